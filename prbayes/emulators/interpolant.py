@@ -68,15 +68,33 @@ class Interpolant:
         for rows, square, cube in self._distances(z):
             np.sqrt(square, out=cube)
             cube *= square
-            terms, slopes = _polynomials(self._scaled(z[rows]), self.powers)
+            terms = _terms(_legendre(self._scaled(z[rows]), self.powers), self.powers)
+            polynomial, *slopes = np.split(self._polynomial_with_slopes @ terms, d + 1)
             steepness, *by_axis = np.split(of_cubes @ cube, d + 1)
             square *= cube
-            values[rows] = (self.coefficients.T @ terms - self.weights.T @ square).T
+            values[rows] = (polynomial - self.weights.T @ square).T
             for a in range(d):
-                radial = by_axis[a] - z[rows, a] * steepness
-                polynomial = self.coefficients.T @ slopes[a] / self.half_width[a]
-                jacobian[rows, :, a] = (radial + polynomial).T
+                jacobian[rows, :, a] = (by_axis[a] - z[rows, a] * steepness + slopes[a]).T
         return values, jacobian
+
+    @cached_property
+    def _polynomial_with_slopes(self) -> Floats:
+        """Coefficients of the polynomial and of its d partial derivatives, ((1 + d) m, terms)."""
+        degree = int(self.powers.max())
+        base = (degree + 1) ** np.arange(self.powers.shape[1] - 1, -1, -1)
+        codes = self.powers @ base  # increasing
+        rows = [self.coefficients.T]
+        for a, half_width in enumerate(self.half_width):
+            slope = np.zeros_like(self.coefficients)
+            # P'_p = (2 p - 1) P_{p-1} + (2 p - 5) P_{p-3} + ...
+            for reduction in range(1, degree + 1, 2):
+                lower = self.powers[:, a] - reduction
+                exists = np.flatnonzero(lower >= 0)
+                places = np.searchsorted(codes, codes[exists] - reduction * base[a])
+                factors = 2 * lower[exists, None] + 1
+                slope[places] += factors * self.coefficients[exists]
+            rows.append(slope.T / half_width)
+        return np.concatenate(rows)
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m), without the Jacobian."""
@@ -147,13 +165,18 @@ class Interpolant:
         """
         n = len(self.z)
         step = min(max(1, IN_CACHE // 4 // n), len(z))
-        arrays = np.empty((2, n, step))
+        arrays = np.empty((2, n * step))
+        runs = self.z - self.center
+        # |a - b|^2 = |a|^2 + |b|^2 - 2 a'b; the digits that small ones lose do not matter in |r|^5.
+        ones = np.ones((n, 1))
+        left = np.concatenate([-2 * runs, (runs**2).sum(axis=1, keepdims=True), ones], axis=1)
         for first in range(0, len(z), step):
             rows = slice(first, first + step)
-            columns = z[rows].T
-            square, spare = arrays[:, :, : columns.shape[1]]
-            _squared_differences(self.z.T, columns, square, spare)
-            yield rows, square, spare
+            points = (z[rows] - self.center).T
+            right = np.stack([*points, np.ones(points.shape[1]), (points**2).sum(axis=0)])
+            square, spare = arrays[:, : n * points.shape[1]].reshape(2, n, -1)
+            np.matmul(left, right, out=square)
+            yield rows, np.maximum(square, 0.0, out=square), spare
 
 
 @one_thread()
@@ -257,26 +280,6 @@ def _sparse_powers(d: int, degree: int) -> list[tuple[int, ...]]:
     if d == 1:
         return [(p,) for p in range(degree + 1)]
     return [(p, *rest) for p in range(degree + 1) for rest in _sparse_powers(d - 1, degree - p)]
-
-
-def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floats]]:
-    """Return products of Legendre polynomials, (d, k) -> (terms, k), and d partial derivatives."""
-    single = _legendre(u, powers)
-    slope = np.zeros_like(single)
-    # P'_{p+1} = P'_{p-1} + (2 p + 1) P_p
-    for p in range(len(single) - 1):
-        slope[p + 1] = (2 * p + 1) * single[p]
-        if p > 0:
-            slope[p + 1] += slope[p - 1]
-    factors = [single[powers[:, a], a] for a in range(len(u))]
-    slopes = []
-    for a in range(len(u)):
-        derivative = slope[powers[:, a], a]
-        for b, factor in enumerate(factors):
-            if b != a:
-                derivative *= factor
-        slopes.append(derivative)
-    return _terms(single, powers), slopes
 
 
 def _legendre(u: Floats, powers: NDArray[np.intp]) -> Floats:

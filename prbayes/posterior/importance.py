@@ -150,28 +150,23 @@ def _derivatives(
     count, d = thetas.shape
     axes = steps[:, None] * np.eye(d)
     first, second = np.triu_indices(d, 1)
-    along, across = axes[:, first], axes[:, second]
-    pairs = along + across, along - across, across - along, -along - across
+    diagonals = axes[:, first] + axes[:, second]
     center = np.zeros((count, 1, d))
-    shifts = np.concatenate([center, axes, -axes, *pairs], axis=1)
+    shifts = np.concatenate([center, axes, -axes, diagonals, -diagonals], axis=1)
     points = thetas[:, None] + shifts
     values = log_density(points.reshape(-1, d)).reshape(count, -1)
     if not np.isfinite(values).all():
         raise ValueError("got a log-density that is not finite around a mode")
-    middle, up, down, *mixed = np.split(values, _ends(d, len(first)), axis=1)
+    ends = np.cumsum([1, d, d, len(first)]).tolist()
+    middle, up, down, ahead, behind = np.split(values, ends, axis=1)
     gradient = (up - down) / (2 * steps)
-    second_derivatives = (up + down - 2 * middle) / steps**2
-    hessian = second_derivatives[..., None] * np.eye(d)
-    area = steps[:, first] * steps[:, second]
-    cross = (mixed[0] - mixed[1] - mixed[2] + mixed[3]) / (4 * area)
+    bends = up + down - 2 * middle
+    hessian = (bends / steps**2)[..., None] * np.eye(d)
+    cross = (ahead + behind - 2 * middle - bends[:, first] - bends[:, second]) / 2
+    cross /= steps[:, first] * steps[:, second]
     hessian[:, first, second] = cross
     hessian[:, second, first] = cross
     return middle[:, 0], gradient, hessian
-
-
-def _ends(d: int, pairs: int) -> list[int]:
-    """Return where the values of the middle, up, down and three of the mixed points end."""
-    return np.cumsum([1, d, d, pairs, pairs, pairs]).tolist()
 
 
 def importance_sample(

@@ -200,21 +200,34 @@ def _target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
 
 def _modes(target: Target) -> list[Laplace] | None:
     """Return Laplace approximations of the modes, None if the density jumps at a start."""
+    starts = np.stack(target.starts)
     try:
-        candidates = laplace(target.log_posterior, np.stack(target.starts), target.scale)
+        if len(starts) > 1:
+            # Starts that are on the way to the same mode go on as one.
+            rough = laplace(target.log_posterior, starts, target.scale, steps=6)
+            starts = np.stack([mode.mode for mode in _distinct(rough)])
+        candidates = laplace(target.log_posterior, starts, target.scale)
     except (ValueError, np.linalg.LinAlgError):
         return None
-    candidates.sort(key=lambda mode: (not mode.converged, -mode.log_mass))
-    modes: list[Laplace] = []
-    for mode in candidates:
+    highest = max(mode.log_mass for mode in candidates)
+    return [
+        mode
+        for i, mode in enumerate(_distinct(candidates))
+        if mode.log_mass >= highest - 10 and (mode.converged or i == 0)
+    ]
+
+
+def _distinct(modes: list[Laplace]) -> list[Laplace]:
+    """Return the modes, best ones first, that are half a standard deviation from better ones."""
+    distinct: list[Laplace] = []
+    for mode in sorted(modes, key=lambda mode: (not mode.converged, -mode.log_mass)):
         distances = [
-            np.abs(mode.mode - each.mode) / np.sqrt(np.diag(each.covariance)) for each in modes
+            np.abs(mode.mode - better.mode) / np.sqrt(np.diag(better.covariance))
+            for better in distinct
         ]
-        negligible = mode.log_mass < candidates[0].log_mass - 10
-        unusable = negligible or (bool(modes) and not mode.converged)
-        if not unusable and all(distance.max() > 0.5 for distance in distances):
-            modes.append(mode)
-    return modes
+        if all(distance.max() > 0.5 for distance in distances):
+            distinct.append(mode)
+    return distinct
 
 
 def _of_importance_sample(

@@ -147,13 +147,20 @@ class Fibres:
         return values, np.where(usable[:, None, None], jacobian, np.nan)
 
     def solve(
-        self, specimen: Indices, z: Floats, directions: Floats | None = None
+        self,
+        specimen: Indices,
+        z: Floats,
+        directions: Floats | None = None,
+        solution: tuple[Floats, Floats] | None = None,
     ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Move z onto fibres by at most 15 Newton steps, at most one unit long.
 
+        With directions the determinant of the Jacobian along them keeps its sign on the way: beyond
+        a fold of the fibre another chart finds the points.
+
         The same start always gives the same point. Convergence is judged by the length of the
         step, in units of the population: a tolerance relative to the range of y depends on the
-        batch, and counted points of two charts twice.
+        batch, and counted points of two charts twice. Steps of 1e-6 leave an error of their square.
 
         Parameters
         ----------
@@ -161,6 +168,9 @@ class Fibres:
         z : ndarray, shape (n, d)
         directions : ndarray, shape (n, d, m), optional
             Span of the steps; by default that of the Jacobian's rows (steps of least norm).
+        solution : tuple of ndarray, shapes (n, d) and (n, m, d), optional
+            Points of the fibres and Jacobians there. Steps that come within .01 of these points
+            have converged to them, and others are not searched for.
 
         Returns
         -------
@@ -170,13 +180,23 @@ class Fibres:
         z = z.copy()
         jacobian = np.zeros((len(z), self.y.shape[1], z.shape[1]))
         converged = np.zeros(len(z), dtype=bool)
+        sign = np.zeros(len(z))
+        if directions is not None and solution is not None:
+            sign = _signs(solution[1] @ directions)
         active = np.arange(len(z))
         for _ in range(15):
             if not active.size:
                 break
             values, slopes = self.outputs(z[active])
             span = slopes.transpose(0, 2, 1) if directions is None else directions[active]
-            coefficients = solve_each(slopes @ span, self.y[specimen[active]] - values)
+            matrices = slopes @ span
+            if directions is not None:
+                signs = _signs(matrices)
+                same = (signs == sign[active]) | (sign[active] == 0)
+                sign[active] = signs
+                active, values, slopes = active[same], values[same], slopes[same]
+                span, matrices = span[same], matrices[same]
+            coefficients = solve_each(matrices, self.y[specimen[active]] - values)
             with np.errstate(all="ignore"):
                 step = (span @ coefficients[..., None])[..., 0]
                 length = np.sqrt((step**2).sum(axis=1))
@@ -185,8 +205,12 @@ class Fibres:
             active, step, length = active[usable], step[usable], length[usable]
             jacobian[active] = slopes[usable]
             z[active] += step / np.maximum(length, 1)[:, None]
-            converged[active] = length < 1e-8
-            active = active[length >= 1e-8]
+            is_done = length < 1e-6
+            if solution is not None:
+                away = np.abs(z[active] - solution[0][active]).max(axis=1)
+                is_done |= away < 0.01
+            converged[active] = is_done
+            active = active[~is_done]
         return z, jacobian, converged
 
 
@@ -262,12 +286,17 @@ class Charts:
         return Charts(**arrays)
 
     def points(
-        self, fibres: Fibres, specimen: Indices, slot: Indices, u: Floats
+        self,
+        fibres: Fibres,
+        specimen: Indices,
+        slot: Indices,
+        u: Floats,
+        solution: tuple[Floats, Floats] | None = None,
     ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Return the points at free coordinates u, (n, d - m), as `Fibres.solve` does."""
         along = self.free[specimen, slot] @ u[..., None]
         start = self.centre[specimen, slot] + along[..., 0]
-        return fibres.solve(specimen, start, self.solved[specimen, slot])
+        return fibres.solve(specimen, start, self.solved[specimen, slot], solution)
 
     def coordinates(self, specimen: Indices, slot: Indices, z: Floats) -> Floats:
         """Return the free coordinates (n, d - m) of points z, (n, d)."""
@@ -275,11 +304,17 @@ class Charts:
         return (away[:, None, :] @ self.free[specimen, slot])[:, 0]
 
     def reach(
-        self, fibres: Fibres, specimen: Indices, slot: Indices, u: Floats, z: Floats
+        self,
+        fibres: Fibres,
+        specimen: Indices,
+        slot: Indices,
+        z: Floats,
+        jacobian: Floats,
     ) -> NDArray[np.bool_]:
-        """Return whether the charts map u, (n, d - m), to the points z, (n, d), of their fibre."""
-        end, _, converged = self.points(fibres, specimen, slot, u)
-        return converged & (np.abs(end - z).max(axis=1) < 1e-5)
+        """Return whether charts reach points z of their fibre, (n, d), with Jacobians (n, m, d)."""
+        u = self.coordinates(specimen, slot, z)
+        end, _, converged = self.points(fibres, specimen, slot, u, (z, jacobian))
+        return converged & (np.abs(end - z).max(axis=1) < 0.01)
 
     def log_mixture(
         self, fibres: Fibres, specimen: Indices, slot: Indices, z: Floats, jacobian: Floats
@@ -312,12 +347,10 @@ class Charts:
             constant = constant + np.log(self.share)
         n, charts = len(z), self.share.shape[1]
         terms = np.full((n, charts), -np.inf)
-        u = np.zeros((n, charts, k))
         for c in range(charts):
             rows = np.flatnonzero(self.share[specimen, c] > 0)
             i, j = specimen[rows], np.full(len(rows), c)
-            u[rows, c] = self.coordinates(i, j, z[rows])
-            away = u[rows, c] - self.location[i, c]
+            away = self.coordinates(i, j, z[rows]) - self.location[i, c]
             scaled = inverse[i, c] @ away[..., None]
             distance = (scaled[..., 0] ** 2).sum(axis=1)
             with np.errstate(divide="ignore"):
@@ -332,9 +365,15 @@ class Charts:
         for c in range(charts):
             rows = np.flatnonzero((terms[:, c] > -np.inf) & (slot != c))
             j = np.full(len(rows), c)
-            reached = self.reach(fibres, specimen[rows], j, u[rows, c], z[rows])
+            reached = self.reach(fibres, specimen[rows], j, z[rows], jacobian[rows])
             terms[rows[~reached], c] = -np.inf
         return np.asarray(logsumexp(terms, axis=1))
+
+
+def _signs(matrices: Floats) -> Floats:
+    """Return the signs of determinants, (n, m, m) -> (n,)."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sign(np.linalg.det(matrices)))
 
 
 def solve_each(matrices: Floats, right: Floats) -> Floats:
@@ -468,8 +507,7 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
         cosine = np.abs(np.linalg.det(projected)) / volume[rows]
         covered = cosine >= 0.3
         near, near_slot = rows[covered], slot[covered]
-        u = charts.coordinates(specimen[near], near_slot, z[near])
-        covered[covered] = charts.reach(fibres, specimen[near], near_slot, u, z[near])
+        covered[covered] = charts.reach(fibres, specimen[near], near_slot, z[near], jacobian[near])
         remaining: Indices = rows[~covered]
         return remaining
 

@@ -139,7 +139,7 @@ class FibreProposal:
         """Number of charts of each specimen, (N,); zero if no point of the fibre was reached."""
         return (self.charts.share > 0).sum(axis=1)
 
-    def draw(self, points: int, seed: int) -> FibrePoints:
+    def draw(self, points: int, seed: int, after: int = 0) -> FibrePoints:
         """Draw points on all fibres.
 
         Parameters
@@ -147,6 +147,8 @@ class FibreProposal:
         points : int
             K, for each specimen. A power of two fills the fibre most evenly.
         seed : int
+        after : int
+            Points of the same seed that are left out, as they were drawn before.
 
         Returns
         -------
@@ -160,9 +162,8 @@ class FibreProposal:
         chart = np.empty((n, points), dtype=np.intp)
         for block in _blocks(n, points):
             numbers = self.numbers[block]
-            sample = _draw(
-                self.fibres.subset(block), self.charts.subset(block), points, (1, seed), numbers
-            )
+            parts = self.fibres.subset(block), self.charts.subset(block)
+            sample = _draw(*parts, points, (1, seed), numbers, after)
             x[block] = sample.x
             log_a[block] = sample.log_a
             chart[block] = sample.chart
@@ -358,11 +359,16 @@ class _Sample:
 
 
 def _draw(
-    fibres: Fibres, charts: Charts, points: int, key: tuple[int, int], numbers: Indices
+    fibres: Fibres,
+    charts: Charts,
+    points: int,
+    key: tuple[int, int],
+    numbers: Indices,
+    after: int = 0,
 ) -> _Sample:
     """Draw points of the fibres from the mixture of their charts."""
     n, k = len(numbers), charts.location.shape[-1]
-    uniform = _shifted_sobol(points, k + 2, key, numbers)
+    uniform = _shifted_sobol(after + points, k + 2, key, numbers)[:, after:]
     cumulative = np.cumsum(charts.share, axis=1)[:, :-1]
     slot = (uniform[..., :1] > cumulative[:, None, :]).sum(axis=2).ravel()
     specimen = np.repeat(np.arange(n), points)

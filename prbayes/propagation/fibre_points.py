@@ -14,11 +14,17 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from prbayes._checks import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.fibre import ReferencePopulation, fit_fibres, with_error
+from prbayes.propagation.fibre import (
+    FibreProposal,
+    ReferencePopulation,
+    fit_fibres,
+    with_error,
+)
 from prbayes.propagation.guards import half_difference
 from prbayes.propagation.points import sobol
 from prbayes.propagation.roots import Response
@@ -28,6 +34,7 @@ from prbayes.propagation.specimen_points import (
     SpecimenPoints,
     extended,
     first_runs,
+    require_accurate,
     spread_out,
     typical_sd,
 )
@@ -35,6 +42,10 @@ from prbayes.propagation.specimen_points import (
 
 class Draws(Protocol):
     """Draws of the hyperparameters."""
+
+    @property
+    def thetas(self) -> Floats:
+        """The draws, (S, p)."""
 
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
         """Return log p(y_i | theta), (S, N)."""
@@ -94,10 +105,12 @@ def fibre_points(
     d = bounds.shape[1]
     n = first_runs(d) if n is None else n
     spread = readings.spread()
-    emulation = Emulation.first(run, 2 * sobol(n, d, seed) - 1, bounds, readings, options, name)
     population = ReferencePopulation.from_sample(prior_specimens)
+    # Wider than the population by half; even points of a box would be in its corners.
+    first = np.clip(population.inputs(1.5 * ndtri(sobol(n, d, seed))), *bounds)
+    emulation = Emulation.first(run, first, bounds, readings, options, name)
     rng = np.random.default_rng([seed, 1])
-    count = 256
+    count, batch_size = 256, max(n // 2, options.fresh)
     for batch in range(6):
         points, draws = _reliable_draws(
             emulation, readings, population, posterior, count, options, seed + batch, name
@@ -106,27 +119,29 @@ def fibre_points(
         population = ReferencePopulation.from_sample(draws.specimens())
         if batch >= 2 and emulation.bias <= options.bias:
             break
-        fresh = _fresh(points, draws, max(n // 2, options.fresh), options.fresh, bounds, rng)
-        emulation = extended(emulation, run, fresh, readings, options, spread, name)
-    if emulation.bias > options.bias:
-        raise DesignError(
-            f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
-            f"input by {emulation.bias:.2g} posterior standard deviations after "
-            f"{len(emulation.z)} runs, expected at most {options.bias}; use "
-            "metric=prb.ProbabilityResidual(), or more first runs with "
-            "propagation=prb.Reweighted(n)"
-        )
+        fresh = _fresh(points, draws, batch_size, bounds, rng)
+        half = batch_size // 2
+        emulation = extended(emulation, run, fresh, readings, options, spread, name, half)
+    require_accurate(emulation, readings, options, name)
     # Points on fibres cost more than those around roots, and their error falls more slowly.
-    goal, largest = 2 * options.half_difference, 3 * options.half_difference
+    unit = options.half_difference * _per_hyperparameter(draws)
+    goal, largest = 2 * unit, 3 * unit
     count = 128
+    proposals = [
+        _Proposals.fitted(emulation, readings, population, 100 + seed + half) for half in (0, 1)
+    ]
+    halves = [proposal.draw(count) for proposal in proposals]
     while True:
-        halves = [_draw(emulation, readings, population, count, 100 + seed + h) for h in (0, 1)]
         difference = _difference(*(draws.log_likelihoods(p.z, p.log_a) for p in halves))
         is_last = 4 * count > options.most_points
         if difference <= (largest if is_last else goal):
             break
         if is_last:
             raise _monte_carlo_error(name, 2 * count, difference, largest)
+        halves = [
+            _joined(half, proposal.draw(count, after=count))
+            for half, proposal in zip(halves, proposals, strict=True)
+        ]
         count *= 2
     joint = _joined(*halves)
     return emulation, SpecimenPoints(
@@ -162,12 +177,13 @@ def _reliable_draws(
     count : int
         Points at first.
     largest : float
-        Half difference in nats that shifts a posterior by about its standard deviation.
+        Half difference in nats that shifts the posterior of four hyperparameters by about half of
+        their standard deviations.
     """
     free = population.root.shape[0] - int(readings.is_measured.sum(axis=1).min())
     narrows = False
     while True:
-        points = _draw(emulation, readings, population, count, seed)
+        points = _Proposals.fitted(emulation, readings, population, seed).draw(count)
         if not narrows:
             draws = posterior(points.z, points.log_a, None)
             half = count // 2
@@ -179,10 +195,11 @@ def _reliable_draws(
                 ),
             )
             difference = _difference(*(draws.log_likelihoods(*part) for part in parts))
-            if difference <= largest:
+            limit = largest * _per_hyperparameter(draws)
+            if difference <= limit:
                 return points, draws
             if 2 * count > options.most_points:
-                raise _monte_carlo_error(name, count, difference, largest)
+                raise _monte_carlo_error(name, count, difference, limit)
         smoothing = count ** (-2 / (free + 4)) * population.root @ population.root.T
         specimens = posterior(points.z, points.log_a, smoothing).specimens()
         smoothed = ReferencePopulation.from_sample(specimens).wider(smoothing)
@@ -190,6 +207,15 @@ def _reliable_draws(
         narrows = bool(volumes[0] < volumes[1] / 2)
         population = smoothed
         count = count if narrows else 2 * count
+
+
+def _per_hyperparameter(draws: Draws) -> float:
+    """Return the error of a log-likelihood that shifts hyperparameters as 1 shifts each of four.
+
+    A random function of p hyperparameters with a standard deviation of s nats over the posterior
+    has slopes of about s / sqrt(p) nats a posterior standard deviation, and shifts means by that.
+    """
+    return float(np.sqrt(max(draws.thetas.shape[1], 4) / 4))
 
 
 def _monte_carlo_error(name: str, count: int, difference: float, largest: float) -> DesignError:
@@ -207,7 +233,7 @@ def _difference(first: Floats, second: Floats) -> float:
 
 
 def _joined(first: _Points, second: _Points) -> _Points:
-    """Return two independent sets of points as one; each counts half."""
+    """Return two sets of points as one; each counts half."""
     return _Points(
         np.concatenate([first.z, second.z], axis=1),
         np.concatenate([first.outputs, second.outputs], axis=1),
@@ -216,63 +242,99 @@ def _joined(first: _Points, second: _Points) -> _Points:
     )
 
 
-def _draw(
-    emulation: Emulation, readings: Readings, population: ReferencePopulation, count: int, seed: int
-) -> _Points:
-    """Draw points of all specimens, by the pattern of outputs that were measured."""
-    n, m = readings.values.shape
-    d = len(population.mean)
-    z = np.empty((n, count, d))
-    log_proposal = np.full((n, count), np.inf)
-    exact = np.zeros((n, count))
-    sd = readings.comparison_sd(emulation.error)
-    has_error = readings.is_measured & ((readings.error > 0) | (readings.step > 0))
-    patterns, which = np.unique(
-        np.concatenate([readings.is_measured, has_error], axis=1), axis=0, return_inverse=True
-    )
-    numbers = np.arange(n)
-    for k, pattern in enumerate(patterns):
-        rows = np.flatnonzero(which.ravel() == k)
-        columns = np.flatnonzero(pattern[:m])
-        noisy = pattern[m:][columns]
-        part = readings.rows(rows)
-        if not len(columns):
-            z[rows], log_proposal[rows] = _population_points(population, rows, count, seed)
-            continue
-        response = _columns(emulation, columns)
-        y = part.values[:, columns]
-        if not noisy.any() and len(columns) < d:
-            points = fit_fibres(response, y, population, seed=seed, numbers=numbers[rows]).draw(
-                count, seed
-            )
-            z[rows], exact[rows] = points.x, points.log_a
-            log_proposal[rows] = 0.0
-            continue
-        # A reading error per pattern; the density of each reading replaces it below.
-        error = typical_sd(sd[np.ix_(rows, columns)])
-        proposal = fit_fibres(
-            with_error(response, error),
-            y,
-            population.with_errors(len(columns)),
-            seed=seed,
-            numbers=numbers[rows],
+@dataclass(frozen=True, eq=False)
+class _Proposals:
+    """Proposals on the fibres of specimens, by the pattern of outputs that were measured.
+
+    Attributes
+    ----------
+    emulation : Emulation
+    readings : Readings
+    population : ReferencePopulation
+    seed : int
+    patterns : list of _Pattern
+    """
+
+    emulation: Emulation
+    readings: Readings
+    population: ReferencePopulation
+    seed: int
+    patterns: list[_Pattern]
+
+    @classmethod
+    def fitted(
+        cls, emulation: Emulation, readings: Readings, population: ReferencePopulation, seed: int
+    ) -> _Proposals:
+        """Return proposals that are fitted to the fibres under a population."""
+        m = readings.values.shape[1]
+        sd = readings.comparison_sd(emulation.error)
+        has_error = readings.is_measured & ((readings.error > 0) | (readings.step > 0))
+        both = np.concatenate([readings.is_measured, has_error], axis=1)
+        patterns, which = np.unique(both, axis=0, return_inverse=True)
+        fitted = []
+        for k, pattern in enumerate(patterns):
+            rows = np.flatnonzero(which.ravel() == k)
+            columns = np.flatnonzero(pattern[:m])
+            if not len(columns):
+                fitted.append(_Pattern(rows, columns))
+                continue
+            response = _columns(emulation, columns)
+            y = readings.values[np.ix_(rows, columns)]
+            error, reference = None, population
+            if pattern[m:].any() or len(columns) >= len(population.mean):
+                # A reading error per pattern; the density of each reading replaces it in `draw`.
+                error = typical_sd(sd[np.ix_(rows, columns)])
+                response = with_error(response, error)
+                reference = population.with_errors(len(columns))
+            proposal = fit_fibres(response, y, reference, seed=seed, numbers=rows)
+            fitted.append(_Pattern(rows, columns, proposal, error))
+        return cls(emulation, readings, population, seed, fitted)
+
+    def draw(self, count: int, after: int = 0) -> _Points:
+        """Draw points of all specimens, other ones than the first `after`."""
+        n, m = self.readings.values.shape
+        d = len(self.population.mean)
+        z = np.empty((n, count, d))
+        log_proposal = np.full((n, count), np.inf)
+        exact = np.full((n, count), np.nan)
+        for pattern in self.patterns:
+            rows, columns = pattern.rows, pattern.columns
+            if pattern.proposal is None:
+                z[rows], log_proposal[rows] = _population_points(
+                    self.population, rows, count, self.seed, after
+                )
+                continue
+            points = pattern.proposal.draw(count, self.seed, after)
+            if pattern.error is None:
+                z[rows], exact[rows] = points.x, points.log_a
+                log_proposal[rows] = 0.0
+                continue
+            points = points.without_errors(len(columns))
+            z[rows] = points.x
+            values, _ = _columns(self.emulation, columns)(points.x.reshape(-1, d))
+            y = self.readings.values[np.ix_(rows, columns)]
+            away = (y[:, None] - values.reshape(len(rows), count, -1)) / pattern.error
+            log_normal = -0.5 * away**2 - np.log(pattern.error) - 0.5 * np.log(2 * np.pi)
+            log_proposal[rows] = log_normal.sum(axis=-1) - points.log_a
+        outputs = self.emulation.values(z.reshape(-1, d)).reshape(n, count, m)
+        readings, error = self.readings, self.emulation.error
+        censored = replace(readings, values=np.full_like(readings.values, np.nan))
+        log_a = np.where(
+            np.isnan(exact),
+            readings.log_density(outputs, error) - log_proposal,
+            exact + censored.log_density(outputs, error),
         )
-        points = proposal.draw(count, seed).without_errors(len(columns))
-        z[rows] = points.x
-        values, _ = response(points.x.reshape(-1, d))
-        away = (y[:, None] - values.reshape(len(rows), count, -1)) / error
-        log_normal = -0.5 * away**2 - np.log(error) - 0.5 * np.log(2 * np.pi)
-        normal = log_normal.sum(axis=-1)
-        log_proposal[rows] = normal - points.log_a
-    outputs = emulation(z.reshape(-1, d))[0].reshape(n, count, m)
-    is_exact = np.isfinite(log_proposal) & (log_proposal == 0.0)
-    censored = replace(readings, values=np.full_like(readings.values, np.nan))
-    log_a = np.where(
-        is_exact,
-        exact + censored.log_density(outputs, emulation.error),
-        readings.log_density(outputs, emulation.error) - log_proposal,
-    )
-    return _Points(z, outputs, np.where(np.isnan(log_a), -np.inf, log_a), log_proposal)
+        return _Points(z, outputs, np.where(np.isnan(log_a), -np.inf, log_a), log_proposal)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pattern:
+    """Specimens with the same outputs measured, and the proposal on their fibres."""
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    proposal: FibreProposal | None = None  # None: nothing is measured
+    error: Floats | None = None  # (columns,): of the readings; None if they are exact
 
 
 def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
@@ -292,13 +354,11 @@ def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
 
 
 def _population_points(
-    population: ReferencePopulation, rows: NDArray[np.intp], count: int, seed: int
+    population: ReferencePopulation, rows: NDArray[np.intp], count: int, seed: int, after: int
 ) -> tuple[Floats, Floats]:
     """Return points of a wide population, and the log of count times their density."""
-    from scipy.special import ndtri
-
     d = len(population.mean)
-    base = sobol(count, d, seed)
+    base = sobol(after + count, d, seed)[after:]
     rng = np.random.default_rng([seed, 2])
     size = int(rows.max()) + 1
     shift = rng.random((size, 1, d))[rows]
@@ -316,11 +376,10 @@ def _fresh(
     points: _Points,
     draws: Draws,
     count: int,
-    sampled: int,
     bounds: Floats,
     rng: np.random.Generator,
 ) -> Floats:
-    """Return points for new runs: a sample of the specimens' inputs, and the rest spread out."""
+    """Return points for new runs: half a sample of the specimens' inputs, half spread out."""
     specimens = draws.specimens()
     _, each, d = points.z.shape
     # Weights of the points under the normal population of the draws.
@@ -337,4 +396,4 @@ def _fresh(
         k = (cumulative < rng.random((len(weights), 1))).sum(axis=1).clip(max=each - 1)
         chosen.append(points.z[finite][np.arange(len(k)), k])
     z = np.clip(np.concatenate(chosen), bounds[0], bounds[1])
-    return spread_out(z, bounds, count, sampled, rng)
+    return spread_out(z, bounds, count, count // 2, rng)

@@ -81,7 +81,7 @@ class PointOptions:
 
 def first_runs(dimensions: int) -> int:
     """Return the number of runs that an emulator of so many inputs starts from."""
-    return 64 if dimensions <= 2 else 128 if dimensions <= 4 else 512
+    return 64 if dimensions <= 2 else 128 if dimensions <= 4 else 480
 
 
 class Surface(Protocol):
@@ -164,8 +164,9 @@ class Emulation:
         """Return the emulation of runs at first points."""
         y = run(z)
         spread = readings.spread()
-        surface, left_out = surface_near(z, y, readings, spread, name)
-        error = np.maximum(2 * left_out, options.floor * spread)
+        surface, left_out, is_near = surface_near(z, y, readings, spread, name)
+        rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
+        error = np.maximum(2 * rms, options.floor * spread)
         nothing = np.full(z.shape[1], np.inf)
         empty = np.stack([nothing, -nothing])
         return cls(
@@ -306,6 +307,19 @@ def emulate(
     else:
         roots = specimen_roots(emulation, readings, options)
     options, roots = _all_roots(emulation, readings, options, roots, seed)
+    require_accurate(emulation, readings, options, name)
+    return emulation, roots
+
+
+def require_accurate(
+    emulation: Emulation, readings: Readings, options: PointOptions, name: str
+) -> None:
+    """Raise if the emulator's error is as large as the scatter of the data, or shifts populations.
+
+    Raises
+    ------
+    DesignError
+    """
     rough = (
         "the response is not smooth enough for prb.LogLikelihood(): use "
         "metric=prb.ProbabilityResidual(), or more first runs with propagation=prb.Reweighted(n)"
@@ -322,7 +336,6 @@ def emulate(
             f"input by {emulation.bias:.2g} posterior standard deviations after "
             f"{len(emulation.z)} runs, expected at most {options.bias}; {rough}"
         )
-    return emulation, roots
 
 
 def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
@@ -373,14 +386,22 @@ def extended(
     options: PointOptions,
     spread: Floats,
     name: str,
+    sampled: int | None = None,
 ) -> Emulation:
-    """Return the emulation with runs at fresh points, whose misfit gives its error and bias."""
+    """Return the emulation with runs at fresh points, whose misfit gives its error and bias.
+
+    The misfit is that of the emulator before at the first points. With `sampled` it is the left-out
+    error of the new emulator at so many first points, which are a sample of the specimens' inputs.
+    """
     values, jacobian = emulation.surface(fresh)
     outputs = run(fresh)
-    misfit = outputs - values
+    z = np.concatenate([emulation.z, fresh])
+    y = np.concatenate([emulation.y, outputs])
+    surface, left_out, _ = surface_near(z, y, readings, spread, name)
+    misfit = outputs - values if sampled is None else left_out[len(emulation.z) :]
     good = np.isfinite(misfit).all(axis=1)
     error, bias = emulation.error, np.inf
-    some = np.flatnonzero(good[: options.fresh])
+    some = np.flatnonzero(good[: options.fresh if sampled is None else sampled])
     if len(some) >= 4:
         # At the roots alone: points around them may lie far out, where nothing was measured.
         error = 2 * np.sqrt((misfit[some] ** 2).mean(axis=0))
@@ -388,9 +409,9 @@ def extended(
         unit = typical_sd(readings.comparison_sd(error))
         scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
         bias = float(np.abs(predicted_bias(*scaled, fresh[some], len(readings))).max())
-    z = np.concatenate([emulation.z, fresh])
-    y = np.concatenate([emulation.y, outputs])
-    surface, _ = surface_near(z, y, readings, spread, name)
+        # Each reading informs of one input.
+        per_specimen = readings.is_measured.sum(axis=1).mean()
+        bias *= np.sqrt(min(1.0, per_specimen / fresh.shape[1]))
     reach = np.concatenate([emulation.range, fresh])
     extremes = np.stack([reach.min(axis=0), reach.max(axis=0)])
     return Emulation(
@@ -411,10 +432,11 @@ def typical_sd(sd: Floats) -> Floats:
 
 def surface_near(
     z: Floats, y: Floats, readings: Readings, spread: Floats, name: str
-) -> tuple[Interpolant, Floats]:
-    """Return the interpolant, and its root mean square left-out error near the data, (m,).
+) -> tuple[Interpolant, Floats, NDArray[np.bool_]]:
+    """Return the interpolant, left-out errors, (n, m), and which runs are near the data, (n,).
 
     Of runs that are equal to nine digits one is taken: others add nothing but rounding errors.
+    Left-out errors are NaN where there is no response.
     """
     good = np.isfinite(y).all(axis=1)
     if good.sum() < 8:
@@ -422,17 +444,21 @@ def surface_near(
             f"{name}: got {int(good.sum())} runs with a response of {len(y)}, expected at least 8; "
             "check the response, or give the hyperparameters priors where it exists"
         )
-    z, y = z[good], y[good]
-    _, first = np.unique(np.round(z, 9), axis=0, return_index=True)
-    zg = z[first]
-    yg = _limited(y[first], readings, spread)
+    rows = np.flatnonzero(good)
+    _, first, copies = np.unique(
+        np.round(z[rows], 9), axis=0, return_index=True, return_inverse=True
+    )
+    zg = z[rows[first]]
+    yg = _limited(y[rows[first]], readings, spread)
     inside = _is_near(yg, readings, spread)
     if inside.sum() < len(yg) // 4:
         distance = (((yg - np.nanmean(readings.values, axis=0)) / spread) ** 2).sum(axis=1)
         inside = np.zeros(len(yg), dtype=bool)
         inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
     surface = fit_interpolant(zg, yg, inside)
-    return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
+    left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
+    left_out[rows], is_near[rows] = surface.left_out[copies.ravel()], inside[copies.ravel()]
+    return surface, left_out, is_near
 
 
 def _limited(y: Floats, readings: Readings, spread: Floats, most: float = 1e4) -> Floats:

@@ -84,8 +84,9 @@ def test_a_chart_maps_free_coordinates_to_the_fibre_and_back() -> None:
     np.testing.assert_allclose(parabola(z)[0], fibres.y[i])
     np.testing.assert_allclose(jacobian[:, 0, 0], z[:, 0])
     np.testing.assert_allclose(charts.coordinates(i, slot, z), u)
-    assert charts.reach(fibres, i, slot, u, z).all()
-    assert not charts.reach(fibres, i, slot, u + 1e-3, z).any()
+    assert charts.reach(fibres, i, slot, z, jacobian).all()
+    beside = z + np.array([0.0, 0.1])
+    assert not charts.reach(fibres, i, slot, beside, parabola(beside)[1]).any()
     axes = np.concatenate([charts.solved, charts.free], axis=3)[:, 0]
     np.testing.assert_allclose(axes.transpose(0, 2, 1) @ axes, [np.eye(2)] * 2, atol=1e-12)
 
@@ -166,13 +167,7 @@ def test_the_density_of_the_mixture_is_that_of_the_coarea_measure() -> None:
     present = np.flatnonzero(charts.share[0] > 0)
     reached = np.stack(
         [
-            charts.reach(
-                fibres,
-                i := np.zeros(n, dtype=int),
-                c := np.full(n, s),
-                charts.coordinates(i, c, z),
-                z,
-            )
+            charts.reach(fibres, np.zeros(n, dtype=int), np.full(n, s), z, circle(z)[1])
             for s in present
         ],
         axis=1,

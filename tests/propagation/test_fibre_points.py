@@ -27,6 +27,10 @@ class NormalDraws:
     means: Floats  # (S, d)
     sds: Floats  # (S, d)
 
+    @property
+    def thetas(self) -> Floats:
+        return np.concatenate([self.means, self.sds], axis=1)
+
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
         standard = (z - self.means[:, None, None]) / self.sds[:, None, None]
         log_p = -0.5 * (standard**2).sum(axis=-1) - z.shape[-1] / 2 * np.log(2 * np.pi)
