@@ -263,7 +263,9 @@ def importance_sample(
         sample = _weighted(points, log_p, log_ratio, size, seed)
         # Too few effective points have no moments.
         is_lost = round_ > 2 and sample.effective_size < 10 * points.shape[1]
-        if sample.is_reliable(options) or round_ == options.rounds or is_lost:
+        # Fitted proposals look better than they are until the points have seen all regions.
+        is_enough = round_ == 1 or sample.effective_size >= size
+        if (sample.is_reliable(options) and is_enough) or round_ == options.rounds or is_lost:
             break
         proposal = _fitted(points, log_ratio, options, rng)
         count = round_ * size // 2
