@@ -1,12 +1,13 @@
 """Many products with a population each: one emulator, and a posterior for each product.
 
 The points of all specimens come in blocks from the emulator of the first products. A posterior is
-importance sampling on `PopulationDensity`. `benchmarks.speed` measures it on the frame.
+importance sampling on `PopulationDensity`, around modes that are found in blocks. `benchmarks.speed` measures it on the frame.
 """
 
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -54,27 +55,36 @@ def fleet(products: int, size: int = 20) -> dict[str, Any]:
     density = PopulationDensity(likelihood.inputs)
     order = [str(root.name) for root in likelihood.inputs.roots]
     free = [str(rv.name) for rv in evaluator.model.free_RVs]
+    weighted = [WeightedPoints.of(likelihood.inputs, *each) for each in zip(x, log_a, strict=True)]
+
+    def log_posteriors(thetas: Any, members: range) -> Any:
+        """Return log-densities of equal parts of the thetas, a part for each product."""
+        values = names.constrained(thetas)
+        params = [np.split(values[name], len(members)) for name in order]
+        logs = [
+            density.log_likelihoods(part, weighted[r]).sum(axis=1)
+            for r, part in zip(members, zip(*params, strict=True), strict=True)
+        ]
+        return names.log_prior(thetas) + np.concatenate(logs)
+
     means, sds = [], []
-    for r in range(products):
-        weighted = WeightedPoints.of(likelihood.inputs, x[r], log_a[r])
-
-        def log_posterior(thetas: Any, weighted: WeightedPoints = weighted) -> Any:
-            values = names.constrained(thetas)
-            params = [values[name] for name in order]
-            logs = density.log_likelihoods(params, weighted).sum(axis=1)
-            return names.log_prior(thetas) + logs
-
+    for first in range(0, products, BLOCK):
+        members = range(first, min(first + BLOCK, products))
         # The moments of the points are near the mode.
-        centers = [np.where(np.isfinite(log_a[r]), v, np.nan) for v in x[r]]
-        medians = [np.nanmedian(v, axis=1) for v in centers]
-        start = {"mu1": medians[0].mean(), "sd1": medians[0].std()}
-        start |= {"mu2": medians[1].mean(), "sd2": medians[1].std()}
-        theta = names.thetas_of([np.array([start[name]]) for name in free])
-        modes = laplace(log_posterior, theta, names.prior_sd)
-        sample = importance_sample(log_posterior, modes, DRAWS, r)
-        values = names.constrained(sample.draws)
-        means.append([values[name].mean() for name in problem.priors])
-        sds.append([values[name].std() for name in problem.priors])
+        medians = [
+            [np.nanmedian(np.where(np.isfinite(log_a[r]), v, np.nan), axis=1) for v in x[r]]
+            for r in members
+        ]
+        means_of, sds_of = np.mean(medians, axis=2).T, np.std(medians, axis=2).T
+        start = dict(zip(("mu1", "mu2", "sd1", "sd2"), (*means_of, *sds_of), strict=True))
+        starts = names.thetas_of([start[name] for name in free])
+        modes = laplace(partial(log_posteriors, members=members), starts, names.prior_sd)
+        for r, mode in zip(members, modes, strict=True):
+            log_posterior = partial(log_posteriors, members=range(r, r + 1))
+            sample = importance_sample(log_posterior, [mode], DRAWS, r)
+            values = names.constrained(sample.draws)
+            means.append([values[name].mean() for name in problem.priors])
+            sds.append([values[name].std() for name in problem.priors])
     done = time.process_time()
     checked = range(min(products, 100))
     references = [problem.reference(size, r) for r in checked]

@@ -147,7 +147,12 @@ class StoredScores:
     def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
         """Return log weights of populations, (S, M'), and the scores of their responses."""
         _, weights = evaluator.populations(thetas, self.simulator)
-        return _log_normalised(weights[:, self.is_observable]), self.scores
+        if not self.is_observable.all():
+            weights = weights[:, self.is_observable]
+            with np.errstate(invalid="ignore"):
+                weights /= weights.sum(axis=1, keepdims=True)
+        with np.errstate(divide="ignore"):
+            return np.log(weights), self.scores
 
     def combined(self, combinations: Floats) -> StoredScores:
         """Return combinations of the scores, (d, r)."""
@@ -196,14 +201,6 @@ class ResimulatedScores:
     def combined(self, combinations: Floats) -> ResimulatedScores:
         """Return combinations of the scores, (d, r)."""
         return replace(self, combinations=combinations)
-
-
-def _log_normalised(weights: Floats) -> Floats:
-    """Return logarithms of weights (S, M) that sum to one; NaN where a population has none."""
-    totals = weights.sum(axis=1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = weights / totals
-        return np.asarray(np.log(shares))
 
 
 def estimate_likelihood(

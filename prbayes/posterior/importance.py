@@ -1,14 +1,16 @@
 """Importance sampling of a density from Laplace approximations of its modes.
 
-The proposal is a mixture of multivariate t distributions with five degrees of freedom, one for each
-mode. A second round takes the moments of the first. Pareto-smoothed importance sampling judges the
-weights (Vehtari et al. 2024, J. Mach. Learn. Res. 25(72)).
+The first proposal is a mixture of multivariate t distributions with five degrees of freedom, one
+for each mode. Where it is not enough, further rounds fit mixtures to all weighted points. Draws of
+the prior cover what these points have not seen. The weights are those of the mixture of all
+proposals (adaptive multiple importance sampling: Cornuet et al. 2012, Scand. J. Stat. 39(4)).
+Pareto-smoothed importance sampling judges them (Vehtari et al. 2024, J. Mach. Learn. Res. 25(72)).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
@@ -33,16 +35,39 @@ class ImportanceOptions:
         Degrees of freedom of the proposal's t distributions.
     pareto_k : float
         Largest shape of the weights' tail with which the draws are trusted (Vehtari et al. 2024).
-    efficiency : float
-        Smallest effective sample size, as a share of the points.
+    effective : float
+        Smallest effective sample size, as a share of the draws.
     rounds : int
+        Largest number of proposals. The r-th fitted one has r / 2 points for each draw.
+    components : int
+        Components of a fitted mixture.
+    prior_share : float
+        Share of the prior in the points of a fitted proposal; half in the first.
     """
 
     oversampling: int = 2
     degrees: float = 5.0
     pareto_k: float = 0.7
-    efficiency: float = 0.25
-    rounds: int = 2
+    effective: float = 0.5
+    rounds: int = 6
+    components: int = 4
+    prior_share: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """The prior as a proposal.
+
+    Attributes
+    ----------
+    draws : callable
+        ``draws(size, seed)``, shape (size, d).
+    log_density : callable
+        (S, d) -> (S,).
+    """
+
+    draws: Callable[[int, int], Floats]
+    log_density: LogDensity
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +100,9 @@ class ImportanceSample:
     pareto_k : float
         Shape of the tail of the weights.
     efficiency : float
-        Effective sample size as a share of the proposal's points.
+        Effective sample size as a share of the points.
+    n_points : int
+        Points of all proposals.
     log_evidence : float
         Logarithm of the integral of the density.
     """
@@ -84,11 +111,18 @@ class ImportanceSample:
     log_density: Floats
     pareto_k: float
     efficiency: float
+    n_points: int
     log_evidence: float
+
+    @property
+    def effective_size(self) -> float:
+        """The effective sample size of the weighted points."""
+        return self.efficiency * self.n_points
 
     def is_reliable(self, options: ImportanceOptions) -> bool:
         """Return whether the weights are even enough."""
-        return self.pareto_k <= options.pareto_k and self.efficiency >= options.efficiency
+        smallest = options.effective * len(self.draws)
+        return self.pareto_k <= options.pareto_k and self.effective_size >= smallest
 
 
 def laplace(
@@ -175,6 +209,7 @@ def importance_sample(
     size: int,
     seed: int,
     options: ImportanceOptions = ImportanceOptions(),
+    prior: Prior | None = None,
 ) -> ImportanceSample:
     """Return draws of a density by importance sampling around its modes.
 
@@ -186,40 +221,113 @@ def importance_sample(
         Number of draws.
     seed : int
     options : ImportanceOptions
+    prior : Prior, optional
+        Part of the proposals after the first.
     """
-    centers = np.stack([mode.mode for mode in modes])
-    roots = np.stack([np.linalg.cholesky(mode.covariance) for mode in modes])
     masses = np.array([mode.log_mass for mode in modes])
-    shares = np.exp(masses - logsumexp(masses))
-    for round_ in range(options.rounds):
-        # A mode whose mass the approximation gets wrong still has points.
-        shares = np.maximum(shares, 0.1 / len(shares))
-        proposal = _Mixture(centers, roots, shares / shares.sum(), options.degrees)
-        points = proposal.draws(options.oversampling * size, seed + round_)
-        by_component = proposal.log_densities(points)
-        log_q = logsumexp(by_component, axis=1)
-        log_p = log_density(points)
-        weights, sample = _weighted(points, log_p, log_p - log_q, size, seed + round_)
-        if sample.is_reliable(options):
+    # A mode whose mass the approximation gets wrong still has points.
+    shares = np.maximum(np.exp(masses - logsumexp(masses)), 0.1 / len(masses))
+    proposal = _Mixture(
+        np.stack([mode.mode for mode in modes]),
+        np.stack([np.linalg.cholesky(mode.covariance) for mode in modes]),
+        shares / shares.sum(),
+        options.degrees,
+    )
+    points = proposal.draws(options.oversampling * size, seed)
+    # A few points show whether the others are worth their time.
+    pilot = min(max(len(points) // 8, 512), len(points))
+    log_p = log_density(points[:pilot])
+    log_ratio = log_p - logsumexp(proposal.log_densities(points[:pilot]), axis=1)
+    weights = np.exp(log_ratio - logsumexp(log_ratio))
+    is_poor = (weights**2).sum() * pilot > options.oversampling / options.effective
+    if is_poor and options.rounds > 1:
+        points = points[:pilot]
+    elif pilot < len(points):
+        log_p = np.concatenate([log_p, log_density(points[pilot:])])
+    proposals, counts = [proposal], [len(points)]
+    from_prior = 0
+    rng = np.random.default_rng([seed, 1])
+    for round_ in range(1, options.rounds + 1):
+        terms = [
+            logsumexp(each.log_densities(points), axis=1) + np.log(count / len(points))
+            for each, count in zip(proposals, counts, strict=True)
+        ]
+        if prior is not None and from_prior:
+            terms.append(prior.log_density(points) + np.log(from_prior / len(points)))
+        log_ratio = log_p - logsumexp(terms, axis=0)
+        sample = _weighted(points, log_p, log_ratio, size, seed)
+        # Too few effective points have no moments.
+        is_lost = round_ > 2 and sample.effective_size < 10 * points.shape[1]
+        # Fitted proposals look better than they are until the points have seen all regions.
+        is_enough = round_ == 1 or sample.effective_size >= size
+        if (sample.is_reliable(options) and is_enough) or round_ == options.rounds or is_lost:
             break
-        responsibilities = np.exp(by_component - log_q[:, None])
-        responsibilities = responsibilities * weights[:, None]
-        shares = responsibilities.sum(axis=0)
-        for m, share in enumerate(shares):
-            if share * len(points) * sample.efficiency < 10 * points.shape[1]:
-                continue  # too few effective points for moments
-            rows = responsibilities[:, m] / share
-            centers[m] = rows @ points
-            away = points - centers[m]
-            covariance = (away * rows[:, None]).T @ away
-            roots[m] = np.linalg.cholesky(covariance)
+        proposal = _fitted(points, log_ratio, options, rng)
+        count = round_ * size // 2
+        share = 0.0 if prior is None else 0.5 if round_ == 1 else options.prior_share
+        added = int(share * count)
+        parts = [proposal.draws(count - added, seed + round_)]
+        if prior is not None:
+            parts.append(prior.draws(added, seed + round_))
+        new = np.concatenate(parts)
+        points, log_p = np.concatenate([points, new]), np.concatenate([log_p, log_density(new)])
+        proposals, counts = [*proposals, proposal], [*counts, count - added]
+        from_prior += added
     return sample
+
+
+def _fitted(
+    points: Floats, log_ratio: Floats, options: ImportanceOptions, rng: np.random.Generator
+) -> _Mixture:
+    """Return a mixture of t distributions fitted to weighted points by the EM algorithm.
+
+    Weights of few effective points are raised to a power below one until they have a hundred.
+    """
+    for power in np.linspace(1, 0, 20, endpoint=False):
+        weights = np.exp(power * (log_ratio - log_ratio.max()))
+        weights /= weights.sum()
+        if 1 / (weights**2).sum() >= 100:
+            break
+    points, weights = points[weights > 0], weights[weights > 0]
+    d, m, nu = points.shape[1], options.components, options.degrees
+    away = points - weights @ points
+    covariance = (away * weights[:, None]).T @ away
+    ridge = 1e-9 * np.diag(np.diag(covariance))
+    root = np.linalg.cholesky(covariance + ridge)
+    # Centers far from each other.
+    standard = np.linalg.solve(root, away.T)
+    squares = (standard**2).sum(axis=0)
+    chosen: list[int] = []
+    for _ in range(m):
+        chances = weights * squares
+        chosen.append(int(rng.choice(len(points), p=chances / chances.sum())))
+        to_last = ((standard - standard[:, chosen[-1:]]) ** 2).sum(axis=0)
+        squares = to_last if len(chosen) == 1 else np.minimum(squares, to_last)
+    mixture = _Mixture(points[chosen], np.tile(root / np.sqrt(m), (m, 1, 1)), np.full(m, 1 / m), nu)
+    for _ in range(15):
+        by_component = mixture.log_densities(points)
+        by_component -= logsumexp(by_component, axis=1, keepdims=True)
+        masses = (np.exp(by_component) * weights[:, None]).T
+        shares = masses.sum(axis=1, keepdims=True)
+        rows = masses / np.maximum(shares, 1e-300)
+        # The expected precision of a t distribution's normal variable, given the point.
+        precise = rows * (nu + d) / (nu + mixture.squares(points))
+        centers = precise @ points / precise.sum(axis=1, keepdims=True)
+        away = points - centers[:, None]
+        within = (away * precise[..., None]).swapaxes(1, 2) @ away
+        # Few effective points leave the covariance that of all, of an m-th of the volume.
+        effective = 1 / (rows**2).sum(axis=1)
+        trust = (effective / (effective + 2 * d))[:, None, None]
+        roots = np.linalg.cholesky(trust * within + (1 - trust) * covariance / m + ridge)
+        mixture = _Mixture(centers, roots, shares[:, 0], nu)
+    shares = np.maximum(mixture.shares, 0.01 / m)
+    return replace(mixture, shares=shares / shares.sum())
 
 
 def _weighted(
     points: Floats, log_p: Floats, log_ratio: Floats, size: int, seed: int
-) -> tuple[Floats, ImportanceSample]:
-    """Return smoothed weights with sum 1, and draws by systematic resampling."""
+) -> ImportanceSample:
+    """Return draws by smoothed weights and systematic resampling."""
     stats: Any = import_module("arviz_stats")
     log_evidence = float(logsumexp(log_ratio) - np.log(len(log_ratio)))
     # ArviZ takes log-likelihoods, whose negatives are log weights of leave-one-out.
@@ -233,14 +341,14 @@ def _weighted(
     chosen = np.searchsorted(np.cumsum(weights[order]), positions)
     # Copies of a point are next to each other.
     rows = rng.permutation(order[chosen.clip(max=len(weights) - 1)])
-    sample = ImportanceSample(
+    return ImportanceSample(
         points[rows],
         log_p[rows],
         float(pareto_k),
         efficiency,
+        len(points),
         log_evidence,
     )
-    return weights, sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,10 +375,13 @@ class _Mixture:
     def log_densities(self, points: Floats) -> Floats:
         """Return log(share times density) of each component, (S, M)."""
         nu, d = self.degrees, points.shape[1]
-        away = points - self.centers[:, None]
-        standard = np.linalg.solve(self.roots, away.swapaxes(1, 2))
-        square = np.einsum("mds,mds->ms", standard, standard)
         log_det = np.log(np.einsum("mdd->md", self.roots)).sum(axis=1)
         constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
-        tail = (nu + d) / 2 * np.log1p(square / nu)
+        tail = (nu + d) / 2 * np.log1p(self.squares(points) / nu)
         return np.asarray((np.log(self.shares) + constant - log_det)[:, None] - tail).T
+
+    def squares(self, points: Floats) -> Floats:
+        """Return squared standardised distances from the centers, (M, S)."""
+        away = points - self.centers[:, None]
+        standard = np.linalg.solve(self.roots, away.swapaxes(1, 2))
+        return np.asarray(np.einsum("mds,mds->ms", standard, standard))

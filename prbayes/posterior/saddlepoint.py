@@ -35,6 +35,8 @@ class SaddlepointOptions:
         Smallest determinant of the tilted covariance, to the power of one over its dimension, in
         units of the covariance at the estimate. Below, the tilted distribution is nearly one atom
         and the approximation has no meaning.
+    smallest_value : float
+        Smallest value of the cumulant function, in nats. Below, the density counts as zero.
     smallest_eigenvalue : float
         Combinations of scores with smaller eigenvalues of their correlation matrix are dropped.
     """
@@ -42,6 +44,7 @@ class SaddlepointOptions:
     iterations: int = 40
     tolerance: float = 1e-5
     smallest_variance: float = 1e-4
+    smallest_value: float = -1000.0
     smallest_eigenvalue: float = 1e-6
 
 
@@ -66,9 +69,15 @@ class Scores:
         return int(self.values.shape[1])
 
     @cached_property
+    def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The elements of the upper triangle of a covariance."""
+        first, second = np.triu_indices(self.rank)
+        return first, second
+
+    @cached_property
     def powers(self) -> Floats:
         """Ones, scores and products of two scores, (1 + r + r (r + 1) / 2, M)."""
-        first, second = np.triu_indices(self.rank)
+        first, second = self.pairs
         scores = self.values.T
         ones = np.ones((1, scores.shape[1]))
         return np.concatenate([ones, scores, scores[first] * scores[second]])
@@ -124,7 +133,7 @@ def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Fl
     values = np.zeros(count)
     gradients = np.zeros((count, r))
     hessians = np.zeros((count, r, r))
-    first, second = np.triu_indices(r)
+    first, second = scores[0].pairs
     for logs, score in zip(log_weights, scores, strict=True):
         exponents = tilts @ score.powers[1 : 1 + r]
         exponents += logs
@@ -161,8 +170,9 @@ def saddlepoints(
     """
 
     def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
-        selected = [logs[rows] for logs in log_weights]
-        return cumulants(selected, scores, tilts)
+        if len(rows) == len(log_weights[0]):
+            return cumulants(log_weights, scores, tilts)
+        return cumulants([logs[rows] for logs in log_weights], scores, tilts)
 
     shape = len(log_weights[0]), scores[0].rank
     size = sum(score.size for score in scores)
@@ -194,7 +204,8 @@ def minimum(
     limit = options.tolerance * size
     converged = np.linalg.norm(state.gradients, axis=1) < limit
     for _ in range(options.iterations):
-        rows = np.flatnonzero(~converged)
+        # Without a minimum, values fall and tilts grow without end.
+        rows = np.flatnonzero(~converged & (state.values > options.smallest_value))
         if rows.size == 0:
             break
         hessians = state.hessians[rows] + ridge

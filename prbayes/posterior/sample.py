@@ -24,6 +24,7 @@ from prbayes.posterior.importance import (
     ImportanceOptions,
     ImportanceSample,
     Laplace,
+    Prior,
     importance_sample,
     laplace,
 )
@@ -52,9 +53,9 @@ def sample(
     """Draw from the posterior of any model, by the fastest sampler that is exact for it.
 
     With the log-likelihood by specimen: importance sampling from Laplace approximations of the
-    modes. If Pareto k is above .7, or the effective sample size below a quarter of the points, NUTS
-    from the optimum; of several modes, or where the likelihood jumps at the optimum, sequential
-    Monte Carlo from the prior.
+    modes, then from mixtures fitted to the weighted points. If Pareto k stays above .7, or the
+    effective sample size below half of the draws, NUTS from the optimum; of several modes, or where
+    the likelihood jumps at the optimum, sequential Monte Carlo from the prior.
 
     With a metric, the posterior is prior times density of the metric's own estimate, by a
     saddlepoint approximation [2]_: of its score, if the gradient is a mean over specimens (PR, the
@@ -159,7 +160,8 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                 break
             size = asked.chains * asked.draws
             seed = seed_number(asked.random_seed)
-            sample = importance_sample(target.log_posterior, modes, size, seed, _OPTIONS)
+            prior = Prior(evaluator.prior_thetas, evaluator.hyperparameters.log_prior)
+            sample = importance_sample(target.log_posterior, modes, size, seed, _OPTIONS, prior)
             if not sample.is_reliable(_OPTIONS):
                 sample = None
                 if len(modes) == 1 and not evaluator.nodes:

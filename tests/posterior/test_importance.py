@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, multivariate_t
 
 from prbayes._checks import Floats
-from prbayes.posterior.importance import ImportanceOptions, importance_sample, laplace
+from prbayes.posterior.importance import ImportanceOptions, Prior, importance_sample, laplace
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.0], [0.6, 0.5, -0.1], [0.0, -0.1, 0.3]])
@@ -113,3 +113,27 @@ def test_chains_are_independent_halves() -> None:
     sd = np.sqrt(np.diag(COVARIANCE))
     assert (np.abs(halves[0] - halves[1]) < 5 * sd * np.sqrt(2 / 2000)).all()
     assert np.isfinite(logsumexp(sample.log_density))
+
+
+def test_further_rounds_follow_a_bent_ridge_into_the_prior() -> None:
+    """Only the sum of two variances is known: either may be nearly zero."""
+    prior = multivariate_normal(np.zeros(2), 4 * np.eye(2))
+
+    def ridge(thetas: Floats) -> Floats:
+        total = np.exp(thetas).sum(axis=1)
+        return np.asarray(prior.logpdf(thetas) - 0.5 * ((total - 1) / 0.05) ** 2)
+
+    def draws(size: int, seed: int) -> Floats:
+        return np.asarray(prior.rvs(size, random_state=seed))
+
+    modes = laplace(ridge, np.full((1, 2), np.log(0.5)), np.full(2, 2.0))
+    sample = importance_sample(ridge, modes, 4000, seed=0, prior=Prior(draws, prior.logpdf))
+    assert sample.n_points > 8000
+    assert sample.is_reliable(ImportanceOptions())
+    x = np.linspace(-14, 1, 3001)
+    grid = np.stack([a.ravel() for a in np.meshgrid(x, np.linspace(-14, 1, 3001))], axis=1)
+    weights = np.exp(ridge(grid))
+    mean = weights @ grid[:, 0] / weights.sum()
+    sd = np.sqrt(weights @ (grid[:, 0] - mean) ** 2 / weights.sum())
+    # Five standard errors of the smallest effective size.
+    assert (np.abs(sample.draws.mean(axis=0) - mean) < 5 * sd / np.sqrt(2000)).all()

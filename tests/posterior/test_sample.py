@@ -96,7 +96,7 @@ def test_moving_ends_are_sampled_by_smc() -> None:
 def test_few_specimens_are_sampled_by_nuts(monkeypatch: pytest.MonkeyPatch) -> None:
     from prbayes.posterior import sample as module
 
-    monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, efficiency=1.0))
+    monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, effective=100.0))
     result = prb.sample(500, chains=2, model=linear_model(), progressbar=False)
     assert result.posterior.attrs["sampler"] == "NUTS"
     for name, (mean, sd) in exact_moments(X).items():
@@ -180,7 +180,7 @@ def test_where_importance_sampling_is_not_reliable_a_metric_is_sampled_by_smc(
 ) -> None:
     from prbayes.posterior import sample as module
 
-    monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, efficiency=1.0))
+    monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, effective=100.0))
     model = metric_model(prb.ProbabilityResidual(), X)
     result = prb.sample(50, chains=1, model=model, progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC"
