@@ -424,6 +424,18 @@ class Evaluator:
         other.__dict__["objective"] = other._uncompiled
         return other
 
+    def coarse_where_sufficient(self, theta: Floats) -> Evaluator:
+        """Return that of an eighth of the points of large designs if they support theta, (d,)."""
+        coarse = self.coarser()
+        if coarse is None:
+            return self
+        support = coarse.support(theta[None])
+        is_sufficient = [
+            support[name]["weight_ess"][0] >= design.required_ess
+            for name, design in coarse.designs.items()
+        ]
+        return coarse if all(is_sufficient) else self
+
     def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
         """Return an evaluator of the same model with other prepared metrics, by simulator."""
         other = copy.copy(self)
