@@ -22,7 +22,6 @@ from prbayes.estimate.feature_map import WORTH, Shortcut
 from prbayes.estimate.identifiability import oriented
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import measured_by_refits
-from prbayes.estimate.prepared_anew import PREPARED, told_enough
 from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
@@ -200,40 +199,41 @@ class SamplingDistribution:
 
     @property
     def prepares(self) -> bool:
-        """Whether the metric takes from the data how it looks at them, as at several outputs.
+        """Whether the metric takes its coordinates from the data, as with several outputs.
 
-        It is known of stored responses, and of metrics whose minimum declares something.
+        False unless responses are stored and the metric declares its minimum.
         """
         several = any(node.target.event for node in self.evaluator.nodes)
         return several and self._stored and not measured_by_refits(self.evaluator)
 
-    def refit_anew(self, sets: DataSets, start: Floats, minimisers: Floats) -> Floats:
-        """Return minimisers of the metric prepared for each of some data sets, (n_sets, r).
+    def refit_prepared(
+        self, sets: DataSets, minimisers: Floats
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the minimiser of the metric prepared for each data set, and which converged.
 
-        From ``start`` or those of what was prepared for the data, ``minimisers``, of which some run
-        away, (n_sets, r) both. NaN for the other data sets; for all of them where a metric sees one
-        output, responses are not stored, or minimisers are simplices'.
+        Parameters
+        ----------
+        sets : DataSets
+        minimisers : ndarray, shape (n_sets, r)
+            Those of the metric prepared for the observed data (`refit`). They remain where the
+            metric cannot be prepared, as for specimens that are all alike.
         """
-        found = np.full(start.shape, np.nan)
-        if not self.prepares:
-            return found
+        result = minimisers.copy()
+        is_converged = np.zeros(len(minimisers), dtype=bool)
         shared = BatchObjective.of(self.evaluator, self.scales, observed_set(self.evaluator))
         descent = self._descent(shared, roughly=True)
-        most = min(PREPARED, len(start))
-        with progress("metric prepared anew", most) as report:
-            for i in range(most):
+        with progress("refits", len(minimisers)) as report:
+            for i, minimiser in enumerate(minimisers):
                 report(1, "")
-                own = self._objective_anew(sets, i)
-                if own is None:
+                objective = self._objective_anew(sets, i)
+                if objective is None:
                     continue
-                begin = np.stack([start[i], minimisers[i]])
-                (values,) = own(self.thetas(begin)[None], slice(1))
-                minimiser, converged = self._minimise(own, descent, begin[[values.argmin()]])
+                starts = np.stack([np.zeros_like(minimiser), minimiser])
+                (values,) = objective(self.thetas(starts)[None], slice(1))
+                x, converged = self._minimise(objective, descent, starts[[values.argmin()]])
                 if converged[0]:
-                    found[i] = minimiser[0]
-                if told_enough(found[: i + 1] - minimisers[: i + 1]):
-                    break
-        return found
+                    result[i], is_converged[i] = x[0], True
+        return result, is_converged
 
     def _objective_anew(self, sets: DataSets, i: int) -> BatchObjective | None:
         """Return the objective of the metric prepared for a data set; None where it cannot be."""

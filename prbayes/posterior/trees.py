@@ -281,7 +281,6 @@ def bootstrap_tree(
     *,
     sampler: str,
     converged: float,
-    warnings: tuple[str, ...] = (),
     seed: int,
     n_responses: int,
     seconds: float,
@@ -290,7 +289,6 @@ def bootstrap_tree(
     attrs = {
         "sampler": sampler,
         "converged": converged,
-        "warnings": "\n".join(warnings),
         "n_responses": n_responses,
         "seconds": seconds,
         "random_seed": str(seed),
