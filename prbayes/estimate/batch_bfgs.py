@@ -108,7 +108,6 @@ class Minima(NamedTuple):
     x: Floats  # (B, r)
     values: Floats  # (B,)
     converged: NDArray[np.bool_]  # (B,)
-    inverse: Floats  # (B, r, r): what they learned of the inverse Hessians
 
 
 def descend(
@@ -132,8 +131,8 @@ def descend(
     value : callable
         ``value(x, rows)``, shapes (A, s, r), (A,) -> (A, s): function ``rows[a]`` at s points each.
     start : ndarray, shape (B, r)
-    inverse_hessian : ndarray, shape (r, r) or (B, r, r)
-        A first guess, positive definite, for all or for each.
+    inverse_hessian : ndarray, shape (r, r)
+        A first guess, positive definite.
     step : float
         Of the differences.
     tolerance : float
@@ -198,14 +197,14 @@ def descend(
         stuck = accepted.stuck
         converged[active[stuck]] = True
         active = np.delete(active, stuck)
-    return Minima(x, f, converged, inverse)
+    return Minima(x, f, converged)
 
 
 @dataclass(frozen=True, eq=False)
 class Descent:
     """How functions of coordinates are minimised, many at once."""
 
-    inverse: Floats  # (r, r) or (B, r, r): first guesses of inverse Hessians
+    inverse: Floats  # (r, r): a first guess of inverse Hessians
     tolerance: float  # gain that is left on the table
     step: float  # of the differences
     curvature: Floats | None = None  # (r, r): of which one-sided differences are freed

@@ -18,7 +18,6 @@ from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
 from prbayes.estimate.data_sets import SETS, DataSets, observed_set, one_set
-from prbayes.estimate.feature_map import WORTH, Shortcut
 from prbayes.estimate.identifiability import oriented
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import measured_by_refits
@@ -134,28 +133,15 @@ class SamplingDistribution:
         settled = (ratio > 1 / _STEADY) & (ratio < _STEADY)
         return [] if settled.all() else jumping
 
-    def coordinates(self, thetas: Floats) -> tuple[Floats, Floats]:
-        """Return coordinates along the axes, and what remains of thetas (..., d).
+    def coordinates(self, thetas: Floats) -> Floats:
+        """Return coordinates of thetas along the axes, in standard errors, (..., d) -> (..., r)."""
+        shifts = (thetas - self.theta) / self.local.prior_sd
+        return np.asarray(shifts @ self.axes / self.stderr)
 
-        Returns
-        -------
-        x : ndarray, shape (..., r)
-            In standard errors.
-        remainder : ndarray, shape (..., d)
-            In theta.
-        """
-        prior_sd = self.local.prior_sd
-        shifts = (thetas - self.theta) / prior_sd
-        x = shifts @ self.axes
-        along = x @ self.axes.T
-        remainder = (shifts - along) * prior_sd
-        return x / self.stderr, remainder
-
-    def thetas(self, x: Floats, remainder: Floats | float = 0.0) -> Floats:
-        """Return thetas, (..., d), of coordinates (..., r) and what remains."""
+    def thetas(self, x: Floats) -> Floats:
+        """Return thetas, (..., d), of coordinates (..., r)."""
         shifts = (x * self.stderr) @ self.axes.T
-        shifted = self.theta + shifts * self.local.prior_sd
-        return np.asarray(shifted + remainder)
+        return np.asarray(self.theta + shifts * self.local.prior_sd)
 
     def refit(
         self, sets: DataSets, start: Floats | None = None, *, roughly: bool = False
@@ -173,7 +159,6 @@ class SamplingDistribution:
         n_sets = len(sets.weights[0])
         at_once = self._at_once(sets)
         begin = np.zeros((n_sets, self.stderr.size)) if start is None else start
-        shortcut = Shortcut(begin, self.thetas) if roughly and self._populous else None
         descent = None
         minimisers = []
         arrived = []
@@ -184,14 +169,7 @@ class SamplingDistribution:
                 objective = BatchObjective.of(self.evaluator, self.scales, some)
                 if descent is None:  # that of some serves all of them
                     descent = self._descent(objective, roughly=roughly, one_sided=roughly)
-                x = begin[i : i + at_once]
-                own = descent
-                if shortcut is not None:
-                    x, inverse = shortcut.begin(objective, x, descent)
-                    own = replace(descent, inverse=inverse)
-                x, converged = self._minimise(objective, own, x)
-                if shortcut is not None:
-                    shortcut.learn(x, converged)
+                x, converged = self._minimise(objective, descent, begin[i : i + at_once])
                 minimisers.append(x)
                 arrived.append(converged)
                 report(len(converged), "")
@@ -251,13 +229,6 @@ class SamplingDistribution:
             here = len(node.target.parts) * max(node.bound.n_points, len(values))
             points = max(points, here)
         return max(1, 2 * AT_ONCE // points)
-
-    @property
-    def _populous(self) -> bool:
-        """Whether populations are so many numbers that it pays to interpolate between some."""
-        nodes = self.evaluator.nodes
-        most = max(len(node.target.parts) * node.bound.n_points for node in nodes)
-        return most >= WORTH and not measured_by_refits(self.evaluator)
 
     def design_error(self) -> DesignErrors:
         """Return how far the optimum of another design would be, by its points and emulators.

@@ -255,13 +255,6 @@ class Discrepancy(ABC):
         small = len(simulated) * self.columns <= AT_ONCE
         return self.basis(simulated) if small else self.compact(simulated)
 
-    def thinned(self, basis: tuple[NDArray[Any], ...], most: int) -> tuple[NDArray[Any], ...]:
-        """Return a basis of about the same features with no more than about so many numbers each.
-
-        By default it is the same.
-        """
-        return basis
-
     def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
         """Return the derivatives for the weights, (..., n), of a sum over the only feature.
 

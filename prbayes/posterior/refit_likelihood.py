@@ -168,7 +168,7 @@ class RefitLikelihood:
         """Return the log-density of the observed estimate, (S, d) -> (S,)."""
         if self.sets.estimates.shape[1] == 0:
             return np.zeros(len(thetas))
-        x, _ = self.sampling.coordinates(self.continuation.coordinates(thetas))
+        x = self.sampling.coordinates(self.continuation.coordinates(thetas))
         largest = max(count.shape[1] for count in self.sets.counts)
         rows = max(16, AT_ONCE // max(largest, len(self.sets.estimates)))
         blocks = [self._block(x[first : first + rows]) for first in range(0, len(x), rows)]
@@ -197,7 +197,7 @@ def nearest(
     centers: Sequence[SamplingDistribution], thetas: Floats
 ) -> tuple[NDArray[np.intp], Floats]:
     """Return the nearest center of each theta, (S,), and coordinates around it, (S, r)."""
-    x = np.stack([center.coordinates(thetas)[0] for center in centers])
+    x = np.stack([center.coordinates(thetas) for center in centers])
     distances = np.linalg.norm(x, axis=2)
     chosen = distances.argmin(axis=0)
     return chosen, x[chosen, np.arange(len(thetas))]
@@ -330,7 +330,7 @@ def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
     modes = laplace(density, likelihood.starts, likelihood.scale)
     sample = importance_sample(density, modes, number, options.seed)
     thetas = likelihood.continuation.coordinates(sample.draws)
-    x, _ = likelihood.sampling.coordinates(thetas)
+    x = likelihood.sampling.coordinates(thetas)
     chosen, _ = nearest(likelihood.centers, thetas)
     for i in np.unique(chosen):
         members = chosen == i
@@ -452,7 +452,7 @@ def _balls(
     points = []
     for i, center in enumerate(centers):
         ball = _ball(number // len(centers), r, options, options.seed + i)
-        x, _ = sampling.coordinates(center.thetas(ball))
+        x = sampling.coordinates(center.thetas(ball))
         points.append(x)
     return np.concatenate(points)
 
@@ -499,7 +499,7 @@ def _at_minimiser(
     for _ in range(5):
         sampling = SamplingDistribution.of(evaluator, start, scales, options.weakest)
         moved = _moved_to_minimiser(sampling)
-        x, _ = sampling.coordinates(moved.theta)
+        x = sampling.coordinates(moved.theta)
         start = moved.theta
         if np.abs(x).max(initial=0.0) < 0.5:
             return moved
