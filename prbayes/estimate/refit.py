@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes._progress import progress
-from prbayes.estimate.batch_bfgs import Descent, Slopes
-from prbayes.estimate.batch_gradient import WORTH_A_GRADIENT, BatchGradient
+from prbayes.estimate.batch_bfgs import Descent
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
@@ -168,7 +167,7 @@ class SamplingDistribution:
                 some = DataSets(sets.values, weights)
                 objective = BatchObjective.of(self.evaluator, self.scales, some)
                 if descent is None:  # that of some serves all of them
-                    descent = self._descent(objective, roughly=roughly, one_sided=roughly)
+                    descent = self._descent(objective, roughly=roughly)
                 x, converged = self._minimise(objective, descent, begin[i : i + at_once])
                 minimisers.append(x)
                 arrived.append(converged)
@@ -345,9 +344,7 @@ class SamplingDistribution:
             blocks.append(np.zeros_like(own) if node.bound.is_line else own)
         return blocks
 
-    def _descent(
-        self, objective: BatchObjective, *, roughly: bool = False, one_sided: bool = False
-    ) -> Descent:
+    def _descent(self, objective: BatchObjective, *, roughly: bool = False) -> Descent:
         """Return how data sets are fitted whose objectives have about the same curvature."""
 
         def typical(x: Floats) -> Floats:
@@ -357,7 +354,7 @@ class SamplingDistribution:
 
         r = self.stderr.size
         if r == 0 or measured_by_refits(self.evaluator):  # then nothing follows it
-            return Descent(np.zeros((r, r)), 0.0, _REFIT_STEP)
+            return Descent(np.eye(r), 0.0, _REFIT_STEP)
         root = self._root
         across = np.linalg.inv(root)
         curvature = across.T @ _mean_hessian(lambda z: typical(z @ root.T), r) @ across
@@ -366,7 +363,7 @@ class SamplingDistribution:
         # together the mean curvature is that of the direction across, in which next to none is.
         cost = r / np.trace(inverse)
         gain = (_ROUGHLY if roughly else _TOLERANCE) * cost
-        return Descent(inverse, gain, _REFIT_STEP, curvature if one_sided else None)
+        return Descent(curvature, gain, _REFIT_STEP)
 
     @property
     def _root(self) -> Floats:
@@ -403,23 +400,8 @@ class SamplingDistribution:
             # In standard errors; the second one starts where the first has ended.
             x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
             return x, converged
-        found = descent(value, start, self._slopes(objective))
+        found = descent(value, start)
         return found.x, found.converged
-
-    def _slopes(self, objective: BatchObjective) -> Slopes | None:
-        """Return values and exact gradients along the axes, where these are worth their graphs."""
-        if self.stderr.size < WORTH_A_GRADIENT:
-            return None
-        gradient = BatchGradient.of(objective)
-        if gradient is None:
-            return None
-        along = self.local.prior_sd[:, None] * self.axes * self.stderr
-
-        def slopes(x: Floats, rows: Any) -> tuple[Floats, Floats]:
-            values, by_theta = gradient(self.thetas(x), rows)
-            return values, by_theta @ along
-
-        return slopes
 
 
 def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:

@@ -19,7 +19,6 @@ from prbayes.estimate.data_sets import (
     observed_set,
     one_set,
     reweighted_sets,
-    sets_along,
     simulated_sets,
 )
 from prbayes.estimate.refit import SamplingDistribution, _mean_hessian
@@ -134,34 +133,6 @@ def test_clouds_come_closer_at_the_rate_of_their_dimension(monkeypatch: pytest.M
     monkeypatch.setattr(SamplingDistribution, "_spread_of_parts", lambda *_: np.array([8.0]))
     # Eight parts, two inputs: 1/2 + 1/4 as the power of the size.
     np.testing.assert_allclose(sampling._error_of_points(), 8 / 8**0.75)
-
-
-def test_exact_gradients_lead_where_differences_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(4)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("a", 0, 2), pm.HalfNormal("b", 1))
-        y = pm.Normal.dist(pm.Normal("c", 0, 2), pm.HalfNormal("d", 1))
-        together = lambda x, y: np.stack([x + y, x - y], axis=-1)  # noqa: E731
-        data = together(rng.normal(1.0, 0.7, 40), rng.normal(0.5, 0.4, 40))
-        metric = prb.Joint(METRICS["kl"])
-        prb.Simulator("y", together, x, y, metric=metric, observed=data, propagation=R256)
-    evaluator = Evaluator(model)
-    theta = np.array([1.0, np.log(0.7), 0.5, np.log(0.4)])
-    sampling = SamplingDistribution.of(evaluator, theta, np.ones(1))
-    sets = reweighted_sets(evaluator, 8)
-    objective = refit.BatchObjective.of(evaluator, np.ones(1), sets)
-    slopes = sampling._slopes(objective)
-    assert slopes is not None
-    here = 0.3 * rng.normal(size=(8, 4))
-    rows = np.arange(8)
-    steps = 1e-4 * np.eye(4)
-    up, down = (objective(sampling.thetas(here[:, None] + sign * steps), rows) for sign in (1, -1))
-    np.testing.assert_allclose(slopes(here, rows)[1], (up - down) / 2e-4, rtol=1e-3, atol=1e-7)
-    exact, converged = sampling.refit(sets)
-    assert converged.all()
-    monkeypatch.setattr(refit, "WORTH_A_GRADIENT", 5)
-    assert sampling._slopes(objective) is None
-    np.testing.assert_allclose(sampling.refit(sets)[0], exact, atol=0.02)
 
 
 def test_the_observed_responses_are_fitted_by_the_optimum() -> None:
@@ -286,8 +257,7 @@ def test_rough_refits_are_around_the_exact_ones_where_hyperparameters_hang_toget
     covariance = local.identified @ local.covariance @ local.identified.T
     stderr = np.sqrt(np.diag(covariance))
     along = replace(sampling, axes=np.eye(2), stderr=stderr)
-    thetas = np.tile(sampling.theta, (300, 1))
-    sets = sets_along(along.evaluator, thetas, np.random.default_rng(1))
+    sets = simulated_sets(along.evaluator, sampling.theta, 300, seed=1)
     exact, _ = along.refit(sets)
     assert np.corrcoef(exact.T)[0, 1] < -0.9
     rough, converged = along.refit(sets, roughly=True)
