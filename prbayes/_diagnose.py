@@ -349,7 +349,8 @@ def _lost_in(result: xr.DataTree, key: str = "lost_mass") -> dict[str, float]:
         return {}
     calibration = result["calibration"].to_dataset()
     shares = calibration[key].transpose("simulator", ...).values
-    means = shares.reshape(len(shares), -1).mean(axis=1)
+    rows = [row[~np.isnan(row)] for row in shares.reshape(len(shares), -1)]
+    means = np.array([row.mean() if row.size else np.nan for row in rows])
     if f"{key}_at_best" in calibration:
         means = np.where(np.isnan(means), calibration[f"{key}_at_best"].values, means)
     names = calibration["simulator"].values.tolist()

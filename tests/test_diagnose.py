@@ -19,7 +19,6 @@ from scipy import stats
 import prbayes as prb
 from prbayes._diagnose import _NOISE, _failed
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.chains import Particles
 from prbayes.posterior.smc import _refuse_lost
 from prbayes.propagation.base import DesignError
 
@@ -474,9 +473,42 @@ def test_an_answer_is_refused_where_most_draws_lose_too_much(
 ) -> None:
     evaluator = Evaluator(failing(prb.Resimulated(16, on_failure=REPLACED)))
     lost = np.where(np.arange(50) < 50 * of_draws, 0.3, 0.0).reshape(1, 50, 1)
-    particles = Particles(np.zeros((1, 50, 1)), np.zeros((1, 50, 1)), lost, [])
     with nullcontext() if not refused else pytest.raises(DesignError, match=r"got 30\.0% of the"):
-        _refuse_lost(evaluator, particles, {"y": {"lost_mass": 0.0}})
+        _refuse_lost(evaluator, lost, {"y": {"lost_mass": 0.0}})
+
+
+@pytest.mark.parametrize("sampler", [prb.sample, prb.sample_smc])
+@pytest.mark.parametrize(("limit", "refused"), [(0.05, False), (-0.3, True)])
+def test_draws_given_the_estimate_that_lose_too_much_are_reported_or_refused(
+    sampler: Any, limit: float, refused: bool
+) -> None:
+    center = OBSERVED.mean()
+
+    def response(x: Any, u: Any, mu: Any) -> Any:
+        near = np.abs(mu - center) < 0.02
+        return np.where(u < np.where((mu > center + limit) & ~near, 0.3, 0.03), np.nan, x)
+
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 1, 1)
+        x, u = pm.Normal.dist(mu, 0.5), pm.Uniform.dist(0, 1)
+        prb.Simulator(
+            "y", response, x, u, mu,
+            metric=prb.KullbackLeibler(), observed=OBSERVED, propagation=prb.Resimulated(256),
+        )  # fmt: skip
+    keywords = {"optimum": prb.minimize(model, progressbar=False), "progressbar": False}
+    with nullcontext() if not refused else pytest.raises(DesignError, match=r"got 29\.7% of the"):
+        tree = sampler(200, chains=1, model=model, **keywords)
+    if refused:
+        return
+    calibration = tree["calibration"].to_dataset()
+    lost = calibration["lost_mass"].values.ravel()
+    lost = lost[~np.isnan(lost)]
+    assert lost.size == 64
+    share = np.mean(lost > 0.05)
+    assert 0.1 < share < 0.5
+    assert calibration["lossy_draws"].item() == share
+    (message,) = [m for m in prb.diagnose(tree).messages if "lost mass" in m]
+    assert message.startswith(f"Y: lost mass: of {share:.0%} of the draws more than")
 
 
 def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:

@@ -457,7 +457,6 @@ def test_a_number_says_why() -> None:
 # Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py` tests directly.
 INNER = {
     "posterior.returned": {"pymc.backends.base.MultiTrace", "pymc.backends.ndarray.NDArray"},
-    "estimate.batch_gradient": {"pytensor.gradient.NullTypeGradError"},
     "estimate.search": {"pytensor.gradient.NullTypeGradError"},
     "model.description": {
         "pymc.printing.str_for_dist",

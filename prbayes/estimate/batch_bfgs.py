@@ -17,9 +17,6 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 
-# Values (A,) and gradients (A, r) of some rows at one point each, of x (A, r) and rows (A,).
-type Slopes = Callable[[Floats, NDArray[np.intp]], tuple[Floats, Floats]]
-
 
 @dataclass(frozen=True, eq=False)
 class _Differences:
@@ -27,54 +24,45 @@ class _Differences:
 
     value: Callable[[Floats, Any], Floats]
     step: float
-    stencil: Floats  # (s, r): here, and around
+    stencil: Floats  # (1 + r, r): here, and beside; of central differences (1 + 2 r, r)
     back: Floats  # (r, r): slopes along the stencil's axes -> gradients
-    bend: float | None  # what one-sided differences have too much; None of central ones
+    bend: float  # excess of one-sided differences for a function of typical curvature
 
     @classmethod
     def of(
         cls,
         value: Callable[[Floats, Any], Floats],
-        r: int,
         step: float,
-        curvature: Floats | None = None,
+        curvature: Floats,
+        is_central: bool,
     ) -> _Differences:
-        here = np.zeros((1, r))
-        if curvature is None:
-            unit = step * np.eye(r)
-            return cls(
-                value=value,
-                step=step,
-                stencil=np.concatenate([here, unit, -unit]),
-                back=np.eye(r),
-                bend=None,
-            )
+        r = len(curvature)
         # Axes along which a typical function is bent alike, of a mean length of one: along others a
         # function of coordinates that hang together is bent by much more than it is across them,
         # and a difference to one side would move its minimum by as much.
         axes = np.linalg.inv(np.linalg.cholesky(curvature))
         axes *= np.sqrt(r) / np.linalg.norm(axes)
         bent = float(np.trace(axes @ curvature @ axes.T)) / r
-        stencil = np.concatenate([here, step * axes])
+        sides = [step * axes, -step * axes] if is_central else [step * axes]
         return cls(
             value=value,
             step=step,
-            stencil=stencil,
+            stencil=np.concatenate([np.zeros((1, r)), *sides]),
             back=np.linalg.inv(axes).T,
             bend=step * bent / 2,
         )
 
     def __call__(self, x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return values (A,) and gradients (A, r) of some rows at one point each, (A, r)."""
-        r = x.shape[-1]
         points = x[:, None] + self.stencil
-        found = self.value(points, rows)
-        up = found[:, 1 : 1 + r]
+        values = self.value(points, rows)
+        here, up, down = np.split(values, [1, 1 + x.shape[-1]], axis=1)
         with np.errstate(invalid="ignore"):
-            if self.bend is None:
-                return found[:, 0], (up - found[:, 1 + r :]) / (2 * self.step)
-            slopes = (up - found[:, :1]) / self.step - self.bend
-            return found[:, 0], slopes @ self.back
+            if down.size:
+                slopes = (up - down) / (2 * self.step)
+            else:
+                slopes = (up - here) / self.step - self.bend
+            return here[:, 0], slopes @ self.back
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,45 +96,40 @@ class Minima(NamedTuple):
     x: Floats  # (B, r)
     values: Floats  # (B,)
     converged: NDArray[np.bool_]  # (B,)
-    inverse: Floats  # (B, r, r): what they learned of the inverse Hessians
 
 
 def descend(
     value: Callable[[Floats, Any], Floats],
     start: Floats,
-    inverse_hessian: Floats,
+    curvature: Floats,
     *,
     step: float,
     tolerance: float,
     max_iterations: int = 40,
-    curvature: Floats | None = None,
-    slopes: Slopes | None = None,
+    is_central: bool = False,
 ) -> Minima:
     """Minimise B functions of r parameters of order one, each from its own start, all in step.
 
-    Gradients are differences, unless they are given. A row has converged when its next step
-    promises to gain less than ``tolerance``, or when no shorter step gains anything.
+    Gradients are one-sided differences, along axes that ``curvature`` makes alike, and freed of
+    what it bends them by: minima are off by half a step, times the relative deviation of a
+    function's Hessian. A row has converged when its next step promises to gain less than
+    ``tolerance``, or when no shorter step gains anything.
 
     Parameters
     ----------
     value : callable
         ``value(x, rows)``, shapes (A, s, r), (A,) -> (A, s): function ``rows[a]`` at s points each.
     start : ndarray, shape (B, r)
-    inverse_hessian : ndarray, shape (r, r) or (B, r, r)
-        A first guess, positive definite, for all or for each.
+    curvature : ndarray, shape (r, r)
+        The Hessian of a typical function, positive definite.
     step : float
         Of the differences.
     tolerance : float
         In units of the functions.
     max_iterations : int
-    curvature : ndarray, shape (r, r), optional
-        The Hessian of a typical function, positive definite. With it differences are one-sided
-        instead of central, which halves the calls, along axes that it makes alike, and freed of
-        what it bends them by: minima are off by half a step, times by how much the function's
-        own Hessian is another one.
-    slopes : callable, optional
-        ``slopes(x, rows)``, shapes (A, r), (A,) -> (A,), (A, r): values and exact gradients of the
-        same functions, instead of differences.
+    is_central : bool
+        Whether differences are central, at twice the cost: minima are then exact where functions
+        have other Hessians than the typical one.
 
     References
     ----------
@@ -158,14 +141,14 @@ def descend(
     >>> import numpy as np
     >>> centers = np.array([[0.0], [2.0]])
     >>> value = lambda x, rows: ((x - centers[rows, None]) ** 2).sum(-1)
-    >>> found = descend(value, np.zeros((2, 1)), np.eye(1), step=1e-3, tolerance=1e-9)
+    >>> found = descend(value, np.zeros((2, 1)), 2 * np.eye(1), step=1e-3, tolerance=1e-9)
     >>> np.abs(found.x - centers).max() < 1e-4
     np.True_
     """
     size, r = start.shape
-    problem = slopes or _Differences.of(value, r, step, curvature)
+    problem = _Differences.of(value, step, curvature, is_central)
     x = start.copy()
-    inverse = np.broadcast_to(inverse_hessian, (size, r, r)).copy()
+    inverse = np.broadcast_to(np.linalg.inv(curvature), (size, r, r)).copy()
     active = np.arange(size)
     f, g = problem(x, active)
     converged = np.zeros(size, dtype=bool)
@@ -198,31 +181,20 @@ def descend(
         stuck = accepted.stuck
         converged[active[stuck]] = True
         active = np.delete(active, stuck)
-    return Minima(x, f, converged, inverse)
+    return Minima(x, f, converged)
 
 
 @dataclass(frozen=True, eq=False)
 class Descent:
     """How functions of coordinates are minimised, many at once."""
 
-    inverse: Floats  # (r, r) or (B, r, r): first guesses of inverse Hessians
+    curvature: Floats  # (r, r): the Hessian of a typical function
     tolerance: float  # gain that is left on the table
     step: float  # of the differences
-    curvature: Floats | None = None  # (r, r): of which one-sided differences are freed
 
-    def __call__(
-        self, value: Callable[[Floats, Any], Floats], start: Floats, slopes: Slopes | None = None
-    ) -> Minima:
-        """Return minimisers from starts (B, r) on; with exact gradients where they are given."""
-        return descend(
-            value,
-            start,
-            self.inverse,
-            step=self.step,
-            tolerance=self.tolerance,
-            curvature=self.curvature,
-            slopes=slopes,
-        )
+    def __call__(self, value: Callable[[Floats, Any], Floats], start: Floats) -> Minima:
+        """Return minimisers from starts (B, r) on."""
+        return descend(value, start, self.curvature, step=self.step, tolerance=self.tolerance)
 
 
 def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:
@@ -242,7 +214,7 @@ def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:
     return plan.only(sound)
 
 
-def _line_search(problem: Slopes, plan: _Steps, x: Floats, f: Floats, g: Floats) -> _Accepted:
+def _line_search(problem: _Differences, plan: _Steps, x: Floats, f: Floats, g: Floats) -> _Accepted:
     """Halve the steps until they keep enough of what they promise."""
     rows = plan.rows
     new_x = x[rows].copy()

@@ -139,10 +139,6 @@ class ContinuedEvaluator(Evaluator):
         """Return coordinates spread evenly over the prior, (size, d)."""
         return self.continuation.coordinates(self.inner.prior_points(size, seed))
 
-    def pulled_back(self, *_: object) -> Floats:
-        """Refuse: gradients are differences."""
-        raise NotImplementedError("gradients of a continued prior are differences")
-
 
 def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
     """Return the coordinates of a model, with ends at which populations of thetas, (S, d), go on.

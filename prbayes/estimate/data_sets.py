@@ -157,20 +157,6 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
     return sets_at(evaluator, populations, points)
 
 
-def sets_along(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -> DataSets:
-    """Draw one data set from the populations at each theta, (n, d), where responses are stored.
-
-    As `simulated_sets` does; the same points carry all of them.
-
-    Raises
-    ------
-    ValueError
-        As `simulated_sets`.
-    """
-    points = points_along(evaluator, thetas, rng)
-    return sets_at(evaluator, stored_populations(evaluator, thetas), points)
-
-
 def stored_populations(evaluator: Evaluator, thetas: Floats) -> list[tuple[Floats, Floats]]:
     """Return stored responses by simulator, (1, n), as `sets_at` takes them."""
     populations = []

@@ -9,7 +9,7 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes._weighted import distribution_function
 from prbayes.estimate.data_sets import DataSets, observed_set
-from prbayes.estimate.goodness import BEYOND, UNLIKELY, Refitted
+from prbayes.estimate.goodness import UNLIKELY, Refitted, log_distances, probability_of
 from prbayes.metrics.lifted import failure_caps
 from prbayes.model.node import Node
 
@@ -39,7 +39,7 @@ def _of_simulator(refitted: Refitted, k: int, node: Node) -> str:
     names = node.outputs.names
     outputs = []
     for j in data.columns:
-        p = _probability(data.distances(j)[0], drawn.distances(j)[refitted.converged])
+        p = probability_of(data.distances(j)[0], drawn.distances(j)[refitted.converged])
         if p < UNLIKELY:
             outputs.append(f"{names[j]} (p = {p:.2g})")
     pairs = []
@@ -47,7 +47,7 @@ def _of_simulator(refitted: Refitted, k: int, node: Node) -> str:
         measured, calibrated = data.correlations(i, j)
         theirs, fitted = drawn.correlations(i, j)
         residuals = (theirs - fitted)[refitted.converged, None]
-        p = _probability(measured - calibrated, residuals, both_sides=True)
+        p = probability_of(measured - calibrated, residuals, both_sides=True)
         if p < UNLIKELY:
             pairs.append(
                 f"{names[i]} with {names[j]} (measured {measured[0]:.2f}, calibrated "
@@ -68,26 +68,6 @@ def _of_simulator(refitted: Refitted, k: int, node: Node) -> str:
 
 def _pairs(columns: list[int]) -> list[tuple[int, int]]:
     return [(i, j) for place, i in enumerate(columns) for j in columns[place + 1 :]]
-
-
-def _probability(here: Floats, drawn: Floats, *, both_sides: bool = False) -> float:
-    """Return how often numbers of a data set, (q,), are as far out as these: those drawn (S, q).
-
-    Each in spreads of its own distribution, the worst of them; what is not known counts not.
-    """
-    known = np.isfinite(drawn).all(axis=1)
-    if not np.isfinite(here).all() or known.sum() < 2:
-        return 1.0
-    rows = drawn[known]
-    middle = rows.mean(axis=0)
-    spread = np.maximum(rows.std(axis=0), 1e-300)
-    out = (rows - middle) / spread
-    own = (here - middle) / spread
-    if both_sides:
-        out = np.abs(out)
-        own = np.abs(own)
-    farther = np.count_nonzero(out.max(axis=1) >= own.max())
-    return float((1 + farther) / (1 + len(rows)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,23 +104,12 @@ class _Seen:
         has = ~np.isnan(self.values[:, j])
         values = self.values[has, j]
         order = np.argsort(values, kind="stable")
-        weights = self.weights[:, has]
-        w = _normalised(weights[:, order])
-        below = np.cumsum(w, axis=1) - w / 2
         at = values[order]
         # In the middle of a step
         column = self.simulated[:, j]
         up_to = distribution_function(column, self.masses, at)
         under = distribution_function(column, self.masses, np.nextafter(at, -np.inf))
-        expected = (up_to + under) / 2
-        squares = w * (below - expected) ** 2
-        inside = np.clip(expected, BEYOND, 1 - BEYOND)
-        variance = inside * (1 - inside)
-        # Of Cramer and von Mises, and of Anderson and Darling
-        of_middle = squares.sum(axis=1)
-        of_tails = (squares / variance).sum(axis=1)
-        both = np.stack([of_middle, of_tails], axis=1)
-        return np.asarray(np.log(np.maximum(both, 1e-300)))
+        return log_distances((up_to + under) / 2, self.weights[:, has][:, order])
 
     def correlations(self, i: int, j: int) -> tuple[Floats, Floats]:
         """Return the correlations of two outputs in data sets and in populations, (S,) each."""

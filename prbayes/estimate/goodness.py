@@ -2,8 +2,7 @@
 
 Data sets are drawn from the model at its minimiser, and each is refitted. How far each is from its
 own fit is what the data's distance from theirs is held against (Stute, Gonzalez Manteiga and
-Presedo Quindimil 1993, doi:10.1007/BF02613687). With designs no response is computed, and else
-those of the populations one standard error to either side.
+Presedo Quindimil 1993, doi:10.1007/BF02613687). Responses are stored: none is computed.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 UNLIKELY = 0.01
 # Probability that a population has below its least and above its greatest value at least, so that
 # one observation outside weighs as one in ten thousand, and not without bound.
-BEYOND = 1e-4
+_BEYOND = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,87 +61,71 @@ class Refitted:
 
     @property
     def probability(self) -> float:
-        """How probable a distance as the data's from their fit is; NaN where too few converged."""
-        return probability_of_fit(self.sampling, self.center, self.sets, self.x, self.converged)
+        """How probable a distance as the data's from their fit is; NaN if too few converged."""
+        if self.converged.mean() < ARRIVED:
+            return np.nan
+        observed = self._distances(self.center[None], observed_set(self.sampling.evaluator))
+        return probability_of(observed[0], self._distances(self.x, self.sets)[self.converged])
+
+    def _distances(self, x: Floats, sets: DataSets) -> Floats:
+        """Return distances of data sets from their fits, by simulator and part, (n_sets, 2 K)."""
+        evaluator = self.sampling.evaluator
+        thetas = self.sampling.thetas(x)
+        columns = []
+        for k, node in enumerate(evaluator.nodes):
+            simulated, shares = evaluator.populations(thetas, k)
+            for part in number_parts(node.target):
+                seen, rows = part.observed_of(sets.values[k])
+                weights = sets.weights[k][:, rows]
+                order = np.argsort(seen, kind="stable")
+                expected = _middles(part.of(simulated), shares, seen[order])
+                columns.append(log_distances(expected, weights[:, order]))
+        return np.concatenate(columns, axis=1)
 
 
-def probability_of_fit(
-    sampling: SamplingDistribution,
-    center: Floats,
-    sets: DataSets,
-    x: Floats,
-    converged: NDArray[np.bool_],
-) -> float:
-    """Return the same from refits that are known.
+def probability_of(observed: Floats, drawn: Floats, *, both_sides: bool = False) -> float:
+    """Return the probability that drawn numbers are as far out as observed ones.
+
+    Each number is in standard deviations of its own distribution, and the largest of them counts.
+    Data sets with an unknown number are left out.
 
     Parameters
     ----------
-    sampling : SamplingDistribution
-    center : ndarray, shape (r,)
-        The minimiser of the observed data, in coordinates.
-    sets : DataSets
-        Drawn from the model there.
-    x : ndarray, shape (n_sets, r)
-        Their minimisers.
-    converged : ndarray of bool, shape (n_sets,)
+    observed : ndarray, shape (q,)
+    drawn : ndarray, shape (S, q)
+    both_sides : bool
+        Whether small numbers are far out as well.
     """
-    if converged.mean() < ARRIVED:
-        return np.nan
-    populations = _Populations.around_center(sampling, center)
-    observed = _distances(populations, center[None], observed_set(sampling.evaluator))
-    drawn = _distances(populations, x, sets)[converged]
-    # Distances of several kinds and simulators, each in spreads of its own distribution: the worst.
-    middle = drawn.mean(axis=0)
-    spread = np.maximum(drawn.std(axis=0), 1e-300)
-    worst = ((drawn - middle) / spread).max(axis=1)
-    (here,) = ((observed - middle) / spread).max(axis=1)
-    return float((1 + np.sum(worst >= here)) / (1 + worst.size))
+    rows = drawn[np.isfinite(drawn).all(axis=1)]
+    if not np.isfinite(observed).all() or len(rows) < 2:
+        return 1.0
+    middle = rows.mean(axis=0)
+    spread = np.maximum(rows.std(axis=0), 1e-300)
+    out = (np.vstack([observed, rows]) - middle) / spread
+    worst = (np.abs(out) if both_sides else out).max(axis=1)
+    return float(np.mean(worst >= worst[0]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Populations:
-    """The distribution functions of populations at refits."""
+def log_distances(expected: Floats, weights: Floats) -> Floats:
+    """Return logarithms of two distances of data sets from distribution functions, (S, 2).
 
-    sampling: SamplingDistribution
-    center: Floats  # (r,)
-    # By simulator whose responses are not stored: those at the centre, and one standard error to
-    # either side of it along each axis, values and weights of shape (1 + 2 r, n).
-    around: dict[int, tuple[Floats, Floats]]
+    Those of Cramer and von Mises, which sees the middle of a distribution, and of Anderson and
+    Darling, which sees its tails.
 
-    @classmethod
-    def around_center(cls, sampling: SamplingDistribution, center: Floats) -> _Populations:
-        """Compute the populations around a centre, of responses that are not stored."""
-        evaluator = sampling.evaluator
-        r = center.size
-        cross = np.concatenate([np.zeros((1, r)), np.eye(r), -np.eye(r)])
-        around = {}
-        for k, node in enumerate(evaluator.nodes):
-            if not node.bound.stored:
-                around[k] = evaluator.populations(sampling.thetas(center + cross), k)
-        return cls(sampling, center, around)
-
-    def of(self, k: int, x: Floats) -> tuple[Floats, Floats]:
-        """Return values and weights of a simulator, from which those at x, (n_sets, r), follow."""
-        if k in self.around:
-            return self.around[k]
-        return self.sampling.evaluator.populations(self.sampling.thetas(x), k)
-
-    def below(self, k: int, seen: Floats, weights: Floats, x: Floats, at: Floats) -> Floats:
-        """Return distribution functions at values, (m,), of populations at x, (n_sets, r).
-
-        Of what a part of the metric sees of the values that `of` gives. Shape (n_sets, m); of
-        responses that are not stored to first order, as refits are.
-        """
-        found = _middles(seen, weights, at)
-        if k not in self.around:
-            return found
-        r = self.center.size
-        ahead = found[1 : 1 + r]
-        behind = found[1 + r :]
-        slopes = (ahead - behind) / 2
-        away = x - self.center
-        linear = found[0] + away @ slopes
-        return np.asarray(np.clip(linear, 0.0, 1.0))
+    Parameters
+    ----------
+    expected : ndarray, shape (S, n)
+        Distribution functions at the values in order.
+    weights : ndarray, shape (S, n)
+        Of the values.
+    """
+    weights = weights / weights.sum(axis=1, keepdims=True)
+    below = np.cumsum(weights, axis=1) - weights / 2
+    squares = weights * (below - expected) ** 2
+    inside = np.clip(expected, _BEYOND, 1 - _BEYOND)
+    in_the_tails = squares / (inside * (1 - inside))
+    both = np.stack([squares.sum(axis=1), in_the_tails.sum(axis=1)], axis=1)
+    return np.asarray(np.log(np.maximum(both, 1e-300)))
 
 
 def _middles(values: Floats, weights: Floats, at: Floats) -> Floats:
@@ -151,6 +134,7 @@ def _middles(values: Floats, weights: Floats, at: Floats) -> Floats:
     Each goes through the middles of its steps.
     """
     rows = []
+    values = np.broadcast_to(values, weights.shape)
     for own, share in zip(values, weights, strict=True):
         # Only what is finite can be observed.
         finite = np.isfinite(own)
@@ -159,43 +143,6 @@ def _middles(values: Floats, weights: Floats, at: Floats) -> Floats:
         mass = mass / mass.sum()
         rows.append(np.interp(at, own[finite][order], np.cumsum(mass) - mass / 2))
     return np.array(rows)
-
-
-def _distances(populations: _Populations, x: Floats, sets: DataSets) -> Floats:
-    """Return logarithms of two distances of each data set from its fit, by simulator and part.
-
-    Those of Cramer and von Mises, which sees the middle of a distribution, and of Anderson and
-    Darling, which sees its tails; shape (n_sets, 2 K).
-    """
-    columns = []
-    nodes = populations.sampling.evaluator.nodes
-    for k, (node, values, weights) in enumerate(zip(nodes, sets.values, sets.weights, strict=True)):
-        simulated, shares = populations.of(k, x)
-        for part in number_parts(node.target):
-            seen, rows = part.observed_of(values)
-            own = weights[:, rows]
-            if len(seen) < len(values):
-                own = own / own.sum(axis=1, keepdims=True)
-            ranked = np.argsort(seen, kind="stable")
-            at = seen[ranked]
-            columns += _distances_of(
-                populations.below(k, part.of(simulated), shares, x, at), own[:, ranked]
-            )
-    stacked = np.maximum(np.stack(columns, axis=1), 1e-300)
-    return np.asarray(np.log(stacked))
-
-
-def _distances_of(expected: Floats, w: Floats) -> list[Floats]:
-    """Return the two distances of what a part sees.
-
-    Of distribution functions at the values, in order, and of their weights, (n_sets, n) both.
-    """
-    below = np.cumsum(w, axis=1) - w / 2
-    squares = w * (below - expected) ** 2
-    inside = np.clip(expected, BEYOND, 1 - BEYOND)
-    in_the_middle = squares.sum(axis=1)
-    in_the_tails = (squares / (inside * (1 - inside))).sum(axis=1)
-    return [in_the_middle, in_the_tails]
 
 
 def of_held_away(probability: float) -> list[str]:

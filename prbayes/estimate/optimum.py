@@ -305,6 +305,16 @@ def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
     return require_minimiser(optimum, caller)
 
 
+def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
+    """Return the optimum and local optima that the data support as well, (M, d).
+
+    Their elements are in the evaluator's order, which may differ in a clone of the optimum's model.
+    """
+    order = [optimum.names.index(name) for name in evaluator.names]
+    rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
+    return np.array([optimum.theta, *rivals])[:, order]
+
+
 def require_minimiser(optimum: Optimum, caller: str) -> Optimum:
     """Return an optimum of the discrepancy alone, whose model is the one that was minimised.
 

@@ -12,17 +12,14 @@ from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes._progress import progress
-from prbayes.estimate.batch_bfgs import Descent, Slopes
-from prbayes.estimate.batch_gradient import WORTH_A_GRADIENT, BatchGradient
+from prbayes.estimate.batch_bfgs import Descent
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
 from prbayes.estimate.data_sets import SETS, DataSets, observed_set, one_set
-from prbayes.estimate.feature_map import WORTH, Shortcut
 from prbayes.estimate.identifiability import oriented
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import measured_by_refits
-from prbayes.estimate.prepared_anew import PREPARED, told_enough
 from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
@@ -135,28 +132,15 @@ class SamplingDistribution:
         settled = (ratio > 1 / _STEADY) & (ratio < _STEADY)
         return [] if settled.all() else jumping
 
-    def coordinates(self, thetas: Floats) -> tuple[Floats, Floats]:
-        """Return coordinates along the axes, and what remains of thetas (..., d).
+    def coordinates(self, thetas: Floats) -> Floats:
+        """Return coordinates of thetas along the axes, in standard errors, (..., d) -> (..., r)."""
+        shifts = (thetas - self.theta) / self.local.prior_sd
+        return np.asarray(shifts @ self.axes / self.stderr)
 
-        Returns
-        -------
-        x : ndarray, shape (..., r)
-            In standard errors.
-        remainder : ndarray, shape (..., d)
-            In theta.
-        """
-        prior_sd = self.local.prior_sd
-        shifts = (thetas - self.theta) / prior_sd
-        x = shifts @ self.axes
-        along = x @ self.axes.T
-        remainder = (shifts - along) * prior_sd
-        return x / self.stderr, remainder
-
-    def thetas(self, x: Floats, remainder: Floats | float = 0.0) -> Floats:
-        """Return thetas, (..., d), of coordinates (..., r) and what remains."""
+    def thetas(self, x: Floats) -> Floats:
+        """Return thetas, (..., d), of coordinates (..., r)."""
         shifts = (x * self.stderr) @ self.axes.T
-        shifted = self.theta + shifts * self.local.prior_sd
-        return np.asarray(shifted + remainder)
+        return np.asarray(self.theta + shifts * self.local.prior_sd)
 
     def refit(
         self, sets: DataSets, start: Floats | None = None, *, roughly: bool = False
@@ -174,7 +158,6 @@ class SamplingDistribution:
         n_sets = len(sets.weights[0])
         at_once = self._at_once(sets)
         begin = np.zeros((n_sets, self.stderr.size)) if start is None else start
-        shortcut = Shortcut(begin, self.thetas) if roughly and self._populous else None
         descent = None
         minimisers = []
         arrived = []
@@ -184,15 +167,8 @@ class SamplingDistribution:
                 some = DataSets(sets.values, weights)
                 objective = BatchObjective.of(self.evaluator, self.scales, some)
                 if descent is None:  # that of some serves all of them
-                    descent = self._descent(objective, roughly=roughly, one_sided=roughly)
-                x = begin[i : i + at_once]
-                own = descent
-                if shortcut is not None:
-                    x, inverse = shortcut.begin(objective, x, descent)
-                    own = replace(descent, inverse=inverse)
-                x, converged = self._minimise(objective, own, x)
-                if shortcut is not None:
-                    shortcut.learn(x, converged)
+                    descent = self._descent(objective, roughly=roughly)
+                x, converged = self._minimise(objective, descent, begin[i : i + at_once])
                 minimisers.append(x)
                 arrived.append(converged)
                 report(len(converged), "")
@@ -200,40 +176,41 @@ class SamplingDistribution:
 
     @property
     def prepares(self) -> bool:
-        """Whether the metric takes from the data how it looks at them, as at several outputs.
+        """Whether the metric takes its coordinates from the data, as with several outputs.
 
-        It is known of stored responses, and of metrics whose minimum declares something.
+        False unless responses are stored and the metric declares its minimum.
         """
         several = any(node.target.event for node in self.evaluator.nodes)
         return several and self._stored and not measured_by_refits(self.evaluator)
 
-    def refit_anew(self, sets: DataSets, start: Floats, minimisers: Floats) -> Floats:
-        """Return minimisers of the metric prepared for each of some data sets, (n_sets, r).
+    def refit_prepared(
+        self, sets: DataSets, minimisers: Floats
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the minimiser of the metric prepared for each data set, and which converged.
 
-        From ``start`` or those of what was prepared for the data, ``minimisers``, of which some run
-        away, (n_sets, r) both. NaN for the other data sets; for all of them where a metric sees one
-        output, responses are not stored, or minimisers are simplices'.
+        Parameters
+        ----------
+        sets : DataSets
+        minimisers : ndarray, shape (n_sets, r)
+            Those of the metric prepared for the observed data (`refit`). They remain where the
+            metric cannot be prepared, as for specimens that are all alike.
         """
-        found = np.full(start.shape, np.nan)
-        if not self.prepares:
-            return found
+        result = minimisers.copy()
+        is_converged = np.zeros(len(minimisers), dtype=bool)
         shared = BatchObjective.of(self.evaluator, self.scales, observed_set(self.evaluator))
         descent = self._descent(shared, roughly=True)
-        most = min(PREPARED, len(start))
-        with progress("metric prepared anew", most) as report:
-            for i in range(most):
+        with progress("refits", len(minimisers)) as report:
+            for i, minimiser in enumerate(minimisers):
                 report(1, "")
-                own = self._objective_anew(sets, i)
-                if own is None:
+                objective = self._objective_anew(sets, i)
+                if objective is None:
                     continue
-                begin = np.stack([start[i], minimisers[i]])
-                (values,) = own(self.thetas(begin)[None], slice(1))
-                minimiser, converged = self._minimise(own, descent, begin[[values.argmin()]])
+                starts = np.stack([np.zeros_like(minimiser), minimiser])
+                (values,) = objective(self.thetas(starts)[None], slice(1))
+                x, converged = self._minimise(objective, descent, starts[[values.argmin()]])
                 if converged[0]:
-                    found[i] = minimiser[0]
-                if told_enough(found[: i + 1] - minimisers[: i + 1]):
-                    break
-        return found
+                    result[i], is_converged[i] = x[0], True
+        return result, is_converged
 
     def _objective_anew(self, sets: DataSets, i: int) -> BatchObjective | None:
         """Return the objective of the metric prepared for a data set; None where it cannot be."""
@@ -251,13 +228,6 @@ class SamplingDistribution:
             here = len(node.target.parts) * max(node.bound.n_points, len(values))
             points = max(points, here)
         return max(1, 2 * AT_ONCE // points)
-
-    @property
-    def _populous(self) -> bool:
-        """Whether populations are so many numbers that it pays to interpolate between some."""
-        nodes = self.evaluator.nodes
-        most = max(len(node.target.parts) * node.bound.n_points for node in nodes)
-        return most >= WORTH and not measured_by_refits(self.evaluator)
 
     def design_error(self) -> DesignErrors:
         """Return how far the optimum of another design would be, by its points and emulators.
@@ -374,9 +344,7 @@ class SamplingDistribution:
             blocks.append(np.zeros_like(own) if node.bound.is_line else own)
         return blocks
 
-    def _descent(
-        self, objective: BatchObjective, *, roughly: bool = False, one_sided: bool = False
-    ) -> Descent:
+    def _descent(self, objective: BatchObjective, *, roughly: bool = False) -> Descent:
         """Return how data sets are fitted whose objectives have about the same curvature."""
 
         def typical(x: Floats) -> Floats:
@@ -386,7 +354,7 @@ class SamplingDistribution:
 
         r = self.stderr.size
         if r == 0 or measured_by_refits(self.evaluator):  # then nothing follows it
-            return Descent(np.zeros((r, r)), 0.0, _REFIT_STEP)
+            return Descent(np.eye(r), 0.0, _REFIT_STEP)
         root = self._root
         across = np.linalg.inv(root)
         curvature = across.T @ _mean_hessian(lambda z: typical(z @ root.T), r) @ across
@@ -395,7 +363,7 @@ class SamplingDistribution:
         # together the mean curvature is that of the direction across, in which next to none is.
         cost = r / np.trace(inverse)
         gain = (_ROUGHLY if roughly else _TOLERANCE) * cost
-        return Descent(inverse, gain, _REFIT_STEP, curvature if one_sided else None)
+        return Descent(curvature, gain, _REFIT_STEP)
 
     @property
     def _root(self) -> Floats:
@@ -432,23 +400,8 @@ class SamplingDistribution:
             # In standard errors; the second one starts where the first has ended.
             x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
             return x, converged
-        found = descent(value, start, self._slopes(objective))
+        found = descent(value, start)
         return found.x, found.converged
-
-    def _slopes(self, objective: BatchObjective) -> Slopes | None:
-        """Return values and exact gradients along the axes, where these are worth their graphs."""
-        if self.stderr.size < WORTH_A_GRADIENT:
-            return None
-        gradient = BatchGradient.of(objective)
-        if gradient is None:
-            return None
-        along = self.local.prior_sd[:, None] * self.axes * self.stderr
-
-        def slopes(x: Floats, rows: Any) -> tuple[Floats, Floats]:
-            values, by_theta = gradient(self.thetas(x), rows)
-            return values, by_theta @ along
-
-        return slopes
 
 
 def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:

@@ -8,16 +8,12 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.estimate.batch_bfgs import Minima, Slopes, descend
-from prbayes.estimate.batch_gradient import WORTH_A_GRADIENT, BatchGradient
-from prbayes.estimate.batch_objective import BatchObjective
-from prbayes.estimate.data_sets import observed_set
+from prbayes.estimate.batch_bfgs import Minima, descend
 from prbayes.estimate.objective import Hold
 from prbayes.estimate.refinement import visited
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import shortcomings
-from prbayes.response.budget import budget
 
 # Difference, in multiples of the noise, up to which data could come from either optimum; three of
 # them are about the noise floor, since the noise is a third of it.
@@ -87,46 +83,23 @@ class Best:
         """Return values of shifts; the same function for all rows."""
         return self(self.thetas(shifts))
 
-    def descended(self, shifts: Floats, inverse_hessian: Floats) -> Minima:
+    def descended(self, shifts: Floats, curvature: Floats) -> Minima:
         """Return the minima that shifts, (n, d), lead to."""
         return descend(
             self.along,
             shifts,
-            inverse_hessian,
+            curvature,
             step=1e-3,
             tolerance=_NEGLIGIBLE * self.noise,
-            slopes=self._slopes(),
+            is_central=True,
         )
-
-    def _slopes(self) -> Slopes | None:
-        """Return values and exact gradients of shifts, where these pay and there are any."""
-        evaluator = self.evaluator
-        if len(self.theta) < WORTH_A_GRADIENT or evaluator.has_other_terms:
-            return None
-        if not all(node.bound.stored for node in evaluator.nodes):
-            return None
-        observed = BatchObjective.of(evaluator, self.scales, observed_set(evaluator))
-        gradient = BatchGradient.of(observed)
-        if gradient is None:
-            return None
-
-        def slopes(shifts: Floats, rows: Any) -> tuple[Floats, Floats]:
-            budget().go_on()
-            thetas = self.thetas(shifts)
-            values, by_theta = gradient(thetas, np.zeros(len(thetas), dtype=np.intp))
-            if self.hold is not None:
-                by_theta = by_theta + self.hold.slope(thetas, self.local.prior_sd)
-            values = np.where(evaluator.in_support(thetas), values, np.inf)
-            return self._held(thetas, values), by_theta * self.local.prior_sd
-
-        return slopes
 
     def polished(self, thetas: Floats) -> tuple[Floats, Floats]:
         """Return minima near thetas, (n, d), and their values: they are bent about as at best."""
         local = self.local
         known = local.identified @ local.covariance @ local.identified.T
         inverse = (known + local.unidentified @ local.unidentified.T) / self.noise
-        ends, values, *_ = self.descended(self.shifts(thetas), inverse)
+        ends, values, *_ = self.descended(self.shifts(thetas), np.linalg.inv(inverse))
         return self.thetas(ends), values
 
 
@@ -159,26 +132,22 @@ def rivals(best: Best, *, starts: int, seed: int) -> list[Rival]:
         return []
 
     # Descend, all at once.
-    ends, values, *_ = best.descended(starts_at, np.eye(best.theta.size) / size)
+    ends, values, *_ = best.descended(starts_at, size * np.eye(best.theta.size))
     lowest = float(best(best.theta[None])[0])
     ends, values = _in_line(best, ends, values)
 
     found = _kept(best, best.thetas(ends), values, lowest)
+    if not found:
+        return []
+    thetas = np.stack([rival.theta for rival in found])
+    values = np.array([rival.value for rival in found])
     # In a bent valley a descent ends where it has not learned how flat that is.
     for _ in range(_GOING_ON):
-        before = found
-        if not before:
+        before = values
+        thetas, values = best.polished(thetas)
+        if not (before - values > _NEGLIGIBLE * best.noise).any():
             break
-        found = standing(best, np.stack([rival.theta for rival in before]))
-        if not _lower(before, found, _NEGLIGIBLE * best.noise):
-            break
-    return found
-
-
-def _lower(before: list[Rival], after: list[Rival], least: float) -> bool:
-    """Return whether optima are fewer, or one of them is lower by more than a least gain."""
-    gains = [a.value - b.value for a, b in zip(before, after, strict=False)]
-    return len(after) < len(before) or max(gains) > least
+    return _kept(best, thetas, values, lowest)
 
 
 def standing(best: Best, thetas: Floats) -> list[Rival]:

@@ -101,17 +101,6 @@ class AreaDiscrepancy(Discrepancy):
         observed = summed_below(self.weights, own, own_below, xp)
         return simulated - observed, lengths
 
-    def thinned(self, basis: tuple[NDArray[Any], ...], most: int) -> tuple[NDArray[Any], ...]:
-        """Return the basis of wider intervals, each with the difference at its middle."""
-        order, below, own, own_below, lengths = basis
-        if lengths.size <= most:
-            return basis
-        ends = np.linspace(0, lengths.size, most + 1).astype(np.intp)
-        first, last = ends[:-1], ends[1:]
-        middle = (first + last) // 2
-        wider = np.add.reduceat(lengths, first)
-        return order, below[middle], own, own_below[middle], wider
-
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum of |F - S_N| times length: eq. 5."""
         gap, lengths = features

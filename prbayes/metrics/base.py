@@ -255,18 +255,10 @@ class Discrepancy(ABC):
         small = len(simulated) * self.columns <= AT_ONCE
         return self.basis(simulated) if small else self.compact(simulated)
 
-    def thinned(self, basis: tuple[NDArray[Any], ...], most: int) -> tuple[NDArray[Any], ...]:
-        """Return a basis of about the same features with no more than about so many numbers each.
-
-        By default it is the same.
-        """
-        return basis
-
     def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
         """Return the derivatives for the weights, (..., n), of a sum over the only feature.
 
-        Of the sum of the feature times the cotangent, (..., m), by the basis or its compact form;
-        where densities are compared.
+        Of the sum of the feature times the cotangent, (..., m), by the compact form of the basis.
         """
         raise NotImplementedError
 
@@ -528,10 +520,6 @@ class DensityDiscrepancy(Discrepancy):
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the density on the cells."""
         return (product(weights, *basis) if xp is np else weights @ basis[0],)
-
-    def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
-        """Return the derivatives for the weights of a sum over the density."""
-        return product(cotangent, basis.T)
 
     @property
     def density_cells(self) -> Cells:

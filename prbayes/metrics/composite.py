@@ -497,8 +497,6 @@ class _Densities(_Group):
 
     def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
         """Return the derivatives for the weights of a sum over the densities."""
-        if not self._is_compact(basis):
-            return product(cotangent, basis.T)
         total: Any = 0.0
         for part, values, cells in zip(self.parts, basis.T, self._slices, strict=True):
             own = cast(Cells, part.target.density_cells)

@@ -168,8 +168,7 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
 def identical_specimens(y: Floats) -> tuple[tuple[int, ...], ...]:
     """Return groups of specimens that are identical in all measured outputs, by their indices.
 
-    Size 0, power 1.00 for exact repeats. Repeats with a new reading error are not identical: see
-    `closest_pairs`.
+    Size 0, power 1.00 for exact repeats. Repeats with a new reading error are not identical.
 
     Parameters
     ----------
@@ -221,37 +220,6 @@ def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0)
 def _repeats(y: Floats) -> int:
     """Return the number of specimens that repeat an earlier one."""
     return sum(len(group) - 1 for group in identical_specimens(y))
-
-
-def closest_pairs(y: Floats, simulated: Floats, pairs: int = 5) -> float:
-    """Return the p-value of the distances of the closest specimens.
-
-    The statistic is the mean log-distance of the closest pairs, outputs whitened. Small p-values
-    say that specimens were measured twice with a new reading error. Take p <= .01: size .00 to .03;
-    power for 20 % repeats with a reading error of .01 standard deviations 1.00 (two frequencies),
-    .42 to .79 (three outputs), .09 to .18 (one output). At .05 the size is up to .10.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N, m)
-        Finite values, N > m + 1.
-    simulated : ndarray, shape (B, N, m)
-        Bootstrap samples of the fitted population.
-    pairs : int
-        Number of closest pairs.
-    """
-    from scipy.spatial.distance import pdist
-
-    def distance(values: Floats) -> float:
-        centered = values - values.mean(axis=0)
-        covariance = np.atleast_2d(np.cov(centered.T))
-        whitened = np.linalg.solve(np.linalg.cholesky(covariance), centered.T).T
-        closest = np.sort(pdist(whitened))[:pairs]
-        return float(np.log(closest + np.finfo(np.float64).tiny).mean())
-
-    observed = distance(y)
-    null = np.array([distance(values) for values in simulated])
-    return float((np.sum(null <= observed) + 1) / (len(null) + 1))
 
 
 def data_findings(

@@ -6,7 +6,7 @@ One evaluator serves all routes.
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -38,7 +38,7 @@ from prbayes.propagation.base import Bound
 from prbayes.propagation.cloud import CLOUD
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
-from prbayes.response.compilation import compile_batched, compiled, ninf_for_invalid, untraced
+from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
 
@@ -404,8 +404,7 @@ class Evaluator:
         other = copy.copy(self)
         other.nodes = [node]
         other._variables = [self._variables[k]]
-        for name in ("_roots", "_roots_slopes"):
-            vars(other).pop(name, None)
+        vars(other).pop("_roots", None)
         other.__dict__["objective"] = other._uncompiled
         return other
 
@@ -423,6 +422,18 @@ class Evaluator:
         other.nodes = [replace(node, bound=bound) for node, bound in pairs]
         other.__dict__["objective"] = other._uncompiled
         return other
+
+    def coarse_where_sufficient(self, theta: Floats) -> Evaluator:
+        """Return that of an eighth of the points of large designs if they support theta, (d,)."""
+        coarse = self.coarser()
+        if coarse is None:
+            return self
+        support = coarse.support(theta[None])
+        is_sufficient = [
+            support[name]["weight_ess"][0] >= design.required_ess
+            for name, design in coarse.designs.items()
+        ]
+        return coarse if all(is_sufficient) else self
 
     def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
         """Return an evaluator of the same model with other prepared metrics, by simulator."""
@@ -482,30 +493,6 @@ class Evaluator:
             np.full(len(thetas), place) if is_group(root) else values[str(root.name)]
             for root in inputs.roots
         ]
-
-    @cached_property
-    def _roots_slopes(self) -> dict[int, Any]:
-        """Compiled derivatives of the roots, by simulator, as far as they were asked for."""
-        return {}
-
-    def pulled_back(self, thetas: Floats, k: int, by_roots: Sequence[Floats]) -> Floats:
-        """Return the derivatives for thetas, (P, d), of a sum over the k-th simulator's roots.
-
-        Of the sum of the roots times ``by_roots``, shapes (P, *shape).
-        """
-        if k not in self._roots_slopes:
-            self._roots_slopes[k] = self._compiled_slopes(k)
-        (found,) = self._roots_slopes[k](np.ascontiguousarray(thetas), *by_roots)
-        return np.asarray(np.broadcast_to(found, thetas.shape))
-
-    def _compiled_slopes(self, k: int) -> Any:
-        with untraced():
-            roots = self.model.replace_rvs_by_values(self._params()[k])
-            graphs, theta = self.hyperparameters.joined(roots)
-            cotangents = [pt.tensor(dtype="float64", shape=graph.type.shape) for graph in graphs]
-            sums = [(g * by).sum() for g, by in zip(graphs, cotangents, strict=True)]
-            slopes = pt.grad(sum(sums), theta, disconnected_inputs="ignore")
-            return compile_batched([theta, *cotangents], [slopes])
 
     def populations(self, thetas: Floats, k: int) -> tuple[Floats, Floats]:
         """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`."""

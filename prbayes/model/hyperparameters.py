@@ -5,7 +5,7 @@ Theta is the vector of the model's value variables, unconstrained through PyMC's
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -172,6 +172,20 @@ class Hyperparameters:
         """Return the log prior density with the Jacobian of the transforms, shape (P,)."""
         values = self._log_prior(np.ascontiguousarray(thetas))
         return np.array(np.broadcast_to(sum(values), len(thetas)))
+
+    def log_posterior(self, thetas: Floats, log_likelihood: Callable[[Floats], Floats]) -> Floats:
+        """Return the log prior density plus a log-likelihood, (P, d) -> (P,).
+
+        The log-likelihood is evaluated where the prior is positive. Where it is not known the
+        result is -inf.
+        """
+        thetas = np.ascontiguousarray(thetas)
+        result = self.log_prior(thetas)
+        is_possible = np.isfinite(result)
+        if is_possible.any():
+            result[is_possible] += log_likelihood(thetas[is_possible])
+        result[~np.isfinite(result)] = -np.inf
+        return result
 
     def in_support(self, thetas: Floats) -> Any:
         """Return which thetas have a finite log prior, shape (P,)."""

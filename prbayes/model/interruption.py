@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pymc as pm
@@ -13,17 +13,22 @@ from prbayes.response.budget import BudgetError
 
 
 @contextmanager
-def designs_as_before(evaluator: Evaluator) -> Iterator[None]:
+def designs_as_before(evaluator: Evaluator) -> Iterator[Callable[[], None]]:
     """Give designs that have grown inside their first size back, where the work is interrupted.
 
-    The same call then begins where this one began, and finds the responses.
+    The same call then begins where this one began, and finds the responses. The function that is
+    yielded does the same, for work that a budget ended with a part of its result.
     """
     before = [(design, design.mark()) for design in evaluator.designs.values()]
-    try:
-        yield
-    except (BudgetError, KeyboardInterrupt):
+
+    def restore() -> None:
         for design, mark in before:
             design.go_back(mark, remember=True)
+
+    try:
+        yield restore
+    except (BudgetError, KeyboardInterrupt):
+        restore()
         raise
 
 

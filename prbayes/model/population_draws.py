@@ -164,19 +164,12 @@ class Populations:
         names = self.hyperparameters
         d = names.size
 
-        def log_posterior(thetas: Floats) -> Floats:
-            prior = names.log_prior(thetas)
-            inside = np.isfinite(prior)
-            total = np.full(len(thetas), -np.inf)
-            if inside.any():
-                logs = self.log_likelihoods(thetas[inside], z, log_a, smoothing)
-                total[inside] = prior[inside] + logs.sum(axis=1)
-                if share is not None:
-                    total[inside] -= self.log_share(thetas[inside], share, len(z))
-            return total
+        def log_likelihood(thetas: Floats) -> Floats:
+            total = self.log_likelihoods(thetas, z, log_a, smoothing).sum(axis=1)
+            return total if share is None else total - self.log_share(thetas, share, len(z))
 
         thetas = names.prior_points(2048, seed)
-        log_weights = log_posterior(thetas) - names.log_prior(thetas)
+        log_weights = names.log_posterior(thetas, log_likelihood) - names.log_prior(thetas)
         weights, _ = _tempered(log_weights, 10 * d)
         for attempt in range(12):
             mean = weights @ thetas
@@ -188,7 +181,8 @@ class Populations:
             standard = ndtri(u[:, :d]) * radius[:, None]
             thetas = mean + standard @ root.T
             log_proposal = -(5 + d) / 2 * np.log1p((standard**2).sum(axis=1) / 5)
-            weights, temper = _tempered(log_posterior(thetas) - log_proposal, 10 * d)
+            log_density = names.log_posterior(thetas, log_likelihood)
+            weights, temper = _tempered(log_density - log_proposal, 10 * d)
             if temper == 1.0 and attempt >= 2 and 1 / (weights**2).sum() > 200:
                 break
         rng = np.random.default_rng([seed, 5])

@@ -425,15 +425,15 @@ class SpecimenLikelihood:
         """
         shared, shared_log_a = self.arrays
         log_a = shared_log_a.get_value(borrow=True)
-        last: tuple[Any, list[WeightedPoints]] = vars(self).get("_last_points", (None, []))
-        known, points = last
-        if known is not log_a:
+        cache: tuple[Any, list[WeightedPoints]] = vars(self).get("_cached_points", (None, []))
+        cached_log_a, points = cache
+        if cached_log_a is not log_a:
             x = [variable.get_value(borrow=True) for variable in shared]
             points = [
                 WeightedPoints.of(self.inputs, [v[rows] for v in x], log_a[rows])
                 for _, rows in self.by_group
             ]
-            vars(self)["_last_points"] = (log_a, points)
+            vars(self)["_cached_points"] = (log_a, points)
         return points
 
     @property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 
 import numpy as np
@@ -13,12 +12,9 @@ from prbayes._progress import shown
 from prbayes.estimate.data_sets import dirichlet_weights, reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.optimum import Optimum, require_refits
-from prbayes.estimate.prepared_anew import as_prepared_anew, of_few_pairs
 from prbayes.estimate.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.model.turns import in_turn
 from prbayes.posterior.trees import bootstrap_tree
-
-_log = logging.getLogger("prbayes")
 
 
 @in_turn
@@ -39,10 +35,10 @@ def bootstrap(
     together.
 
     With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is
-    of first order. A metric of several outputs takes from the data in which coordinates it looks at
-    them: some minimisations are of the metric as it is prepared for their data set, and tell where
-    all are. With the log-likelihood by specimen the minimisers are maximum-likelihood estimates;
-    simulated data sets are drawn from one pool of simulated specimens, and nothing is run.
+    of first order. A metric of several outputs takes its coordinates from the data, and is prepared
+    for each data set, which takes some hundredths of a second. With the log-likelihood by specimen
+    the minimisers are maximum-likelihood estimates; simulated data sets are drawn from one pool of
+    simulated specimens, and nothing is run.
 
     Parameters
     ----------
@@ -59,7 +55,7 @@ def bootstrap(
     xarray.DataTree
         Group ``posterior`` with dimensions (chain, draw), chain of length one, for ArviZ and
         `compare`; and ``observed_data``. The attribute ``converged`` is the share of minimisations
-        that did, ``warnings`` what speaks against them, which is in the log as well.
+        that did.
 
     Raises
     ------
@@ -106,17 +102,13 @@ def bootstrap(
         data = reweighted_sets(evaluator, draws, seed)
     with shown(progressbar):
         x, converged = sampling.refit(data)
-        anew = sampling.refit_anew(data, np.zeros_like(x), x)
-    x = as_prepared_anew(x, anew, np.random.default_rng([seed, 9]).random(draws))
-    doubts = of_few_pairs(anew) if sampling.prepares else []
-    for line in doubts:
-        _log.warning("%s", line)
+        if sampling.prepares:
+            x, converged = sampling.refit_prepared(data, x)
     return bootstrap_tree(
         evaluator,
         sampling.thetas(x)[None],
         sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         converged=float(converged.mean()),
-        warnings=tuple(doubts),
         seed=seed,
         n_responses=optimum.n_responses,
         seconds=time.perf_counter() - clock,

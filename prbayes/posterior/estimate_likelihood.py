@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import SETS, aligned, groups, observable, specimens
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, optima_of
 from prbayes.estimate.refinement import noise_floors
 from prbayes.metrics.score import (
     ScoreOptions,
@@ -87,8 +87,8 @@ class EstimateLikelihood:
     Attributes
     ----------
     evaluator : Evaluator
-    point : ndarray, shape (d,)
-        Where the score is taken: the estimate, or a point inside if it is at an edge.
+    starts : ndarray, shape (M, d)
+        The point of the score, and optima that are as good as the estimate.
     groups : tuple of StoredScores and ResimulatedScores
         One of each set of simulators that share specimens.
     scale : ndarray, shape (d,)
@@ -98,10 +98,15 @@ class EstimateLikelihood:
     """
 
     evaluator: Evaluator
-    point: Floats
+    starts: Floats
     groups: tuple[StoredScores | ResimulatedScores, ...]
     scale: Floats
     options: SaddlepointOptions
+
+    @property
+    def point(self) -> Floats:
+        """Where the score is taken, (d,): the estimate, or a point inside if it is at an edge."""
+        return np.asarray(self.starts[0])
 
     @one_thread()
     def log_likelihood(self, thetas: Floats) -> Floats:
@@ -230,13 +235,13 @@ def estimate_likelihood(
     obstacle = score_obstacle(evaluator)
     if obstacle is not None:
         raise ValueError(f"metric: {obstacle}; expected a refit_likelihood")
-    order = [optimum.names.index(name) for name in evaluator.names]
-    point = move_inside(evaluator, optimum.theta[order], options)
+    optima = optima_of(optimum, evaluator)
+    point = move_inside(evaluator, optima[0], options)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     if _needs_population(evaluator, options):
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
-    evaluator = _coarse_where_sufficient(evaluator, point)
+    evaluator = evaluator.coarse_where_sufficient(point)
     parts = [
         _group_scores(evaluator, members, point, scales, options)
         for members in groups(evaluator.nodes)
@@ -248,7 +253,7 @@ def estimate_likelihood(
     combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
     return EstimateLikelihood(
         evaluator=evaluator,
-        point=point,
+        starts=np.vstack([point, optima[1:]]),
         groups=tuple(part.combined(combinations) for part in parts),
         scale=_unit(evaluator, point, optimum, options),
         options=options.saddlepoint,
@@ -449,19 +454,6 @@ def _likelihood_spread(
         population = _weight_slopes(evaluator, k, theta, options)
         variance += population.spread**2
     return np.asarray(np.sqrt(variance) * evaluator.prior_sd)
-
-
-def _coarse_where_sufficient(evaluator: Evaluator, point: Floats) -> Evaluator:
-    """Return an evaluator with an eighth of the points of large designs, if they are sufficient."""
-    coarse = evaluator.coarser()
-    if coarse is None:
-        return evaluator
-    support = coarse.support(point[None])
-    is_sufficient = [
-        support[name]["weight_ess"][0] >= design.required_ess
-        for name, design in coarse.designs.items()
-    ]
-    return coarse if all(is_sufficient) else evaluator
 
 
 def score_obstacle(evaluator: Evaluator) -> str | None:

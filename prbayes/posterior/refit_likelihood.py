@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ from prbayes.estimate.data_sets import (
     specimens,
     stored_populations,
 )
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, optima_of
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import Evaluator
@@ -167,7 +168,7 @@ class RefitLikelihood:
         """Return the log-density of the observed estimate, (S, d) -> (S,)."""
         if self.sets.estimates.shape[1] == 0:
             return np.zeros(len(thetas))
-        x, _ = self.sampling.coordinates(self.continuation.coordinates(thetas))
+        x = self.sampling.coordinates(self.continuation.coordinates(thetas))
         largest = max(count.shape[1] for count in self.sets.counts)
         rows = max(16, AT_ONCE // max(largest, len(self.sets.estimates)))
         blocks = [self._block(x[first : first + rows]) for first in range(0, len(x), rows)]
@@ -191,26 +192,12 @@ class RefitLikelihood:
         with np.errstate(invalid="ignore"):
             return np.asarray(logs - logsumexp(logs, axis=1, keepdims=True))
 
-    def log_posterior(self, thetas: Floats) -> Floats:
-        """Return the unnormalised log-posterior density in unconstrained space, (S, d) -> (S,)."""
-        thetas = np.ascontiguousarray(thetas)
-        evaluator = self.evaluator
-        logs = evaluator.hyperparameters.log_prior(thetas)
-        logs = logs + evaluator.log_other(thetas)
-        is_possible = np.isfinite(logs)
-        if not is_possible.any():
-            return np.full(len(thetas), -np.inf)
-        log_likelihood = self.log_likelihood(thetas[is_possible])
-        result = np.full(len(thetas), -np.inf)
-        result[is_possible] = logs[is_possible] + log_likelihood
-        return result
-
 
 def nearest(
     centers: Sequence[SamplingDistribution], thetas: Floats
 ) -> tuple[NDArray[np.intp], Floats]:
     """Return the nearest center of each theta, (S,), and coordinates around it, (S, r)."""
-    x = np.stack([center.coordinates(thetas)[0] for center in centers])
+    x = np.stack([center.coordinates(thetas) for center in centers])
     distances = np.linalg.norm(x, axis=2)
     chosen = distances.argmin(axis=0)
     return chosen, x[chosen, np.arange(len(thetas))]
@@ -253,12 +240,14 @@ def extended_log_density(
         empirical = cumulants([log_weights[rows]], scores, tilts)
         linear = np.einsum("skl,sl->sk", covariance[rows], tilts)
         normal = (mean[rows] * tilts).sum(axis=1) + (linear * tilts).sum(axis=1) / 2
-        own = share[rows]
-        rest = 1 - own
+        weight = share[rows]
+        normal_weight = 1 - weight
+        gradients = normal_weight[:, None] * (mean[rows] + linear)
+        hessians = normal_weight[:, None, None] * covariance[rows]
         return Cumulants(
-            own * empirical.values + rest * normal,
-            own[:, None] * empirical.gradients + rest[:, None] * (mean[rows] + linear),
-            own[:, None, None] * empirical.hessians + rest[:, None, None] * covariance[rows],
+            weight * empirical.values + normal_weight * normal,
+            weight[:, None] * empirical.gradients + gradients,
+            weight[:, None, None] * empirical.hessians + hessians,
         )
 
     points = minimum(function, away.shape, 1, options.saddlepoint)
@@ -283,18 +272,13 @@ def refit_likelihood(
 
     Raises
     ------
-    TypeError
-        If responses are not stored.
     ValueError
         If the estimate is at an edge, stored responses do not support populations around it, or
         refits do not converge.
     """
-    _require_stored(evaluator)
     if optimum.at_edge:
         raise ValueError(_at_edge(", ".join(optimum.at_edge)))
-    order = [optimum.names.index(name) for name in evaluator.names]
-    rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
-    thetas = np.array([optimum.theta, *rivals])[:, order]
+    thetas = optima_of(optimum, evaluator)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     continuation = continuation_of(evaluator, thetas[:1])
     start, *others = continuation.coordinates(thetas)
@@ -309,7 +293,7 @@ def refit_likelihood(
         if center.stderr.size == sampling.stderr.size:
             centers.append(center)
     # Identified directions are known from all stored responses; an eighth is enough for the rest.
-    evaluator = _coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
+    evaluator = evaluator.coarse_where_sufficient(continuation.within(thetas[:1])[0])
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0])
@@ -337,11 +321,16 @@ def refit_likelihood(
 def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
     """Return coordinates of draws from the posterior, spread out around each optimum, (n, r)."""
     options = likelihood.options
-    density = likelihood.log_posterior
+    evaluator = likelihood.evaluator
+
+    def log_likelihood(thetas: Floats) -> Floats:
+        return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
+
+    density = partial(evaluator.hyperparameters.log_posterior, log_likelihood=log_likelihood)
     modes = laplace(density, likelihood.starts, likelihood.scale)
     sample = importance_sample(density, modes, number, options.seed)
     thetas = likelihood.continuation.coordinates(sample.draws)
-    x, _ = likelihood.sampling.coordinates(thetas)
+    x = likelihood.sampling.coordinates(thetas)
     chosen, _ = nearest(likelihood.centers, thetas)
     for i in np.unique(chosen):
         members = chosen == i
@@ -463,7 +452,7 @@ def _balls(
     points = []
     for i, center in enumerate(centers):
         ball = _ball(number // len(centers), r, options, options.seed + i)
-        x, _ = sampling.coordinates(center.thetas(ball))
+        x = sampling.coordinates(center.thetas(ball))
         points.append(x)
     return np.concatenate(points)
 
@@ -510,7 +499,7 @@ def _at_minimiser(
     for _ in range(5):
         sampling = SamplingDistribution.of(evaluator, start, scales, options.weakest)
         moved = _moved_to_minimiser(sampling)
-        x, _ = sampling.coordinates(moved.theta)
+        x = sampling.coordinates(moved.theta)
         start = moved.theta
         if np.abs(x).max(initial=0.0) < 0.5:
             return moved
@@ -580,26 +569,3 @@ def _scale(
     is_known = ~continuation.is_continued & (errors > 0)
     units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
     return np.asarray(units * evaluator.prior_sd)
-
-
-def _coarse_where_sufficient(evaluator: Evaluator, theta: Floats) -> Evaluator:
-    """Return an evaluator with an eighth of the points of large designs, if they are sufficient."""
-    coarse = evaluator.coarser()
-    if coarse is None:
-        return evaluator
-    support = coarse.support(theta[None])
-    sizes = [support[name]["weight_ess"][0] for name in coarse.designs]
-    required = [design.required_ess for design in coarse.designs.values()]
-    return coarse if (np.array(sizes) >= required).all() else evaluator
-
-
-def _require_stored(evaluator: Evaluator) -> None:
-    """Raise if responses are not stored."""
-    if not evaluator.nodes:
-        raise TypeError("model: got no simulator with a metric, expected one")
-    for node in evaluator.nodes:
-        if not node.bound.stored:
-            raise TypeError(
-                f"{node.name}: propagation: got {type(node.propagation).__name__}, expected "
-                "prb.Reweighted(), whose stored responses serve all hyperparameters"
-            )

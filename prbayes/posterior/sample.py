@@ -75,7 +75,9 @@ def sample(
     idata_kwargs, var_names
         As in `sample_smc`.
     max_seconds : float, optional
-        Seconds after which no further run is begun.
+        Seconds after which no further run is begun. If they are over, or `max_runs` is reached,
+        during sequential Monte Carlo, the finished chains are returned, if there are any; the
+        attribute ``stopped`` and a warning say so.
     max_runs : int, optional
         Largest number of responses to compute, the first runs included.
     random_seed : int, sequence of int, numpy.random.Generator or None
@@ -187,8 +189,8 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             attrs,
             log_likelihood=log_likelihood,
             sample_stats=stats,
-            n_responses=evaluator.n_responses - before,
-            seconds=time.perf_counter() - clock,
+            n_before=before,
+            clock=clock,
         )
 
 

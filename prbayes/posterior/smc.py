@@ -43,6 +43,7 @@ from prbayes.posterior.returned import (
 )
 from prbayes.posterior.target import estimate_target, prior_conflicts, require_density
 from prbayes.posterior.trees import posterior_tree, share_of_lossy
+from prbayes.propagation.base import Missing
 from prbayes.response.budget import BudgetError, limited, unlimited
 
 _log = logging.getLogger("prbayes")
@@ -120,10 +121,10 @@ def sample_smc(
         Variables and deterministics that the result has; all by default. Without a free variable
         nothing can be predicted from it.
     max_stages : int, optional
-        Largest number of stages of a chain. Where it is reached, or another budget is spent, the
-        chains that are finished are returned, if there are any and no design had to grow for them;
-        the attribute ``stopped`` and a warning say so. The same call with a larger budget and the
-        same ``checkpoint`` goes on, and gives the draws that it would have given at once.
+        Largest number of stages of a chain. If it is reached, or another budget is spent, the
+        finished chains are returned, if there are any; the attribute ``stopped`` and a warning say
+        so. Designs that grew for them are then as before. The same call with a larger budget and
+        the same ``checkpoint`` goes on, and gives the draws that it would have given at once.
     max_seconds : float, optional
         Seconds after which nothing new is begun.
     max_runs : int, optional
@@ -141,12 +142,13 @@ def sample_smc(
     xarray.DataTree
         Groups ``posterior`` (chain, draw), ``sample_stats`` (chain, stage; NaN after the last
         stage), ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw
-        weight, lost mass, ``lossy_draws``: the share of draws of whose populations more than
-        ``max_lost`` has no response; ``discrepancy_error``: the Monte Carlo error of the
-        discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it,
-        ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and predictive draws
-        (``posterior_predictive``, ``prior_predictive``) of simulators whose responses are stored,
-        and ``log_likelihood`` for power-scaling, with one number for each draw. Attributes of
+        weight, lost mass, of 64 draws if it costs responses, ``lossy_draws``: the share of draws of
+        whose populations more than ``max_lost`` has no response; ``discrepancy_error``: the Monte
+        Carlo error of the discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ
+        takes it, ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and
+        predictive draws (``posterior_predictive``, ``prior_predictive``) of simulators whose
+        responses are stored, and ``log_likelihood`` for power-scaling, with one number for each
+        draw. Attributes of
         ``posterior``: ``adjustment``; ``log_marginal_likelihood``, from all chains, and
         ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
         with one metric and one epsilon, and with no others.
@@ -270,7 +272,7 @@ def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """Return draws of the posterior: given the estimate, or of a log-likelihood by specimen."""
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
-    with designs_as_before(evaluator):
+    with designs_as_before(evaluator) as restore_designs:
         optimum = estimate_of(evaluator, asked, "sample_smc")
         rounds = _rounds(evaluator, asked, optimum)
         particles = rounds.until_supported(asked.progressbar)
@@ -278,7 +280,7 @@ def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         if rounds.log_likelihood is not None:
             rows = particles.thetas.reshape(-1, evaluator.size)
             log_likelihood = rounds.log_likelihood(rows).reshape(particles.thetas.shape[:2])
-        return result_tree(
+        tree = result_tree(
             evaluator,
             particles.thetas,
             asked,
@@ -288,9 +290,12 @@ def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             stats=particles.stats,
             warnings=_of_budget(particles.stopped, particles, asked),
             stopped=particles.stopped,
-            n_responses=evaluator.n_responses - before,
-            seconds=time.perf_counter() - clock,
+            n_before=before,
+            clock=clock,
         )
+        if particles.stopped:
+            restore_designs()
+        return tree
 
 
 def estimate_of(evaluator: Evaluator, asked: Sampling, caller: str) -> Optimum | None:
@@ -317,20 +322,16 @@ def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """Return draws of prior times exp(-sum of d_k / epsilon_k)."""
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
-    drawn = [design.n_drawn for design in evaluator.designs.values()]
-    with epsilons_restored(evaluator), designs_as_before(evaluator):
+    with epsilons_restored(evaluator), designs_as_before(evaluator) as restore_designs:
         optimum = _calibrated(evaluator, asked)
         particles = _rounds(evaluator, asked, optimum).until_supported(asked.progressbar)
-        grown = [design.n_drawn for design in evaluator.designs.values()] != drawn
-        if particles.stopped and grown:
-            raise BudgetError(particles.stopped)
         stopped, errors, missing = particles.stopped, None, None
         try:
             errors, missing = _at_the_best(evaluator, particles)
         except BudgetError as spent:
             stopped = stopped or str(spent)
         else:
-            _refuse_lost(evaluator, particles, missing)
+            _refuse_lost(evaluator, particles.lost, missing)
         with unlimited():
             groups = None
             if asked.with_groups:
@@ -339,7 +340,7 @@ def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                 other = evaluator.log_other(thetas.reshape(-1, evaluator.size))
                 logs = kernels.sum(axis=-1) + other.reshape(thetas.shape[:2])
                 groups = arviz_groups(evaluator, thetas, logs, asked.random_seed)
-            return posterior_tree(
+            tree = posterior_tree(
                 evaluator,
                 particles.thetas,
                 particles.discrepancies,
@@ -348,7 +349,7 @@ def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                 sampler={"sampler": "SMC-ABC"},
                 warnings=(
                     *_of_budget(stopped, particles, asked),
-                    *_of_lost(evaluator, particles),
+                    *_of_lost(evaluator, particles.lost),
                     *(() if optimum is None else optimum.warnings),
                 ),
                 errors=errors,
@@ -359,6 +360,9 @@ def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                 seconds=time.perf_counter() - clock,
                 groups=groups,
             )
+        if stopped:
+            restore_designs()
+        return tree
 
 
 def _of_budget(stopped: str, particles: Particles, asked: Sampling) -> list[str]:
@@ -376,27 +380,38 @@ def _of_budget(stopped: str, particles: Particles, asked: Sampling) -> list[str]
 
 
 def _refuse_lost(
-    evaluator: Evaluator, particles: Particles, missing: Mapping[str, Mapping[str, float]]
+    evaluator: Evaluator,
+    lost: Floats,
+    missing: Mapping[str, Mapping[str, float]] | None = None,
 ) -> None:
-    """Raise where too much of the best draw's population, or of most draws', has no response."""
-    lost = {}
+    """Raise if too much of the populations of most draws, or of the best, has no response.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    lost : ndarray, shape (chains, draws, k)
+        Shares of the populations without response; NaN if not known.
+    missing : mapping, optional
+        By simulator, of the best draw.
+    """
+    shares = {}
     for k, node in enumerate(evaluator.nodes):
-        lost[node.name] = missing[node.name]["lost_mass"]
-        if node.design is None:
-            of_most = float(np.median(particles.lost[:, :, k]))
-            lost[node.name] = max(lost[node.name], of_most)
-    refuse_lost(evaluator, lost)
+        shares[node.name] = 0.0 if missing is None else missing[node.name]["lost_mass"]
+        values = lost[:, :, k]
+        if not np.isnan(values).all():
+            shares[node.name] = max(shares[node.name], float(np.nanmedian(values)))
+    refuse_lost(evaluator, shares)
 
 
-def _of_lost(evaluator: Evaluator, particles: Particles) -> list[str]:
-    """Say, also in the log, of how many draws too much of the population has no response.
+def _of_lost(evaluator: Evaluator, lost: Floats) -> list[str]:
+    """Report, also in the log, the share of draws whose populations lack too many responses.
 
-    Of designs, `diagnose` says it, as it does where more than these draws are concerned.
+    For designs, `diagnose` reports it.
     """
     lines = []
     for k, node in enumerate(evaluator.nodes):
         most = node.bound.max_lost
-        share = share_of_lossy(particles.lost[:, :, k], most)
+        share = share_of_lossy(lost[:, :, k], most)
         if share > _FAR_OUT:
             lines.append(
                 f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
@@ -539,22 +554,29 @@ def result_tree(
     sample_stats: xr.Dataset | None = None,
     warnings: Sequence[str] = (),
     stopped: str = "",
-    n_responses: int,
-    seconds: float,
+    n_before: int,
+    clock: float,
 ) -> xr.DataTree:
     """Return the DataTree of draws of the posterior, (chains, draws, d).
 
     With a metric ``log_likelihood``, (chains, draws), is that given the estimate. Discrepancies are
-    computed where that costs no response.
+    computed where that costs no response. ``n_before`` and ``clock`` are the number of responses
+    and the time at the start.
+
+    Raises
+    ------
+    DesignError
+        If too much of the populations of most draws has no response.
     """
     chains, draws, d = thetas.shape
     shape = (chains, draws, len(evaluator.nodes))
-    discrepancies, lost = np.full(shape, np.nan), np.full(shape, np.nan)
+    discrepancies = np.full(shape, np.nan)
+    lost = _lost_of_some(evaluator, thetas)
+    _refuse_lost(evaluator, lost)
     with unlimited():
         if evaluator.nodes and not evaluator.responses_per_theta:
             evaluation = evaluator(thetas.reshape(-1, d))
             discrepancies = evaluation.discrepancies.reshape(shape)
-            lost = evaluation.lost.reshape(shape)
         groups = None
         if asked.with_groups and log_likelihood is None:
             groups = specimen_groups(evaluator, thetas, asked.random_seed)
@@ -569,13 +591,38 @@ def result_tree(
             sampler=sampler,
             sample_stats=sample_stats,
             adjustment="estimate" if evaluator.nodes else "none",
-            warnings=(*warnings, *_warnings(evaluator, optimum, thetas)),
+            warnings=(
+                *warnings,
+                *_of_lost(evaluator, lost),
+                *_warnings(evaluator, optimum, thetas),
+            ),
             stopped=stopped,
             seed=asked.random_seed,
-            n_responses=n_responses,
-            seconds=seconds,
+            n_responses=evaluator.n_responses - n_before,
+            seconds=time.perf_counter() - clock,
             groups=groups,
         )
+
+
+def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floats:
+    """Return shares of populations without response, (chains, draws, k).
+
+    Responses that are not stored are computed at a sample of draws, within the budget. The shares
+    of other draws, and of stored responses, are NaN.
+    """
+    chains, draws, _ = thetas.shape
+    lost = np.full((chains, draws, len(evaluator.nodes)), np.nan)
+    rows = np.linspace(0, chains * draws - 1, count).astype(np.intp)
+    try:
+        for row in np.unique(rows):
+            where = np.unravel_index(row, (chains, draws))
+            for k, node in enumerate(evaluator.nodes):
+                if not node.bound.stored:
+                    population = evaluator.populations(thetas[where][None], k)
+                    lost[(*where, k)] = Missing.of(*population).lost[0]
+    except BudgetError:
+        pass
+    return lost
 
 
 def _warnings(evaluator: Evaluator, optimum: Optimum | None, thetas: Floats) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes._finding import Finding
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, optima_of
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.estimate_likelihood import estimate_likelihood, score_obstacle
@@ -38,13 +38,7 @@ class Target:
 
     def log_posterior(self, thetas: Floats) -> Floats:
         """Return the unnormalised log-density, (S, d) -> (S,); -inf where it is not known."""
-        thetas = np.ascontiguousarray(thetas)
-        result = np.array(self.evaluator.hyperparameters.log_prior(thetas))
-        is_possible = np.isfinite(result)
-        if is_possible.any():
-            result[is_possible] += self.log_likelihood(thetas[is_possible])
-        result[~np.isfinite(result)] = -np.inf
-        return result
+        return self.evaluator.hyperparameters.log_posterior(thetas, self.log_likelihood)
 
 
 def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
@@ -52,7 +46,7 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     if optimum is None:
         starts = _prior_starts(evaluator)
     else:
-        starts = optima_of(optimum, evaluator)
+        starts = tuple(optima_of(optimum, evaluator))
     return Target(evaluator, evaluator.log_other, starts, evaluator.prior_sd)
 
 
@@ -91,9 +85,7 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
 
-    # The point of the score may differ from the optimum.
-    starts = (likelihood.point, *optima_of(optimum, evaluator)[1:])
-    return Target(evaluator, log_likelihood, starts, likelihood.scale)
+    return Target(evaluator, log_likelihood, tuple(likelihood.starts), likelihood.scale)
 
 
 def require_density(evaluator: Evaluator) -> None:
@@ -119,16 +111,6 @@ def require_density(evaluator: Evaluator) -> None:
             f"distribution of the estimate is not known ({reason}); expected {expected}, or "
             "prb.sample_smc with adjustment=None, whose draws are as wide as epsilon makes them"
         )
-
-
-def optima_of(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
-    """Return the optimum and local optima that the data support as well.
-
-    Their elements are in the evaluator's order, which may differ in a clone of the optimum's model.
-    """
-    order = [optimum.names.index(name) for name in evaluator.names]
-    rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
-    return tuple(theta[order] for theta in (optimum.theta, *rivals))
 
 
 def prior_conflicts(

@@ -51,7 +51,7 @@ def posterior_tree(
     discrepancies : ndarray, shape (chains, draws, k)
         NaN where they would cost responses.
     lost : ndarray, shape (chains, draws, k)
-        Shares of populations without response; NaN of stored responses.
+        Shares of populations without response; NaN of stored responses, or if not known.
     stats : list of dict
         By chain: statistics by name, one value per stage.
     sampler : mapping
@@ -238,7 +238,8 @@ def _support(evaluator: Evaluator, thetas: Floats, lost: Floats) -> dict[str, An
 
 def share_of_lossy(lost: Floats, max_lost: float) -> float:
     """Return the share of draws of whose populations too much has no response."""
-    return float((lost > max_lost).mean())
+    known = lost[~np.isnan(lost)]
+    return float((known > max_lost).mean()) if known.size else 0.0
 
 
 def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
@@ -280,7 +281,6 @@ def bootstrap_tree(
     *,
     sampler: str,
     converged: float,
-    warnings: tuple[str, ...] = (),
     seed: int,
     n_responses: int,
     seconds: float,
@@ -289,7 +289,6 @@ def bootstrap_tree(
     attrs = {
         "sampler": sampler,
         "converged": converged,
-        "warnings": "\n".join(warnings),
         "n_responses": n_responses,
         "seconds": seconds,
         "random_seed": str(seed),

@@ -26,7 +26,6 @@ from prbayes._checks import Floats
 from prbayes._threads import one_thread
 from prbayes.response.distributions import (
     compiled_log_density,
-    compiled_log_density_slopes,
     is_mvnormal,
 )
 from prbayes.response.inputs import Inputs
@@ -215,14 +214,6 @@ class ExponentialForm:
         """
         return ~(np.abs(at_anchors).max(axis=1) < 1000.0)
 
-    def pulled_back(self, by_logs: Floats) -> Floats:
-        """Return derivatives for log-densities at anchors from those at all points.
-
-        (S, n) -> (S, q + 1)
-        """
-        by_parameters = (self.statistics @ by_logs.T).T
-        return np.asarray(by_parameters @ self.inverse.T)
-
 
 def _anchors(statistics: Floats) -> NDArray[np.intp]:
     """Return points whose statistics are far from dependent, (q + 1,), by pivoted QR.
@@ -247,10 +238,6 @@ class PointDensity:
     @cached_property
     def _log_density(self) -> Any:
         return compiled_log_density(self.inputs)
-
-    @cached_property
-    def _slopes(self) -> Any:
-        return compiled_log_density_slopes(self.inputs)
 
     def _form_of(self, points: Sequence[Floats]) -> ExponentialForm | None:
         """Return the log-density at points as a matrix product, if the inputs have that form."""
@@ -295,15 +282,6 @@ class PointDensity:
             return np.asarray(logs)
 
         return by_product
-
-    def pulled_back(
-        self, params: Sequence[Any], by_logs: Floats, points: Sequence[Floats]
-    ) -> list[Floats]:
-        """Return derivatives for the roots from those for log-densities at points, (k, n)."""
-        form = self._form_of(points)
-        if form is None:
-            return list(self._slopes(*params, by_logs, *points))
-        return list(self._slopes(*params, form.pulled_back(by_logs), *form.anchors))
 
 
 def normalise(logs: Floats) -> Floats:

@@ -55,7 +55,7 @@ from prbayes.propagation.edges import (
 from prbayes.propagation.exponential_families import PointDensity, normalise
 from prbayes.propagation.ops import CompactOp, OpaqueOp
 from prbayes.propagation.points import base_points
-from prbayes.response.compilation import compile_batched, untraced
+from prbayes.response.compilation import compile_batched
 from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,
@@ -1146,39 +1146,7 @@ class Design(Bound):
 
     def _forget_compiled(self) -> None:
         """Compile anew what reads the shared variables: those of a copy are others."""
-        for name in ("_log_weights", "_log_weight_slopes"):
-            self.__dict__.pop(name, None)
-
-    @cached_property
-    def _log_weight_slopes(self) -> Any:
-        symbols = self.inputs.placeholders()
-        cotangent = pt.dvector("cotangent")
-        with untraced():
-            known: Any = {self.log_weights(symbols): cotangent}
-            slopes = pt.grad(None, symbols, known_grads=known, disconnected_inputs="ignore")
-        return compile_batched([*symbols, cotangent], slopes)
-
-    def pulled_back(
-        self, params: Sequence[Any], weights: Floats, by_weights: Floats
-    ) -> list[Floats]:
-        """Return the derivatives for the roots of a sum over weights, shapes (k, *shape).
-
-        Of the sum of the weights times ``by_weights``, both (k, n), at given roots.
-        """
-        with np.errstate(invalid="ignore"):
-            mean = np.vecdot(weights, by_weights)
-            by_logs = by_weights - mean[:, None]
-            by_logs *= weights
-        if self._moving:
-            slopes = self._log_weight_slopes(*params, by_logs)
-        else:
-            slopes = self._density.pulled_back(params, by_logs, self.contents.table.points)
-        found = []
-        for root, by_root in zip(self.inputs.roots, slopes, strict=True):
-            # What does not depend on the roots comes without the leading axis.
-            shape = np.shape(by_root)[np.ndim(by_root) - root.ndim :]
-            found.append(np.broadcast_to(by_root, (len(weights), *shape)))
-        return found
+        self.__dict__.pop("_log_weights", None)
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the reweighted responses, +inf where no point has weight."""

@@ -75,19 +75,6 @@ def compiled_log_density(inputs: Inputs) -> Any:
     return compile_batched(symbols, [density], points)
 
 
-@untraced()
-def compiled_log_density_slopes(inputs: Inputs) -> Any:
-    """Return the derivatives for the roots of a sum over log p(x), shapes (k, *shape).
-
-    A function of roots (k, *shape), the factors of the sum (k, n), then points (n, *event).
-    """
-    symbols, points, density = _log_density(inputs)
-    factors = pt.dvector("factors")
-    known: Any = {density: factors}
-    slopes = pt.grad(None, symbols, known_grads=known, disconnected_inputs="ignore")
-    return compile_batched([*symbols, factors], slopes, points)
-
-
 def _log_density(inputs: Inputs) -> tuple[list[Any], list[Any], TensorVariable]:
     """Return symbols of roots, (*shape), and points, (n, *event), and their log-density, (n,)."""
     symbols = inputs.placeholders()

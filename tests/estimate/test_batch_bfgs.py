@@ -19,8 +19,8 @@ def test_quadratics_with_their_own_data() -> None:
         gap = x - centers[rows][:, None]
         return np.einsum("bsi,bij,bsj->bs", gap, curvatures[rows], gap) + rows[:, None]
 
-    x, values, converged, _ = descend(
-        value, np.zeros((30, 3)), np.eye(3), step=1e-3, tolerance=1e-10
+    x, values, converged = descend(
+        value, np.zeros((30, 3)), np.eye(3), step=1e-3, tolerance=1e-10, is_central=True
     )
     assert converged.all()
     # A promise below 2 tol leaves |x - c|^2 < tol / curvature, at least 0.3, by a Hessian that is
@@ -37,8 +37,8 @@ def test_a_curved_valley_and_a_wall() -> None:
         return np.where(x[..., 0] > 1.5, np.inf, f)
 
     starts = np.array([[-1.2, 1.0], [1.4, -1.0], [0.0, 0.0], [2.0, 2.0]])
-    x, values, converged, _ = descend(
-        value, starts, np.eye(2), step=1e-4, tolerance=1e-9, max_iterations=200
+    x, values, converged = descend(
+        value, starts, np.eye(2), step=1e-4, tolerance=1e-9, max_iterations=200, is_central=True
     )
     np.testing.assert_allclose(x[:3], 1.0, atol=1e-3)
     assert converged[:3].all()
@@ -49,7 +49,7 @@ def test_a_curved_valley_and_a_wall() -> None:
 
 
 def test_too_few_iterations_are_not_convergence() -> None:
-    _, _, converged, _ = descend(lambda x, rows: (x**2).sum(-1), np.full((2, 1), 50.0), np.eye(1), step=1e-3,
+    _, _, converged = descend(lambda x, rows: (x**2).sum(-1), np.full((2, 1), 50.0), np.eye(1), step=1e-3,
                               tolerance=1e-9, max_iterations=2)  # fmt: skip
     assert not converged.any()
 
@@ -80,13 +80,11 @@ def test_a_first_guess_of_the_wrong_size_costs_few_steps() -> None:
         gap = x - at
         return np.asarray(np.einsum("bsi,bij,bsj->bs", gap, curvatures[rows], gap) / 2)
 
-    x, _, converged, _ = descend(
-        value, np.zeros((8, 3)), np.linalg.inv(shape), step=1e-4, tolerance=1e-9
-    )
+    x, _, converged = descend(value, np.zeros((8, 3)), shape, step=1e-4, tolerance=1e-9)
     assert converged.all()
     np.testing.assert_allclose(x, np.tile(at, (8, 1)), atol=1e-3)
     # The first step tells the size; without that it takes half as many steps again.
-    assert sum(calls) <= 8 * 7
+    assert sum(calls) <= 8 * 8
 
 
 def test_a_kink_is_the_end_of_a_line_search() -> None:
@@ -96,7 +94,7 @@ def test_a_kink_is_the_end_of_a_line_search() -> None:
     def value(x: Floats, rows: Any) -> Floats:
         return np.asarray(np.abs(x - centers[rows][:, None]).sum(axis=-1))
 
-    x, _, converged, _ = descend(value, np.zeros((3, 1)), np.eye(1), step=1e-3, tolerance=1e-9)
+    x, _, converged = descend(value, np.zeros((3, 1)), np.eye(1), step=1e-3, tolerance=1e-9)
     assert converged.all()
     np.testing.assert_allclose(x, centers, atol=0.02)
 
@@ -116,13 +114,12 @@ def test_one_sided_differences_arrive_within_a_fraction_of_a_step(
         return stiffer * np.einsum("...i,ij,...j->...", away, curvature, away) / 2
 
     step = 0.02
-    x, _, converged, _ = descend(
+    x, _, converged = descend(
         value,
         np.zeros((2, 2)),
-        np.linalg.inv(curvature),
+        curvature,
         step=step,
         tolerance=1e-9,
-        curvature=curvature,
     )
     assert converged.all()
     # Half a step, times by how much the typical curvature is another one: to one side along the

@@ -17,11 +17,13 @@ from prbayes.estimate.data_sets import (
     fresh_data,
     groups,
     one_set,
+    points_along,
     reweighted_sets,
-    sets_along,
+    sets_at,
     siblings,
     simulated_sets,
     specimens,
+    stored_populations,
 )
 from prbayes.estimate.differences import differences
 from prbayes.model.evaluator import Evaluator
@@ -396,6 +398,12 @@ def test_designs_of_the_same_points() -> None:
 
 # -- a data set at each theta
 # ---------------------------------------------------------------------------------------------
+
+
+def sets_along(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -> DataSets:
+    """Draw one data set from the populations at each theta, (n, d)."""
+    points = points_along(evaluator, thetas, rng)
+    return sets_at(evaluator, stored_populations(evaluator, thetas), points)
 
 
 def test_each_theta_has_a_data_set_from_its_own_population() -> None:

@@ -124,19 +124,6 @@ def resimulated(family: str, metric: prb.Metric, n: int = 50) -> prb.Optimum:
     return prb.minimize(model, starts=0)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["kl", pytest.param("area", marks=pytest.mark.slow)])
-def test_what_is_not_stored_is_known_to_first_order(name: str) -> None:
-    right, wrong = (resimulated(f, METRICS[name]).sampling() for f in ("normal", "bimodal"))
-    before = right.evaluator.n_responses
-    p = fit_probability(right)
-    # The population that data sets are drawn from, and to either side of it along two axes.
-    assert right.evaluator.n_responses <= before + 6 * 256
-    stored = fit_probability(optimum(name, "normal", 0).sampling())
-    assert p == pytest.approx(stored, abs=0.15)
-    assert fit_probability(wrong) < 0.02
-
-
 def test_where_it_is_not_looked_at_a_line_says_why() -> None:
     found = resimulated("normal", METRICS["kl"])
     before = found.evaluator.n_responses

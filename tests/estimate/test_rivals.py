@@ -336,44 +336,6 @@ def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
     assert standing(around(0), followed(0).theta[None] + 0.02) == []
 
 
-def of_four(**keywords: Any) -> Best:
-    """Return a place of a model of two inputs, one prior with an end, and what holds a search."""
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("a", 0, 1), pm.HalfNormal("b", 1))
-        y = pm.Normal.dist(pm.Normal("c", 0, 1), pm.Uniform("d", 0.1, 2, default_transform=None))
-        data = np.random.default_rng(4).normal(0.3, [0.8, 0.5], (30, 2))
-        metric = prb.Joint(prb.KullbackLeibler())
-        together = lambda x, y: np.stack([x + y, x - y], axis=-1)  # noqa: E731
-        prb.Simulator(
-            "y", together, x, y, metric=metric, observed=data, propagation=prb.Reweighted(256)
-        )
-        if keywords.pop("other", False):
-            pm.Potential("other", -(model["a"] ** 2))
-    evaluator = Evaluator(model)
-    local = Local(evaluator.prior_sd, np.eye(4), np.zeros((4, 0)), np.eye(4))
-    theta = np.array([0.1, -0.4, 0.2, 0.6])
-    return Best(evaluator, theta, np.array([0.7]), local, 0.05, **keywords)
-
-
-def test_searches_for_others_have_exact_gradients() -> None:
-    hold = Hold(np.zeros(4), np.eye(4)[:, :2], 0.8)
-    best = of_four(hold=hold)
-    slopes = best._slopes()
-    assert slopes is not None
-    shifts = 0.1 * np.random.default_rng(1).normal(size=(3, 4))
-    rows = np.arange(3)
-    values, found = slopes(shifts, rows)
-    np.testing.assert_allclose(values, best.along(shifts, rows), rtol=1e-12)
-    steps = 1e-5 * np.eye(4)
-    up, down = (best.along(shifts[:, None] + sign * steps, rows) for sign in (1, -1))
-    np.testing.assert_allclose(found, (up - down) / 2e-5, rtol=1e-5, atol=1e-7)
-    # None goes where the prior has nothing.
-    outside = best.shifts(best.theta - np.array([0, 0, 0, 0.55]))[None]
-    assert np.isposinf(slopes(outside, rows[:1])[0]).all()
-    # The other terms of a model are not in it.
-    assert of_four(other=True)._slopes() is None
-
-
 @dataclass(frozen=True)
 class Landscape:
     """A discrepancy that is a formula, in place of a model."""

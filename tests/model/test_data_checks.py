@@ -10,7 +10,6 @@ from prbayes._checks import Floats
 from prbayes.model.data_checks import (
     DataCheckOptions,
     chance_of_repeats,
-    closest_pairs,
     count_at_ends,
     data_findings,
     identical_specimens,
@@ -261,24 +260,6 @@ def test_the_finding_names_the_specimens() -> None:
     (finding,) = data_findings(np.concatenate([y, y]))
     assert "17 groups more" not in finding.text
     assert "groups more" in finding.text
-
-
-def test_closest_pairs() -> None:
-    rng = np.random.default_rng(16)
-    simulated = rng.standard_normal((199, 20, 2))
-    independent = [closest_pairs(rng.standard_normal((20, 2)), simulated) for _ in range(50)]
-    # size .01; the null data sets are shared
-    assert np.mean(np.array(independent) <= 0.01) <= 0.08
-    power = []
-    for _ in range(20):
-        y = with_copies(rng.standard_normal((20, 2)))
-        power.append(closest_pairs(y + 0.01 * rng.standard_normal(y.shape), simulated) <= 0.01)
-    assert np.mean(power) >= 0.9  # 1.00 with two frequencies
-    order, unit = rng.permutation(20), np.array([1e3, 1e-3])
-    y = rng.standard_normal((20, 2))
-    expected = closest_pairs(y, simulated)
-    assert closest_pairs(y[order] * unit + 5, simulated * unit) == expected
-    assert 0 < closest_pairs(rng.standard_normal((20, 1)), simulated[:, :, :1]) <= 1
 
 
 # All checks together.

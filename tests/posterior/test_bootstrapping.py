@@ -102,15 +102,7 @@ def test_several_outputs_are_looked_at_as_the_metric_is_prepared_for_them(parame
         np.testing.assert_allclose(draws[i], expected, rtol=0.02)
     as_measured = own_values(evaluator, sampling.thetas(shared))
     assert np.abs(draws / as_measured - 1).max() > 0.04
-    assert found.posterior.attrs["warnings"] == ""
-
-
-def test_too_few_data_sets_that_a_metric_is_prepared_for_are_told(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    found = prb.bootstrap(of_two_outputs(), 10)
-    assert "could be prepared for 10 of the data sets" in found.posterior.attrs["warnings"]
-    assert caplog.messages[-1] == found.posterior.attrs["warnings"]
+    assert found.posterior.attrs["converged"] > 0.8
 
 
 def own_values(evaluator: Any, thetas: Any) -> Any:

@@ -58,7 +58,11 @@ def likelihood_of(model: pm.Model, options: RefitLikelihoodOptions = OPTIONS) ->
 
 def posterior(likelihood: RefitLikelihood) -> dict[str, Floats]:
     """Return draws by name."""
-    density = likelihood.log_posterior
+    evaluator = likelihood.evaluator
+
+    def density(thetas: Floats) -> Floats:
+        return evaluator.hyperparameters.log_posterior(thetas, likelihood.log_likelihood)
+
     modes = laplace(density, likelihood.starts, likelihood.scale)
     sample = importance_sample(density, modes, DRAWS, seed=0)
     assert sample.pareto_k < 0.7
@@ -252,17 +256,6 @@ def test_an_estimate_at_an_edge_is_refused() -> None:
         refit_likelihood(optimum.evaluator, replace(optimum, at_edge=("mu",)))
     with pytest.raises(ValueError, match="estimates of synthetic data sets at an edge"):
         refit_likelihood(optimum.evaluator, optimum, RefitLikelihoodOptions(reach=0.5))
-
-
-def test_responses_have_to_be_stored() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), SD)
-        prb.Simulator(
-            "y", lambda x: x, x, observed=data(12), metric=prb.AreaMetric(),
-            propagation=prb.Resimulated(256),
-        )  # fmt: skip
-    with pytest.raises(TypeError, match="Reweighted"):
-        likelihood_of(model)
 
 
 # -- parts --

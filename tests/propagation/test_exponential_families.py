@@ -51,18 +51,6 @@ def test_the_matrix_form_equals_the_density(name):
     np.testing.assert_allclose(natural @ form.statistics, expected, atol=1e-11)
 
 
-def test_slopes_at_anchors_are_those_of_a_weighted_sum():
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=100)
-    form = ExponentialForm.of([pm.Normal.dist(0, 1)], [points])
-    factors = rng.normal(size=(2, 100))
-    direction = rng.normal(size=(2, 3))
-
-    total = (form.natural_parameters(direction) @ form.statistics * factors).sum()
-
-    np.testing.assert_allclose((form.pulled_back(factors) * direction).sum(), total)
-
-
 @pytest.mark.parametrize(
     "dist",
     [

@@ -251,6 +251,26 @@ def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_t
     assert posterior.attrs["n_responses"] == at_once.attrs["n_responses"]
 
 
+def test_chains_that_finish_on_a_design_that_grew_are_returned_and_the_rest_goes_on(
+    tmp_path: Path,
+) -> None:
+    def drawn(model: pm.Model, **limits: Any) -> xr.DataTree:
+        return prb.sample_smc(30, chains=2, model=model, random_seed=10, **limits, **QUIET)
+
+    def made() -> Any:
+        return build(prb.Reweighted(16), black_box, metric=prb.KullbackLeibler())
+
+    model, node = made()
+    path = tmp_path / "run.nc"
+    part = drawn(model, checkpoint=path, max_stages=3)
+    assert part["posterior"].attrs["stopped"].endswith("in chain 2 of 2")
+    assert (part["posterior"].sizes["chain"], node.bound.n_points) == (1, 16)
+    rest = drawn(model, checkpoint=path)
+    assert node.bound.n_points > 16
+    xr.testing.assert_equal(rest["posterior"]["mu"], drawn(made()[0])["posterior"]["mu"])
+    np.testing.assert_array_equal(part["posterior"]["mu"], rest["posterior"]["mu"][:1])
+
+
 def test_the_optimum_within_is_not_taken_for_an_answer() -> None:
     model, _ = build(prb.Resimulated(16), black_box, epsilon=None)
     with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_runs = 50 was reached"):
