@@ -84,11 +84,16 @@ class PopulationDensity:
         terms = np.vstack([form.statistics, np.maximum(base, -1e300)]).T
         parameters = np.vstack([natural.T, np.ones(len(natural))])
         result = np.empty((n, len(natural)))
-        step = max(16, IN_CACHE // 4 // log_a.size)
+        step = max(64, IN_CACHE // 4 // log_a.size)
+        rows = max(1, IN_CACHE // 4 // (step * n))
         for first in range(0, len(natural), step):
-            block = slice(first, first + step)
-            exponents = terms @ parameters[:, block]
-            _log_sum_exp_first(exponents.reshape(count, n, -1), result[:, block])
+            block = parameters[:, first : first + step]
+            total = np.full((n, block.shape[1]), -np.inf)
+            for k in range(0, count, rows):
+                exponents = terms[k * n : (k + rows) * n] @ block
+                part = _log_sum_exp_first(exponents.reshape(-1, n, block.shape[1]))
+                total = np.logaddexp(total, part)
+            result[:, first : first + step] = total
         if is_rounded.any():
             narrow = [root[is_rounded] for root in roots]
             result[:, is_rounded] = self._by_graph(narrow, points).T
@@ -112,11 +117,10 @@ class PopulationDensity:
         return result
 
 
-def _log_sum_exp_first(exponents: Floats, out: Floats) -> None:
-    """Put the log of the sum of exponentials over the first axis into ``out``."""
+def _log_sum_exp_first(exponents: Floats) -> Floats:
+    """Return the log of the sum of exponentials over the first axis; exponents are overwritten."""
     largest = exponents.max(axis=0)
     exponents -= largest
     np.exp(exponents, out=exponents)
-    np.log(exponents.sum(axis=0), out=out)
-    out += largest
-    out[largest < -1e299] = -np.inf
+    total = np.log(exponents.sum(axis=0)) + largest
+    return np.where(largest < -1e299, -np.inf, total)
