@@ -562,14 +562,14 @@ def few_runs() -> Iterator[Row]:
 
 
 def many_inputs() -> Iterator[Row]:
-    """Return the rows of eight inputs by a surrogate."""
+    """Return the rows of eight inputs by the log-likelihood."""
     from benchmarks.many_inputs import figures
 
-    for runs, rows in found("many_inputs").items():
-        if runs.isdigit():
-            cell = figures(rows)
-            errors = [short(cell[key], 3) for key in ("off", "worst")]
-            yield [runs, str(len(rows)), *errors, f"{cell['widths']:.1%}", f"{cell['seconds']:.0f}"]
+    for row in found("many_inputs")["rows"]:
+        cell = figures(row)
+        bias = [short(cell[key]) for key in ("largest", "rms")]
+        widths = f"{short(cell['narrowest'])} to {short(cell['widest'])}"
+        yield [str(row["data"]), str(row["runs"]), f"{row['seconds']:.0f}", *bias, widths]
 
 
 def at_a_fold() -> Iterator[Row]:

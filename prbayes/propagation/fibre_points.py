@@ -128,7 +128,7 @@ def fibre_points(
     goal, largest = 2 * unit, 3 * unit
     count = 128
     proposals = [
-        _Proposals.fitted(emulation, readings, population, 100 + seed + half) for half in (0, 1)
+        FibreProposals.fitted(emulation, readings, population, 100 + seed + half) for half in (0, 1)
     ]
     halves = [proposal.draw(count) for proposal in proposals]
     while True:
@@ -183,7 +183,7 @@ def _reliable_draws(
     free = population.root.shape[0] - int(readings.is_measured.sum(axis=1).min())
     narrows = False
     while True:
-        points = _Proposals.fitted(emulation, readings, population, seed).draw(count)
+        points = FibreProposals.fitted(emulation, readings, population, seed).draw(count)
         if not narrows:
             draws = posterior(points.z, points.log_a, None)
             half = count // 2
@@ -243,7 +243,7 @@ def _joined(first: _Points, second: _Points) -> _Points:
 
 
 @dataclass(frozen=True, eq=False)
-class _Proposals:
+class FibreProposals:
     """Proposals on the fibres of specimens, by the pattern of outputs that were measured.
 
     Attributes
@@ -264,7 +264,7 @@ class _Proposals:
     @classmethod
     def fitted(
         cls, emulation: Emulation, readings: Readings, population: ReferencePopulation, seed: int
-    ) -> _Proposals:
+    ) -> FibreProposals:
         """Return proposals that are fitted to the fibres under a population."""
         m = readings.values.shape[1]
         sd = readings.comparison_sd(emulation.error)
