@@ -18,12 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import compress
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, gammaln, ndtri
+from scipy.special import chdtri, expit, gammaln, ndtri
 
 from prbayes._checks import AT_ONCE, IN_CACHE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
@@ -236,13 +237,33 @@ class Emulation:
 
     def _of_nearest(self, of_runs: NDArray[np.bool_], z: Floats) -> NDArray[np.bool_]:
         """Return a property of the nearest run of each point."""
-        if not of_runs.any():
-            return np.zeros(len(z), dtype=bool)
+        result = np.zeros(len(z), dtype=bool)
+        width = self.box[1] - self.box[0]
+        if len(z) and of_runs.any() and not _is_farther(of_runs, self.z / width, z / width):
+            _, nearest = self._tree.query(z / width)
+            result = of_runs[nearest]
+        return result
+
+    @cached_property
+    def _tree(self) -> Any:
         from scipy.spatial import cKDTree
 
-        width = self.box[1] - self.box[0]
-        _, nearest = cKDTree(self.z / width).query(z / width)
-        return np.asarray(of_runs[nearest])
+        return cKDTree(self.z / (self.box[1] - self.box[0]))
+
+
+def _is_farther(of_runs: NDArray[np.bool_], runs: Floats, points: Floats) -> bool:
+    """Return whether each of these runs is farther from all points than another run.
+
+    |x - f|^2 - |x - g|^2 is linear in x: it is least at a corner of the points' range.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, reach = (low + high) / 2, (high - low) / 2
+    these, others = runs[of_runs, None] - middle, runs[~of_runs] - middle
+    # Runs near the middle are most likely nearer.
+    others = others[np.argsort((others**2).sum(axis=1))[: len(low) * 8]]
+    margin = (these**2).sum(axis=2) - (others**2).sum(axis=1)
+    margin = margin - 2 * np.abs(these - others) @ reach
+    return bool((margin.max(axis=1, initial=-np.inf) > 0).all())
 
 
 def emulate(
@@ -915,9 +936,8 @@ def _draw(
     u = _scrambled(len(components.specimen), count, d + 1, seed)
     nu = options.degrees
     normal = ndtri(u[..., :d])
-    z = components.center[:, None] + np.einsum(
-        "rde,rke->rkd", components.root, normal * _t_radius(u[..., d], nu)[..., None]
-    )
+    normal *= _t_radius(u[..., d], nu)[..., None]
+    z = components.center[:, None] + normal @ components.root.swapaxes(1, 2)
     values = _in_blocks(emulation, z.reshape(-1, d))
     # By specimen.
     filled = np.maximum(table, 0)
@@ -929,7 +949,8 @@ def _draw(
         c = filled[:, s]
         away = z_all - components.center[c][:, None]
         inverse = np.linalg.inv(components.root[c])
-        square = (np.einsum("nde,nke->nkd", inverse, away) ** 2).sum(axis=-1)
+        standard = away @ inverse.swapaxes(1, 2)
+        square = np.einsum("nkd,nkd->nk", standard, standard)
         log_det = np.log(np.einsum("ndd->nd", components.root[c])).sum(axis=1)
         constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
         tail = (nu + d) / 2 * np.log1p(square / nu)
@@ -958,13 +979,29 @@ def _in_blocks(emulation: Response, z: Floats) -> Floats:
 def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, int]) -> Floats:
     """Return Sobol points with a random shift for each component, (components, count, d)."""
     base = sobol(count, dimensions, seed[0] * 1009 + seed[1])
-    shift = np.random.default_rng(seed).random((components, 1, dimensions))
-    return np.clip((base + shift) % 1.0, 1e-9, 1 - 1e-9)
+    u = base + np.random.default_rng(seed).random((components, 1, dimensions))
+    u -= u >= 1.0
+    return np.clip(u, 1e-9, 1 - 1e-9, out=u)
 
 
 def _t_radius(u: Floats, degrees: float) -> Floats:
-    """Return the factors that turn normal vectors into vectors of a t distribution."""
-    return np.asarray(np.sqrt(degrees / chdtri(degrees, u)))
+    """Return the factors that turn normal vectors into vectors of a t distribution.
+
+    Their log is smooth in the logit of u. A spline of it, to nine digits, takes a tenth of the time
+    of the quantiles.
+    """
+    from scipy.interpolate import CubicSpline  # takes long to import
+
+    knots = np.linspace(-21.0, 21.0, 513)
+    cubic, *others = CubicSpline(knots, 0.5 * np.log(degrees / chdtri(degrees, expit(knots)))).c
+    away = np.log(u / (1.0 - u)) - knots[0]
+    piece = (away / (knots[1] - knots[0])).astype(np.intp)
+    away -= (knots - knots[0])[piece]
+    log_radius = cubic[piece]
+    for coefficient in others:
+        log_radius *= away
+        log_radius += coefficient[piece]
+    return np.asarray(np.exp(log_radius, out=log_radius))
 
 
 def _by_component(values: Floats, components: _Components) -> Floats:
@@ -1047,7 +1084,13 @@ def normal_populations(
         mean, covariance = start
         for _ in range(steps):
             log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a
+            mean_before, covariance_before = mean, covariance
             mean, covariance = moments(_normalised_weights(log_w) * share[..., None])
+            variance = np.einsum("...dd->...d", covariance)
+            change = np.einsum("...dd->...d", covariance - covariance_before) / variance
+            shift = (mean - mean_before) / np.sqrt(variance)
+            if max(np.abs(change).max(), np.abs(shift).max()) < 1e-9:
+                break
         return mean, covariance
 
     equal = np.full((1, n), 1 / n)
