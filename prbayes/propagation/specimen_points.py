@@ -650,6 +650,11 @@ class _Components:
     log_mass: Floats  # (R,): log of the integral of the readings' density; NaN of uncertain ones
 
     @property
+    def sd(self) -> Floats:
+        """Standard deviations of the components by input, (R, d)."""
+        return np.asarray(np.sqrt(np.einsum("rde,rde->rd", self.root, self.root)))
+
+    @property
     def table(self) -> NDArray[np.intp]:
         """The components of each specimen, (N, most), filled up with -1."""
         count = np.bincount(self.specimen)
@@ -658,6 +663,13 @@ class _Components:
         table = np.full((len(count), count.max()), -1)
         table[self.specimen, slot] = np.arange(len(self.specimen))
         return table
+
+    def of_specimens(self, rows: NDArray[np.intp]) -> _Components:
+        """Return the components of some specimens, with the numbers 0, 1, ..."""
+        place = np.searchsorted(rows, self.specimen)
+        is_of_rows = np.isin(self.specimen, rows)
+        _, *others = (field[is_of_rows] for field in _fields(self))
+        return _Components(place[is_of_rows], *others)
 
 
 def draw_points(
@@ -807,10 +819,10 @@ def _fit_components(
 
     The first scale matrix is that of the Gauss-Newton approximation, within the box. Where the
     weights of 256 points are uneven, as at a turning point of the response, location and scale
-    become their weighted moments, twice. Where the readings leave an input about as uncertain as
-    the population does, the component is that of the specimen given a population twice as wide. A
-    component or a reading that is uncertain by this share of the scatter has no mass: see
-    `_normalised`.
+    become their weighted moments, twice. The points of the last components give the population and
+    the masses. Where the readings leave an input about as uncertain as the population does, the
+    component is that of the specimen given a population twice as wide. A component or a reading
+    that is uncertain by this share of the scatter has no mass: see `_normalised`.
     """
     d = roots.z.shape[1] if len(roots.z) else box.shape[1]
     precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
@@ -823,12 +835,12 @@ def _fit_components(
         # Specimens without a root wait for the population of the others.
         own = readings.rows(some)
         rank = _Components(np.searchsorted(some, roots.specimen), *_fields(components)[1:])
-        rank = _moment_matched(emulation, error, own, rank, options, seed, fine)
-        sample = _draw(emulation, error, own, rank, fine, options, (seed, 7))
+        rank, sample = _moment_matched(emulation, error, own, rank, options, seed, fine)
         ((mean, root),) = normal_populations(sample.z, sample.log_a, 1, seed, bootstrap=False)
         covariance = root @ root.T
-        sd = np.sqrt(np.einsum("rde,rde->rd", rank.root, rank.root))
-        if (sd > 0.2 * np.sqrt(np.diag(covariance))).any():
+        scatter = np.sqrt(np.diag(covariance))
+        is_pulled = (rank.sd > 0.2 * scatter).any()
+        if is_pulled:
             wide = np.linalg.inv(4 * covariance)
             narrow = np.linalg.inv(rank.root @ rank.root.swapaxes(1, 2) / 1.5)
             combined = np.linalg.inv(narrow + wide)
@@ -845,7 +857,14 @@ def _fit_components(
                 center=np.where(is_near, center, rank.center),
                 root=np.where(is_near[..., None], combined_root, rank.root),
             )
-        components = _Components(some[rank.specimen], *_fields(rank)[1:])
+        is_wide = (rank.sd > share * scatter).any(axis=1)
+        is_noisy = (own.comparison_sd(error) > share * readings.spread()) & own.is_measured
+        is_uncertain = (is_noisy | own.is_censored).any(axis=1)
+        has_mass = ~(is_wide | is_uncertain[rank.specimen])
+        if is_pulled and has_mass.any():
+            sample = _draw(emulation, error, own, rank, fine, options, (seed, 9))
+        log_mass = np.where(has_mass, _component_weights(sample, rank)[1], np.nan)
+        components = _Components(some[rank.specimen], rank.center, rank.root, log_mass)
     without = np.setdiff1d(np.arange(len(readings)), some)
     if without.size:
         # Eight components of the population, and sixteen over the box: the specimens with a root
@@ -857,18 +876,11 @@ def _fit_components(
         specimen = np.repeat(without, len(centers))
         center = np.tile(centers, (len(without), 1))
         root = np.tile(np.concatenate([roots_of_population, roots_of_box]), (len(without), 1, 1))
-        added = (specimen, center, root, np.zeros(len(specimen)))
+        added = (specimen, center, root, np.full(len(specimen), np.nan))
         joined = [np.concatenate(pair) for pair in zip(_fields(components), added, strict=True)]
         order = np.argsort(joined[0], kind="stable")
         components = _Components(*(field[order] for field in joined))
-    sample = _draw(emulation, error, readings, components, fine, options, (seed, 9))
-    _, log_mass = _component_weights(sample, components)
-    sd = np.sqrt(np.einsum("rde,rde->rd", components.root, components.root))
-    is_wide = (sd > share * np.sqrt(np.diag(covariance))).any(axis=1)
-    is_noisy = (readings.comparison_sd(error) > share * readings.spread()) & readings.is_measured
-    is_uncertain = (is_noisy | readings.is_censored).any(axis=1)
-    log_mass = np.where(is_wide | is_uncertain[components.specimen], np.nan, log_mass)
-    return replace(components, log_mass=log_mass)
+    return components
 
 
 def _fields(components: _Components) -> tuple[Any, ...]:
@@ -883,11 +895,14 @@ def _moment_matched(
     options: PointOptions,
     seed: int,
     fine: int,
-) -> _Components:
-    """Return components with the weighted moments of their points where weights are uneven."""
+) -> tuple[_Components, _Sample]:
+    """Return components with the weighted moments of uneven points, and points of all components.
+
+    Only specimens with a changed component get other points.
+    """
     d = components.center.shape[1]
+    sample = _draw(emulation, error, readings, components, fine, options, (seed, 3))
     for attempt in range(2):
-        sample = _draw(emulation, error, readings, components, fine, options, (seed, 3 + attempt))
         weights, log_mass = _component_weights(sample, components)
         size = 1 / np.maximum((weights**2).sum(axis=1), 1e-300)
         uneven = np.flatnonzero((size < fine / 2) & np.isfinite(log_mass))
@@ -906,7 +921,18 @@ def _moment_matched(
         new_center[uneven] = center
         new_root[uneven] = np.linalg.cholesky(covariance + 1e-14 * before)
         components = replace(components, center=new_center, root=new_root)
-    return components
+        changed = np.unique(components.specimen[uneven])
+        fresh = _draw(
+            emulation,
+            error,
+            readings.rows(changed),
+            components.of_specimens(changed),
+            fine,
+            options,
+            (seed, 4 + attempt),
+        )
+        sample = sample.with_rows(changed, fresh)
+    return components, sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -918,6 +944,16 @@ class _Sample:
     log_a: Floats  # (N, S * k)
     log_proposal: Floats  # (N, S * k)
     n_roots: NDArray[np.intp]  # (N,)
+
+    def with_rows(self, rows: NDArray[np.intp], sample: _Sample) -> _Sample:
+        """Return the sample with the points of another one for some specimens."""
+        arrays = {}
+        for name in ("z", "outputs", "log_a", "log_proposal"):
+            values = getattr(sample, name)
+            arrays[name] = getattr(self, name).copy()
+            # Without the places of more roots that others have.
+            arrays[name][rows, : values.shape[1]] = values
+        return replace(self, **arrays)
 
 
 def _draw(
