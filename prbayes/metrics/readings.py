@@ -155,7 +155,8 @@ class Readings:
             upper = np.where(self.is_censored, np.minimum(self.upper, far), 1.0)[:, None]
             inside = log_interval_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
             terms = xp.where(self.is_censored[:, None], inside, terms)
-        return terms.sum(axis=-1)
+        # The sum over a short axis takes five times as long.
+        return terms @ np.ones(terms.shape[-1]) if xp is np else terms.sum(axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

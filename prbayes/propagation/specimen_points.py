@@ -256,7 +256,9 @@ def _is_farther(of_runs: NDArray[np.bool_], runs: Floats, points: Floats) -> boo
 
     |x - f|^2 - |x - g|^2 is linear in x: it is least at a corner of the points' range.
     """
-    low, high = points.min(axis=0), points.max(axis=0)
+    # By columns: along the first axis of many rows it takes five times as long.
+    low = np.array([column.min() for column in points.T])
+    high = np.array([column.max() for column in points.T])
     middle, reach = (low + high) / 2, (high - low) / 2
     these, others = runs[of_runs, None] - middle, runs[~of_runs] - middle
     # Runs near the middle are most likely nearer.
@@ -1107,14 +1109,14 @@ def normal_populations(
     """
     rng = np.random.default_rng([seed, 7])
     n, count, d = z.shape
-    flat = z.reshape(-1, d)
-    prior = 1e-12 * np.diag(np.maximum(flat.var(axis=0), 1e-300))
+    columns = np.ascontiguousarray(z.reshape(-1, d).T)
+    prior = 1e-12 * np.diag(np.maximum(columns.var(axis=1), 1e-300))
 
     def moments(weights: Floats) -> tuple[Floats, Floats]:
         weights = weights.reshape(len(weights), -1)
-        mean = weights @ flat
-        away = flat - mean[:, None]
-        return mean, (away * weights[..., None]).swapaxes(1, 2) @ away + prior
+        mean = weights @ columns.T
+        away = columns - mean[..., None]
+        return mean, (away * weights[:, None]) @ away.swapaxes(1, 2) + prior
 
     def fit(start: tuple[Floats, Floats], share: Floats, steps: int) -> tuple[Floats, Floats]:
         mean, covariance = start
@@ -1164,8 +1166,8 @@ def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:
     ndarray, shape (...) or (B, ...)
     """
     d = z.shape[-1]
-    away = z.reshape(-1, d) - mean[..., None, :]
-    standard = np.linalg.inv(root) @ away.swapaxes(-1, -2)
+    away = np.ascontiguousarray(z.reshape(-1, d).T) - mean[..., None]
+    standard = np.linalg.inv(root) @ away
     square = np.einsum("...dk,...dk->...k", standard, standard)
     constant = np.log(np.einsum("...dd->...d", root)).sum(axis=-1) + d / 2 * np.log(2 * np.pi)
     return np.asarray(-0.5 * square - constant[..., None]).reshape(*mean.shape[:-1], *z.shape[:-1])
