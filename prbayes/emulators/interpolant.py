@@ -69,8 +69,9 @@ class Interpolant:
             np.sqrt(square, out=cube)
             cube *= square
             terms = _terms(_legendre(self._scaled(z[rows]), self.powers), self.powers)
-            polynomial, *slopes = np.split(self._polynomial_with_slopes @ terms, d + 1)
-            steepness, *by_axis = np.split(of_cubes @ cube, d + 1)
+            stacked = self._polynomial_with_slopes @ terms
+            polynomial, *slopes = stacked.reshape(d + 1, m, -1)
+            steepness, *by_axis = (of_cubes @ cube).reshape(d + 1, m, -1)
             square *= cube
             values[rows] = (polynomial - self.weights.T @ square).T
             for a in range(d):
@@ -164,7 +165,7 @@ class Interpolant:
         The two arrays are the same for all blocks, so that they stay in the processor's cache.
         """
         n = len(self.z)
-        step = min(max(1, IN_CACHE // 4 // n), len(z))
+        step = min(max(1, IN_CACHE // 2 // n), len(z))
         arrays = np.empty((2, n * step))
         runs = self.z - self.center
         # |a - b|^2 = |a|^2 + |b|^2 - 2 a'b; the digits that small ones lose do not matter in |r|^5.

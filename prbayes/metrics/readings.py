@@ -116,9 +116,11 @@ class Readings:
 
         -inf where an output is NaN.
         """
-        by_point = np.moveaxis(outputs, 1, 0)  # (K, N, m)
-        variance = emulator_error**2 + self.error_sd(by_point) ** 2
-        variance = np.moveaxis(np.broadcast_to(variance, by_point.shape), 0, 1)
+        if self.is_relative.any():
+            by_point = np.moveaxis(outputs, 1, 0)  # (K, N, m)
+            variance = np.moveaxis(emulator_error**2 + self.error_sd(by_point) ** 2, 0, 1)
+        else:
+            variance = (emulator_error**2 + self.error**2)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             result = self.symbolic_log_density(outputs, variance, np)
         return np.where(np.isnan(result), -np.inf, result)
@@ -153,7 +155,8 @@ class Readings:
             upper = np.where(self.is_censored, np.minimum(self.upper, far), 1.0)[:, None]
             inside = log_interval_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
             terms = xp.where(self.is_censored[:, None], inside, terms)
-        return terms.sum(axis=-1)
+        # The sum over a short axis takes five times as long.
+        return terms @ np.ones(terms.shape[-1]) if xp is np else terms.sum(axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

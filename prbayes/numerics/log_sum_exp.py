@@ -12,6 +12,8 @@ def log_sum_exp(terms: Floats) -> Floats:
 
     -inf where there are no terms, or all are -inf.
     """
+    if terms.shape[-1] == 1:
+        return terms[..., 0].copy()
     largest = terms.max(axis=-1, keepdims=True, initial=-np.inf)
     largest = np.where(np.isfinite(largest), largest, 0.0)
     scaled = terms - largest

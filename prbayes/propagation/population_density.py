@@ -88,11 +88,11 @@ class PopulationDensity:
         rows = max(1, IN_CACHE // 4 // (step * n))
         for first in range(0, len(natural), step):
             block = parameters[:, first : first + step]
-            total = np.full((n, block.shape[1]), -np.inf)
+            total: Any = -np.inf
             for k in range(0, count, rows):
                 exponents = terms[k * n : (k + rows) * n] @ block
                 part = _log_sum_exp_first(exponents.reshape(-1, n, block.shape[1]))
-                total = np.logaddexp(total, part)
+                total = np.logaddexp(total, part) if k else part
             result[:, first : first + step] = total
         if is_rounded.any():
             narrow = [root[is_rounded] for root in roots]

@@ -96,7 +96,7 @@ def find_roots(
     def evaluate(z: Floats, rows: Any) -> tuple[Floats, Floats, Floats]:
         values, jacobian = response(z)
         residual = (target[rows] - values) / scale[rows]
-        misfit = (residual**2).sum(axis=1) / 2
+        misfit = np.einsum("km,km->k", residual, residual) / 2
         misfit = np.where(np.isnan(misfit), np.inf, misfit)
         return residual, jacobian / scale[rows][:, :, None], misfit
 
