@@ -99,7 +99,12 @@ class Best:
         local = self.local
         known = local.identified @ local.covariance @ local.identified.T
         inverse = (known + local.unidentified @ local.unidentified.T) / self.noise
-        ends, values, *_ = self.descended(self.shifts(thetas), np.linalg.inv(inverse))
+        variances, axes = np.linalg.eigh(inverse)
+        # A standard error may be zero, as where all responses are on one side of the data.
+        if not variances.max() > 0:
+            return thetas, self(thetas)
+        variances = np.maximum(variances, 1e-12 * variances.max())
+        ends, values, *_ = self.descended(self.shifts(thetas), (axes / variances) @ axes.T)
         return self.thetas(ends), values
 
 
