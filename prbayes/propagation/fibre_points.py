@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from prbayes._checks import Floats
+from prbayes._threads import one_thread
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre import (
@@ -262,6 +263,7 @@ class FibreProposals:
     patterns: list[_Pattern]
 
     @classmethod
+    @one_thread()
     def fitted(
         cls, emulation: Emulation, readings: Readings, population: ReferencePopulation, seed: int
     ) -> FibreProposals:
@@ -290,6 +292,7 @@ class FibreProposals:
             fitted.append(_Pattern(rows, columns, proposal, error))
         return cls(emulation, readings, population, seed, fitted)
 
+    @one_thread()
     def draw(self, count: int, after: int = 0) -> _Points:
         """Draw points of all specimens, other ones than the first `after`."""
         n, m = self.readings.values.shape

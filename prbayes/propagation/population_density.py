@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import IN_CACHE, Floats
+from prbayes._threads import one_thread
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.exponential_families import ExponentialForm
 from prbayes.response.distributions import PopulationSampler, compiled_log_density
@@ -69,6 +70,7 @@ class PopulationDensity:
         """Draws of specimens."""
         return PopulationSampler(self.inputs)
 
+    @one_thread()
     def log_likelihoods(self, roots: Sequence[Floats], points: WeightedPoints) -> Floats:
         """Return log p(y_i | theta), (S, N), of populations at roots, shapes (S, *shape)."""
         form, log_a = points.form, points.log_a
