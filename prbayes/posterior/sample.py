@@ -75,7 +75,7 @@ def sample(
     idata_kwargs, var_names
         As in `sample_smc`.
     max_seconds : float, optional
-        Seconds after which no further run is begun. If they are over, or `max_runs` is reached,
+        Seconds after which no further run is begun. If they are over, or ``max_runs`` is reached,
         during sequential Monte Carlo, the finished chains are returned, if there are any; the
         attribute ``stopped`` and a warning say so.
     max_runs : int, optional
