@@ -338,8 +338,8 @@ def pooled(found: dict[str, dict[str, Any]], keep: Callable[[Cell], bool]) -> di
 
 
 def table() -> dict[str, Any]:
-    """Summarise the stored rows, and print them."""
-    found = {}
+    """Summarise the stored rows, and print them; cells without rows here stay as they were."""
+    found = dict(record.load(OUT, {"cells": {}})["cells"])
     for cell in cells(list(PROBLEMS), list(PRIORS), list(SIZES), list(METRICS)):
         rows = rows_of(cell)
         if rows:
