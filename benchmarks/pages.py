@@ -474,7 +474,7 @@ def speed() -> Iterator[Row]:
 def speed_jobs() -> Iterator[Row]:
     """Return the rows of CPU seconds by job."""
     for name, job in found("speed")["jobs"].items():
-        if "error" in job or "bias" in job:
+        if job.keys() & {"error", "bias", "runs"}:
             cells = [short(job[key]) if key in job else "" for key in _OF_JOBS]
             yield [name, *cells, job.get("error", "")]
 
