@@ -249,8 +249,8 @@ def importance_sample(
     rng = np.random.default_rng([seed, 1])
     for round_ in range(1, options.rounds + 1):
         terms = [
-            logsumexp(each.log_densities(points), axis=1) + np.log(count / len(points))
-            for each, count in zip(proposals, counts, strict=True)
+            logsumexp(mixture.log_densities(points), axis=1) + np.log(count / len(points))
+            for mixture, count in zip(proposals, counts, strict=True)
         ]
         if prior is not None and from_prior:
             terms.append(prior.log_density(points) + np.log(from_prior / len(points)))

@@ -424,7 +424,8 @@ def extended(
     misfit = outputs - values if sampled is None else left_out[len(emulation.z) :]
     good = np.isfinite(misfit).all(axis=1)
     error, bias = emulation.error, np.inf
-    some = np.flatnonzero(good[: options.fresh if sampled is None else sampled])
+    count = options.fresh if sampled is None else sampled
+    some = np.flatnonzero(good[:count])
     if len(some) >= 4:
         # At the roots alone: points around them may lie far out, where nothing was measured.
         error = 2 * np.sqrt((misfit[some] ** 2).mean(axis=0))
@@ -432,9 +433,9 @@ def extended(
         unit = typical_sd(readings.comparison_sd(error))
         scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
         bias = float(np.abs(predicted_bias(*scaled, fresh[some], len(readings))).max())
-        # Each reading informs of one input.
-        per_specimen = readings.is_measured.sum(axis=1).mean()
-        bias *= np.sqrt(min(1.0, per_specimen / fresh.shape[1]))
+        # m readings identify m of d directions; the posterior is wider than the formula assumes.
+        readings_per_specimen = (readings.is_measured | readings.is_censored).sum(axis=1).mean()
+        bias *= np.sqrt(min(1.0, readings_per_specimen / fresh.shape[1]))
     reach = np.concatenate([emulation.range, fresh])
     extremes = np.stack([reach.min(axis=0), reach.max(axis=0)])
     return Emulation(
