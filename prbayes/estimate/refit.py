@@ -400,8 +400,8 @@ class SamplingDistribution:
             # In standard errors; the second one starts where the first has ended.
             x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
             return x, converged
-        found = descent(value, start)
-        return found.x, found.converged
+        minima = descent(value, start)
+        return minima.x, minima.converged
 
 
 def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:

@@ -142,10 +142,9 @@ def sample_smc(
     xarray.DataTree
         Groups ``posterior`` (chain, draw), ``sample_stats`` (chain, stage; NaN after the last
         stage), ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw
-        weight, lost mass, of 64 draws if it costs responses, ``lossy_draws``: the share of draws of
-        whose populations more than ``max_lost`` has no response; ``discrepancy_error``: the Monte
-        Carlo error of the discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ
-        takes it, ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and
+        weight, lost mass, of 64 draws if it costs responses, ``lossy_draws``: the share of draws
+        with more lost mass than ``max_lost``; ``discrepancy_error``: the Monte Carlo error of the
+        discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and
         predictive draws (``posterior_predictive``, ``prior_predictive``) of simulators whose
         responses are stored, and ``log_likelihood`` for power-scaling, with one number for each
         draw. Attributes of
