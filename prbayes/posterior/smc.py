@@ -144,9 +144,10 @@ def sample_smc(
         stage), ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw
         weight, lost mass, of 64 draws if it costs responses, ``lossy_draws``: the share of draws
         with more lost mass than ``max_lost``; ``discrepancy_error``: the Monte Carlo error of the
-        discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and
-        predictive draws (``posterior_predictive``, ``prior_predictive``) of simulators whose
-        responses are stored, and ``log_likelihood`` for power-scaling, with one number for each
+        discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it,
+        ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and predictive draws
+        (``posterior_predictive``, ``prior_predictive``) of simulators whose responses are stored,
+        and ``log_likelihood`` for power-scaling, with one number for each
         draw. Attributes of
         ``posterior``: ``adjustment``; ``log_marginal_likelihood``, from all chains, and
         ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
