@@ -72,8 +72,8 @@ def errors(metric: Any, rooted: bool, size: int, replicates: int) -> Any:
     import pymc as pm
 
     import prbayes as prb
-    from prbayes.estimate.minimization import Minimisation, find_optimum
     from prbayes.model.evaluator import Evaluator
+    from prbayes.optimize.minimize import Minimisation, find_optimum
 
     def data(replicate: int) -> Any:
         y = folded.data(size, replicate)

@@ -68,7 +68,7 @@ LEFT_OUT = "two inputs, PR, N = 30"
 PATIENCE = 300
 # What by its nature touches no answer.
 SKIPPED = {
-    "_diagnose._NOISE": "the limit of a test that simulates it (tests/test_diagnose.py)",
+    "_diagnose._NOISE": "the limit of a test that simulates it (tests/results/test_diagnose.py)",
     "estimate.data_sets._MOST_POINTS": "memory",
     "estimate.measured._LEVELS": "quantiles, and what they are of a normal distribution",
     "estimate.measured._WIDTH": "quantiles, and what they are of a normal distribution",

@@ -29,7 +29,7 @@ REPEATS = 3
 
 def row(n: int) -> dict[str, float]:
     """Return the least seconds of a few repetitions, and MiB."""
-    from prbayes.propagation.cloud import Cloud, Emulation
+    from prbayes.propagation.importance import Cloud, Emulation
 
     response = RESPONSES["eight inputs"]
     rng = np.random.default_rng(n)

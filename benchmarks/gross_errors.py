@@ -22,7 +22,7 @@ from scipy.special import ndtri
 
 import prbayes as prb
 from benchmarks import record
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 
 OUT = record.RESULTS / "gross_errors.json"

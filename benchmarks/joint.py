@@ -281,7 +281,7 @@ class Cell:
 
     def calibrated(self, method: str, x: Any) -> dict[str, Any]:
         """Calibrate one data set; return estimate, posterior and what it cost."""
-        from prbayes.estimate.minimization import Minimisation, find_optimum
+        from prbayes.optimize.minimize import Minimisation, find_optimum
         from prbayes.posterior.sample import draw_posterior
         from prbayes.posterior.smc import Sampling
 

@@ -26,8 +26,8 @@ import numpy as np
 import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS
-from prbayes.estimate.methods import Method
-from prbayes.estimate.search import Search, Trace, approach, minimise, settle
+from prbayes.optimize.convergence import Search, Trace, approach, minimise, settle
+from prbayes.optimize.methods import Method
 
 SIZE = 1000
 REACH = {

@@ -22,10 +22,10 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.likelihood_coverage import PROBLEMS, Problem, likelihood_of, thetas_of
 from benchmarks.scoreboard.problem import Input, normal, truncated
-from prbayes._specimen_checks import check_draws
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.population_draws import Populations
 from prbayes.model.specimen_likelihood import SpecimenLikelihood
+from prbayes.results.likelihood_checks import check_draws
 
 OUT = record.RESULTS / "likelihood_guards.json"
 # With priors that matter beside the data: conflicts are reported where the prior pulls.

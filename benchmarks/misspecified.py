@@ -24,9 +24,9 @@ from scipy import stats
 import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS
-from prbayes.estimate.methods import Method
-from prbayes.estimate.search import Search, approach, minimise, settle
 from prbayes.model.evaluator import Evaluator
+from prbayes.optimize.convergence import Search, approach, minimise, settle
+from prbayes.optimize.methods import Method
 
 SIZES = (20, 50, 1000, 100_000)
 LEVELS = (np.arange(100_000) + 0.5) / 100_000

@@ -27,8 +27,8 @@ import numpy as np
 import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS
-from prbayes.estimate.methods import Method
-from prbayes.estimate.search import Search, Trace, minimise, settle
+from prbayes.optimize.convergence import Search, Trace, minimise, settle
+from prbayes.optimize.methods import Method
 
 SIZES = (20, 50, 1000, 100_000)
 POINTS = {

@@ -27,7 +27,7 @@ from scipy.stats import norm, qmc
 
 from benchmarks import record
 from benchmarks.responses import RESPONSES, Response
-from prbayes.emulators.emulator import Runs, candidates, chosen, emulated
+from prbayes.emulators.selection import Runs, candidates, chosen, emulated
 
 RUNS = 64
 WIDER = 1.4  # the first runs, as those of a prior are

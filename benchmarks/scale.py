@@ -126,7 +126,7 @@ def tasks(size: int) -> dict[str, float]:
     import cloudpickle
     import distributed
 
-    from prbayes.response import calling
+    from prbayes.response import call as calling
 
     numbers = np.random.default_rng(1).normal(size=(size, 5))
     function = calling.scalar(lambda *x: sum(x))

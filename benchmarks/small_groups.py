@@ -23,7 +23,7 @@ import pymc as pm
 
 import prbayes as prb
 from benchmarks import record, suppliers
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 OUT = record.RESULTS / "small_groups.json"
 METRICS = {

@@ -9,7 +9,7 @@ import pymc as pm
 import xarray as xr
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 NAMES = ["Adler", "Busch", "Celik", "Dorn", "Eder", "Falk"]
 EACH = 20

@@ -32,7 +32,7 @@ from scipy.stats import norm, qmc
 
 import prbayes as prb
 from benchmarks import record
-from prbayes.emulators.emulator import Runs, candidates, chosen, emulated
+from prbayes.emulators.selection import Runs, candidates, chosen, emulated
 from prbayes.model.evaluator import Evaluator
 
 N = 50

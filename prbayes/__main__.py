@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import xarray as xr
 
-    from prbayes.validation.validity import ValidityTest
+    from prbayes.validation.area_test import ValidityTest
 
 _REPORT = """examples:
   prbayes report results.nc
@@ -219,7 +219,7 @@ def _opened(path: Path) -> xr.DataTree:
     import xarray as xr
 
     from prbayes.reports.decision import kind_of_decision
-    from prbayes.reports.soundness import complaints
+    from prbayes.reports.schema import complaints
 
     try:
         with xr.open_datatree(path, engine="h5netcdf") as tree:
@@ -241,8 +241,8 @@ def _opened(path: Path) -> xr.DataTree:
 
 
 def _test_of(path: Path, dataset: xr.Dataset) -> ValidityTest:
-    from prbayes.model.identity import from_attributes
-    from prbayes.validation.validity import ValidityTest
+    from prbayes.model.fingerprint import from_attributes
+    from prbayes.validation.area_test import ValidityTest
 
     try:
         return ValidityTest(

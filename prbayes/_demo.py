@@ -16,14 +16,14 @@ import pymc as pm
 import xarray as xr
 
 from prbayes import datasets
-from prbayes._checks import Floats
-from prbayes._predict import predict
-from prbayes.estimate.minimization import minimize
+from prbayes._validate import Floats
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.simulator import Simulator
+from prbayes.optimize.minimize import minimize
 from prbayes.posterior.smc import sample_smc
 from prbayes.reports.report import Report
-from prbayes.validation.validity import ValidityTest, area_test
+from prbayes.results.predict import predict
+from prbayes.validation.area_test import ValidityTest, area_test
 
 _log = logging.getLogger("prbayes")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 # Replicates from which an envelope is made. The share of right models within it then has a standard
 # error of sqrt(.05 * .95 / 999) = .007. More of them cost memory, n numbers each, and no null needs

@@ -21,7 +21,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from prbayes._checks import flag
+from prbayes._validate import flag
 
 _log = logging.getLogger("prbayes")
 

@@ -21,7 +21,7 @@ import xarray as xr
 from first_use import first_use
 
 import prbayes as prb
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 
 OBSERVED = np.random.default_rng(1).normal(2.0, 1.0, 30)
 OUTPUTS = np.stack([OBSERVED, OBSERVED**2 - OBSERVED], axis=-1)

@@ -16,8 +16,8 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import nodes
-from prbayes.response.compilation import PLAIN
+from prbayes.model.random_variable import nodes
+from prbayes.response.compile import PLAIN
 
 OBSERVED = 0.75 * (2.0 + 0.8 * norm.ppf((np.arange(30) + 0.5) / 30))
 SMALL = (prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64))

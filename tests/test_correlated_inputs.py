@@ -13,11 +13,11 @@ from first_use import first_use
 from scipy import stats
 
 import prbayes as prb
-from prbayes._checks import Floats
-from prbayes.estimate.data_sets import DataSets
-from prbayes.estimate.refit import SamplingDistribution
-from prbayes.estimate.solution import point_and_stderr
+from prbayes._validate import Floats
+from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.resampling import DataSets
 from prbayes.model.evaluator import Evaluator
+from prbayes.optimize.solution import point_and_stderr
 
 MEAN = np.array([1.0, 2.0])
 SDS = np.array([1.0, 0.7])
@@ -124,7 +124,7 @@ def test_tables_have_the_correlation_once(optimum: prb.Optimum) -> None:
 def test_how_faint_a_direction_may_be_changes_nothing_of_what_is_known(
     faint: float, optimum: prb.Optimum, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("prbayes.estimate.refit._FAINT", faint)
+    monkeypatch.setattr("prbayes.inference.refits._FAINT", faint)
     functions = optimum.sampling().of_functions
     _, stderr = point_and_stderr(optimum.evaluator, optimum.theta, optimum.covariance, functions)
     for name in ("chol_stds", "chol_corr"):

@@ -15,12 +15,12 @@ from scipy import stats
 from suppliers import labelled
 
 import prbayes as prb
-from prbayes.estimate.refinement import _add
 from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
+from prbayes.optimize.design_refinement import _add
 from prbayes.plots._margins import chosen, margins
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 
 NAMES = ["Adler", "Busch"]
 WHO = np.repeat(NAMES, [20, 30])

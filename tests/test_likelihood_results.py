@@ -16,9 +16,9 @@ import xarray as xr
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes import _specimen_checks
-from prbayes._specimen_checks import influence, separate_modes
-from prbayes.estimate.specimen_refits import other_specimens, specimen_pool, specimen_refits
+from prbayes.optimize.specimen_refits import other_specimens, specimen_pool, specimen_refits
+from prbayes.results import likelihood_checks as _specimen_checks
+from prbayes.results.likelihood_checks import influence, separate_modes
 
 N = 20
 

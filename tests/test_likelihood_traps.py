@@ -20,7 +20,6 @@ from scipy.stats import norm
 import prbayes as prb
 from benchmarks.scoreboard.problems import frame
 from prbayes._finding import Finding
-from prbayes._specimen_checks import check_draws, check_optimum
 from prbayes.inference.checks.population_test import population_statistics, population_test
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.data_checks import data_findings
@@ -29,6 +28,7 @@ from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likel
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.specimen_points import PointOptions
 from prbayes.response.failures import ResponseError
+from prbayes.results.likelihood_checks import check_draws, check_optimum
 
 type Floats = np.ndarray
 SEEDS = range(20)
@@ -115,7 +115,7 @@ def outcome(monkeypatch: pytest.MonkeyPatch) -> Callable[[pm.Model], list[str]]:
         return tuple(findings)
 
     monkeypatch.setattr("prbayes.model.specimen_likelihood.report", recorded)
-    monkeypatch.setattr("prbayes.estimate.maximum_likelihood.report", recorded)
+    monkeypatch.setattr("prbayes.optimize.maximum_likelihood.report", recorded)
 
     def run(model: pm.Model, *, optimum: bool) -> list[str]:
         codes.clear()

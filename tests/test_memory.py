@@ -18,7 +18,7 @@ from line_problem import OBSERVED, line
 import prbayes as prb
 from prbayes.metrics.density import twice_silverman
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 
 MIB = 1 << 20
@@ -151,7 +151,7 @@ def test_the_log_likelihood_of_many_observations_takes_little_memory(density: An
 def test_readings_in_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     observed = np.random.default_rng(1).normal(size=200)
     whole = prb.LogLikelihood(density=prb.GaussianKDE()).against(observed)
-    monkeypatch.setattr("prbayes.metrics.cells.AT_ONCE", 20 * whole.reading.size)  # type: ignore[attr-defined]
+    monkeypatch.setattr("prbayes.metrics.grid.AT_ONCE", 20 * whole.reading.size)  # type: ignore[attr-defined]
     parts = prb.LogLikelihood(density=prb.GaussianKDE()).against(observed)
     assert np.allclose(parts.reading, whole.reading, rtol=1e-12, atol=1e-15)  # type: ignore[attr-defined]
 

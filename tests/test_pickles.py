@@ -15,7 +15,7 @@ import xarray as xr
 from line_problem import build, line
 
 import prbayes as prb
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 
 QUIET: dict[str, Any] = {"progressbar": False}
 

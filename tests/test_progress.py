@@ -209,7 +209,7 @@ def test_everything_inside_the_sampler_follows_its_keyword(
 def test_refits_are_counted(
     screen: io.StringIO, visible: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("prbayes.estimate.refit.AT_ONCE", 10_000)
+    monkeypatch.setattr("prbayes.inference.refits.AT_ONCE", 10_000)
     model = build(prb.Reweighted(64))
     prb.bootstrap(prb.minimize(model, progressbar=False), draws=1000, progressbar=visible)
     assert ("refits" in screen.getvalue()) == visible

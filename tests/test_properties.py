@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 import prbayes as prb
-from prbayes._checks import Floats
-from prbayes._weighted import distribution_function, quantile, reached
+from prbayes._stats import distribution_function, quantile, reached
+from prbayes._validate import Floats
 from prbayes.metrics.density import likelihood_bandwidth, twice_silverman
 from prbayes.model.evaluator import Evaluator
 

@@ -15,7 +15,7 @@ def test_nothing_is_loaded_before_a_public_name_is_asked_for() -> None:
         "import sys, prbayes\n"
         "assert prbayes.__version__\n"
         "assert not {'pymc', 'numpy', 'xarray'} & set(sys.modules)\n"
-        "assert prbayes.minimize.__module__ == 'prbayes.estimate.minimization'\n"
+        "assert prbayes.minimize.__module__ == 'prbayes.optimize.minimize'\n"
         "assert 'pymc' in sys.modules\n"
         "from prbayes import *\n"
         "assert Simulator is prbayes.Simulator\n"

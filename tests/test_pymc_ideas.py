@@ -15,7 +15,7 @@ import pytest
 from pytensor.tensor.random.type import RandomType
 
 import prbayes as prb
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 CALLS: list[int] = []

@@ -9,9 +9,9 @@ import xarray as xr
 from first_use import first_use
 
 import prbayes as prb
-from prbayes.estimate.data_sets import simulated_sets
+from prbayes.inference.resampling import simulated_sets
 from prbayes.model.evaluator import Evaluator
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 
 N = 40
 JOINT = prb.Joint(prb.ProbabilityResidual())

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 # Standard normal levels of the quantiles between which a margin is straight. Of a normal margin,
 # variances are then right to half a percent; closer ones follow the noise of four thousand draws.

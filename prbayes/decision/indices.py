@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 # Sets of points, each scrambled by itself, whose spread tells the error: known to 18%.
 REPLICATES = 16

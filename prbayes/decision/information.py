@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats, called
-from prbayes._weighted import reached
+from prbayes._stats import reached
+from prbayes._validate import Floats, called
 from prbayes.decision.populations import Told
-from prbayes.estimate.data_sets import observable
-from prbayes.estimate.differences import cross, slopes
-from prbayes.estimate.measured import drawn_in
-from prbayes.estimate.refit import SamplingDistribution
+from prbayes.inference.measured import drawn_in
+from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
+from prbayes.numerics.derivatives import cross, slopes
 from prbayes.response.response import refuse_uncallable
 
 # Specimens of the ideal sample from which the information in one is told, or as many as there are:

@@ -12,17 +12,9 @@ import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from prbayes._checks import AT_ONCE, Floats
-from prbayes._predict import (
-    known_outputs,
-    model_of,
-    populations_of,
-    refuse_unsupported,
-    serving,
-)
+from prbayes._validate import AT_ONCE, Floats
 from prbayes.decision.quantities import Quantity
-from prbayes.estimate.identifiability import oriented
-from prbayes.estimate.optimum import Optimum, require_sampling
+from prbayes.inference.identifiability import oriented
 from prbayes.model.emulated import (
     EmulatedResponse,
     EmulatedSample,
@@ -30,13 +22,21 @@ from prbayes.model.emulated import (
     values_of,
 )
 from prbayes.model.evaluator import Evaluator
+from prbayes.numerics.points import sobol
+from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.points import sobol
 from prbayes.propagation.reweighted import Design
-from prbayes.response.grouping import refuse_groups
+from prbayes.response.groups import refuse_groups
 from prbayes.response.inputs import read_inputs
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import Responses
+from prbayes.results.predict import (
+    known_outputs,
+    model_of,
+    populations_of,
+    refuse_unsupported,
+    serving,
+)
 
 # Draws at which it is looked whether the design supports a result: quantiles of so many are known
 # to a few percent, and they cost a weight at each point.

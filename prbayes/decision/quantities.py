@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats, finite_number, flag, share
-from prbayes.model.node import response_name
+from prbayes._validate import Floats, finite_number, flag, share
+from prbayes.model.random_variable import response_name
 from prbayes.response.response import refuse_uncallable
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.decision.indices import (
     REPLICATES,
     Indices,
@@ -15,10 +15,10 @@ from prbayes.decision.indices import (
     first_order,
     total_order,
 )
+from prbayes.decision.inverse_transform import Specimens
 from prbayes.decision.populations import Told
 from prbayes.decision.quantities import Quantity
-from prbayes.decision.specimens import Specimens
-from prbayes.propagation.points import sobol
+from prbayes.numerics.points import sobol
 
 # Step of differences in standard normal numbers, over which emulators are smooth. Half or twice
 # changes an index of Ishigami's function by less than a hundredth (tests/decision/test_scatter.py).

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_number
-from prbayes._threads import one_thread
+from prbayes._validate import Floats, positive_number
 from prbayes.emulators.surfaces import Predict, Surface
+from prbayes.numerics.threads import one_thread
 
 # Points on which lengths are found: half leaves errors six times as large on eight inputs, twice
 # gains a third and takes eight times as long (benchmarks/emulators.py).

@@ -23,8 +23,8 @@ from numpy.polynomial.legendre import legder, legval
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dsytrf, dsytri, dsytrs
 
-from prbayes._checks import IN_CACHE, Floats
-from prbayes._threads import one_thread
+from prbayes._validate import IN_CACHE, Floats
+from prbayes.numerics.threads import one_thread
 
 
 @dataclass(frozen=True, eq=False)

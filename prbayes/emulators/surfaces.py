@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._validate import Floats, positive_integer
 
 # The lowest degree with which each kernel is conditionally positive definite, so that the
 # interpolant is unique: Wendland (2005), Scattered Data Approximation, ch. 8;

@@ -13,7 +13,7 @@ from functools import cache, update_wrapper
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 # The four uniform cubic B-splines that reach a point at fraction t between two nodes: coefficients
 # of 1, t, t^2, t^3 (any textbook on splines).

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
-from prbayes._weighted import finite_sample, ranked, summed_below
+from prbayes._stats import finite_sample, ranked, summed_below
+from prbayes._validate import Floats
 from prbayes.metrics._loops import sum_below
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
 

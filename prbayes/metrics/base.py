@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import (
+from prbayes._validate import (
     AT_ONCE,
     Floats,
     observed_outputs,
@@ -28,7 +28,7 @@ from prbayes._checks import (
     sample_weights,
     simulated_sample,
 )
-from prbayes.metrics.cells import Cells, product
+from prbayes.metrics.grid import Cells, product
 
 # Share of the uniform density that is mixed into densities before a logarithm is taken. Any value
 # up to 1e-6 gives the same minimum on normal data, to a thousandth of a standard error (test). It

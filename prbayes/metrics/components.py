@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes._weighted import quantile
+from prbayes._stats import quantile
+from prbayes._validate import Floats
 
 # More outputs than this are compared by their principal components; of as many the directions that
 # are enough are seventy.

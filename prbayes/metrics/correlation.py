@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_number, sample_weights
+from prbayes._validate import Floats, positive_number, sample_weights
 from prbayes.metrics.base import Discrepancy, Minimum, Part
-from prbayes.metrics.cells import product
-from prbayes.metrics.composite import Centered, Projection, Standardized
+from prbayes.metrics.grid import product
 from prbayes.metrics.lifted import LiftedMetric, failure_caps
+from prbayes.metrics.multivariate import Centered, Projection, Standardized
 from prbayes.metrics.whitening import units
 
 # Least variance, in units of an observed output's spread squared: a population that is one number

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from prbayes._checks import Floats, positive_integer, positive_number
-from prbayes._weighted import finite_sample, quantile
-from prbayes.metrics.cells import BinCells, Cells, KernelCells
+from prbayes._stats import finite_sample, quantile
+from prbayes._validate import Floats, positive_integer, positive_number
+from prbayes.metrics.grid import BinCells, Cells, KernelCells
 
 # Grid nodes per bandwidth. The density is then exact to 3e-5 of a kernel's peak, which a test
 # holds; with three nodes to 1e-4, with six to 6e-6. The cost of comparing densities grows in

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 # Steps of the repulsion. With twice as many the largest cosine is the same to .03 (test).
 _REPULSIONS = 2000

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from prbayes._checks import Floats, flag
+from prbayes._validate import Floats, flag
 from prbayes.metrics.base import CellwiseDiscrepancy, Discrepancy, Metric, Minimum, raised
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._validate import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy, Part
 from prbayes.metrics.components import (
     FEWEST,
@@ -17,9 +17,9 @@ from prbayes.metrics.components import (
     Components,
     principal_components,
 )
-from prbayes.metrics.composite import Centered, CompositeDiscrepancy, Projection
 from prbayes.metrics.directions import directions, enough
 from prbayes.metrics.lifted import LiftedMetric, failure_caps
+from prbayes.metrics.multivariate import Centered, CompositeDiscrepancy, Projection
 from prbayes.metrics.whitening import Whitening, units, whitening
 
 # By judgement: sets of measured outputs that are compared by themselves, each with directions of

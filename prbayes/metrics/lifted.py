@@ -10,9 +10,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from prbayes._checks import Floats, called, real_array
+from prbayes._validate import Floats, called, real_array
 from prbayes.metrics.base import Discrepancy, Metric, Minimum, Part
-from prbayes.metrics.composite import CompositeDiscrepancy, OnlyOutput
+from prbayes.metrics.multivariate import CompositeDiscrepancy, OnlyOutput
 
 
 @dataclass(frozen=True)

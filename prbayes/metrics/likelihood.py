@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from prbayes._checks import Floats, flag, real_array
+from prbayes._validate import Floats, flag, real_array
 from prbayes.metrics.base import (
     CellwiseDiscrepancy,
     Discrepancy,
@@ -16,13 +16,13 @@ from prbayes.metrics.base import (
     observed_density,
     raised,
 )
-from prbayes.metrics.cells import Cells
 from prbayes.metrics.density import (
     DensityEstimator,
     GaussianKDE,
     density_estimator,
     likelihood_bandwidth,
 )
+from prbayes.metrics.grid import Cells
 from prbayes.metrics.readings import Readings
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from prbayes._checks import Floats, positive_number
+from prbayes._validate import Floats, positive_number
 from prbayes.metrics.base import (
     CellwiseDiscrepancy,
     Discrepancy,
@@ -16,8 +16,8 @@ from prbayes.metrics.base import (
     Minimum,
     observed_density,
 )
-from prbayes.metrics.cells import Cells
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
+from prbayes.metrics.grid import Cells
 
 
 @dataclass(frozen=True)

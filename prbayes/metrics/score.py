@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes._weighted import finite_sample, quantile
+from prbayes._stats import finite_sample, quantile
+from prbayes._validate import Floats
 from prbayes.metrics.base import Discrepancy, Part
 from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 

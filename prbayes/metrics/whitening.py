@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from prbayes._checks import Floats
-from prbayes._weighted import quantile
+from prbayes._stats import quantile
+from prbayes._validate import Floats
 from prbayes.metrics.density import spread
 
 # Degrees of freedom of the t distribution whose scatter it is. One is the most robust: it bears a

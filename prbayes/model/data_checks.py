@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import bdtrc
 
-from prbayes._checks import Floats
 from prbayes._finding import Finding
+from prbayes._validate import Floats
 from prbayes.numerics.min_p import adjusted_p_values
 
 

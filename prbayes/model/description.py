@@ -15,7 +15,7 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
 from prbayes.model.measurement import Measurement
-from prbayes.model.node import Node, nodes, response_name
+from prbayes.model.random_variable import Node, nodes, response_name
 from prbayes.model.specimen_likelihood import (
     SpecimenLikelihood,
     measurements_of,

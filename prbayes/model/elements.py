@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 
 def element_name(name: str, index: Sequence[object]) -> str:

@@ -17,11 +17,11 @@ import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from prbayes._checks import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats
 from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.base import Metric
 from prbayes.model.measurement import Measurement
-from prbayes.model.node import Node, nodes
+from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import (
     SpecimenLikelihood,
     measurements_of,

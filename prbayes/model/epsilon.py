@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pymc as pm
 
-from prbayes._checks import called, positive_number
+from prbayes._validate import called, positive_number
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import Identity, identity_of, require_same
-from prbayes.model.node import AnySimulator, required_simulators, simulators
+from prbayes.model.fingerprint import Identity, identity_of, require_same
+from prbayes.model.locking import in_turn
+from prbayes.model.random_variable import AnySimulator, required_simulators, simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
-from prbayes.model.turns import in_turn
 
 _log = logging.getLogger("prbayes")
 

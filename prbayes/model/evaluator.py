@@ -16,12 +16,12 @@ import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 
-from prbayes._checks import AT_ONCE, IN_CACHE, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import PopulationSimulator, emulated_simulators
-from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.measurement import Measurement
-from prbayes.model.node import (
+from prbayes.model.parameters import Hyperparameters
+from prbayes.model.random_variable import (
     Node,
     log_kernel,
     nodes,
@@ -35,11 +35,11 @@ from prbayes.model.specimen_likelihood import (
     specimen_likelihoods,
 )
 from prbayes.propagation.base import Bound
-from prbayes.propagation.cloud import CLOUD
+from prbayes.propagation.importance import CLOUD
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
-from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
-from prbayes.response.grouping import is_group
+from prbayes.response.compile import compiled, ninf_for_invalid, untraced
+from prbayes.response.groups import is_group
 from prbayes.response.inputs import Inputs
 
 # Points of a design from which on an eighth of them serve on the way to an answer: those of the

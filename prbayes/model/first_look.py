@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 _log = logging.getLogger("prbayes")
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement
-from prbayes.model.node import Node
+from prbayes.model.random_variable import Node
 from prbayes.response.outputs import Outputs
 
 

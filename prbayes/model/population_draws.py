@@ -16,14 +16,14 @@ import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
-from prbayes._checks import IN_CACHE, Floats
-from prbayes.model.hyperparameters import Hyperparameters
+from prbayes._validate import IN_CACHE, Floats
+from prbayes.model.parameters import Hyperparameters
 from prbayes.numerics.log_sum_exp import log_sum_exp
+from prbayes.numerics.points import sobol
 from prbayes.propagation.coordinates import Coordinates
-from prbayes.propagation.points import sobol
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.propagation.response_share import ResponseShare
-from prbayes.response.grouping import is_group
+from prbayes.response.groups import is_group
 from prbayes.response.inputs import Inputs
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats
 from prbayes._finding import Finding
+from prbayes._validate import Floats
 from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError

@@ -16,7 +16,7 @@ from pytensor import config
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import (
+from prbayes._validate import (
     Floats,
     called,
     flag,
@@ -29,17 +29,16 @@ from prbayes._checks import (
 )
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.model.costing import Asked, SpecimenRuns, listening, with_points
+from prbayes.model.cost import Asked, SpecimenRuns, listening, with_points
 from prbayes.model.first_look import tell_copies
 from prbayes.model.measurement import Measurement
-from prbayes.model.node import (
+from prbayes.model.random_variable import (
     AnySimulator,
     SimulatorDistribution,
     Specification,
     effective_specimens,
     has_default_epsilon,
     known_value,
-    model_on_context,
     shared_epsilon,
     simulators,
 )
@@ -52,10 +51,10 @@ from prbayes.model.specimen_likelihood import (
 )
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 from prbayes.response.distributions import refuse_without_density
-from prbayes.response.grouping import Groups, is_group, places_of
-from prbayes.response.inputs import Inputs, is_labelled, read_inputs
+from prbayes.response.groups import Groups, is_group, places_of
+from prbayes.response.inputs import Inputs, is_labelled, model_on_context, read_inputs
 from prbayes.response.outputs import ONE, Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 

@@ -35,20 +35,20 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats, called
 from prbayes._finding import Finding, report
+from prbayes._validate import Floats, called
 from prbayes.metrics.readings import Readings
 from prbayes.model.data_checks import data_findings
-from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.measurement import Measurement, StackedReadings
-from prbayes.model.node import (
+from prbayes.model.parameters import Hyperparameters
+from prbayes.model.population_draws import Populations
+from prbayes.model.random_variable import (
     builds_priors_alone,
     known_value,
     required_simulators,
     response_name,
     rv_signature,
 )
-from prbayes.model.population_draws import Populations
 from prbayes.model.run_checks import (
     emulator_findings,
     refuse_scatter,
@@ -72,7 +72,7 @@ from prbayes.propagation.specimen_points import (
 )
 from prbayes.response.costs import in_words
 from prbayes.response.distributions import log_density
-from prbayes.response.grouping import is_group
+from prbayes.response.groups import is_group
 from prbayes.response.inputs import Inputs, aleatory_names
 from prbayes.response.response import Responses
 

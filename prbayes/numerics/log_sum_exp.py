@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 
 def log_sum_exp(terms: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 
 def upper_p_values(statistics: Floats, null: Floats) -> Floats:

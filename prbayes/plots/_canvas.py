@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats, texts
+from prbayes._validate import Floats, texts
 from prbayes.plots._colours import ColourScale, draw_colour_bar
 from prbayes.plots._legends import draw_legend, legend_entry
 from prbayes.plots._ticks import Ticks

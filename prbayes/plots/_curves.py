@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes._weighted import cumulated, distribution_function, quantile
+from prbayes._stats import cumulated, distribution_function, quantile
+from prbayes._validate import Floats
 from prbayes.metrics.density import GaussianKDE, Histogram, silverman
 
 # Points of a curve, 256 steps: a step is about a pixel or two of a panel, by judgement.

@@ -11,14 +11,14 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import AT_ONCE, Floats
-from prbayes._predict import populations_of
-from prbayes.estimate.optimum import Optimum, require_of_model
+from prbayes._validate import AT_ONCE, Floats
+from prbayes.model.coverage import VISIBLE, supports_each
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import Level
-from prbayes.model.node import model_on_context
-from prbayes.model.support import VISIBLE, supports_each
+from prbayes.model.fingerprint import Level
+from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.propagation.base import DesignError
+from prbayes.response.inputs import model_on_context
+from prbayes.results.predict import populations_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes.estimate.optimum import Optimum
+from prbayes._validate import Floats
 from prbayes.model.elements import single_elements, variable_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import labelled
+from prbayes.optimize.optimum import Optimum
 from prbayes.plots._ensemble import supported
 from prbayes.plots._objective import free_elements, objective
 

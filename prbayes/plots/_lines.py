@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
-from prbayes._weighted import INTERVAL
+from prbayes._stats import INTERVAL
+from prbayes._validate import Floats
 from prbayes.plots._canvas import BLUE, DASHED, GREY, VERMILION, Limits, Panel
 from prbayes.plots._curves import central_levels
 from prbayes.plots._ensemble import Ensemble

@@ -12,11 +12,11 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats, called
+from prbayes._validate import Floats, called
 from prbayes.model.elements import element_name, variable_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._curves import GRID_POINTS, central_range, smooth_densities
-from prbayes.response.compilation import compile_batched
+from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, is_mvnormal
 from prbayes.response.inputs import Inputs, aleatory_names
 

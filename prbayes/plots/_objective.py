@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes.estimate.optimum import Optimum
+from prbayes._validate import Floats
 from prbayes.model.elements import split_elements, told_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import labelled
+from prbayes.optimize.optimum import Optimum
 
 # What a reader calls a metric of the package; any other one goes by the name of its class.
 METRIC_LABELS = {

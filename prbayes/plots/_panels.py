@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.plots._names import named
 from prbayes.response.outputs import Outputs

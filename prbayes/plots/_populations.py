@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.plots._canvas import BLUE, Panel
 from prbayes.plots._curves import pointwise_band
 from prbayes.plots._ensemble import Ensemble

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 # Cells along each axis of the plane; a cell is a fifth of the narrowest kernel that has them all
 # within sight, and an outline looks smooth.

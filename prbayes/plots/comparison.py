@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats, flag
-from prbayes._compare import COSTS
+from prbayes._validate import Floats, flag
 from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, Panel, refuse_look
 from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._objective import METRIC_LABELS
 from prbayes.plots._ticks import round_ticks
+from prbayes.results.compare import COSTS
 
 
 def plot_comparison(

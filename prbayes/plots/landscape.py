@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._checks import Floats, called, positive_integer
-from prbayes.estimate.optimum import Optimum, require_of_model
+from prbayes._validate import Floats, called, positive_integer
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import Level
-from prbayes.model.turns import in_turn
+from prbayes.model.fingerprint import Level
+from prbayes.model.locking import in_turn
+from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._colours import ColourScale
 from prbayes.plots._grid import Landscape, landscape, rooted

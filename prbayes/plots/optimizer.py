@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes.estimate.optimum import Optimum
+from prbayes._validate import Floats
+from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, GREY, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._objective import (

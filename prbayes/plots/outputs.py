@@ -11,12 +11,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, called, positive_integer
-from prbayes._weighted import INTERVAL
-from prbayes.estimate.optimum import Optimum
+from prbayes._stats import INTERVAL
+from prbayes._validate import Floats, called, positive_integer
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.turns import in_turn
+from prbayes.model.locking import in_turn
+from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, INK, VERMILION, Canvas, Limits, Panel, refuse_look
 from prbayes.plots._curves import central_range
 from prbayes.plots._ensemble import read_before, read_result, supported

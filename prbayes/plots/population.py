@@ -9,9 +9,9 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import positive_integer, share
-from prbayes.estimate.optimum import Optimum
-from prbayes.model.turns import in_turn
+from prbayes._validate import positive_integer, share
+from prbayes.model.locking import in_turn
+from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, SOLID, Canvas, Panel, refuse_look
 from prbayes.plots._ensemble import Ensemble, read_result
 from prbayes.plots._margins import Margin, chosen, margin_densities, margins

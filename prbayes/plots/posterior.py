@@ -11,8 +11,7 @@ import pymc as pm
 import xarray as xr
 from scipy.stats import norm
 
-from prbayes._checks import Floats, share
-from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
+from prbayes._validate import Floats, share
 from prbayes.model.elements import (
     read_elements,
     single_elements,
@@ -22,8 +21,9 @@ from prbayes.model.elements import (
     variable_of,
 )
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import Level, require_together
+from prbayes.model.fingerprint import Level, require_together
 from prbayes.model.labels import labelled
+from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.plots._canvas import (
     BLUE,
     DASHED,

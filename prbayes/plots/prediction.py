@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats, share
-from prbayes._weighted import INTERVAL
+from prbayes._stats import INTERVAL
+from prbayes._validate import Floats, share
 from prbayes.plots._canvas import BLUE, INK, Canvas, Panel, refuse_look
 from prbayes.plots._curves import (
     GRID_POINTS,
@@ -20,7 +20,7 @@ from prbayes.plots._curves import (
     staircase,
 )
 from prbayes.plots._names import named, refuse_labels
-from prbayes.validation.side_by_side import Comparable, comparables
+from prbayes.validation.measured_vs_predicted import Comparable, comparables
 
 
 def plot_prediction(

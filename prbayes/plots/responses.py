@@ -11,10 +11,10 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, flag, positive_integer, share
-from prbayes.estimate.optimum import Optimum
+from prbayes._validate import Floats, flag, positive_integer, share
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.turns import in_turn
+from prbayes.model.locking import in_turn
+from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._curves import (
     GRID_POINTS,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.plots._canvas import CYCLE, DASHDOT, DASHED, DOTTED, SOLID, Canvas, Panel, refuse_look
 from prbayes.plots._names import STATISTIC_LABELS, named, refuse_labels
 from prbayes.plots._ticks import Ticks, log_ticks, spans_decades

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.plots._canvas import (
     BLUE,
     DASHED,
@@ -22,8 +22,8 @@ from prbayes.plots._canvas import (
     refuse_look,
 )
 from prbayes.plots._curves import steps
+from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.conditions import DIRECTION
-from prbayes.validation.validity import ValidityTest
 
 
 def plot_validity(

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from prbayes._checks import Floats
 from prbayes._progress import CONSOLE, lines, live, shown
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.checkpoint import Checkpoint
 from prbayes.posterior.importance import LogDensity
-from prbayes.posterior.smc_kernel import BatchedKernel
+from prbayes.posterior.kernel import BatchedKernel
 from prbayes.response.budget import BudgetError
 
 Stages = dict[str, list[float]]

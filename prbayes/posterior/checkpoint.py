@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats
-from prbayes.model.identity import Identity, Level, as_text, differences, from_text
+from prbayes._validate import Floats
+from prbayes.model.fingerprint import Identity, Level, as_text, differences, from_text
 from prbayes.response.store import StoreError
 
 _FORMAT = 3  # of what is in a file; others are refused

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes._weighted import INTERVAL
-from prbayes.estimate.data_sets import SETS, DataSets, groups
-from prbayes.estimate.identifiability import identified_by_area, identified_by_curvature
-from prbayes.estimate.measured import Refits
-from prbayes.estimate.obstacles import simulator_obstacle
-from prbayes.estimate.optimum import Optimum, require_minimiser, require_sampling
-from prbayes.estimate.sampling import first_order_shifts, local_sampling
-from prbayes.estimate.sandwich import Information, LinearArea
+from prbayes._stats import INTERVAL
+from prbayes._validate import Floats
+from prbayes.inference.asymptotics import first_order_shifts, local_sampling
+from prbayes.inference.identifiability import identified_by_area, identified_by_curvature
+from prbayes.inference.measured import Refits
+from prbayes.inference.requirements import simulator_obstacle
+from prbayes.inference.resampling import SETS, DataSets, groups
+from prbayes.inference.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 from prbayes.model.epsilon import Epsilon, refuse_without_epsilon
-from prbayes.model.turns import in_turn
+from prbayes.model.locking import in_turn
+from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
 
 # Thetas that carry each simulated data set's posterior: half or twice changes epsilon by 3%, as
 # much as another number of data sets does (docs/constants.md).

@@ -15,11 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import IN_CACHE, Floats
-from prbayes._threads import one_thread
-from prbayes.estimate.data_sets import SETS, aligned, groups, observable, specimens
-from prbayes.estimate.optimum import Optimum, optima_of
-from prbayes.estimate.refinement import noise_floors
+from prbayes._validate import IN_CACHE, Floats
+from prbayes.inference.resampling import SETS, aligned, groups, observable, specimens
 from prbayes.metrics.score import (
     ScoreOptions,
     ShiftedResponses,
@@ -29,6 +26,9 @@ from prbayes.metrics.score import (
     tabulated_scores,
 )
 from prbayes.model.evaluator import Evaluator
+from prbayes.numerics.threads import one_thread
+from prbayes.optimize.design_refinement import noise_floors
+from prbayes.optimize.optimum import Optimum, optima_of
 from prbayes.posterior.saddlepoint import (
     SaddlepointOptions,
     Scores,

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
-from prbayes._checks import Floats
-from prbayes.propagation.points import sobol
+from prbayes._validate import Floats
+from prbayes.numerics.points import sobol
 
 LogDensity = Callable[[Floats], Floats]  # (S, d) -> (S,)
 

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 from scipy.special import logsumexp, ndtri
 
-from prbayes._checks import AT_ONCE, Floats
-from prbayes._threads import one_thread
-from prbayes.estimate.batch_objective import BatchObjective
-from prbayes.estimate.continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.estimate.data_sets import (
+from prbayes._validate import AT_ONCE, Floats
+from prbayes.inference.batched_objective import BatchObjective
+from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
+from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.resampling import (
     DataSets,
     groups,
     observable,
@@ -36,12 +36,13 @@ from prbayes.estimate.data_sets import (
     specimens,
     stored_populations,
 )
-from prbayes.estimate.optimum import Optimum, optima_of
-from prbayes.estimate.refit import SamplingDistribution
 from prbayes.metrics.score import prepared_on_population
+from prbayes.model.coverage import TOLERABLE, supports_each
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.hyperparameters import THETAS
-from prbayes.model.support import TOLERABLE, supports_each
+from prbayes.model.parameters import THETAS
+from prbayes.numerics.points import sobol
+from prbayes.numerics.threads import one_thread
+from prbayes.optimize.optimum import Optimum, optima_of
 from prbayes.posterior.importance import importance_sample, laplace
 from prbayes.posterior.saddlepoint import (
     Cumulants,
@@ -51,7 +52,6 @@ from prbayes.posterior.saddlepoint import (
     density_at,
     minimum,
 )
-from prbayes.propagation.points import sobol
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,14 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
-from prbayes.estimate.optimum import Optimum
-from prbayes.estimate.refinement import MAX_ROUNDS, refine_at
+from prbayes._validate import Floats, Seed, positive_integer, seed_number
+from prbayes.model.budgets import designs_as_before, explained
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.hyperparameters import THETAS
-from prbayes.model.interruption import designs_as_before, explained
-from prbayes.model.node import model_on_context
-from prbayes.model.turns import in_turn
+from prbayes.model.locking import in_turn
+from prbayes.model.parameters import THETAS
+from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
+from prbayes.optimize.optimum import Optimum
 from prbayes.posterior.importance import (
     ImportanceOptions,
     ImportanceSample,
@@ -28,10 +27,11 @@ from prbayes.posterior.importance import (
     importance_sample,
     laplace,
 )
-from prbayes.posterior.returned import as_asked, checked_idata_kwargs, checked_names
+from prbayes.posterior.results import as_asked, checked_idata_kwargs, checked_names
 from prbayes.posterior.smc import Sampling, estimate_of, evaluator_of, result_tree, sample_posterior
 from prbayes.posterior.target import Target, estimate_target, specimen_target
 from prbayes.response.budget import limited
+from prbayes.response.inputs import model_on_context
 
 _OPTIONS = ImportanceOptions()
 

@@ -17,20 +17,20 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes._progress import progress, shown
-from prbayes.estimate.data_sets import fresh_data
-from prbayes.estimate.specimen_refits import (
+from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
+from prbayes.inference.resampling import fresh_data
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.locking import in_turn
+from prbayes.optimize.specimen_refits import (
     other_specimens,
     simulation_obstacle,
     specimen_pool,
 )
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import model_on_context
-from prbayes.model.turns import in_turn
 from prbayes.posterior.sample import draw_posterior
 from prbayes.posterior.smc import Adjustment, Sampling, refuse_adjustment, sample
 from prbayes.posterior.trees import calibration_tree
+from prbayes.response.inputs import model_on_context
 
 _log = logging.getLogger("prbayes")
 # Data sets that a worker analyses before it reports: seconds of work, against milliseconds of

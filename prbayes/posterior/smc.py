@@ -15,27 +15,27 @@ import pymc as pm
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from prbayes._checks import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes._pages import more_in
 from prbayes._progress import shown
-from prbayes.estimate.minimization import Minimisation, find_optimum, require_finished
-from prbayes.estimate.optimum import Optimum, require_sampling
-from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
+from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
+from prbayes.model.budgets import designs_as_before, explained
+from prbayes.model.coverage import shortcomings
 from prbayes.model.epsilon import checked_epsilon
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.hyperparameters import THETAS
-from prbayes.model.identity import identity_of, require_same
-from prbayes.model.interruption import designs_as_before, explained
-from prbayes.model.node import log_kernel, model_on_context
-from prbayes.model.start import fingerprint, starting_thetas
-from prbayes.model.support import shortcomings
-from prbayes.model.turns import in_turn
+from prbayes.model.fingerprint import identity_of, require_same
+from prbayes.model.locking import in_turn
+from prbayes.model.parameters import THETAS
+from prbayes.model.random_variable import log_kernel
+from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
+from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
+from prbayes.optimize.optimum import Optimum, require_sampling
+from prbayes.posterior.arviz_groups import arviz_groups, specimen_groups
 from prbayes.posterior.chains import Chains, Particles, Stages
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
-from prbayes.posterior.groups import arviz_groups, specimen_groups
 from prbayes.posterior.importance import LogDensity
-from prbayes.posterior.returned import (
+from prbayes.posterior.initial_particles import fingerprint, starting_thetas
+from prbayes.posterior.results import (
     as_asked,
     as_multitrace,
     checked_idata_kwargs,
@@ -45,6 +45,7 @@ from prbayes.posterior.target import estimate_target, prior_conflicts, require_d
 from prbayes.posterior.trees import posterior_tree, share_of_lossy
 from prbayes.propagation.base import Missing
 from prbayes.response.budget import BudgetError, limited, unlimited
+from prbayes.response.inputs import model_on_context
 
 _log = logging.getLogger("prbayes")
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._checks import Floats
 from prbayes._finding import Finding
-from prbayes.estimate.optimum import Optimum, optima_of
+from prbayes._validate import Floats
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.evaluator import Evaluator
+from prbayes.optimize.optimum import Optimum, optima_of
 from prbayes.posterior.estimate_likelihood import estimate_likelihood, score_obstacle
 from prbayes.posterior.importance import LogDensity
 from prbayes.posterior.refit_likelihood import refit_likelihood

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import as_attributes, identity_of
+from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.labels import (
     arviz_attributes,
     failures_dataset,

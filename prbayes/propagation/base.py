@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats, flag, positive_number
+from prbayes._validate import Floats, flag, positive_number
 from prbayes.metrics.base import Discrepancy
-from prbayes.response.compilation import compile_batched
+from prbayes.response.compile import compile_batched
 from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp, ndtri
 
-from prbayes._checks import Floats
-from prbayes.propagation.points import sobol
+from prbayes._validate import Floats
+from prbayes.numerics.points import sobol
 
 Response = Callable[[Floats], tuple[Floats, Floats]]
 """Inputs (n, d) to outputs (n, m) and Jacobians (n, m, d); NaN where the response has no value."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.response.budget import unlimited
 from prbayes.response.failures import Replace, ResponseError
 from prbayes.response.response import Responses

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats
 from prbayes.response.distributions import PopulationSampler, prior_draws
 from prbayes.response.inputs import Inputs
 

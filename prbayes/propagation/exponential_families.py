@@ -22,8 +22,8 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from prbayes._checks import Floats
-from prbayes._threads import one_thread
+from prbayes._validate import Floats
+from prbayes.numerics.threads import one_thread
 from prbayes.response.distributions import (
     compiled_log_density,
     is_mvnormal,

@@ -50,7 +50,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv, logsumexp, ndtri, stdtrit
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
+from prbayes.numerics.points import sobol
 from prbayes.propagation.charts import (
     Charts,
     Fibres,
@@ -60,7 +61,6 @@ from prbayes.propagation.charts import (
     charts_at_modes,
     cover,
 )
-from prbayes.propagation.points import sobol
 
 __all__ = [
     "FibrePoints",

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from prbayes._checks import Floats
-from prbayes._threads import one_thread
+from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
+from prbayes.numerics.points import sobol
+from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre import (
     FibreProposal,
@@ -27,7 +28,6 @@ from prbayes.propagation.fibre import (
     with_error,
 )
 from prbayes.propagation.guards import half_difference
-from prbayes.propagation.points import sobol
 from prbayes.propagation.roots import Response
 from prbayes.propagation.specimen_points import (
     Emulation,

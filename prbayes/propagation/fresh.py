@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._validate import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
     BY_EVALUATIONS,
@@ -21,7 +21,7 @@ from prbayes.propagation.base import (
     refuse_max_lost,
 )
 from prbayes.propagation.ops import OwnOp
-from prbayes.response.batches import batch_shape, broadcast_batch
+from prbayes.response.broadcasting import batch_shape, broadcast_batch
 from prbayes.response.costs import Demand
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import Inputs

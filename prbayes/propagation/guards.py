@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes.propagation.points import sobol
+from prbayes._validate import Floats
+from prbayes.numerics.points import sobol
 
 
 def missing_share(

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 
-from prbayes._checks import Floats
-from prbayes.propagation.points import base_points, inside
-from prbayes.response.compilation import compile_batched
+from prbayes._validate import Floats
+from prbayes.numerics.points import base_points, inside
+from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.inputs import Inputs
 
@@ -43,7 +43,7 @@ def new_specimens(
         placed, epistemic = through_inverses(label, inputs, symbols, uniforms)
     except TypeError:
         return PopulationSampler(inputs)(roots, n, rng)
-    _, base = base_points(inputs, n, int(rng.integers(2**31)))
+    _, base = base_points(inputs.event_shapes, n, int(rng.integers(2**31)))
     order = rng.permutation(n)
     k = len(roots[0])
     shifted = []

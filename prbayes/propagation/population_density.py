@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import IN_CACHE, Floats
-from prbayes._threads import one_thread
+from prbayes._validate import IN_CACHE, Floats
 from prbayes.numerics.log_sum_exp import log_sum_exp
+from prbayes.numerics.threads import one_thread
 from prbayes.propagation.exponential_families import ExponentialForm
 from prbayes.response.distributions import PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs

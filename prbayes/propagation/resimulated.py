@@ -14,9 +14,10 @@ from pytensor import shared
 from pytensor.compile import function
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes._pages import more_in
+from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
+from prbayes.numerics.points import base_points, points_from
 from prbayes.propagation.base import (
     BY_EVALUATIONS,
     MAX_LOST,
@@ -27,8 +28,7 @@ from prbayes.propagation.base import (
     refuse_nested,
 )
 from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
-from prbayes.propagation.points import base_points, points_from
-from prbayes.response.compilation import PLAIN, compile_batched, ninf_for_invalid
+from prbayes.response.compile import PLAIN, compile_batched, ninf_for_invalid
 from prbayes.response.costs import Demand
 from prbayes.response.distributions import PopulationSampler, quantiles, valid
 from prbayes.response.inputs import Inputs
@@ -105,7 +105,9 @@ class Resimulated(Propagation):
 
     def base_points(self, inputs: Inputs) -> list[Floats]:
         """Return points of the unit cube for each aleatory input, shapes (n, *event)."""
-        _, points = base_points(inputs, self.n, self.random_seed, points_from(self.points))
+        _, points = base_points(
+            inputs.event_shapes, self.n, self.random_seed, points_from(self.points)
+        )
         return points
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:

@@ -20,11 +20,11 @@ from typing import Protocol
 import numpy as np
 from scipy.special import logsumexp, stdtrit
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.numerics.log_sum_exp import log_sum_exp
+from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.coordinates import Coordinates
-from prbayes.propagation.points import sobol
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.propagation.specimen_points import Emulation, PointOptions, first_runs
 

@@ -21,11 +21,12 @@ from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import IN_CACHE, Floats, positive_integer
-from prbayes._threads import one_thread
-from prbayes.emulators.emulator import MOST_RUNS
+from prbayes._validate import IN_CACHE, Floats, positive_integer
+from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
 from prbayes.metrics.base import Discrepancy
+from prbayes.numerics.points import base_points
+from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import (
     MAX_LOST,
     N_BLOCKS,
@@ -36,7 +37,9 @@ from prbayes.propagation.base import (
     refuse_max_lost,
     refuse_nested,
 )
-from prbayes.propagation.cloud import (
+from prbayes.propagation.coarse import Coarse
+from prbayes.propagation.exponential_families import PointDensity, normalise
+from prbayes.propagation.importance import (
     CLOUD,
     LARGEST_CLOUD,
     Cloud,
@@ -45,18 +48,16 @@ from prbayes.propagation.cloud import (
     mixture_of,
     some_of,
 )
-from prbayes.propagation.coarse import Coarse
-from prbayes.propagation.edges import (
+from prbayes.propagation.moving_support import (
     averaged_log_density,
     cells_around,
     moving_inputs,
     refuse_moving_atoms,
 )
-from prbayes.propagation.exponential_families import PointDensity, normalise
 from prbayes.propagation.ops import CompactOp, OpaqueOp
-from prbayes.propagation.points import base_points
-from prbayes.response.compilation import compile_batched
+from prbayes.response.compile import compile_batched
 from prbayes.response.costs import Demand
+from prbayes.response.deduplication import Known, once_each
 from prbayes.response.distributions import (
     PopulationSampler,
     log_density,
@@ -66,7 +67,6 @@ from prbayes.response.distributions import (
 )
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import lacking
-from prbayes.response.repeats import Known, once_each
 from prbayes.response.response import Responses, refuse_coarse, refuse_other_number
 
 _log = logging.getLogger("prbayes")
@@ -937,7 +937,7 @@ class Design(Bound):
         Scrambled Sobol points go through the inverse distribution functions where they exist.
         """
         k = len(components[0])
-        spare, uniforms = base_points(self.inputs, n, seed)
+        spare, uniforms = base_points(self.inputs.event_shapes, n, seed)
         if shares is None:
             which = (spare * k).astype(int)
         else:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 # Coordinates (k, d) -> values (k, m), Jacobian (k, m, d). NaN where there is no response.
 Response = Callable[[Floats], tuple[Floats, Floats]]

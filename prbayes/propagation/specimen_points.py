@@ -26,13 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, expit, gammaln, ndtri
 
-from prbayes._checks import AT_ONCE, IN_CACHE, Floats
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.log_sum_exp import log_sum_exp
+from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.guards import half_difference, missing_share, predicted_bias
-from prbayes.propagation.points import sobol
 from prbayes.propagation.roots import (
     Response,
     Roots,

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._diagnose import Diagnosis
-from prbayes._weighted import INTERVAL
+from prbayes._stats import INTERVAL
 from prbayes.plots._names import named
 from prbayes.plots.validity import in_directions
 from prbayes.reports.decision import CALLED, kind_of_decision
@@ -28,8 +27,9 @@ from prbayes.reports.problem import described
 from prbayes.reports.section import Section
 from prbayes.reports.summary import verdict
 from prbayes.reports.tables import rows_table
-from prbayes.validation.side_by_side import Comparable, comparables
-from prbayes.validation.validity import ValidityTest
+from prbayes.results.diagnose import Diagnosis
+from prbayes.validation.area_test import ValidityTest
+from prbayes.validation.measured_vs_predicted import Comparable, comparables
 
 # -- comparison ------------------------------------------------------------------------------
 

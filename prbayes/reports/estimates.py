@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._weighted import INTERVAL
+from prbayes._stats import INTERVAL
 from prbayes.model.elements import (
     read_elements,
     single_elements,

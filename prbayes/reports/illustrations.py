@@ -13,10 +13,9 @@ import pymc as pm
 
 from prbayes.model.elements import variable_of
 from prbayes.model.emulated import population_simulators
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 from prbayes.model.specimen_likelihood import measurements_of
 from prbayes.plots.comparison import plot_comparison
-from prbayes.plots.influences import plot_sensitivity
 from prbayes.plots.landscape import plot_landscape
 from prbayes.plots.optimizer import plot_optimizer
 from prbayes.plots.outputs import plot_outputs
@@ -24,6 +23,7 @@ from prbayes.plots.population import plot_population
 from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.prediction import plot_prediction
 from prbayes.plots.responses import plot_responses
+from prbayes.plots.sensitivity import plot_sensitivity
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
 from prbayes.reports.decision import kind_of_decision

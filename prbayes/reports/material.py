@@ -10,14 +10,11 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, called, texts
-from prbayes._compare import compare
-from prbayes._diagnose import Diagnosis, diagnose
-from prbayes.estimate.optimum import Optimum, identity_in
+from prbayes._validate import Floats, called, texts
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import (
+from prbayes.model.fingerprint import (
     Identity,
     Level,
     differences,
@@ -25,12 +22,15 @@ from prbayes.model.identity import (
     require_same,
     require_together,
 )
-from prbayes.model.identity import from_attributes as identity_of_attributes
+from prbayes.model.fingerprint import from_attributes as identity_of_attributes
+from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.plots._names import refuse_labels
 from prbayes.response.outputs import ONE, Outputs, read_observed
+from prbayes.results.compare import compare
+from prbayes.results.diagnose import Diagnosis, diagnose
+from prbayes.validation.area_test import ValidityTest
+from prbayes.validation.measured_vs_predicted import comparables
 from prbayes.validation.probability_transform import u_values
-from prbayes.validation.side_by_side import comparables
-from prbayes.validation.validity import ValidityTest
 
 # Measured values are rounded, or predicted ones for a test: by far less than this in half of the
 # u-values, while those of other data are apart by .3 on average.

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats
-from prbayes.estimate.optimum import compared_in
+from prbayes._validate import Floats
+from prbayes.optimize.optimum import compared_in
 from prbayes.plots.outputs import correlation
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import NOTHING, alike

@@ -15,12 +15,12 @@ from typing import Any, Self
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import called, file_path, flag, folder_path, plain_text
-from prbayes.estimate.optimum import Optimum
+from prbayes._validate import called, file_path, flag, folder_path, plain_text
+from prbayes.optimize.optimum import Optimum
 from prbayes.reports.contents import contents
 from prbayes.reports.section import Section
 from prbayes.reports.tables import cells
-from prbayes.validation.validity import ValidityTest
+from prbayes.validation.area_test import ValidityTest
 
 # What Markdown, or HTML inside it, would read as markup (CommonMark 0.31, 2.4; tables and
 # strikethrough of GitHub; formulas between dollars).

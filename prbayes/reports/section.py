@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from prbayes._checks import plain_text
+from prbayes._validate import plain_text
 from prbayes.reports.images import image, is_broad, kind_of
 from prbayes.reports.tables import cells
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.elements import (
     read_variables,
     single_elements,
@@ -20,7 +20,7 @@ from prbayes.plots.validity import in_directions
 from prbayes.reports.decision import interval_of, kind_of_decision
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus, probability
-from prbayes.validation.validity import ValidityTest
+from prbayes.validation.area_test import ValidityTest
 
 # More hyperparameters than this make a list, which a table shows better: by judgement.
 _MOST_NAMES = 6

@@ -2,9 +2,9 @@
 
 from prbayes.response.budget import BudgetError
 from prbayes.response.costs import Cost
+from prbayes.response.discrepancy import Additive, Multiplicative
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
-from prbayes.response.grouping import group
-from prbayes.response.inadequacy import Additive, Multiplicative
+from prbayes.response.groups import group
 from prbayes.response.store import Store, StoreError
 
 __all__ = [

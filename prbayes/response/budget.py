@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
-from prbayes._checks import positive_integer, positive_number
+from prbayes._validate import positive_integer, positive_number
 
 
 class BudgetError(RuntimeError):

@@ -18,8 +18,8 @@ from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
-from prbayes.response.compilation import (
+from prbayes._validate import Floats
+from prbayes.response.compile import (
     PLAIN,
     compile_batched,
     interpreted,

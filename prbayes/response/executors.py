@@ -24,7 +24,7 @@ from traceback import walk_tb
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from prbayes._checks import called, positive_number
+from prbayes._validate import called, positive_number
 from prbayes.response.failures import ResponseError
 
 _log = logging.getLogger("prbayes")

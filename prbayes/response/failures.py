@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prbayes._checks import Floats, called, flag, positive_integer
+from prbayes._validate import Floats, called, flag, positive_integer
 
 
 class ResponseError(RuntimeError):

@@ -18,9 +18,9 @@ from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import real_array
-from prbayes.response.compilation import PLAIN, interpreted
-from prbayes.response.grouping import Groups, groups_of, is_group
+from prbayes._validate import real_array
+from prbayes.response.compile import PLAIN, interpreted
+from prbayes.response.groups import Groups, groups_of, is_group
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,3 +314,18 @@ def event_shape(dist: TensorVariable) -> tuple[int, ...]:
     with interpreted():
         drawn = pm.draw(dist, random_seed=0, mode=PLAIN)
     return tuple(int(s) for s in drawn.shape)
+
+
+def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
+    """Return the model given, or the one on the context, or raise.
+
+    Within another model, the outermost: that has the variables of all.
+    """
+    found = pm.Model.get_context(error_if_none=False) if model is None else model
+    if not isinstance(found, pm.Model):
+        got = "no model on the context" if found is None else type(found).__name__
+        raise TypeError(
+            f"{caller}: got {got}, expected a pm.Model; "
+            "call it inside `with pm.Model():` or pass model="
+        )
+    return found.root

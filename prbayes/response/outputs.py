@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, real_array
+from prbayes._validate import Floats, real_array
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from pytensor.graph.basic import Variable
 
-from prbayes._checks import Floats, called, executes, folder_path
-from prbayes.response.batches import batch_shape, broadcast_batch
+from prbayes._validate import Floats, called, executes, folder_path
+from prbayes.response.batch_consistency import refuse_mixing
+from prbayes.response.broadcasting import batch_shape, broadcast_batch
 from prbayes.response.budget import budget
-from prbayes.response.calling import (
+from prbayes.response.call import (
     Calling,
     Points,
     Tally,
@@ -28,11 +29,10 @@ from prbayes.response.calling import (
     scalar,
     shapes,
 )
+from prbayes.response.discrepancy import caveats_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
-from prbayes.response.inadequacy import caveats_of
 from prbayes.response.inputs import Inputs
-from prbayes.response.mixing import refuse_mixing
 from prbayes.response.outputs import ONE, Outputs, outputs_of_result
 from prbayes.response.store import Store
 

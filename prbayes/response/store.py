@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, plain_text, positive_integer, stated_path
+from prbayes._validate import Floats, plain_text, positive_integer, stated_path
 from prbayes.response.database import (
     COMPUTED,
     FAILED,

@@ -10,11 +10,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, Seed, flag, real_array, sample_labels, seed_number
-from prbayes._predict import specimen_names
+from prbayes._validate import Floats, Seed, flag, real_array, sample_labels, seed_number
 from prbayes.metrics.base import View
-from prbayes.model.identity import Identity, Level, from_attributes, require_together
+from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
 from prbayes.response.outputs import Outputs, read_observed
+from prbayes.results.predict import specimen_names
 from prbayes.validation.predictive import Predictive
 from prbayes.validation.statistic import area
 from prbayes.validation.views import views

@@ -10,16 +10,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
-from prbayes.estimate.data_sets import DataSets, specimens
-from prbayes.estimate.optimum import Optimum, require_refits
-from prbayes.estimate.specimen_refits import is_specimen_optimum, specimen_refits
+from prbayes._validate import Floats, Seed, positive_integer, seed_number
+from prbayes.inference.resampling import DataSets, specimens
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import versions
-from prbayes.model.turns import in_turn
+from prbayes.model.locking import in_turn
+from prbayes.optimize.optimum import Optimum, require_refits
+from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.validation.scores import Scoring
 
 _ADVICE = ", so that the model cannot be calibrated anew"

@@ -10,18 +10,18 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, called, positive_integer
-from prbayes._predict import data_digest, in_order, serving, specimen_names
-from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
-from prbayes.estimate.optimum import Optimum, require_refits
-from prbayes.estimate.refit import SamplingDistribution
-from prbayes.model.identity import Level, require_same
-from prbayes.model.node import Node
-from prbayes.model.support import shortcomings
+from prbayes._validate import Floats, called, positive_integer
+from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
+from prbayes.model.coverage import shortcomings
+from prbayes.model.fingerprint import Level, require_same
+from prbayes.model.random_variable import Node
+from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import UntoldError
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
+from prbayes.results.predict import data_digest, in_order, serving, specimen_names
 from prbayes.validation.conditions import Case, Condition
 from prbayes.validation.nulls import LEAST_REPLICATES, SimulatedNull
 from prbayes.validation.predictive import Predictive

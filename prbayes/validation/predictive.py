@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes._weighted import cumulated
+from prbayes._stats import cumulated
+from prbayes._validate import Floats
 
 
 class Predictive:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 
-from prbayes._checks import Floats, Seed
+from prbayes._validate import Floats, Seed
 from prbayes.validation.conditions import Predicted, read_case
 
 

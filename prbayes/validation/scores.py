@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from prbayes._checks import Floats
-from prbayes._weighted import finite_sample, quantile
+from prbayes._stats import finite_sample, quantile
+from prbayes._validate import Floats
 from prbayes.metrics.base import Discrepancy, Metric, Part
 from prbayes.metrics.density import GaussianKDE, spread
 from prbayes.metrics.joint import Joint

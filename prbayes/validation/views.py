@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes._checks import Floats
-from prbayes.metrics.composite import Centered, Projection
+from prbayes._validate import Floats
 from prbayes.metrics.directions import directions, enough
 from prbayes.metrics.lifted import failure_caps
+from prbayes.metrics.multivariate import Centered, Projection
 from prbayes.metrics.whitening import whitening
 
 # Specimens of the prediction that tell its coordinates: their correlations are then known to .02,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.decision.indices import Indices, derivative_bound, first_order, total_order
 
 # Sobol' indices of Ishigami's function with 7 and 0.1 (Ishigami and Homma 1990).

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import KERNELS, GaussianProcess, Likelihood
 
 

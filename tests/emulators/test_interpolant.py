@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.emulators import interpolant
 from prbayes.emulators.interpolant import fit_interpolant
-from prbayes.propagation.points import sobol
+from prbayes.numerics.points import sobol
 
 
 def design(n: int, d: int, seed: int = 0) -> Floats:

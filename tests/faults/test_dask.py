@@ -18,8 +18,8 @@ import units
 from um_server import Real
 
 import prbayes as prb
-from prbayes.model.node import nodes
-from prbayes.response.calling import Calling, Points, Tally, respond
+from prbayes.model.random_variable import nodes
+from prbayes.response.call import Calling, Points, Tally, respond
 from prbayes.response.executors import Capacity, capacity
 from prbayes.response.outputs import Outputs
 from prbayes.response.store import Store

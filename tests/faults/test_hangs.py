@@ -14,7 +14,7 @@ from hostile import EXECUTORS
 from um_server import Real
 
 import prbayes as prb
-from prbayes.response.calling import Calling, Points, Tally, respond
+from prbayes.response.call import Calling, Points, Tally, respond
 
 LIMIT = 0.4
 

@@ -28,7 +28,7 @@ import xarray as xr
 
 import prbayes
 from prbayes.__main__ import main
-from prbayes.model.identity import Identity
+from prbayes.model.fingerprint import Identity
 from prbayes.posterior.checkpoint import Checkpoint
 from prbayes.response.store import Store, StoreError
 

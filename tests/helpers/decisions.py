@@ -10,7 +10,7 @@ import pymc as pm
 import xarray as xr
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 N = 50
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, N)

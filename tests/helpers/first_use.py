@@ -6,7 +6,7 @@ from typing import Any
 
 import pymc as pm
 
-from prbayes.model.node import Node, nodes
+from prbayes.model.random_variable import Node, nodes
 
 
 def first_use(model: pm.Model) -> dict[Any, Node]:

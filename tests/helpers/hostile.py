@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import prbayes as prb
-from prbayes.response.calling import Calling, Points, Tally, respond
+from prbayes.response.call import Calling, Points, Tally, respond
 from prbayes.response.failures import OnFailure, ResponseError
 from prbayes.response.store import Store
 
@@ -27,7 +27,7 @@ from prbayes.response.store import Store
 def processes() -> Iterator[Executor]:
     context = get_context("forkserver")
     # Workers are forked from a process that has imported already what takes long.
-    context.set_forkserver_preload(["prbayes.response.calling", "cloudpickle"])
+    context.set_forkserver_preload(["prbayes.response.call", "cloudpickle"])
     with ProcessPoolExecutor(2, context) as pool:
         yield pool
 

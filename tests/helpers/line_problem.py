@@ -10,7 +10,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes.metrics.base import Metric
-from prbayes.model.node import Node, nodes
+from prbayes.model.random_variable import Node, nodes
 from prbayes.propagation.base import Propagation
 
 N, MU, SIGMA, EPSILON, POINTS = 30, 2.0, 0.8, 0.02, 128

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 LogPrior = Callable[[Floats, Floats], Floats]  # of mu and sigma
 

@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 

@@ -9,7 +9,7 @@ import pytensor.tensor as pt
 import pytest
 from scipy.stats import wasserstein_distance
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics._loops import sum_below
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum

@@ -12,7 +12,7 @@ import pytensor.tensor as pt
 import pytest
 from scipy.optimize import minimize
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics import base
 from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric
 from prbayes.metrics.density import DensityEstimator, GaussianKDE

@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
-from prbayes._weighted import quantile
+from prbayes._stats import quantile
+from prbayes._validate import Floats
 from prbayes.metrics import density
-from prbayes.metrics.cells import KernelCells
 from prbayes.metrics.density import (
     GaussianKDE,
     Histogram,
@@ -17,6 +16,7 @@ from prbayes.metrics.density import (
     silverman,
     spread,
 )
+from prbayes.metrics.grid import KernelCells
 
 H, INF, NAN = 0.5, np.inf, np.nan
 OBSERVED = np.array([-2.0, -0.3, 0.1, 0.7, 2.1])

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import GaussianKDE, Histogram
 from prbayes.metrics.divergence import DivergenceDiscrepancy, KullbackLeibler

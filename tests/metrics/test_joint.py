@@ -11,12 +11,12 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm, qmc
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric, Minimum
+from prbayes.metrics.custom import FunctionMetric
 from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler
-from prbayes.metrics.function import FunctionMetric
 from prbayes.metrics.joint import Joint, patterns
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.correlation import MarginalCorrelation

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import (
     DensityEstimator,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import prbayes.metrics._loops as loops
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.density import GaussianKDE
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings, averaged, log_interval_probability
 
 NAN = np.nan

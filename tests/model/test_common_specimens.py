@@ -17,11 +17,11 @@ from pymc.model.fgraph import clone_model
 from scipy import stats
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.propagation.specimen_points import PointOptions
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 from prbayes.validation.cross_validation import _mean_log_losses
 
 N = 20

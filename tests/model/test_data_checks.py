@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.data_checks import (
     DataCheckOptions,
     chance_of_repeats,

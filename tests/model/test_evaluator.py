@@ -15,11 +15,11 @@ from line_problem import EPSILON, OBSERVED, POINTS, N, build, line
 from scipy import stats
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import Propagation
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 
 PROPAGATIONS: dict[str, Propagation] = {
     "Reweighted": prb.Reweighted(POINTS),

@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.first_look import tell_copies, tell_far_data
 
 RNG = np.random.default_rng(0)

@@ -21,7 +21,7 @@ from pymc.model.fgraph import clone_model
 import prbayes as prb
 from prbayes._progress import _hidden
 from prbayes.model.evaluator import Evaluator
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.5, 0.6, 20)
 QUIET: dict[str, Any] = {"progressbar": False}

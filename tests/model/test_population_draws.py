@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.population_draws import Populations, specimens_of
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 

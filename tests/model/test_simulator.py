@@ -18,11 +18,11 @@ from pytensor import config
 from scipy import stats
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import Node
+from prbayes.model.random_variable import Node
 from prbayes.propagation.base import Propagation
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 
 
 @dataclass

@@ -17,11 +17,11 @@ from pymc.model.fgraph import clone_model
 from scipy import stats
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.propagation.base import DesignError
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 
 N = 20
 Y = 1 + 2 * np.random.default_rng(1).normal(1.0, 0.5, N)

@@ -12,10 +12,10 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import identity_of
+from prbayes.model.fingerprint import identity_of
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint
-from prbayes.posterior.smc_kernel import BatchedKernel
+from prbayes.posterior.kernel import BatchedKernel
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 20)
 DRAWS, CHAINS = 20, 3
@@ -153,7 +153,7 @@ def test_large_designs_are_whole_in_the_last_stage_alone(monkeypatch: pytest.Mon
 
 
 def test_where_few_particles_serve_the_chain_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("prbayes.posterior.smc_kernel._SERVE", 1.1)
+    monkeypatch.setattr("prbayes.posterior.kernel._SERVE", 1.1)
     found = run("large")
     for stages in found.stats:
         assert stages["beta"].count(1) == 1

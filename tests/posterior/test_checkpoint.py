@@ -13,7 +13,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import identity_of
+from prbayes.model.fingerprint import identity_of
 from prbayes.posterior.checkpoint import Checkpoint, _sealed, stored_settings
 from prbayes.response.budget import BudgetError
 from prbayes.response.store import StoreError

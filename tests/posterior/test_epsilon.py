@@ -9,11 +9,11 @@ import pytest
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._checks import Floats
-from prbayes.estimate.sandwich import Information
+from prbayes._validate import Floats
+from prbayes.inference.sandwich import Information
 from prbayes.metrics.density import Histogram
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, multivariate_t
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.posterior.importance import ImportanceOptions, Prior, importance_sample, laplace
 
 MEAN = np.array([1.0, -2.0, 0.5])

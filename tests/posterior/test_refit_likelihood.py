@@ -13,8 +13,8 @@ import pytest
 from scipy import stats
 
 import prbayes as prb
-from prbayes._checks import Floats
-from prbayes.estimate.continuation import ContinuedEvaluator, continuation_of
+from prbayes._validate import Floats
+from prbayes.inference.prior_continuation import ContinuedEvaluator, continuation_of
 from prbayes.posterior.importance import importance_sample, laplace
 from prbayes.posterior.refit_likelihood import (
     RefitLikelihood,

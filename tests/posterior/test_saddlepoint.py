@@ -13,7 +13,7 @@ from normal_posterior import LogPrior, Moments, exact_moments, require_close
 from scipy import stats
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
 from prbayes.metrics.score import WeightSlopes, specimen_scores
 from prbayes.model.evaluator import Evaluator

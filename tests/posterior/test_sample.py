@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 
 X = np.random.default_rng(0).normal(10, 1, 20)
 

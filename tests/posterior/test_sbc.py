@@ -16,11 +16,11 @@ import xarray as xr
 from four_metrics import METRICS, R256, same
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 from prbayes.posterior import sbc
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compile import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size

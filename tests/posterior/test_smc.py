@@ -15,9 +15,9 @@ from first_use import first_use
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, MEAN = OBSERVED.size, float(OBSERVED.mean())

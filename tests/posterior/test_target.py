@@ -14,9 +14,9 @@ from normal_posterior import Moments, exact_moments, grid_moments, require_close
 from scipy import stats
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 from prbayes.posterior.target import estimate_target
 
 KLD = prb.KullbackLeibler()

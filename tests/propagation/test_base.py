@@ -9,7 +9,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 from prbayes.propagation.base import Bound, Missing, Propagation
 
 OBSERVED = [0.5, 1.0, 1.5, 2.5]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
+from prbayes.numerics.points import sobol
 from prbayes.propagation.charts import (
     Charts,
     Fibres,
@@ -16,7 +17,6 @@ from prbayes.propagation.charts import (
     cover,
     solve_each,
 )
-from prbayes.propagation.points import sobol
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 STANDARD = ReferencePopulation(np.zeros(2), np.eye(2))

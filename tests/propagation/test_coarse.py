@@ -15,8 +15,8 @@ from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import SimulatorIdentity, identity_of
-from prbayes.propagation.cloud import CLOUD
+from prbayes.model.fingerprint import SimulatorIdentity, identity_of
+from prbayes.propagation.importance import CLOUD
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import limited
 from prbayes.response.failures import ResponseError

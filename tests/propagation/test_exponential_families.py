@@ -6,7 +6,7 @@ import pytensor.tensor as pt
 import pytest
 
 from prbayes.propagation.exponential_families import ExponentialForm
-from prbayes.response.compilation import PLAIN, compile_batched
+from prbayes.response.compile import PLAIN, compile_batched
 
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
 # Constructor with two parameters, and ranges of these.

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import logsumexp, ndtr
 from scipy.stats import multivariate_normal, ncx2
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre_points import fibre_points

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 import prbayes as prb
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 from prbayes.propagation.base import Bound
 
 

@@ -6,7 +6,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.special import logsumexp, ndtri
 from scipy.stats import norm, qmc
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.propagation.guards import (
     half_difference,
     missing_share,

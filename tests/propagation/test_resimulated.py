@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 import prbayes as prb
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 from prbayes.propagation.base import Bound
 
 OBSERVED = [0.5, 1.0, 1.5, 2.5]

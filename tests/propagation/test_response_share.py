@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
+from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.points import sobol
 from prbayes.propagation.response_share import ResponseShare, boundary_points, response_share
 from prbayes.propagation.specimen_points import Emulation, PointOptions
 

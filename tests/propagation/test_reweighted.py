@@ -14,10 +14,10 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
+from prbayes.model.coverage import shortcomings
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import nodes
-from prbayes.model.support import shortcomings
+from prbayes.model.random_variable import nodes
 from prbayes.propagation.reweighted import Design
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import read_inputs

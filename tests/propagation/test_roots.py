@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
-from prbayes.propagation.points import sobol
+from prbayes._validate import Floats
+from prbayes.numerics.points import sobol
 from prbayes.propagation.roots import Roots, find_roots, gabriel_neighbours, nearest_starts
 
 BOX = np.array([[-3.0], [3.0]])

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.model.node import nodes
+from prbayes.model.random_variable import nodes
 from prbayes.reports.material import gather
 from prbayes.reports.tables import cells
 

@@ -11,7 +11,7 @@ import pytensor.tensor as pt
 import pytest
 from scipy import stats
 
-from prbayes.response.compilation import PLAIN, compile_batched
+from prbayes.response.compile import PLAIN, compile_batched
 from prbayes.response.distributions import (
     PopulationSampler,
     PriorPoints,

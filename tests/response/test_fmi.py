@@ -18,7 +18,7 @@ from hostile import processes
 
 import prbayes as prb
 from prbayes.response import fmi
-from prbayes.response.calling import Calling, Points, Tally, respond
+from prbayes.response.call import Calling, Points, Tally, respond
 from prbayes.response.executors import Pool
 from prbayes.response.store import Store
 

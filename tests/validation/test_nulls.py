@@ -8,7 +8,7 @@ import pytest
 from scipy.special import ndtri
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.validation.conditions import Case, Condition, read_case
 from prbayes.validation.nulls import SimulatedNull
 from prbayes.validation.statistic import area

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.validation.statistic import area
 
 Posterior = Callable[..., Any]

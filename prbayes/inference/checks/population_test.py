@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from prbayes._checks import Floats
 from prbayes._finding import Finding
+from prbayes._validate import Floats
 from prbayes.numerics.min_p import adjusted_p_values, upper_p_values
 
 

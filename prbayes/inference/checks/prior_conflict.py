@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._checks import Floats
 from prbayes._finding import Finding
+from prbayes._validate import Floats
 
 
 @dataclass(frozen=True)

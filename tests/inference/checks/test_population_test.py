@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp, ndtr, ndtri
 from scipy.stats import norm
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.inference.checks.population_test import (
     PopulationTest,
     mixture_ratio,

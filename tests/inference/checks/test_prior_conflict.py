@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from prbayes._checks import Floats
+from prbayes._validate import Floats
 from prbayes.inference.checks.prior_conflict import conflict_findings, prior_conflict
 
 

@@ -1,1 +1,0 @@
-"""The deterministic optimiser, and what is known of its answer."""

@@ -1,0 +1,196 @@
+"""Populations beyond the ends of bounded priors, so that minimisers do not pile up there.
+
+A uniform prior ends, and the unconstrained parameter of PyMC with it. The population often goes on:
+the mean of an input may be less than its prior allows. Minimisers of synthetic data sets are then
+sought beyond the end. Only the posterior knows the prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, logit
+
+from prbayes._validate import Floats
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import THETAS
+
+
+@dataclass(frozen=True, eq=False)
+class Continuation:
+    """Coordinates of theta in which bounded elements go on beyond an end of their prior.
+
+    An element in the interval (a, b) has the value v = a + (b - a) / (1 + exp(-theta)). Its
+    coordinate is v if populations go on beyond both ends, log(v - a) if only beyond b, -log(b - v)
+    if only beyond a. Elements that do not go on have the coordinate theta.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (d,)
+        Ends a and b; NaN of elements without them.
+    below, above : ndarray of bool, shape (d,)
+        Whether populations go on there.
+    margin : float
+        Part of the interval at its ends in which the parameters of a population are continued.
+    """
+
+    lower: Floats
+    upper: Floats
+    below: NDArray[np.bool_]
+    above: NDArray[np.bool_]
+    margin: float = 1e-3
+
+    @property
+    def is_continued(self) -> NDArray[np.bool_]:
+        """Which elements go on beyond an end, (d,)."""
+        return self.below | self.above
+
+    def coordinates(self, thetas: Floats) -> Floats:
+        """Return coordinates of thetas, (S, d)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            width = self.upper - self.lower
+            distance = width * expit(thetas)
+            remaining = width * expit(-thetas)
+            result = np.where(self.below & self.above, self.lower + distance, thetas)
+            result = np.where(self.above & ~self.below, np.log(distance), result)
+            result = np.where(self.below & ~self.above, -np.log(remaining), result)
+        return np.asarray(result)
+
+    def values(self, coordinates: Floats) -> Floats:
+        """Return values of continued elements, NaN of others, (S, d)."""
+        with np.errstate(over="ignore"):
+            result = np.where(self.below & self.above, coordinates, np.nan)
+            above = self.lower + np.exp(coordinates)
+            below = self.upper - np.exp(-coordinates)
+        result = np.where(self.above & ~self.below, above, result)
+        return np.asarray(np.where(self.below & ~self.above, below, result))
+
+    def within(self, coordinates: Floats, margin: float | None = None) -> Floats:
+        """Return thetas of coordinates, moved within the ends, (S, d)."""
+        margin = self.margin if margin is None else margin
+        return self._thetas(self._shares(coordinates, margin), coordinates)
+
+    def _shares(self, coordinates: Floats, margin: float) -> Floats:
+        """Return values as shares of the interval, a margin away from ends that are passed."""
+        width = self.upper - self.lower
+        shares = (self.values(coordinates) - self.lower) / width
+        least = np.where(self.below, margin, 1e-300)
+        most = np.where(self.above, 1 - margin, 1 - 1e-16)
+        return np.clip(shares, least, most)
+
+    def _thetas(self, shares: Floats, coordinates: Floats) -> Floats:
+        return np.asarray(np.where(self.is_continued, logit(shares), coordinates))
+
+    def roots(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
+        """Return the roots of the k-th simulator, continued linearly in values beyond the ends."""
+        shares = self._shares(coordinates, self.margin)
+        base = evaluator.roots(self._thetas(shares, coordinates), k)
+        roots = list(base)
+        width = self.upper - self.lower
+        beyond = (self.values(coordinates) - self.lower) / width - shares
+        for i in np.flatnonzero(self.is_continued):
+            passed = np.abs(beyond[:, i]) > 1e-12
+            if not passed.any():
+                continue
+            inside = shares.copy()
+            steps = -self.margin * np.sign(beyond[:, i])
+            inside[:, i] += steps
+            moved = evaluator.roots(self._thetas(inside, coordinates), k)
+            factors = np.where(passed, beyond[:, i] / np.where(passed, steps, 1.0), 0.0)
+            for j, (root, inner) in enumerate(zip(base, moved, strict=True)):
+                column = factors.reshape(-1, *np.ones(root.ndim - 1, dtype=int))
+                roots[j] = roots[j] + column * (inner - root)
+        return roots
+
+
+class ContinuedEvaluator(Evaluator):
+    """An evaluator of populations at coordinates of a `Continuation` in place of theta."""
+
+    inner: Evaluator
+    continuation: Continuation
+    _unit: Floats
+
+    @classmethod
+    def of(cls, evaluator: Evaluator, continuation: Continuation) -> ContinuedEvaluator:
+        """Return an evaluator that shares all else."""
+        new = object.__new__(cls)
+        vars(new).update(vars(evaluator))
+        new.inner = evaluator
+        del new.prior_points  # the method below takes its place
+        new.continuation = continuation
+        points = continuation.coordinates(evaluator.prior_thetas(THETAS, 0))
+        upper, lower = np.quantile(points, [0.84, 0.16], axis=0)
+        spread = (upper - lower) / 2
+        new._unit = np.where(continuation.is_continued, spread, evaluator.prior_sd)
+        return new
+
+    @property
+    def prior_sd(self) -> Floats:
+        """The prior's standard deviation of each coordinate, (d,)."""
+        return self._unit
+
+    def roots(self, thetas: Floats, k: int) -> list[Floats]:
+        """Return the values of the roots of the k-th simulator, shapes (P, *shape)."""
+        return self.continuation.roots(self.inner, thetas, k)
+
+    def prior_points(self, size: int, seed: int) -> Floats:
+        """Return coordinates spread evenly over the prior, (size, d)."""
+        return self.continuation.coordinates(self.inner.prior_points(size, seed))
+
+
+def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
+    """Return the coordinates of a model, with ends at which populations of thetas, (S, d), go on.
+
+    An element is bounded if its value is the logistic function of theta between fixed ends.
+    """
+    d = evaluator.size
+    lower, upper = _ends(evaluator)
+    bounded = np.isfinite(upper - lower)
+    below, above = bounded.copy(), bounded.copy()
+    for side, sign in ((below, -1), (above, 1)):
+        for i in np.flatnonzero(bounded):
+            alone = np.arange(d) == i
+            side[i] = False
+            trial = Continuation(lower, upper, below=alone, above=alone)
+            points = trial.coordinates(np.nan_to_num(thetas, posinf=30, neginf=-30))
+            middle, half = (upper[i] + lower[i]) / 2, (upper[i] - lower[i]) / 2
+            points[:, i] = middle + sign * 1.05 * half
+            side[i] = _is_possible(ContinuedEvaluator.of(evaluator, trial), points)
+    return Continuation(lower, upper, below, above)
+
+
+def _is_possible(evaluator: Evaluator, points: Floats) -> bool:
+    """Return whether populations at some points have weights."""
+    for k in range(len(evaluator.nodes)):
+        _, weights = evaluator.populations(points, k)
+        if not (np.isfinite(weights).all() and (weights.sum(axis=1) > 0).all()):
+            return False
+    return True
+
+
+def _ends(evaluator: Evaluator) -> tuple[Floats, Floats]:
+    """Return the ends of the values of elements, (d,) each; NaN where there are none."""
+    d = evaluator.size
+    nothing = np.full(d, np.nan)
+    base = evaluator.prior_thetas(2, 0)
+    far = np.full((2, d), 1e6)
+    rows = np.vstack([base, -far, far])
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = _free_values(evaluator, rows)
+    if values.shape != rows.shape:  # elements without values of their own, as of a simplex
+        return nothing, nothing.copy()
+    lower, upper = values[2], values[4]
+    with np.errstate(invalid="ignore"):
+        expected = lower + (upper - lower) * expit(base)
+        is_logistic = np.isclose(values[:2], expected, rtol=1e-9).all(axis=0)
+    is_logistic &= np.isfinite(upper - lower)
+    return np.where(is_logistic, lower, np.nan), np.where(is_logistic, upper, np.nan)
+
+
+def _free_values(evaluator: Evaluator, thetas: Floats) -> Floats:
+    """Return the values of the free variables, side by side."""
+    values = evaluator.constrained(thetas)
+    names = [str(rv.name) for rv in evaluator.model.free_RVs]
+    return np.column_stack([values[name].reshape(len(thetas), -1) for name in names])

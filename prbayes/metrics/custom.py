@@ -1,0 +1,169 @@
+"""A user's own metric from a function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._validate import Floats, flag
+from prbayes.metrics.base import Discrepancy, Metric
+
+
+@dataclass(frozen=True)
+class FunctionMetric(Metric):
+    """A user's own metric from a function; samplers that need gradients refuse it.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(simulated, observed) -> discrepancy``, shapes (..., n), (N,) -> (...); smaller is
+        better.
+    weighted : bool
+        Whether the function takes the weights of the simulated values, shape (..., n), as a third
+        argument. `Reweighted` needs that; the other propagations do not.
+
+    Raises
+    ------
+    TypeError
+        If ``function`` is not callable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> def difference(simulated, observed):
+    ...     return abs(np.mean(simulated, axis=-1) - observed.mean())
+    >>> metric = FunctionMetric(difference)
+    >>> metric([0.0, 2.0], [4.0])
+    3.0
+    """
+
+    function: Callable[..., Any]
+    weighted: bool = False
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            got = type(self.function).__name__
+            raise TypeError(f"function: got {got}, expected f(simulated, observed)")
+        flag(self.weighted, "weighted")
+
+    @property
+    def takes_weights(self) -> bool:
+        """Whether the function takes the weights of simulated responses."""
+        return self.weighted
+
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        if not np.allclose(weights, weights[0]):
+            raise ValueError(
+                "observed weights: got unequal ones, expected none; "
+                "a FunctionMetric has no use for them"
+            )
+        return FunctionDiscrepancy(self, observed, weights, observed.size)
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionDiscrepancy(Discrepancy):
+    """A user's metric against fixed observed values.
+
+    The function takes observed values without weights: a data set that is given by weights of
+    values is handed to it as a sample, in which each value is repeated by its count.
+    """
+
+    metric: FunctionMetric
+    size: int  # number of values in such a sample
+
+    @property
+    def symbolic(self) -> bool:
+        """No: the function is called."""
+        return False
+
+    @property
+    def scale(self) -> float:
+        """One: nothing is known about the function."""
+        return 1.0
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+        """Return the value of the function; the values for several data sets, (B, ...)."""
+        if self.weights.ndim > 1:
+            return (self._of_each(simulated, weights),)
+        observed = repeated(self.observed, self.weights, self.size)
+        return (self._checked(simulated, observed, weights),)
+
+    def _of_each(self, simulated: Floats, weights: Floats) -> Floats:
+        """Return values for B data sets, from populations (B, ..., n) or (1, ..., n)."""
+        n_sets = len(self.weights)
+        simulated = np.broadcast_to(simulated, (n_sets, *simulated.shape[1:]))
+        weights = np.broadcast_to(weights, (n_sets, *weights.shape[1:]))
+        found = np.empty(simulated.shape[:-1])
+        own_weights = self.weights.reshape(n_sets, -1)
+        for i, own in enumerate(own_weights):
+            observed = repeated(self.observed, own, self.size)
+            found[i] = self._checked(simulated[i], observed, weights[i])
+        return found
+
+    def _checked(self, simulated: Floats, observed: Floats, weights: Floats) -> Floats:
+        """Call the function for one data set, and check what it returns."""
+        value = np.asarray(self._called(simulated, observed, weights), dtype=np.float64)
+        expected = simulated.shape[:-1]
+        if value.shape != expected:
+            raise ValueError(
+                f"FunctionMetric: got a result of shape {value.shape} for simulated values of "
+                f"shape {simulated.shape}, expected {expected}; reduce over the last axis"
+            )
+        return value
+
+    def _called(self, simulated: Floats, observed: Floats, weights: Floats) -> Any:
+        """Call the function, with weights if it takes them; equal ones it need not know."""
+        function = self.metric.function
+        if self.metric.weighted:
+            return function(simulated, observed, np.broadcast_to(weights, simulated.shape))
+        if not np.allclose(weights, np.asarray(weights)[..., :1]):
+            raise ValueError(
+                "weights: got unequal ones for a FunctionMetric whose function takes none; "
+                "write function(simulated, observed, weights) and pass weighted=True, "
+                "or use prb.Resimulated"
+            )
+        return function(simulated, observed)
+
+    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return the simulated values themselves."""
+        return (simulated,)
+
+    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
+        """Return the value of the function."""
+        (values,) = basis
+        return self.features(np.broadcast_to(values, weights.shape), weights, xp)
+
+    def outer(self, *features: Any, xp: Any) -> Any:
+        """Return the value of the function."""
+        return features[0]
+
+
+def repeated(values: Floats, weights: Floats, size: int) -> Floats:
+    """Return a sample in which each value occurs as often as its weight says.
+
+    Parameters
+    ----------
+    values, weights : ndarray, shape (n,)
+    size : int
+        Number of values in the sample, if the weights are multiples of its inverse. If they are
+        not, the value of smallest weight occurs once, as where some were left out.
+
+    Raises
+    ------
+    ValueError
+        If the weights are no counts, as those of the loss-likelihood bootstrap.
+    """
+    for counts in (weights * size, weights / weights[weights > 0].min()):
+        whole = np.round(counts)
+        # Weights that are no counts differ from such by far more.
+        if np.abs(counts - whole).max() < 1e-6:
+            return np.repeat(values, whole.astype(int))
+    raise ValueError(
+        "observed weights: got weights that are no counts, expected repeated values; a "
+        "FunctionMetric takes no weights of observed values; use "
+        "prb.bootstrap(optimum, parametric=True)"
+    )

@@ -1,0 +1,345 @@
+"""`Hyperparameters`: the vector theta of a PyMC model, its names, transforms and prior draws.
+
+Theta is the vector of the model's value variables, unconstrained through PyMC's transforms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pymc.pytensorf import join_nonshared_inputs
+from pytensor.graph.replace import graph_replace, vectorize_graph
+from pytensor.graph.traversal import ancestors
+
+from prbayes._validate import Floats, called, real_array, refuse_single_precision
+from prbayes.model.elements import coordinates, element_names
+from prbayes.model.random_variable import priors_alone
+from prbayes.numerics.points import sobol
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid, untraced
+from prbayes.response.distributions import PriorPoints, PriorSampler
+from prbayes.response.inputs import event_shape
+
+# Levels of a normal distribution one standard deviation above and below its mean.
+# Thetas that stand for a distribution of them: for the prior, for what surrounds an optimum, for a
+# posterior. They cost time, not responses.
+THETAS = 256
+
+
+class Hyperparameters:
+    """The free variables of a model as vectors theta of numbers, and their prior.
+
+    Parameters
+    ----------
+    model : pymc.Model
+
+    Attributes
+    ----------
+    shapes : dict
+        Shapes of the value variables, in the order of theta.
+    initial : ndarray, shape (d,)
+        PyMC's initial point.
+    size : int
+        Number of elements of theta, d.
+
+    Raises
+    ------
+    TypeError
+        If one is discrete.
+    """
+
+    def __init__(self, model: pm.Model) -> None:
+        self.model = model
+        discrete = [v.name for v in model.value_vars if not v.dtype.startswith("float")]
+        if discrete:
+            raise TypeError(
+                f"model: got discrete hyperparameters {discrete}, expected continuous ones; "
+                "use pm.sample, or fix them"
+            )
+        for v in model.value_vars:
+            refuse_single_precision(f"model: {v.name}", v.dtype)
+        with interpreted():
+            self._point = model.initial_point(random_seed=0)
+        values = [self._point[v.name] for v in model.value_vars]
+        names = [str(v.name) for v in model.value_vars]
+        shapes = [np.shape(value) for value in values]
+        raveled = [np.ravel(value) for value in values]
+        self.shapes = dict(zip(names, shapes, strict=True))
+        self.initial = np.concatenate(raveled)
+        self.size = self.initial.size
+        self._drawn: dict[tuple[int, int], Floats] = {}
+
+    # Names.
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the elements of theta, such as 'sigma_log__', 'mu[1]' or 'mu[Adler]'."""
+        return self._elements(list(self.shapes))
+
+    @property
+    def plain_names(self) -> list[str]:
+        """The same with places instead of coordinates: they order elements, whatever these are."""
+        found: list[str] = []
+        for name, shape in self.shapes.items():
+            found += element_names(name, shape)
+        return found
+
+    @property
+    def readable_names(self) -> list[str]:
+        """The same with the variables' own names, such as 'sigma'.
+
+        They are transformed nevertheless.
+        """
+        return self._elements(self._own_names)
+
+    @property
+    def _own_names(self) -> list[str]:
+        """Names of the variables themselves, in the order of theta."""
+        return [str(self.model.values_to_rvs[v].name) for v in self.model.value_vars]
+
+    def _elements(self, names: list[str]) -> list[str]:
+        found: list[str] = []
+        shapes = self.shapes.values()
+        for name, own, shape in zip(names, self._own_names, shapes, strict=True):
+            found += element_names(name, shape, coordinates(self.model, own))
+        return found
+
+    def beyond_others(self, graphs: Sequence[Any]) -> NDArray[np.bool_]:
+        """Return which elements of theta hang together with graphs by other variables only, (d,).
+
+        Those above others that the graphs are of, and those below any of these.
+        """
+        free = set(self.model.free_RVs)
+        direct = {v for v in ancestors(graphs, blockers=free) if v in free}
+        joined = free & set(ancestors(list(direct)))
+        # A variable comes after those that it depends on.
+        for rv in self.model.free_RVs:
+            if joined.intersection(ancestors([rv])):
+                joined.add(rv)
+        hidden = {str(rv.name) for rv in joined - direct}
+        sizes = [int(np.prod(shape, dtype=int)) for shape in self.shapes.values()]
+        return np.repeat([name in hidden for name in self._own_names], sizes)
+
+    # Functions of theta.
+
+    def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
+        """Return graphs of the value variables as graphs of one vector theta, and that vector."""
+        outputs, theta = join_nonshared_inputs(self._point, list(graphs), self.model.value_vars)
+        return list(outputs), theta
+
+    def compile(self, graphs: Sequence[Any]) -> Any:
+        """Compile graphs of the value variables into a function of thetas, shape (P, d).
+
+        Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
+        """
+        with untraced():
+            outputs, theta = self.joined(graphs)
+            batch = pt.dmatrix("thetas")
+            batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
+            return compiled([batch], batched)
+
+    @cached_property
+    def _log_prior(self) -> Any:
+        """The log-density of each free variable, in its own units, and the Jacobian of all."""
+        model = self.model
+        with untraced():
+            with priors_alone():
+                terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
+            jacobian: Any = np.float64(0.0)
+            for rv in model.free_RVs:
+                transform = model.rvs_to_transforms[rv]
+                if transform is not None:
+                    value = model.rvs_to_values[rv]
+                    jacobian += transform.log_jac_det(value, *rv.owner.inputs).sum()
+            graphs = model.replace_rvs_by_values([pt.as_tensor(jacobian)])
+            return self.compile([*(term.sum() for term in terms), *graphs])
+
+    def log_prior_terms(self, thetas: Floats) -> dict[str, Floats]:
+        """Return the log-density of each free variable in the user's own units, shapes (P,)."""
+        values = self._log_prior(np.ascontiguousarray(thetas))[:-1]
+        names = [str(rv.name) for rv in self.model.free_RVs]
+        return {
+            name: np.array(np.broadcast_to(value, len(thetas)))
+            for name, value in zip(names, values, strict=True)
+        }
+
+    def log_prior(self, thetas: Floats) -> Floats:
+        """Return the log prior density with the Jacobian of the transforms, shape (P,)."""
+        values = self._log_prior(np.ascontiguousarray(thetas))
+        return np.array(np.broadcast_to(sum(values), len(thetas)))
+
+    def log_posterior(self, thetas: Floats, log_likelihood: Callable[[Floats], Floats]) -> Floats:
+        """Return the log prior density plus a log-likelihood, (P, d) -> (P,).
+
+        The log-likelihood is evaluated where the prior is positive. Where it is not known the
+        result is -inf.
+        """
+        thetas = np.ascontiguousarray(thetas)
+        result = self.log_prior(thetas)
+        is_possible = np.isfinite(result)
+        if is_possible.any():
+            result[is_possible] += log_likelihood(thetas[is_possible])
+        result[~np.isfinite(result)] = -np.inf
+        return result
+
+    def in_support(self, thetas: Floats) -> Any:
+        """Return which thetas have a finite log prior, shape (P,)."""
+        return np.isfinite(self.log_prior(thetas))
+
+    @cached_property
+    def _constrain(self) -> Any:
+        with untraced():
+            return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
+
+    def constrained(self, thetas: Floats) -> dict[str, Floats]:
+        """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
+        size = len(thetas)
+        if not size:  # PyTensor has no transform of nothing for matrices
+            one = self.constrained(self.initial[None])
+            return {name: value[:0] for name, value in one.items()}
+        values = self._constrain(np.ascontiguousarray(thetas))
+        found = {}
+        for variable, value in zip(self.model.unobserved_RVs, values, strict=True):
+            # What does not depend on theta comes without the leading axis, or with one of length
+            # one.
+            shape = (size, *np.shape(value)[1:])
+            found[variable.name] = np.array(np.broadcast_to(value, shape))
+        return found
+
+    def unconstrained(self, point: Mapping[str, Any]) -> Floats:
+        """Return theta, shape (d,), of a point given in the user's own units.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            If the names are not the model's free variables, or a value is outside its support.
+        """
+        if not isinstance(point, Mapping):
+            raise TypeError(
+                f"start: got {called(point)}, expected a dict with a value for each free variable"
+            )
+        free = {rv.name: rv for rv in self.model.free_RVs}
+        if set(point) != set(free):
+            raise KeyError(
+                f"start: got {sorted(map(str, point))}, expected a value for each of {sorted(free)}"
+            )
+        draws = []
+        for name, rv in free.items():
+            value = real_array(point[name], f"start: {name}")
+            shape = event_shape(rv)
+            if value.shape not in ((), shape):
+                raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
+            draws.append(np.broadcast_to(value, shape)[None])
+        thetas = self.thetas_of(draws)
+        finite = np.isfinite(thetas).all()
+        if not (finite and self.in_support(thetas).all()):
+            raise ValueError(
+                f"start: got {dict(point)}, expected values inside the support of the priors"
+            )
+        theta: Floats = thetas[0]
+        return theta
+
+    @cached_property
+    @untraced()
+    def _transform(self) -> Any:
+        free = self.model.free_RVs
+        symbols = [rv.type() for rv in free]
+        columns = []
+        for value_variable in self.model.value_vars:
+            rv = self.model.values_to_rvs[value_variable]
+            transform = self.model.rvs_to_transforms[rv]
+            value = rv
+            if transform is not None:
+                value = transform.forward(rv, *rv.owner.inputs)
+            columns.append(pt.atleast_1d(value).ravel())
+        swap = dict(zip(free, symbols, strict=True))
+        theta = graph_replace(pt.concatenate(columns), swap, strict=False)
+        batched = []
+        for symbol in symbols:
+            shape = (None, *symbol.type.shape)
+            batched.append(pt.tensor(dtype=symbol.dtype, shape=shape))
+        in_batches = dict(zip(symbols, batched, strict=True))
+        thetas = vectorize_graph(theta, in_batches)
+        return compiled(batched, [thetas], allow_input_downcast=True)
+
+    def thetas_of(self, draws: Sequence[Floats]) -> Floats:
+        """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
+        (found,) = self._transform(*draws)
+        return np.asarray(found)
+
+    # The prior.
+
+    @cached_property
+    def _sampler(self) -> PriorSampler:
+        return PriorSampler(self.model.free_RVs)
+
+    def prior_thetas(self, size: int, seed: int) -> Floats:
+        """Draw thetas from the prior, shape (size, d)."""
+        asked = (size, seed)
+        if asked not in self._drawn:
+            draws = self._sampler(size, seed)
+            self._drawn[asked] = self.thetas_of(draws)
+        return self._drawn[asked].copy()
+
+    @cached_property
+    def prior_sd(self) -> Floats:
+        """The prior's standard deviation of each element, robust, shape (d,).
+
+        The unit of parameters.
+        """
+        thetas = self.prior_thetas(THETAS, seed=0)
+        # Of a normal distribution, one standard deviation above and below the mean.
+        upper, lower = np.quantile(thetas, [0.84, 0.16], axis=0)
+        spread = (upper - lower) / 2
+        known = (spread > 0) & np.isfinite(spread)
+        return np.where(known, spread, 1.0)
+
+    @cached_property
+    def _points(self) -> PriorPoints | None:
+        free = self.model.free_RVs
+        try:
+            return PriorPoints(free)
+        except TypeError:  # a prior without inverse distribution function
+            return None
+
+    def prior_points(self, size: int, seed: int) -> Floats:
+        """Return thetas spread evenly over the prior, shape (size, d).
+
+        Sobol points through the inverse distribution functions, or draws where there are none.
+        """
+        if self._points is None:
+            return self.prior_thetas(size, seed)
+        cube = sobol(size, self._points.size, seed)
+        return self._placed(cube)
+
+    def _placed(self, cube: Floats) -> Floats:
+        """Return thetas at points of the unit cube, shape (P, size)."""
+        assert self._points is not None
+        thetas = self.thetas_of(self._points(cube))
+        return np.where(np.isfinite(thetas), thetas, self.initial)
+
+    def fixed_points(self, size: int) -> Floats:
+        """Return thetas, shape (size, d), that are the same for clones.
+
+        Clones may order variables in other ways.
+        """
+        if self._points is None:
+            offsets = sobol(size, self.size, seed=0) - 0.5
+            return self.initial + _by_name(offsets, self.plain_names)
+        names: list[str] = []
+        for rv in self.model.free_RVs:
+            names += element_names(rv.name, event_shape(rv))
+        cube = sobol(size, self._points.size, seed=0)
+        return self._placed(_by_name(cube, names))
+
+
+def _by_name(columns: Floats, names: Sequence[str]) -> Floats:
+    """Return columns such that the first is that of the first name in the alphabet, and so on."""
+    own = np.empty_like(columns)
+    own[:, np.argsort(names)] = columns
+    return own

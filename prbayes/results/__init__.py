@@ -1,0 +1,1 @@
+"""Comparison, diagnosis and prediction from the results of any route."""

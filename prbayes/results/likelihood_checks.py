@@ -1,0 +1,475 @@
+"""Checks of results of the log-likelihood by specimen: population, prior, modes, influence.
+
+Each check returns findings, or a note that says why it was not run. No response is computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import xarray as xr
+
+from prbayes._finding import Finding
+from prbayes._validate import Floats
+from prbayes.inference.checks.failing_region import failing_region_findings
+from prbayes.inference.checks.population_test import (
+    normal_scores,
+    population_findings,
+    population_statistics,
+    population_test,
+    power_text,
+)
+from prbayes.inference.checks.prior_conflict import conflict_findings
+from prbayes.inference.identifiability import oriented
+from prbayes.model.evaluator import Evaluator
+from prbayes.numerics.derivatives import cross, slopes
+from prbayes.optimize.minimize import Minimisation, find_optimum
+from prbayes.optimize.optimum import Optimum
+from prbayes.optimize.specimen_refits import (
+    simulation_obstacle,
+    specimen_refits,
+)
+from prbayes.response.compile import compile_batched
+from prbayes.response.distributions import (
+    PopulationSampler,
+    compiled_log_density,
+    is_mvnormal,
+)
+from prbayes.response.inputs import Inputs, aleatory_names
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """Sizes and thresholds of the checks.
+
+    Attributes
+    ----------
+    replicates : int
+        Of the tests: 199 suffice (likelihood_guards, section 2.4).
+    prior_draws, specimens : int
+        Draws of the prior, and specimens of each from which its information is computed.
+    apart : float
+        Within-chain standard deviations between the means of two chains that are in different
+        modes. Chains of one mode with ten independent draws each differ by one.
+    pull : float
+        Pull of the prior, in standard errors, above which a conflict matters (likelihood_guards,
+        section 2.11).
+    """
+
+    replicates: int = 199
+    prior_draws: int = 500
+    specimens: int = 256
+    apart: float = 2.0
+    pull: float = 0.5
+
+
+_OPTIONS = CheckOptions()
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What checks report.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+    notes : tuple of str
+        What was tested, and with which power.
+    untested : tuple of str
+        What was not tested, and why.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
+    untested: tuple[str, ...] = ()
+
+    def __add__(self, other: Checked) -> Checked:
+        """Return both."""
+        return Checked(
+            (*self.findings, *other.findings),
+            (*self.notes, *other.notes),
+            (*self.untested, *other.untested),
+        )
+
+
+# Of optima that live: the tests take seconds, and reports ask for them as well.
+_DONE: WeakKeyDictionary[Optimum, Checked] = WeakKeyDictionary()
+
+
+def check_optimum(optimum: Optimum) -> Checked:
+    """Return what the emulator and the test of the population report of an optimum."""
+    if optimum not in _DONE:
+        emulators = Checked(notes=emulator_notes(optimum.evaluator))
+        _DONE[optimum] = emulators + _population(optimum)
+    return _DONE[optimum]
+
+
+def emulator_notes(evaluator: Evaluator) -> tuple[str, ...]:
+    """Return a sentence about the emulator and the points of each likelihood by specimen."""
+    notes = []
+    for likelihood in evaluator.likelihoods:
+        emulation, points = likelihood.emulation, likelihood.points
+        roots = points.n_roots
+        low, high = int(roots.min()), int(roots.max())
+        count = f"{low} root(s)" if low == high else f"{low} to {high} roots"
+        notes.append(
+            f"{likelihood.name}: the emulator of {len(emulation.z)} runs shifts a mean or standard "
+            f"deviation of an input by at most {max(emulation.bias, 0.005):.2f} posterior standard "
+            f"deviations; a specimen has {count}, and up to {points.log_a.shape[1]} points."
+        )
+    return tuple(notes)
+
+
+# -- population ------------------------------------------------------------------------------
+
+
+def _population(optimum: Optimum) -> Checked:
+    """Test whether the family of the population fits the inputs of the specimens."""
+    reason = _population_obstacle(optimum)
+    if reason:
+        return _not_tested(reason)
+    evaluator = optimum.evaluator
+    refits = specimen_refits(optimum, "diagnose", simulated=True)
+    scores = [_Scores.of(each.inputs) for each in evaluator.likelihoods]
+    observed = [
+        ([x.get_value() for x in points], log_a.get_value())
+        for points, log_a in (each.arrays for each in evaluator.likelihoods)
+    ]
+    samples = _points(evaluator, scores, optimum.theta, observed)
+    null: list[list[Floats]] = [[] for _ in samples]
+    for refit in refits.simulated(_OPTIONS.replicates, seed=0):
+        if not refit.converged:
+            continue
+        replicates = _points(evaluator, scores, refit.theta, refit.data)
+        for statistics, (z, weights) in zip(null, replicates, strict=True):
+            statistics.append(population_statistics(z, weights))
+    if len(null[0]) < _OPTIONS.replicates / 2:
+        return _not_tested(f"{len(null[0])} of {_OPTIONS.replicates} refits converged")
+    findings: list[Finding] = []
+    notes = []
+    threshold = 0.05 / len(samples)
+    for likelihood, (z, weights), statistics in zip(
+        evaluator.likelihoods, samples, null, strict=True
+    ):
+        labels = _labels(likelihood.inputs, likelihood.measurements[0].responses.function)
+        misfit = population_findings(
+            population_test(z, weights, statistics), labels, threshold=threshold
+        )
+        findings += misfit
+        outputs = likelihood.readings.values.shape[1]
+        if not misfit:
+            power = power_text(len(z), z.shape[-1], outputs)
+            notes.append(f"{likelihood.name}: the test of the population found no misfit. {power}")
+    return Checked(tuple(findings), tuple(notes))
+
+
+def _population_obstacle(optimum: Optimum) -> str:
+    """Return why the family of the population cannot be tested, empty if it can."""
+    evaluator = optimum.evaluator
+    obstacle = simulation_obstacle(evaluator)
+    if obstacle is not None:
+        return obstacle
+    if optimum.prior:
+        return "the prior was part of the optimum"
+    if not optimum.converged or not np.isfinite(optimum.covariance).all():
+        return "nothing is known of the sampling distribution of this optimum"
+    for likelihood in evaluator.likelihoods:
+        outputs = likelihood.readings.values.shape[1]
+        if likelihood.coordinates.size > outputs:
+            return (
+                f"{likelihood.name} has fewer outputs ({outputs}) than inputs "
+                f"({likelihood.coordinates.size}), with which the test has no power"
+            )
+        if not _Scores.of(likelihood.inputs).is_known:
+            return f"PyMC has no distribution function of an input of {likelihood.name}"
+    return ""
+
+
+def _not_tested(reason: str) -> Checked:
+    return Checked(untested=(f"The family of the population was not tested: {reason}.",))
+
+
+def _labels(inputs: Inputs, function: Any) -> list[str]:
+    """Return a label for each number of a specimen."""
+    names = []
+    for name, shape in zip(aleatory_names(inputs, function), inputs.event_shapes, strict=True):
+        size = int(np.prod(shape, dtype=int))
+        names += [name] if not shape else [f"{name}[{i}]" for i in range(size)]
+    return names
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """Compiled normal scores and log-densities of inputs at points of populations."""
+
+    function: Any  # (*roots, *points) -> distribution functions by input; None if unknown
+    log_density: Any
+
+    @property
+    def is_known(self) -> bool:
+        return self.function is not None
+
+    @classmethod
+    def of(cls, inputs: Inputs) -> _Scores:
+        """Compile them; of dependent inputs they are not known."""
+        symbols = inputs.placeholders()
+        dists, _ = inputs.rebuilt(symbols)
+        points = [
+            pt.tensor(dtype="float64", shape=(None,) * (x.type.ndim + 1)) for x in inputs.aleatory
+        ]
+        log_density = compiled_log_density(inputs)
+        if inputs.nested:
+            return cls(None, log_density)
+        graphs = []
+        for dist, x in zip(dists, points, strict=True):
+            if is_mvnormal(dist):
+                mean, covariance = dist.owner.op.dist_params(dist.owner)
+                root = pt.linalg.cholesky(covariance)
+                graphs.append(pt.linalg.solve_triangular(root, (x - mean).T, lower=True).T)
+                continue
+            try:
+                graphs.append(pm.logcdf(dist, x))
+            except NotImplementedError:
+                return cls(None, log_density)
+        return cls(compile_batched(symbols, graphs, points), log_density)
+
+    def at(
+        self, inputs: Inputs, roots: Sequence[Floats], points: Sequence[Floats], log_a: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return scores (N, K, d) and posterior weights (N, K) of points (N, K, *event)."""
+        n, count = log_a.shape
+        flat = [x.reshape(n * count, *x.shape[2:]) for x in points]
+        values = self.function(*roots, *flat)
+        columns = []
+        for dist, value, x in zip(inputs.aleatory, values, flat, strict=True):
+            value = np.broadcast_to(value, (1, *x.shape))[0].reshape(n * count, -1)
+            columns.append(value if is_mvnormal(dist) else normal_scores(np.exp(value)))
+        (log_p,) = self.log_density(*roots, *flat)
+        terms = np.broadcast_to(log_p, (1, n * count))[0].reshape(n, count) + log_a
+        terms = np.where(np.isfinite(terms), terms, -np.inf)
+        largest = terms.max(axis=1, keepdims=True)
+        weights = np.exp(terms - np.where(np.isfinite(largest), largest, 0.0))
+        total = weights.sum(axis=1, keepdims=True)
+        weights = np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1 / count)
+        z = np.concatenate(columns, axis=1).reshape(n, count, -1)
+        # Points that fill up an array have no weight and any score.
+        return np.where(np.isfinite(z), z, 0.0), weights
+
+
+def _points(
+    evaluator: Evaluator,
+    scores: Sequence[_Scores],
+    theta: Floats,
+    data: Sequence[tuple[list[Floats], Floats]],
+) -> list[tuple[Floats, Floats]]:
+    """Return scores and weights of the specimens of each likelihood in the population at theta."""
+    result = []
+    for likelihood, score, (points, log_a) in zip(evaluator.likelihoods, scores, data, strict=True):
+        z = np.empty((*log_a.shape, likelihood.coordinates.size))
+        weights = np.empty(log_a.shape)
+        for place, rows in likelihood.by_group:
+            roots = evaluator.roots_of(theta[None], likelihood.inputs, place)
+            of_group = [x[rows] for x in points]
+            z[rows], weights[rows] = score.at(likelihood.inputs, roots, of_group, log_a[rows])
+        result.append((z, weights))
+    return result
+
+
+# -- draws -----------------------------------------------------------------------------------
+
+
+def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None) -> Checked:
+    """Return what the checks of draws report.
+
+    Parameters
+    ----------
+    evaluator : Evaluator or None
+        None where the model is not given.
+    result : DataTree
+    thetas : ndarray, shape (chains, draws, d), or None
+        Draws in unconstrained space.
+    """
+    checked = Checked(findings=influence(result))
+    if evaluator is None or thetas is None:
+        return checked + Checked(
+            untested=(
+                "The family of the population and the conflict of prior and data were not tested: "
+                "that needs the model; pass model=.",
+            )
+        )
+    center = thetas.reshape(-1, evaluator.size).mean(axis=0)
+    checked += Checked(failing_region_findings(evaluator, center), emulator_notes(evaluator))
+    obstacle = simulation_obstacle(evaluator)
+    if obstacle is not None:
+        return checked + _not_tested(obstacle) + _conflict_not_tested(obstacle)
+    optimum = find_optimum(evaluator, Minimisation())
+    return checked + _population(optimum) + _conflict(optimum, thetas)
+
+
+def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Report chains whose means are farther apart than the chains are wide.
+
+    Parameters
+    ----------
+    thetas : ndarray, shape (chains, draws, d)
+    names : sequence of str
+    """
+    if len(thetas) < 2 or thetas.shape[1] < 4:
+        return ()
+    within = np.sqrt(thetas.var(axis=1).mean(axis=0))
+    apart = np.ptp(thetas.mean(axis=1), axis=0) / np.where(within > 0, within, np.inf)
+    far = np.flatnonzero(apart > _OPTIONS.apart)
+    if not far.size:
+        return ()
+    listed = ", ".join(f"{apart[j]:.1f} for {names[j]}" for j in far.tolist())
+    return (
+        Finding(
+            "chains-in-different-modes",
+            f"The means of the chains differ by {listed} within-chain standard deviations: the "
+            "chains are in different modes, and their number of draws is not the mass of a mode; "
+            "sample with prb.sample_smc, which weighs the modes",
+            "likelihood.md#chains-in-different-modes",
+        ),
+    )
+
+
+def influence(result: xr.DataTree) -> tuple[Finding, ...]:
+    """Report specimens on which the posterior depends, by Pareto k of leave-one-out."""
+    if "log_likelihood" not in result.children:
+        return ()
+    stats: Any = import_module("arviz_stats")
+    findings = []
+    group = result["log_likelihood"].to_dataset()
+    for name, values in group.data_vars.items():
+        if values.ndim != 3 or values.shape[-1] < 2:  # of all specimens together
+            continue
+        limit = min(0.7, 1 - 1 / np.log10(max(values.sizes["chain"] * values.sizes["draw"], 11)))
+        by_sample = values.stack(sample=("chain", "draw")).transpose(..., "sample")
+        with np.errstate(all="ignore"):
+            # Of the log-likelihood itself: ArviZ takes its negative for log weights.
+            _, k = stats.base.array_stats.psislw(by_sample.values, axis=-1)
+        k = np.atleast_1d(k)
+        high = np.flatnonzero(k > limit)
+        if high.size:
+            places = ", ".join(map(str, high[:5])) + (", ..." if high.size > 5 else "")
+            findings.append(
+                Finding(
+                    "influential-specimens",
+                    f"{name}: Pareto k of leave-one-out is above {limit:.2f} for {high.size} of "
+                    f"{k.size} specimens (indices {places}; largest {k.max():.2f}): the posterior "
+                    "depends on them, and az.loo is not reliable; look at these specimens, or use "
+                    "prb.cross_validate",
+                    "likelihood.md#leave-one-out",
+                )
+            )
+    return tuple(findings)
+
+
+def _conflict_not_tested(reason: str) -> Checked:
+    return Checked(untested=(f"The conflict of prior and data was not tested: {reason}.",))
+
+
+def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
+    """Report hyperparameters whose prior pulls the posterior away from the data."""
+    evaluator = optimum.evaluator
+    if not (optimum.converged and np.isfinite(optimum.covariance).all()):
+        return _conflict_not_tested("nothing is known of the sampling distribution of the optimum")
+    if any(rival["comparable"] for rival in optimum.rivals):
+        return _conflict_not_tested("the likelihood has several modes")
+    draws = thetas.reshape(-1, evaluator.size)
+    errors = np.sqrt(np.diag(optimum.covariance))
+    pulls = np.abs(draws.mean(axis=0) - optimum.theta) / errors
+    names = evaluator.names
+    j = int(pulls.argmax())
+    shift = (
+        f"The posterior mean of {names[j]} is {pulls[j]:.2f} standard errors from the estimate "
+        "without the prior"
+    )
+    if pulls[j] <= _OPTIONS.pull:
+        return Checked(notes=(f"{shift}, less than a conflict with the prior that matters.",))
+    prior = evaluator.prior_thetas(_OPTIONS.prior_draws, 0)
+    predictive = _predictive_estimates(optimum, prior)
+    if np.isfinite(predictive).all(axis=1).mean() < 0.5:
+        return _conflict_not_tested(
+            "the information of most populations of the prior is not finite"
+        )
+    findings = conflict_findings(
+        names,
+        prior,
+        optimum.theta,
+        errors,
+        draws.mean(axis=0),
+        predictive,
+    )
+    if findings:
+        return Checked(findings=findings)
+    n = sum(len(each.readings) for each in evaluator.likelihoods)
+    power = np.interp(np.log(n), np.log([10, 20, 50]), [0.86, 0.98, 1.0])
+    return Checked(
+        notes=(
+            f"{shift}; no hyperparameter is in conflict with its prior (p > .05). With {n} "
+            f"specimens the test has a power of {power:.2f} for a mean four prior standard "
+            "deviations off.",
+        )
+    )
+
+
+def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
+    """Return estimates of data sets simulated at draws of the prior, (S, d); NaN where unknown.
+
+    They are normal around a draw. Their covariance is the inverse of the information of the
+    specimens' inputs, in the ratio that the curvature at the optimum has to it there.
+    """
+    rng = np.random.default_rng(31)
+    evaluator = optimum.evaluator
+    compiled = [
+        (PopulationSampler(each.inputs), compiled_log_density(each.inputs))
+        for each in evaluator.likelihoods
+    ]
+    complete = _covariance(evaluator, compiled, optimum.theta, rng)
+    ratio = np.sqrt(np.diag(optimum.covariance) / np.diag(complete))
+    estimates = np.full(prior.shape, np.nan)
+    for row, theta in zip(estimates, prior, strict=True):
+        covariance = _covariance(evaluator, compiled, theta, rng)
+        if np.isfinite(covariance).all():
+            values, vectors = np.linalg.eigh(covariance)
+            noise = oriented(vectors) @ (
+                np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(theta))
+            )
+            row[:] = theta + ratio * noise
+    return estimates
+
+
+def _covariance(
+    evaluator: Evaluator,
+    compiled: Sequence[tuple[PopulationSampler, Any]],
+    theta: Floats,
+    rng: np.random.Generator,
+) -> Floats:
+    """Return the inverse information of the inputs of all specimens, (d, d); NaN if singular."""
+    step = 1e-3 * evaluator.prior_sd
+    around = cross(theta, step)
+    information = np.zeros((theta.size, theta.size))
+    for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
+        for place, rows in likelihood.by_group:
+            roots = evaluator.roots_of(around, likelihood.inputs, place)
+            specimens, _ = sampler([root[:1] for root in roots], _OPTIONS.specimens, rng)
+            (log_p,) = log_density(*roots, *[x[0] for x in specimens])
+            log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))
+            with np.errstate(invalid="ignore"):
+                scores = slopes(log_p, step)
+            information += len(rows) / _OPTIONS.specimens * scores.T @ scores
+    nothing = np.full_like(information, np.nan)
+    if not np.isfinite(information).all():
+        return nothing
+    try:
+        return np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        return nothing

@@ -1,0 +1,566 @@
+"""Responses of the calibrated population, for any response and condition: `predict`."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from prbayes._finding import Finding, report
+from prbayes._progress import shown
+from prbayes._stats import reached
+from prbayes._validate import Floats, Seed, flag, plain_text, positive_integer, seed_number
+from prbayes.model.coverage import TOLERABLE, shortcoming
+from prbayes.model.elements import finite_draws
+from prbayes.model.emulated import (
+    EmulatedResponse,
+    EmulatedSimulator,
+    PopulationSimulator,
+    population_simulators,
+)
+from prbayes.model.fingerprint import (
+    Level,
+    as_attributes,
+    identity_of_model,
+    require_same_responses,
+)
+from prbayes.model.labels import versions
+from prbayes.model.locking import in_turn
+from prbayes.model.random_variable import Node
+from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
+from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
+from prbayes.propagation.new_specimens import new_specimens
+from prbayes.propagation.reweighted import Design, UntoldError
+from prbayes.response.discrepancy import caveats_of
+from prbayes.response.failures import Abort, ResponseError
+from prbayes.response.groups import is_group
+from prbayes.response.inputs import Inputs, model_on_context, read_inputs
+from prbayes.response.outputs import Outputs, lacking
+from prbayes.response.response import Responses, refuse_calling, refuse_uncallable
+
+_log = logging.getLogger("prbayes")
+
+
+@in_turn
+def predict(
+    result: Optimum | xr.DataTree,
+    response: Callable[..., Any],
+    *inputs: Any,
+    model: pm.Model | None = None,
+    n_samples: int = 500,
+    draws: int = 400,
+    stored: bool = True,
+    max_lost: float | None = None,
+    name: str | None = None,
+    executor: Executor | None = None,
+    store: str | PathLike[str] | None = None,
+    version: str | None = None,
+    random_seed: Seed = 0,
+    progressbar: bool = True,
+) -> xr.DataArray:
+    """Draw responses of the calibrated population.
+
+    Also of another response, or under another condition.
+
+    Each draw of the posterior is a population of its own, of which ``n_samples`` specimens are
+    drawn; an optimum is one population. Where the model has a simulator with `Reweighted` and the
+    same ``.dist()`` objects, the specimens are its design points, resampled by their weights: its
+    own response then costs nothing, and any other one is computed once per design point, not once
+    per draw, specimen or call. Where it has a simulator with the log-likelihood by specimen,
+    specimens are new. Its own response is then that of its emulator, without a run; any other one
+    is computed at the points of the emulator's runs, and interpolated. Elsewhere specimens are new:
+    Sobol points through the inverse distribution functions, with another shift for each draw, or
+    random draws where there is no inverse.
+
+    Parameters
+    ----------
+    result : Optimum or xarray.DataTree
+        From `minimize`; or with a ``posterior`` group that has the model's free variables, from
+        `sample_smc`, `bootstrap` or any PyMC sampler.
+    response : callable
+        As for `Simulator`; +inf is a specimen that failed, NaN a point that could not be computed.
+    *inputs
+        ``.dist()`` objects of the model's simulators, or new ones over the model's variables; model
+        variables; constants.
+    model : pymc.Model, optional
+        That of the optimum, or the one on the context, by default.
+    n_samples : int
+        Specimens from each population.
+    draws : int
+        Largest number of populations, over all chains; the posterior's draws are thinned evenly.
+    stored : bool
+        Whether design points or an emulator may serve. With False the response is computed for
+        draws x n_samples specimens.
+    max_lost : float, optional
+        Largest share of the predicted responses that may be NaN; by default what the model's
+        simulators allow, the largest.
+    name : str, optional
+        Of the result; by default that of the function.
+    executor : concurrent.futures.Executor, optional
+        Where the response is computed.
+    store : path-like, optional
+        A folder that keeps every computed response, by ``name``.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
+    random_seed : int, sequence of int, numpy.random.Generator or None
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
+
+    Returns
+    -------
+    xarray.DataArray
+        Dims (chain, draw, sample), and for several outputs a last one, with their names where they
+        are known: those of the simulator with this response, or the keys of a mapping. Where inputs
+        depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
+        ``source`` (how specimens were made), ``responses``
+        (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
+        square error of runs that are left out), ``nan`` (how many values are NaN), ``caveats``
+        (what the response says of itself, such as that its inadequacy extrapolates),
+        ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
+        ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration, by
+        which `area_test` knows them), ``identity`` (of the problem that was calibrated).
+
+    Raises
+    ------
+    TypeError, KeyError, ValueError
+        If an argument is not as described, or the result lacks a free variable, or is of other
+        populations or data than the model.
+    DesignError
+        If the design points do not support the populations, or more responses than ``max_lost`` are
+        NaN.
+    ResponseError
+        If the response raises, has the wrong shape, or is NaN everywhere.
+
+    Notes
+    -----
+    With the same ``result``, inputs, ``n_samples``, ``draws`` and ``random_seed``, sample i of a
+    draw is the same specimen, whatever the response: predictions of several conditions can be set
+    against repeated measurements. Where two simulators of the model have designs of their own, pass
+    ``stored=False``.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     data = [0.0, 2.0, 4.0]
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=data)
+    >>> squares = prb.predict(prb.minimize(model), np.square, x, random_seed=1)
+    >>> squares.name, squares.shape, squares.attrs["responses"]
+    ('square', (1, 1, 500), 1024)
+    """
+    refuse_uncallable("prb.predict", response)
+    positive_integer(n_samples, "n_samples", minimum=2)
+    positive_integer(draws, "draws")
+    flag(stored, "stored")
+    if max_lost is not None:
+        refuse_max_lost(max_lost, "prb.predict")
+    if name is not None:
+        plain_text(name, "name")
+    refuse_calling(executor, store, version, Abort())
+    label = _label(response, name, store)
+    model = model_of(result, model, "prb.predict")
+    points, coords = populations_of(result, model, draws, "prb.predict")
+    sorted_inputs = read_inputs(label, inputs, model)
+    simulators = population_simulators(model)
+    before = sum(each.responses.count for each in simulators)
+    responses = Responses(
+        label,
+        response,
+        sorted_inputs,
+        executor=executor,
+        store=store,
+        version=version,
+        outputs=known_outputs(simulators, response),
+    )
+    seed = None if random_seed is None else seed_number(random_seed)
+    rng = np.random.default_rng(seed)
+    simulator = serving(simulators, responses) if stored else None
+    groups = sorted_inputs.groups
+    with shown(progressbar):
+        drawn = _drawn(simulator, responses, _in_groups(points, sorted_inputs), n_samples, rng)
+    allowed = [each.max_lost for each in simulators] if max_lost is None else [max_lost]
+    missing = _count_missing(label, drawn.values, max(allowed, default=MAX_LOST))
+    _report_rough_surface(label, drawn)
+    among = () if groups is None else (len(groups.labels),)
+    event = drawn.values.shape[2 + len(among) :]
+    outputs = responses.outputs or Outputs(tuple(range(event[0] if event else 0)))
+    last = {outputs.dim: list(outputs.labels)} if event else {}
+    own = {} if groups is None else {groups.dim: list(groups.labels)}
+    leading = (len(coords["chain"]), len(coords["draw"]), *among)
+    return xr.DataArray(
+        drawn.values.reshape(*leading, n_samples, *event),
+        dims=("chain", "draw", *own, "sample", *last),
+        coords={**coords, **own, "sample": np.arange(n_samples), **last},
+        name=label,
+        attrs={
+            "source": drawn.source,
+            "responses": responses.count + sum(e.responses.count for e in simulators) - before,
+            **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
+            "nan": missing,
+            "specimens_id": _digest(*drawn.specimens),
+            "random_seed": str(seed),
+            "caveats": list(caveats_of(response)),
+            **_calibration(result, model),
+            **as_attributes(identity_in(result) or identity_of_model(model)),
+            **versions(),
+        },
+    )
+
+
+def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
+    """Return the model of a result, the one given, or on the context; raise if it is another's."""
+    if model is None and isinstance(result, Optimum):
+        model = result.model
+    model = model_on_context(model, caller)
+    if not (isinstance(result, Optimum) and model is result.model):
+        require_of_model(result, model, caller, Level.POPULATIONS)
+        require_same_responses(identity_in(result), model, caller)
+    return model
+
+
+def _in_groups(points: dict[str, Floats], inputs: Inputs) -> list[dict[str, Floats]]:
+    """Return the populations of each group, or all as they are where there are none."""
+    if inputs.groups is None:
+        return [points]
+    size = len(next(iter(points.values())))
+    (index,) = [str(root.name) for root in inputs.roots if is_group(root)]
+    places = range(len(inputs.groups.labels))
+    return [{**points, index: np.full(size, place)} for place in places]
+
+
+def _drawn(
+    simulator: PopulationSimulator | None,
+    responses: Responses,
+    of_groups: list[dict[str, Floats]],
+    n: int,
+    rng: np.random.Generator,
+) -> _Drawn:
+    """Return responses of n specimens from each population, of one group after the other."""
+    each: list[_Drawn] = []
+    emulated: EmulatedResponse | None = None
+    for points in of_groups:
+        if simulator is None:
+            each.append(_new_responses(responses.name, responses, points, n, rng))
+        elif simulator.is_emulated:
+            emulated = emulated or simulator.emulator(responses)
+            each.append(_emulated_responses(simulator, emulated, responses, points, n, rng))
+        else:
+            each.append(_resampled_responses(simulator, responses, points, n, rng))
+    if len(each) == 1:
+        return each[0]
+    specimens = [x for one in each for x in one.specimens]
+    values = np.stack([one.values for one in each], axis=1)
+    return replace(each[0], values=values, specimens=specimens)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Responses of specimens."""
+
+    # (k, n), or (k, n, m) of several outputs: by population; of groups (k, groups, n) and so on.
+    values: Floats
+    specimens: list[Floats]  # (k, n, *event): aleatory inputs
+    source: str  # how specimens were made
+    error: Floats | None = None  # of an emulator, by output, (m,)
+
+
+def _label(response: Callable[..., Any], name: str | None, store: object) -> str:
+    """Return the name of the result: as given, or that of the response."""
+    label = name or str(getattr(response, "__name__", type(response).__name__))
+    if store is not None and name is None and not label.isidentifier():
+        raise ValueError(
+            f"name: got a store for a function called {label}, expected a name to keep its "
+            "responses by"
+        )
+    return label
+
+
+def _count_missing(label: str, values: Floats, max_lost: float) -> int:
+    """Return how many responses are NaN, said in the log; raise if too many are."""
+    nan = lacking(values.reshape(-1, *values.shape[2:]))
+    missing = int(nan.sum())
+    if missing == nan.size:
+        raise ResponseError(
+            f"{label}: got NaN at all {missing} specimens, expected numbers; +inf is a specimen "
+            "that fails"
+        )
+    if missing > max_lost * nan.size:
+        raise DesignError(
+            f"{label}: lost mass: got {missing / nan.size:.1%} NaN among the predicted "
+            f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
+            "the specimens that have a response; repair it, return +inf for specimens that fail, "
+            "or pass a larger max_lost"
+        )
+    if missing:
+        _log.warning("%s: %d of %d predicted responses are NaN", label, missing, nan.size)
+    return missing
+
+
+def populations_of(
+    result: Any, model: pm.Model, draws: int, caller: str
+) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
+    """Return the populations that a result stands for.
+
+    Parameters
+    ----------
+    result : Optimum or xarray.DataTree
+    model : pymc.Model
+    draws : int
+        Largest number of populations; draws are thinned evenly.
+    caller : str
+        For messages.
+
+    Returns
+    -------
+    points : dict of ndarray, shapes (k, *shape)
+        Values of the free variables, by name.
+    coords : dict of ndarray
+        Chain and draw.
+
+    Raises
+    ------
+    TypeError, KeyError
+        If the result is neither, or lacks a free variable.
+    """
+    names = [str(rv.name) for rv in model.free_RVs]
+    if isinstance(result, Optimum):
+        _refuse_incomplete(result.point, names, caller)
+        points = {n: np.asarray(result.point[n], dtype=np.float64)[None] for n in names}
+        return points, {"chain": np.arange(1), "draw": np.arange(1)}
+    if not isinstance(result, xr.DataTree) or "posterior" not in result:
+        raise TypeError(
+            f"{caller}: got {type(result).__name__}, expected an Optimum from prb.minimize, or a "
+            "DataTree with a posterior group, such as prb.sample_smc returns"
+        )
+    thinned = _thinned(result["posterior"].to_dataset(), draws)
+    _refuse_incomplete(thinned, names, caller)
+    coords = {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
+    return finite_draws(thinned, names), coords
+
+
+def _thinned(posterior: xr.Dataset, draws: int) -> xr.Dataset:
+    """Return at most so many draws of a posterior, over all chains, evenly spaced."""
+    size = posterior.sizes["draw"]
+    each = max(1, draws // posterior.sizes["chain"])
+    places = np.linspace(0, size - 1, min(size, each)).round()
+    return posterior.isel(draw=np.unique(places.astype(int)))
+
+
+def _refuse_incomplete(known: Any, names: list[str], caller: str) -> None:
+    """Raise if a result lacks a free variable of the model."""
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise KeyError(
+            f"{caller}: got a result without {missing}, expected the model's free variables {names}"
+        )
+
+
+def known_outputs(
+    among: Sequence[PopulationSimulator], response: Callable[..., Any]
+) -> Outputs | None:
+    """Return the outputs of a response that is a simulator's; None where its runs tell."""
+    for node in among:
+        if node.responses.function is response:
+            return node.outputs
+    return None
+
+
+def serving(
+    among: Sequence[PopulationSimulator], responses: Responses
+) -> PopulationSimulator | None:
+    """Return the simulator whose specimens have these inputs, if any.
+
+    Best is one with this very response.
+    """
+    able = [each for each in among if _serves(each, responses.inputs)]
+    for each in able:
+        if responses.same_as(each.responses):
+            return each
+    return able[0] if able else None
+
+
+def _serves(simulator: PopulationSimulator, wanted: Inputs) -> bool:
+    """Return whether a simulator has stored or emulated specimens with all of these inputs."""
+    if not simulator.has_specimens or wanted.epistemic:
+        return False
+    known = simulator.inputs.aleatory
+    return all(any(x is y for y in known) for x in wanted.aleatory)
+
+
+def _emulated_responses(
+    simulator: EmulatedSimulator,
+    emulated: EmulatedResponse,
+    responses: Responses,
+    points: dict[str, Floats],
+    n: int,
+    rng: np.random.Generator,
+) -> _Drawn:
+    """Return emulated responses of n new specimens for each population."""
+    inputs = responses.inputs
+    roots = [points[str(rv.name)] for rv in inputs.roots]
+    specimens, _ = new_specimens(responses.name, inputs, roots, n, rng)
+    flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
+    values = emulated(flat).reshape(len(roots[0]), n, *emulated.event)
+    runs = len(emulated.z)
+    is_own = responses.same_as(simulator.responses)
+    source = (
+        f"new specimens, by the emulator of {simulator.name} ({runs} runs)"
+        if is_own
+        else f"new specimens, by an interpolant through {runs} runs at those of {simulator.name}"
+    )
+    return _Drawn(values, specimens, source, emulated.error)
+
+
+def _report_rough_surface(label: str, drawn: _Drawn) -> None:
+    """Report an emulator whose error is visible beside the scatter of the predicted responses."""
+    if drawn.error is None:
+        return
+    flat = drawn.values.reshape(-1, drawn.error.size)
+    good = np.isfinite(flat).all(axis=1)
+    spread = flat[good].std(axis=0) if good.any() else np.full(drawn.error.shape, np.nan)
+    share = float(np.max(drawn.error / np.where(spread > 0, spread, np.inf)))
+    if share > 0.05:
+        report(
+            [
+                Finding(
+                    "rough-prediction",
+                    f"{label}: the interpolant between runs has an error of {share:.0%} of the "
+                    "standard deviation of the predicted responses; pass stored=False, which "
+                    "computes the response at new specimens",
+                    "likelihood.md#predictions",
+                )
+            ]
+        )
+
+
+def _resampled_responses(
+    node: Node,
+    responses: Responses,
+    points: dict[str, Floats],
+    n: int,
+    rng: np.random.Generator,
+) -> _Drawn:
+    """Return responses of n design points for each population."""
+    design = node.design
+    assert design is not None
+    roots = [points[str(rv.name)] for rv in design.inputs.roots]
+    try:
+        values = design.values_of(responses)
+    except UntoldError:
+        with design.alone():
+            return _resampled_responses(node, responses, points, n, rng)
+    chosen = _resampled(node.name, design, roots, n, rng)
+    values = values[chosen]
+    specimens = [x[chosen] for x in design.points_of(responses.inputs)]
+    what = "design points" if responses.count else "stored responses"
+    return _Drawn(values, specimens, f"{what} of {node.name}")
+
+
+def _resampled(
+    name: str, design: Design, roots: list[Floats], n: int, rng: np.random.Generator
+) -> NDArray[np.intp]:
+    """Return design points of n specimens for each population, shape (k, n), in random order.
+
+    Systematic resampling: as many of each point as its weight says, but for one.
+    """
+    refuse_unsupported(name, design, roots)
+    _, weights = design.populations(roots)
+    places = (np.arange(n) + rng.random((len(weights), 1))) / n
+    found = reached(np.nan_to_num(weights), places, normalized=True)
+    return rng.permuted(found, axis=1)
+
+
+def refuse_unsupported(name: str, design: Design, roots: list[Floats]) -> None:
+    """Raise if the design does not support most of the populations."""
+    support = design.support(roots)
+    ess = np.median(support["weight_ess"])
+    mass = np.median(support["mean_weight"])
+    # Points without response become NaN, which are counted and said by themselves.
+    if not shortcoming(support, design.required_ess, 1.0, design.n_points, TOLERABLE):
+        return
+    raise DesignError(
+        f"{name}: got a weight effective sample size of {ess:.0f} and a mean raw weight of "
+        f"{mass:.2f} (medians over the populations), expected {design.required_ess:.0f} and 1; "
+        "call prb.refine(model) and sample again, or pass stored=False, which computes responses "
+        "of new specimens"
+    )
+
+
+def _new_responses(
+    label: str,
+    responses: Responses,
+    points: dict[str, Floats],
+    n: int,
+    rng: np.random.Generator,
+) -> _Drawn:
+    """Return responses of n new specimens from each population."""
+    inputs = responses.inputs
+    roots = [points[str(rv.name)] for rv in inputs.roots]
+    specimens, epistemic = new_specimens(label, inputs, roots, n, rng)
+    values = responses(specimens, epistemic)
+    return _Drawn(values, specimens, "new specimens")
+
+
+def specimen_names(labels: ArrayLike) -> list[str]:
+    """Return labels as text, the same for 3 and 3.0."""
+    names = []
+    for label in np.asarray(labels).tolist():
+        if isinstance(label, float) and label.is_integer():
+            label = int(label)
+        names.append(str(label))
+    return names
+
+
+def data_digest(observed: Floats) -> str:
+    """Return what identifies a set of measured values, (n,) or (n, m), in any order."""
+    return _digest(observed[in_order(observed)])
+
+
+def in_order(observed: Floats) -> NDArray[np.intp]:
+    """Return the order of measured values, of several outputs by the first, then by the others."""
+    if observed.ndim == 1:
+        return np.argsort(observed, kind="stable")
+    return np.lexsort(observed.T[::-1])
+
+
+def _digest(*arrays: Floats) -> str:
+    """Return 16 hexadecimal digits of the bytes of arrays."""
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
+    return found.hexdigest()[:16]
+
+
+def _calibration(result: Optimum | xr.DataTree, model: pm.Model) -> dict[str, list[str]]:
+    """Return attributes that tell on what data the result was calibrated."""
+    is_optimum = isinstance(result, Optimum)
+    simulators = result.evaluator.simulators if is_optimum else population_simulators(model)
+    # As a set that keeps its order.
+    labels: dict[str, None] = {}
+    digests = []
+    for node in simulators:
+        digests.append(data_digest(_calibration_data(result, node)))
+        if node.specimens is not None:
+            labels |= dict.fromkeys(specimen_names(node.specimens))
+    found = {"calibration_data": digests, "calibration_specimens": list(labels)}
+    # netCDF has no empty lists.
+    return {key: value for key, value in found.items() if value}
+
+
+def _calibration_data(result: Optimum | xr.DataTree, node: PopulationSimulator) -> Floats:
+    """Return what a simulator was calibrated on: the result's own data where it has them."""
+    if isinstance(result, xr.DataTree) and "observed_data" in result:
+        kept = result["observed_data"]
+        if node.name in kept:
+            return np.asarray(kept[node.name])
+    return node.observed

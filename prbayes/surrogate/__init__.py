@@ -1,7 +1,0 @@
-"""Response surfaces that stand for a response within the ranges of their runs."""
-
-from prbayes.emulators.gaussian_process import GaussianProcess
-from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
-from prbayes.surrogate.error import CrossValidation
-
-__all__ = ["CrossValidation", "GaussianProcess", "Polynomial", "RadialBasis", "Surface"]

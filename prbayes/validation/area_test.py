@@ -1,0 +1,291 @@
+"""Validity: do measured responses agree with the calibrated population? The area test."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from prbayes._display import view
+from prbayes._progress import shown
+from prbayes._validate import Floats, Seed, share
+from prbayes.model.fingerprint import Identity, as_attributes
+from prbayes.model.labels import versions
+from prbayes.model.locking import in_turn
+from prbayes.results.predict import data_digest
+from prbayes.validation.conditions import DIRECTION, Case, Condition, Predicted, read_case
+from prbayes.validation.exact_null import ExactModel
+from prbayes.validation.nulls import Null, PosteriorNull
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ValidityTest:
+    """The result of `area_test`.
+
+    Attributes
+    ----------
+    statistic : float
+        Area between the ECDF of the u-values and the identity, from 1/(4n) to 1/2.
+    critical_value : float
+        The largest area that is not rejected.
+    p_value : float
+    level : float
+    null : str
+        What was held to be true.
+    folded : bool
+        Whether the area is that of ``|2u - 1|``.
+    u_values : ndarray, shape (n,)
+        Of all conditions, one after the other.
+    envelope : ndarray, shape (2, n)
+        Bounds of the sorted values that are tested; under the null they hold all of them with
+        probability 1 - ``level``.
+    conditions, specimens : ndarray of str, shape (n,)
+        Where each u-value comes from.
+    identity : Identity or None
+        Of the problem whose calibration is tested, where the predictions tell.
+    """
+
+    statistic: float
+    critical_value: float
+    p_value: float
+    level: float
+    null: str
+    folded: bool
+    u_values: Floats
+    envelope: Floats
+    conditions: NDArray[np.str_]
+    specimens: NDArray[np.str_]
+    identity: Identity | None = None
+
+    @property
+    def rejected(self) -> bool:
+        """Whether the model is rejected at the level."""
+        return self.p_value <= self.level
+
+    @property
+    def of_conditions(self) -> list[str]:
+        """The conditions that were tested, each once, in their order."""
+        names = [name.split(DIRECTION)[0] for name in self.conditions.tolist()]
+        return list(dict.fromkeys(names))
+
+    def __repr__(self) -> str:
+        verdict = "rejected" if self.rejected else "not rejected"
+        what = "area of |2u - 1|" if self.folded else "area"
+        values = self.u_values.size
+        specimens = np.unique(self.specimens).size
+        conditions = len(self.of_conditions)
+        under = "1 condition" if conditions == 1 else f"{conditions} conditions"
+        directions = np.unique(self.conditions).size
+        seen = f", seen in {directions} directions" if directions > conditions else ""
+        return (
+            f"ValidityTest: {verdict} at level {self.level:g}\n"
+            f"  {what} {self.statistic:.4f}, critical value {self.critical_value:.4f}, "
+            f"p-value {self.p_value:.3g}\n"
+            f"  {values} values of {specimens} specimens, {under}{seen}\n"
+            f"  null: {self.null}"
+        )
+
+    def _repr_html_(self) -> str:
+        """Show the verdict in a notebook."""
+        heading, *sentences = repr(self).splitlines()
+        return view(heading, sentences=sentences)
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return the result as a Dataset, which ``to_netcdf`` saves.
+
+        The dimension ``rank`` is that of the envelope.
+        """
+        return xr.Dataset(
+            {
+                "u": ("observation", self.u_values),
+                "lower": ("rank", self.envelope[0]),
+                "upper": ("rank", self.envelope[1]),
+                "statistic": self.statistic,
+                "critical_value": self.critical_value,
+                "p_value": self.p_value,
+                "rejected": self.rejected,
+                "level": self.level,
+                "folded": self.folded,
+            },
+            coords={
+                "condition": ("observation", self.conditions),
+                "specimen": ("observation", self.specimens),
+            },
+            attrs={"null": self.null, **as_attributes(self.identity), **versions()},
+        )
+
+
+@in_turn
+def area_test(
+    observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
+    predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
+    *,
+    level: float = 0.05,
+    null: Null | None = None,
+    specimens: ArrayLike
+    | Mapping[str, ArrayLike | None]
+    | Sequence[ArrayLike | None]
+    | None = None,
+    folded: bool = False,
+    randomize: bool = False,
+    random_seed: Seed = 0,
+    progressbar: bool = True,
+) -> ValidityTest:
+    r"""Test whether measured responses may come from the calibrated population.
+
+    The statistic is the area between the ECDF of the u-values, of all conditions together, and the
+    identity:
+
+    .. math:: A = \int_0^1 |F_n(v) - v| \, dv
+
+    It sees a wrong mean well and a wrong spread hardly; the area of ``|2u - 1|`` sees a wrong
+    spread.
+
+    Parameters
+    ----------
+    observed : array_like, shape (n,) or (n, m); or a mapping or list of such, by condition
+        Measured on specimens that were not used in the calibration, but with `JointNull`. +inf is a
+        specimen that had failed. Several outputs of a specimen, (n, m), are seen in directions of
+        the whitened predicted ones; the statistic is the mean over these of the areas of u and
+        ``|2u - 1|``, since a wrong correlation is a wrong spread in some of them.
+    predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
+        Leading axes are draws of the posterior, the last one specimens, (..., S, m) with m outputs.
+        NaN are left out.
+    level : float
+        Probability of rejecting a right model.
+    null : Null, optional
+        `PosteriorNull` by default; with one population only, and one value per specimen,
+        `ExactModel`. `JointNull` for the calibration's own specimens.
+    specimens : as ``observed``, optional
+        Labels. Values with the same label, also of several conditions, are of one specimen, and
+        replicates of the null then are as dependent as they: sample i of a draw must be the same
+        specimen in all conditions, as `predict` has it with the same seed. Without labels all
+        values are of different specimens.
+    folded : bool
+        Whether to test ``|2u - 1|``, which a right model makes uniform as well: responses too far
+        out, or too close to the middle. Two tests at ``level`` / 2 look at both mean and spread.
+    randomize, random_seed
+        As in `u_values`.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
+
+    Returns
+    -------
+    ValidityTest
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described; if the data, or labels, are those of the calibration and
+        the null does not allow for it; if specimens are shared by conditions that were not
+        predicted for the same specimens; if conditions were predicted by calibrations of different
+        problems.
+
+    References
+    ----------
+    .. [1] Ferson, S., W. L. Oberkampf and L. Ginzburg (2008), Model validation and predictive
+       capability for the thermal challenge problem, Comput. Methods Appl. Mech. Eng. 197,
+       2408-2430, doi:10.1016/j.cma.2007.07.030.
+
+    Examples
+    --------
+    >>> import numpy as np, prbayes as prb
+    >>> rng = np.random.default_rng(1)
+    >>> predicted = rng.normal(rng.normal(0, 0.2, (200, 1)), 1.0, (200, 500))
+    >>> prb.area_test(rng.normal(0, 1, 20), predicted).rejected
+    False
+    >>> prb.area_test(rng.normal(2, 1, 20), predicted).rejected
+    True
+    """
+    _refuse_null(null)
+    level = share(level, "level")
+    case = read_case(
+        observed,
+        predicted,
+        specimens,
+        folded=folded,
+        randomize=randomize,
+        random_seed=random_seed,
+    )
+    if null is None:
+        one_each = case.draws == 1 and not case.dependent
+        null = ExactModel() if one_each else PosteriorNull()
+    if not null.own_specimens:
+        for condition in case.conditions:
+            _refuse_own(condition)
+    if case.shared:
+        _refuse_unlike(case)
+
+    u = case.u_values()
+    statistic = float(case.statistic(u))
+    with shown(progressbar):
+        judged = null.judge(case, statistic, level)
+
+    # Where each value comes from.
+    conditions = np.repeat(
+        [c.name for c in case.conditions],
+        [c.observed.size for c in case.conditions],
+    )
+    labels = [label for c in case.conditions for label in c.specimens]
+    return ValidityTest(
+        statistic=statistic,
+        critical_value=judged.critical_value,
+        p_value=judged.p_value,
+        level=level,
+        null=null.describe(case),
+        u_values=u,
+        folded=folded,
+        envelope=np.array([judged.lower, judged.upper]),
+        conditions=conditions,
+        specimens=np.array(labels),
+        identity=case.identity,
+    )
+
+
+def _refuse_null(null: object) -> None:
+    """Raise if it is no null distribution, such as a class of one."""
+    if null is not None and not isinstance(null, Null):
+        raise TypeError(
+            f"null: got {type(null).__name__} {null!r:.60}, expected "
+            "prb.validation.PosteriorNull(), prb.validation.ExactModel() or "
+            "prb.validation.JointNull(optimum)"
+        )
+
+
+def _refuse_own(condition: Condition) -> None:
+    """Raise if the model was calibrated on these specimens."""
+    notes = condition.attributes
+    calibrated = np.atleast_1d(notes.get("calibration_specimens", [])).tolist()
+    own = set(condition.labels or ()) & set(calibrated)
+    if own:
+        got = f"{len(own)} specimens of the calibration, such as {min(own)!r}"
+    elif data_digest(condition.measured) in np.atleast_1d(notes.get("calibration_data", [])):
+        got = "the very data of the calibration"
+    else:
+        return
+    raise ValueError(
+        f"{condition.name}: got {got}, expected specimens that it has not seen: a model is hardly "
+        "ever rejected on those it was fitted to; test others, or pass prb.predict(optimum, ...) "
+        "and null=prb.validation.JointNull(optimum)"
+    )
+
+
+def _refuse_unlike(case: Case) -> None:
+    """Raise if conditions share specimens, but their predictions do not."""
+    shapes = [c.predicted.shape for c in case.conditions]
+    notes = [c.attributes for c in case.conditions]
+    known = {attrs["specimens_id"] for attrs in notes if "specimens_id" in attrs}
+    if len(set(shapes)) > 1:
+        got = f"shapes {shapes}"
+    elif len(known) > 1:
+        got = "different specimens"
+    else:
+        return
+    raise ValueError(
+        f"specimens: got the same labels in several conditions, predicted with {got}, expected the "
+        "same specimens in all; pass the same inputs, n_samples, draws and random_seed to "
+        "prb.predict, and stored=False if designs differ"
+    )

@@ -1,0 +1,162 @@
+"""An emulator knows runs by others, has failures where its runs failed, and is the best of several."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from prbayes._validate import Floats
+from prbayes.emulators.gaussian_process import GaussianProcess
+from prbayes.emulators.selection import (
+    Runs,
+    candidates,
+    chosen,
+    emulated,
+    emulated_without_each,
+    enough,
+    left_out,
+)
+from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
+
+
+def runs(y: Any, n: int = 64, d: int = 2) -> Runs:
+    x = np.random.default_rng(3).standard_normal((n, d))
+    return Runs(x, np.asarray(y(x)), np.full(n, 1 / n), np.arange(n) * 8 // n)
+
+
+def two(x: Floats) -> Floats:
+    return np.stack([x[:, 0] ** 2, 100 * np.exp(0.3 * x[:, 1])], axis=1)
+
+
+def test_a_run_that_is_left_out_is_not_seen() -> None:
+    known = runs(two)
+    said = left_out([RadialBasis(), RadialBasis()], known)
+    block = known.blocks == 3
+    other = Runs(known.x, np.where(block[:, None], 7.0, known.y), known.importance, known.blocks)
+    np.testing.assert_array_equal(
+        left_out([RadialBasis(), RadialBasis()], other)[block], said[block]
+    )
+    assert np.abs(said - known.y).max() > 0
+
+
+def test_each_output_has_the_surface_that_is_best_for_it() -> None:
+    known = runs(lambda x: np.stack([x[:, 0] ** 2, np.abs(x[:, 1]) + (x[:, 0] > 0)], axis=1))
+    models, said = chosen([Polynomial(2), GaussianProcess("matern")], known)
+    assert isinstance(models[0], Polynomial)
+    assert isinstance(models[1], GaussianProcess)
+    assert models[1].lengths is not None
+    np.testing.assert_array_equal(said[:, 0], left_out(models, known)[:, 0])
+
+
+def test_where_the_nearest_run_failed_there_is_no_number() -> None:
+    known = runs(lambda x: np.where(x[:, :1] > 0.5, np.nan, x[:, :1]))
+    at = np.array([[2.0, 0.0], [-1.0, 0.0]])
+    found = emulated([RadialBasis()], known, at)
+    assert np.isnan(found[0]).all()
+    assert found[1] == pytest.approx(-1, abs=1e-6)
+    infinite = runs(lambda x: np.where(x[:, :1] > 0.5, np.inf, x[:, :1]))
+    assert np.isposinf(emulated([RadialBasis()], infinite, at)[0]).all()
+
+
+def test_points_that_come_again_are_no_obstacle() -> None:
+    known = runs(two)
+    twice = Runs(
+        np.concatenate([known.x, known.x]),
+        np.concatenate([known.y, known.y]),
+        np.full(128, 1 / 128),
+        np.arange(128) * 8 // 128,
+    )
+    models = [RadialBasis(), RadialBasis()]
+    np.testing.assert_allclose(emulated(models, twice, known.x), known.y, rtol=1e-6, atol=1e-6)
+
+
+def test_nothing_is_further_than_the_runs_are_from_each_other() -> None:
+    known = runs(two)
+    found = emulated([RadialBasis("quintic")] * 2, known, np.full((1, 2), 1e3))
+    assert (np.abs(found - known.y.mean(axis=0)) < 3 * np.ptp(known.y, axis=0)).all()
+
+
+def test_of_too_many_runs_some_far_ones_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("prbayes.emulators.selection.MOST_RUNS", 20)
+    known = runs(two)
+    importance = np.linspace(0, 1, 64)
+    importance /= importance.sum()
+    some = Runs(known.x, known.y, importance, known.blocks).among(np.ones(64, dtype=bool))
+    assert some.size == 20
+    assert (some >= 54).sum() == 10
+    assert some.min() == 0
+
+
+def test_units_and_scales_do_not_matter() -> None:
+    known = runs(two)
+    other = Runs(1e6 * known.x + 5, 1e-9 * known.y, known.importance, known.blocks)
+    models, said = chosen(candidates(*known.x.shape), known)
+    others, again = chosen(candidates(*known.x.shape), other)
+    assert [type(m) for m in models] == [type(m) for m in others]
+    np.testing.assert_allclose(again * 1e9, said, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("n", "d"), [(16, 2), (32, 8), (256, 8), (200, 3)])
+def test_a_polynomial_has_a_third_as_many_terms_as_there_are_runs(n: int, d: int) -> None:
+    *_, spline = candidates(n, d)
+    assert isinstance(spline, RadialBasis)
+    assert spline.terms(d) <= n / 3 or spline.degree == 2
+
+
+def test_of_many_runs_only_processes_are_tried() -> None:
+    assert all(isinstance(model, GaussianProcess) for model in candidates(257, 2))
+
+
+@pytest.mark.parametrize("kernel", ["squared_exponential", "matern"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0])
+def test_a_process_without_a_block_is_that_of_the_other_runs(kernel: str, bad: float) -> None:
+    # The short way, from one inverse, against a process that is made of each rest by itself. With a
+    # nugget that leaves ten digits to both.
+    model = GaussianProcess(kernel, (1.5, 1.5), 1e-6)
+
+    def response(x: Floats) -> Floats:
+        return np.where(x[:, :1] > 1, bad, np.sin(2 * x[:, :1]) + x[:, 1:])
+
+    known = runs(response)
+    said = left_out([model], known)
+    at = np.random.default_rng(4).standard_normal((50, 2))
+    each = list(emulated_without_each([model], known, at))
+    assert len(each) == 8
+    for number, values in enumerate(each):
+        block = known.blocks == number
+        alone = emulated([model], known, at, ~block)
+        np.testing.assert_allclose(values, alone, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(
+            said[block], emulated([model], known, known.x[block], ~block), rtol=1e-8, atol=1e-8
+        )
+
+
+def test_runs_that_determine_no_surface_are_told() -> None:
+    assert not enough(Polynomial(3), 20, 3)
+    assert enough(Polynomial(1), 20, 3)
+    with pytest.raises(np.linalg.LinAlgError):
+        chosen([Polynomial(9)], runs(two))
+
+
+def test_a_surface_of_a_users_own_and_a_regressor_serve() -> None:
+    class Mean(Surface):
+        def terms(self, dimensions: int) -> int:
+            return 1
+
+        def through(self, x: Floats, y: Floats) -> Any:
+            return lambda at: np.full(len(at), y.mean())
+
+    class Regressor:
+        def fit(self, x: Floats, y: Floats) -> None:
+            self.value = y.mean()
+
+        def predict(self, at: Floats) -> Floats:
+            return np.full((len(at), 1), self.value)
+
+    known = runs(two)
+    for model in (Mean(), Regressor()):
+        found = emulated([model, model], known, known.x)
+        np.testing.assert_allclose(found, np.broadcast_to(known.y.mean(axis=0), (64, 2)))
+        assert not hasattr(model, "value")

@@ -1,0 +1,131 @@
+"""An optimum says where a model inadequacy cannot be told from the inputs' scatter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes.inference.asymptotics import Local
+from prbayes.inference.checks.discrepancy_confounding import _alike, _canonical, _mixed, confounded
+
+TOLD = "the data do not tell the model inadequacy from the inputs"
+
+
+def local(identified: Any, variances: Any, size: int) -> Local:
+    """Return what data identify along some directions, with variances."""
+    axes = np.array(identified, dtype=float).reshape(size, -1)
+    whole, _ = np.linalg.qr(np.concatenate([axes, np.eye(size)], axis=1))
+    rank = axes.shape[1]
+    return Local(np.ones(size), axes, whole[:, rank:], np.diag(np.atleast_1d(variances)))
+
+
+def test_the_canonical_correlation_of_two_numbers_is_their_correlation() -> None:
+    covariance = np.array([[4.0, -1.8], [-1.8, 1.0]])
+    found, _, _ = _canonical(covariance, np.array([0]), np.array([1]))
+    assert found == pytest.approx(0.9)
+
+
+def test_it_is_the_largest_over_all_combinations() -> None:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(5, 5))
+    covariance = root @ root.T
+    own, others = np.array([0, 3]), np.array([1, 2, 4])
+    found, of_own, of_others = _canonical(covariance, own, others)
+    both = rng.normal(size=(20_000, 5))
+    a, b = both[:, own], both[:, others]
+    top = np.einsum("ki,ij,kj->k", a, covariance[np.ix_(own, others)], b)
+    left = np.einsum("ki,ij,kj->k", a, covariance[np.ix_(own, own)], a)
+    right = np.einsum("ki,ij,kj->k", b, covariance[np.ix_(others, others)], b)
+    tried = np.abs(top) / np.sqrt(left * right)
+    assert 0.97 * found < tried.max() <= found * (1 + 1e-9)
+    # The loadings are the covariances with the best combinations.
+    best = np.linalg.solve(covariance[np.ix_(own, own)], of_own)
+    other = np.linalg.solve(covariance[np.ix_(others, others)], of_others)
+    assert best @ covariance[np.ix_(own, others)] @ other == pytest.approx(found)
+
+
+NAMES = ["mu", "lift", "sigma"]
+OWN, OTHERS = np.array([1]), np.array([0, 2])
+
+
+def test_what_is_not_identified_of_both_is_named() -> None:
+    sum_only = local([[1, 0], [1, 0], [0, np.sqrt(2)]] / np.sqrt(2), [0.01, 0.01], 3)
+    assert _mixed(sum_only, OWN, OTHERS, NAMES) in {
+        "mu - lift is not identified",
+        "lift - mu is not identified",
+    }
+
+
+def test_what_is_not_identified_of_one_alone_is_not_mixed() -> None:
+    for missing in range(3):
+        axes = np.delete(np.eye(3), missing, axis=1)
+        assert _mixed(local(axes, [0.01, 0.01], 3), OWN, OTHERS, NAMES) == ""
+    assert _mixed(local(np.zeros((3, 0)), [], 3), OWN, OTHERS, NAMES) == ""
+
+
+@pytest.mark.parametrize(("along", "told"), [(1e-5, True), (1e-2, False)])
+def test_estimates_that_are_alike_are_named(along: float, told: bool) -> None:
+    axes = np.array([[1, 1, 0], [1, -1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
+    found = _alike(local(axes, [along, 0.02, 0.01], 3), OWN, OTHERS, NAMES)
+    assert bool(found) is told
+    if told:
+        assert found == "estimates of lift and mu have a correlation of 0.999 in size"
+
+
+@pytest.fixture(scope="module")
+def study() -> Any:
+    def calibrated(conditions: list[float], prior_sd: float = 5.0) -> Any:
+        rng = np.random.default_rng(1)
+        x, b = rng.normal(1, 0.2, 40), rng.normal(3, 0.4, 40)
+        rise = prb.response.Additive([0.0, 2.0])
+        observed = np.stack([x + b * c / 2 for c in conditions], axis=-1)
+        if len(conditions) == 1:
+            response = rise.of(lambda x: x, conditions[0])
+            metric: Any = prb.KullbackLeibler()
+            observed = observed[:, 0]
+        else:
+            response = rise.of(lambda x: np.stack([x] * len(conditions), axis=-1), conditions)
+            metric = prb.Joint(prb.KullbackLeibler())
+        with pm.Model() as model:
+            x_dist = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+            b_dist = pm.Normal.dist(pm.Normal("lift", 3, prior_sd), 0.4)
+            prb.Simulator(
+                *("y", response, x_dist, b_dist),
+                metric=metric, observed=observed, propagation=prb.Resimulated(128),
+            )  # fmt: skip
+        return prb.minimize(model, progressbar=False)
+
+    return calibrated
+
+
+@pytest.mark.parametrize(
+    ("conditions", "prior_sd", "told"), [([2.0], 5.0, True), ([0.0, 2.0], 5.0, False)]
+)
+def test_one_condition_does_not_tell_them_two_do(
+    study: Any, conditions: list[float], prior_sd: float, told: bool
+) -> None:
+    optimum = study(conditions, prior_sd)
+    lines = [line for line in optimum.warnings if TOLD in line]
+    assert len(lines) == told
+    assert all("lift" in line and "measure under more conditions" in line for line in lines)
+
+
+def test_a_narrow_prior_tells_them(study: Any) -> None:
+    assert not [line for line in study([2.0], 0.02).warnings if TOLD in line]
+
+
+def test_a_model_without_an_inadequacy_has_nothing_to_tell() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        y = pm.Normal.dist(pm.Normal("nu", 0, 2), 1.0)
+        prb.Simulator(
+            *("y", lambda x, y: x + y, x, y),
+            metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0], propagation=prb.Resimulated(64),
+        )  # fmt: skip
+    optimum = prb.minimize(model, progressbar=False)
+    sampling = local(np.array([[1.0], [1.0]]) / np.sqrt(2), [0.1], 2)
+    assert confounded(optimum.evaluator, sampling) == []

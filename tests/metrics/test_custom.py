@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from prbayes._validate import Floats
+from prbayes.metrics.base import Minimum
+from prbayes.metrics.custom import FunctionMetric
+
+OK = [0.0, 1.0, 3.0]
+
+
+def mean_difference(simulated: Any, observed: Any, weights: Any = None) -> Any:
+    return np.abs(np.average(simulated, axis=-1, weights=weights) - observed.mean())
+
+
+def test_it_is_the_value_of_the_function(draw: Callable[..., tuple[Floats, ...]]) -> None:
+    x, _, z, _ = draw(12)
+    plain = FunctionMetric(mean_difference)
+    d = FunctionMetric(mean_difference, weighted=True).against(z)
+    assert plain(x, z) == pytest.approx(abs(x.mean() - z.mean()))
+    rows = np.random.default_rng(13).dirichlet(np.ones(x.size), (2, 3))
+    np.testing.assert_allclose(d(x, rows), np.abs(rows @ x - z.mean()), rtol=1e-12)
+    stored = d.outer(*d.from_basis(rows, d.basis(x), np), xp=np)
+    np.testing.assert_allclose(stored, d(x, rows), rtol=1e-12)
+
+
+def test_nothing_is_assumed_of_it() -> None:
+    plain, weighted = FunctionMetric(mean_difference), FunctionMetric(mean_difference, True)
+    assert plain.minimum is Minimum.UNKNOWN
+    assert not plain.likelihood
+    assert [plain.takes_weights, weighted.takes_weights] == [False, True]
+    assert plain.against(OK).scale == 1.0
+    assert not plain.against(OK).symbolic
+
+
+def test_wrong_functions_and_results() -> None:
+    with pytest.raises(TypeError, match=r"function: got float, expected f\(simulated, observed\)"):
+        FunctionMetric(3.0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"shape \(3,\) .*expected \(\); reduce over"):
+        FunctionMetric(lambda x, z: x)(OK, OK)
+    with pytest.raises(ValueError, match=r"shape \(\) .*expected \(2,\); reduce over"):
+        FunctionMetric(lambda x, z: 0.0)([OK, OK], OK)
+
+
+def test_unequal_weights_need_a_function_that_takes_them() -> None:
+    with pytest.raises(ValueError, match=r"weights: got unequal .*pass weighted=True"):
+        FunctionMetric(mean_difference)(OK, OK, weights=[1, 2, 3])
+    with pytest.raises(ValueError, match="observed weights: got unequal"):
+        FunctionMetric(mean_difference).against(OK, [1, 2, 3])
+
+
+def test_simulated_values_come_first() -> None:
+    metric = FunctionMetric(lambda simulated, observed: simulated.mean(axis=-1) - observed.max())
+    assert metric([6.0, 8.0], [1.0, 4.0]) == pytest.approx(3.0)

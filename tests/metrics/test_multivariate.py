@@ -1,0 +1,252 @@
+"""A sum of discrepancies behaves as any other: batches, data sets, bases, graphs."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+import pytest
+from pytensor.graph.traversal import ancestors
+
+from prbayes._validate import Floats
+from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
+from prbayes.metrics.correlation import MarginalCorrelation
+from prbayes.metrics.custom import FunctionMetric
+from prbayes.metrics.density import GaussianKDE, Histogram
+from prbayes.metrics.divergence import KullbackLeibler
+from prbayes.metrics.joint import Joint
+from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.residual import ProbabilityResidual
+
+NAN = np.nan
+PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
+
+
+class Absolute(Metric):
+    """A metric of one's own on densities, with an outer function that is no sum over cells."""
+
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        cells = GaussianKDE().cells(observed, weights)
+        return AbsoluteDiscrepancy.on_cells(self, observed, weights, cells)
+
+
+class AbsoluteDiscrepancy(DensityDiscrepancy):
+    def outer(self, *features: Any, xp: Any) -> Any:
+        return (xp.abs(features[0] - self.density) * self.cells.widths).sum(axis=-1) ** 1.5
+
+
+class MeanMetric(Metric):
+    """A metric of one's own with features of its own, two of them."""
+
+    minimum = Minimum.QUADRATIC
+
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        return MeanDiscrepancy(self, observed, weights)
+
+
+class MeanDiscrepancy(Discrepancy):
+    scale = 1.0
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+        return (simulated * weights).sum(axis=-1), (simulated**2 * weights).sum(axis=-1)
+
+    def basis(self, simulated: Floats) -> tuple[Floats, ...]:
+        return simulated, simulated**2
+
+    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
+        return weights @ basis[0], weights @ basis[1]
+
+    def outer(self, *features: Any, xp: Any) -> Any:
+        first, second = self.weights @ self.observed, self.weights @ self.observed**2
+        return (features[0] - first) ** 2 + (features[1] - second) ** 2
+
+
+INNER: dict[str, Metric] = {
+    "pr": ProbabilityResidual(),
+    "pr-bins": ProbabilityResidual(Histogram(7)),
+    "kl": KullbackLeibler(),
+    "ll": LogLikelihood(density=GaussianKDE()),
+    "area": AreaMetric(),
+    "absolute": Absolute(),
+    "means": MeanMetric(),
+}
+LIFT: dict[str, Callable[[Metric], Metric]] = {"joint": Joint, "marginal": MarginalCorrelation}
+
+
+@pytest.fixture(params=INNER)
+def inner(request: pytest.FixtureRequest) -> Metric:
+    return INNER[request.param]
+
+
+@pytest.fixture(params=LIFT)
+def metric(request: pytest.FixtureRequest, inner: Metric) -> Metric:
+    return LIFT[request.param](inner)
+
+
+@pytest.fixture
+def draw() -> tuple[Floats, Floats, Floats, Floats]:
+    """Simulated outputs, their weights, observed ones with some missing, and their weights."""
+    rng = np.random.default_rng(0)
+    mix = np.array([[1.0, 0.0, 0.0], [0.9, 0.4, 0.0], [0.2, -0.3, 2.0]])
+    x, z = rng.standard_normal((30, 3)) @ mix.T + 0.2, rng.standard_normal((25, 3)) @ mix.T
+    z[:8, 2] = NAN
+    return x, rng.dirichlet(np.ones(30)), z, rng.dirichlet(np.ones(25))
+
+
+def from_basis(d: Discrepancy, weights: Floats, basis: Any) -> Floats:
+    return np.asarray(d.outer(*d.from_basis(weights, basis, np), xp=np))
+
+
+def test_it_is_the_sum_of_its_parts(metric: Metric, draw: Any) -> None:
+    x, w, z, u = draw
+    d = metric.against(z, u)
+    values = [part.share * part.target.of(part.of(x), w) for part in d.parts]
+    assert d(x, w) == pytest.approx(sum(values), rel=1e-12)
+    assert d.scale == pytest.approx(sum(part.share * part.target.scale for part in d.parts))
+    assert (d.event, d.density_cells) == ((3,), None)
+    overlaps = [part.target.overlap(part.of(x), w) for part in d.parts]
+    assert d.overlap(x, w) == min(overlaps)
+    assert d.n_effective == pytest.approx(1 / (u**2).sum())
+    (itself,) = d.parts[0].target.parts
+    assert (itself.target, itself.share) == (d.parts[0].target, 1.0)
+    assert itself.of(x) is x
+
+
+def test_batches_equal_a_loop_and_a_basis_gives_the_same(metric: Metric, draw: Any) -> None:
+    x, _, z, u = draw
+    d = metric.against(z, u)
+    rng = np.random.default_rng(1)
+    xs, ws = x + rng.normal(0, 0.1, (2, 3, 1, 1)), rng.dirichlet(np.ones(30), (2, 3))
+    expected = [[d(xs[i, j], ws[i, j]) for j in range(3)] for i in range(2)]
+    np.testing.assert_allclose(d(xs, ws), expected, rtol=1e-9)
+    np.testing.assert_allclose(from_basis(d, ws, d.basis(x)), d(x, ws), rtol=1e-9)
+    assert d.overlap(xs, ws).shape == (2, 3)
+
+
+def test_rows_of_weights_are_as_many_data_sets(metric: Metric, draw: Any) -> None:
+    x, w, z, u = draw
+    sets = np.random.default_rng(2).dirichlet(np.ones(25), (4, 1))
+    sets[1, 0, 8:] = 0.0  # only specimens that lack an output
+    sets[1] /= sets[1].sum()
+    several = metric.against(z, u).with_observed(z, sets)
+    some = several.rows([3, 1])
+    basis = some.basis(x)
+    found = from_basis(some, np.stack([[w], [w[::-1]]]), basis)
+    expected = [
+        several.with_observed(z, sets[3, 0])(x, w),
+        several.with_observed(z, sets[1, 0])(x, w[::-1]),
+    ]
+    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-9)
+    # The rows of that data set are there alone: parts that see none of them leave it to the others.
+    alone = several.with_observed(z[:8], sets[1, 0, :8])
+    assert alone(x, w[::-1]) == pytest.approx(expected[1], rel=1e-9)
+    assert found.shape == (2, 1)
+    shares = several.shares.sum(axis=-1)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(shares, sum(part.share for part in several.parts))
+
+
+def test_it_comes_back_from_pickle(metric: Metric, draw: Any) -> None:
+    x, w, z, u = draw
+    d = metric.against(z, u)
+    assert pickle.loads(pickle.dumps(d))(x, w) == d(x, w)
+
+
+def test_other_observed_values_keep_the_slices(metric: Metric, draw: Any) -> None:
+    x, w, z, u = draw
+    d = metric.against(z, u)
+    assert d.with_observed(z, u)(x, w) == pytest.approx(d(x, w), rel=1e-12)
+    other = d.with_observed(x)
+    assert other.observed is x
+    for part, before in zip(other.parts, d.parts, strict=True):
+        assert (part.view, part.share) == (before.view, before.share)
+        np.testing.assert_array_equal(part.target.observed, before.of(x))
+    if d.metric.distance and not isinstance(d.metric.metric, MeanMetric):  # type: ignore[attr-defined]
+        assert other(x) < d(x)
+
+
+def test_the_graph_has_the_same_value_and_the_exact_gradient(metric: Metric, draw: Any) -> None:
+    x, w, z, u = draw
+    d = metric.against(z, u)
+    assert d.symbolic
+    basis = d.basis(x)
+    shared = tuple(pytensor.shared(array) for array in basis)
+    symbol = pt.vector()
+    value = d.outer(*d.from_basis(symbol, shared, pt), xp=pt)
+    function = pytensor.function([symbol], [value, pt.grad(value, symbol)], mode=PYTHON)
+    found, gradient = function(w)
+    np.testing.assert_allclose(found, d(x, w), rtol=1e-10)
+    step = 1e-7 * np.random.default_rng(3).standard_normal(30) * w
+    change = from_basis(d, w + step, basis) - from_basis(d, w - step, basis)
+    np.testing.assert_allclose(gradient @ (2 * step), change, rtol=2e-5, atol=1e-15)
+
+
+def test_views_and_features_are_written_for_graphs_too(draw: Any) -> None:
+    x, w, z, u = draw
+    x[3, 1] = np.inf
+    x[5, 0] = NAN
+    symbol = pt.matrix()
+    for metric in LIFT.values():
+        d = metric(AreaMetric()).against(z, u)
+        for part in d.parts:
+            seen = pytensor.function([symbol], part.of(symbol, pt), mode=PYTHON)(x)
+            np.testing.assert_allclose(seen, part.of(x), rtol=1e-12, atol=1e-12)
+            assert np.isfinite(np.delete(seen, 5, axis=0)).all()
+        whole = d.outer(*d.features(symbol[:5], w[:5], pt), xp=pt)
+        found = pytensor.function([symbol], whole, mode=PYTHON)(x)
+        np.testing.assert_allclose(found, d.of(x[:5], w[:5]), rtol=1e-10)
+
+
+@pytest.mark.parametrize("inner", ["pr", "kl", "ll", "area"])
+def test_the_graph_of_many_outputs_is_no_larger_than_that_of_two(inner: str) -> None:
+    sizes = []
+    for m in (2, 5):
+        x = np.random.default_rng(4).standard_normal((20, m))
+        d = Joint(INNER[inner]).against(x)
+        symbol = pt.vector()
+        basis = tuple(pytensor.shared(array) for array in d.basis(x))
+        value = d.outer(*d.from_basis(symbol, basis, pt), xp=pt)
+        sizes.append(len(list(ancestors([value, pt.grad(value, symbol)]))))
+    assert sizes[0] == sizes[1]
+
+
+def test_a_point_without_a_response_counts_nowhere(metric: Metric, draw: Any) -> None:
+    x, w, z, u = draw
+    if isinstance(metric.metric, MeanMetric):  # type: ignore[attr-defined]
+        pytest.skip("a sum that knows no NaN")
+    d = metric.against(z, u)
+    gone = x.copy()
+    gone[4] = NAN
+    kept = np.delete(np.arange(30), 4)
+    expected = d.of(x[kept], w[kept])
+    if not isinstance(metric.metric, AreaMetric):  # type: ignore[attr-defined]
+        np.testing.assert_allclose(d.of(gone, w), expected, rtol=1e-10)
+    np.testing.assert_allclose(from_basis(d, w, d.basis(gone)), expected, rtol=1e-10)
+
+
+def test_a_function_is_called_with_what_each_part_sees(draw: Any) -> None:
+    x, _, z, _ = draw
+    z = z[8:]
+    calls: list[tuple[Any, ...]] = []
+
+    def apart(simulated: Floats, observed: Floats) -> Floats:
+        calls.append((simulated.shape, observed.shape))
+        return np.asarray(np.abs(simulated.mean(axis=-1) - observed.mean()))
+
+    for lift, number in ((Joint, 10), (MarginalCorrelation, 3)):
+        calls.clear()
+        d = lift(FunctionMetric(apart)).against(z)
+        equal = np.full((2, 30), 1 / 30)
+        found = from_basis(d, equal, d.basis(x))
+        assert not d.symbolic
+        np.testing.assert_allclose(found, d(x), rtol=1e-12)
+        assert calls[:number] == [((2, 30), (17,))] * number
+        sets = np.full((2, 1, 17), 1 / 17)
+        several = d.with_observed(z, sets)
+        np.testing.assert_allclose(
+            from_basis(several, equal[:, None], d.basis(x))[:, 0], d(x), rtol=1e-12
+        )

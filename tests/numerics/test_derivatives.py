@@ -1,0 +1,44 @@
+"""Differences against derivatives in closed form, and at the edge of a support."""
+
+import numpy as np
+import pytest
+
+from prbayes._validate import Floats
+from prbayes.numerics.derivatives import cross, differences, slopes
+
+STEP = np.array([1e-4, 3e-4])
+
+
+def cubic(thetas: Floats) -> Floats:
+    return thetas[:, 0] ** 3 - 2 * thetas[:, 0] * thetas[:, 1]
+
+
+def test_a_cross_is_theta_then_all_up_then_all_down() -> None:
+    theta = np.array([1.0, 2.0])
+    points = cross(theta, np.array([0.5, 0.25]))
+    np.testing.assert_array_equal(points, [[1, 2], [1.5, 2], [1, 2.25], [0.5, 2], [1, 1.75]])
+
+
+def test_slopes_are_derivatives_with_their_sign() -> None:
+    value, gradient, evaluations = differences(cubic, STEP)(np.array([2.0, 0.5]))
+    assert value == 6.0
+    np.testing.assert_allclose(gradient, [11.0, -4.0], rtol=1e-7)
+    assert evaluations == 5
+
+
+def test_slopes_of_arrays_have_the_derivative_last() -> None:
+    def both(thetas: Floats) -> Floats:
+        return np.stack([cubic(thetas), -cubic(thetas)], axis=-1)
+
+    found = slopes(both(cross(np.array([2.0, 0.5]), STEP)), STEP)
+    np.testing.assert_allclose(found, [[11.0, -4.0], [-11.0, 4.0]], rtol=1e-7)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_differences_at_an_edge_are_one_sided(side: float) -> None:
+    def values(thetas: Floats) -> Floats:
+        inside = side * thetas[:, 0] <= 1.0
+        return np.where(inside, thetas[:, 0] ** 2 + thetas[:, 1], np.inf)
+
+    _, gradient, _ = differences(values, np.array([1e-4, 1e-4]))(np.array([side, 3.0]))
+    np.testing.assert_allclose(gradient, [2.0 * side, 1.0], rtol=1e-3)

@@ -1,0 +1,94 @@
+"""Where designs are refined: thetas around an optimum."""
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes.inference.asymptotics import Local
+from prbayes.inference.refits import DesignErrors
+from prbayes.model.coverage import shortcomings
+from prbayes.model.evaluator import Evaluator
+from prbayes.optimize.design_refinement import (
+    pilot,
+    refuse,
+    runs_left,
+    spread_along,
+    spread_around,
+)
+from prbayes.propagation.base import DesignError
+
+PRIOR_SD = np.array([2.0, 0.5])
+
+
+def test_thetas_have_the_covariance_of_the_optimum() -> None:
+    covariance = np.array([[0.04, 0.006], [0.006, 0.0025]])
+    thetas = spread_around(np.array([1.0, -1.0]), covariance, PRIOR_SD)
+    assert thetas.shape == (256, 2)
+    # 256 normal draws: variances to 9%, means to a sixteenth of a standard deviation; 4.5 of them.
+    np.testing.assert_allclose(np.diag(np.cov(thetas.T)), np.diag(covariance), rtol=0.4)
+    assert np.cov(thetas.T)[0, 1] == pytest.approx(0.006, rel=0.5)
+    assert (np.abs(thetas.mean(axis=0) - [1.0, -1.0]) < 0.28 * np.sqrt(np.diag(covariance))).all()
+
+
+@pytest.mark.parametrize("unknown", [np.nan, np.inf, 1e6])
+def test_thetas_are_no_wider_than_the_prior(unknown: float) -> None:
+    covariance = np.diag([unknown, 0.0025])
+    sd = spread_around(np.zeros(2), covariance, PRIOR_SD).std(axis=0)
+    np.testing.assert_allclose(sd, [2.0, 0.05], rtol=0.2)
+
+
+def test_thetas_lie_along_what_the_data_identify() -> None:
+    across, along = np.array([[0.6], [0.8]]), np.array([[0.8], [-0.6]])
+    local = Local(PRIOR_SD, along, across, np.array([[0.01]]))
+    shifts = (spread_along(np.array([1.0, -1.0]), local) - [1.0, -1.0]) / PRIOR_SD
+    np.testing.assert_allclose(shifts @ across, 0.0, atol=1e-12)
+    # 256 normal draws: a standard deviation to 4.4%, four of them.
+    assert (shifts @ along).std() == pytest.approx(0.1, rel=0.18)
+
+
+def test_a_refusal_tells_what_the_data_do_not() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
+    evaluator = Evaluator(model)
+    short = shortcomings(evaluator, np.array([[30.0]]))
+    told = "the data tell less than the prior about mu"
+    with pytest.raises(DesignError, match=rf"y: .*; narrow the priors, .*\. There {told}"):
+        refuse(short, evaluator, [told])
+    refuse({}, evaluator, [told])
+
+
+def test_the_runs_that_are_left_follow_from_the_error_and_the_room() -> None:
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
+        prb.Simulator(
+            "y",
+            lambda a, b: a * b,
+            *(a, pm.Normal.dist(1, 0.1)),
+            metric=prb.AreaMetric(),
+            observed=np.linspace(-1, 3, 20),
+            propagation=prb.Reweighted(64, max_points=192, emulator=None),
+        )
+    evaluator = Evaluator(model)
+    assert runs_left(evaluator, DesignErrors(points=0.15, emulators=np.nan)) == pytest.approx(
+        64 * (1.5 ** (1 / 0.65) - 1), abs=1
+    )
+    assert runs_left(evaluator, DesignErrors(points=np.inf, emulators=np.nan)) == 128
+    assert runs_left(evaluator, DesignErrors(points=0.1, emulators=np.nan)) == 0
+
+
+def test_a_pilot_goes_towards_data_that_are_far() -> None:
+    # Where no response is near the data the discrepancy is the same, up to rounding.
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
+        prb.Simulator(
+            "y",
+            lambda x: x * 1.0,
+            x,
+            metric=prb.ProbabilityResidual(),
+            observed=np.linspace(14, 15, 20),
+            propagation=prb.Reweighted(128),
+        )
+    # Of 1024 draws of the prior the best quarter lies above .67.
+    assert (pilot(Evaluator(model), np.ones(1)) > 0.67).all()

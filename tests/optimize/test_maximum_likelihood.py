@@ -1,0 +1,292 @@
+"""The optimum of models whose observed variables are log-likelihoods by specimen."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes._finding import Finding, report
+from prbayes._validate import Floats
+from prbayes.optimize.maximum_likelihood import LocalOptimum, mode_weights, share_mode
+
+N = 25
+X = np.random.default_rng(3).normal(0.8, 0.5, N)
+
+
+def line(x: Any) -> Any:
+    return 3 * np.asarray(x) - 1
+
+
+def normal_model(sigma: float | None = None, prior_sd: float = 2.0) -> pm.Model:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, prior_sd)
+        sd = pm.HalfNormal("sigma", 1) if sigma is None else sigma
+        prb.Simulator("y", line, pm.Normal.dist(mu, sd), observed=line(X))
+    return model
+
+
+def folded_model() -> pm.Model:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 0.5)
+        prb.Simulator("y", lambda x: x**2, pm.Normal.dist(mu, sigma), observed=X**2)
+    return model
+
+
+def fit(model: pm.Model, **given: Any) -> prb.Optimum:
+    return prb.minimize(model, progressbar=False, **given)
+
+
+@pytest.fixture
+def codes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the codes of findings, as they are reported."""
+    reported: list[str] = []
+
+    def recorded(findings: list[Finding]) -> tuple[Finding, ...]:
+        reported.extend(finding.code for finding in findings)
+        return report(findings)
+
+    monkeypatch.setattr("prbayes.optimize.maximum_likelihood.report", recorded)
+    return reported
+
+
+@cache
+def normal_optimum() -> prb.Optimum:
+    return fit(normal_model())
+
+
+# -- closed forms ------------------------------------------------------------------------------------
+
+
+def test_the_optimum_of_a_normal_population() -> None:
+    optimum = normal_optimum()
+    assert optimum.converged
+    assert optimum.warnings == ()
+    assert optimum.point["mu"] == pytest.approx(X.mean(), abs=1e-3)
+    assert optimum.point["sigma"] == pytest.approx(X.std(), abs=1e-3)
+
+
+def test_standard_errors_are_those_of_the_fisher_information() -> None:
+    optimum = normal_optimum()
+    assert optimum.stderr["mu"] == pytest.approx(X.std() / np.sqrt(N), abs=1e-3)
+    assert optimum.stderr["sigma"] == pytest.approx(X.std() / np.sqrt(2 * N), abs=1e-3)
+    # In unconstrained space, that of log sigma: mean and logarithm of sd are independent.
+    assert np.allclose(optimum.covariance, np.diag([X.var() / N, 1 / (2 * N)]), atol=1e-4)
+
+
+def test_the_value_is_minus_the_log_likelihood() -> None:
+    optimum = normal_optimum()
+    # Of the outputs: three times as wide as the inputs. The mass of each root is right to .01.
+    exact = N * (np.log(3 * X.std() * np.sqrt(2 * np.pi)) + 0.5)
+    assert optimum.discrepancy == pytest.approx(exact, abs=0.1)
+    assert optimum.discrepancies == pytest.approx({"y": optimum.discrepancy})
+    assert optimum.rivals == ()
+
+
+@pytest.mark.long
+def test_the_first_optimum_reports_its_runs_and_the_next_has_none() -> None:
+    model = normal_model()
+    first, second = fit(model), fit(model)
+    assert (first.n_responses, second.n_responses) == (128, 0)
+    assert first.theta.tolist() == second.theta.tolist()
+
+
+def test_the_mode_with_the_prior() -> None:
+    sd, prior_sd = 0.7, 0.2
+    model = normal_model(sigma=sd, prior_sd=prior_sd)
+    precision = N / sd**2 + 1 / prior_sd**2
+    optimum = fit(model, prior=True)
+    assert optimum.prior
+    assert optimum.point["mu"] == pytest.approx(X.sum() / sd**2 / precision, abs=1e-4)
+    assert optimum.stderr["mu"] == pytest.approx(precision**-0.5, abs=1e-4)
+    assert fit(model).point["mu"] == pytest.approx(X.mean(), abs=1e-4)
+
+
+def test_a_specimen_beyond_all_draws_of_the_prior() -> None:
+    sd, prior_sd = 0.5, 0.1
+    precision = N / sd**2 + 1 / prior_sd**2
+    optimum = fit(normal_model(sigma=sd, prior_sd=prior_sd), prior=True)
+    exact = X.sum() / sd**2 / precision
+    assert optimum.point["mu"] == pytest.approx(exact, abs=1e-3)
+
+
+# -- several modes -----------------------------------------------------------------------------------
+
+
+def test_a_folded_response_has_two_modes(codes: list[str]) -> None:
+    optimum = fit(folded_model())
+    assert codes == ["second-mode"]
+    assert "of the posterior's mass" in optimum.warnings[0]
+    (rival,) = optimum.rivals
+    assert rival["point"]["mu"] == pytest.approx(-optimum.point["mu"], abs=1e-3)
+    assert rival["point"]["sigma"] == pytest.approx(optimum.point["sigma"], abs=1e-3)
+    # The roots of each specimen are weighted by masses that are right to .01.
+    assert rival["weight"] == pytest.approx(0.5, abs=0.02)
+    assert rival["comparable"]
+
+
+def test_a_start_selects_the_mode(codes: list[str]) -> None:
+    model = folded_model()
+    for sign in (-1, 1):
+        optimum = fit(model, start={"mu": 0.7 * sign, "sigma": 0.4})
+        assert np.sign(optimum.point["mu"]) == sign
+        assert optimum.rivals == ()
+    assert codes == []
+
+
+def quartic(theta: Floats) -> tuple[float, Floats]:
+    """Return (|theta|^2 - 1)^2: a circle of minima, in one dimension two minima at distance 2."""
+    away = float(theta @ theta) - 1
+    return 20 * away**2, 80 * away * theta
+
+
+@pytest.mark.parametrize("angle", [0.5, 2.0, np.pi])
+def test_optima_on_a_curved_ridge_are_one_mode(angle: float) -> None:
+    unit = np.array([1.0, 1.0])
+    first, second = (
+        LocalOptimum(np.array([np.cos(a), np.sin(a)]), 0.0, np.eye(2), True) for a in (0.0, angle)
+    )
+    assert share_mode(quartic, unit, first, second, 0.01)
+    assert share_mode(quartic, unit, second, first, 0.01)
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.9, True), (1.1, False)])
+def test_a_barrier_divides_modes(height: float, expected: bool) -> None:
+    def double_well(theta: Floats) -> tuple[float, Floats]:
+        # The barrier at theta[0] = 0; another direction in other units.
+        value, slope = quartic(theta[:1])
+        scaled = theta[1] / 1e6 - 3 * theta[0]
+        gradient = [slope[0] * height / 20 - 6 * scaled, 2 * scaled / 1e6]
+        return height / 20 * value + scaled**2, np.array(gradient)
+
+    first, second = (
+        LocalOptimum(np.array([s, 3e6 * s]), 0.0, np.eye(2), True) for s in (-1.0, 1.0)
+    )
+    assert share_mode(double_well, np.array([1.0, 1e6]), first, second, 1.0) == expected
+
+
+@pytest.mark.parametrize(("error", "expected"), [(0.15, True), (0.05, False)])
+def test_ripples_within_the_error_of_the_likelihood_are_no_barrier(
+    error: float, expected: bool
+) -> None:
+    def ridge(theta: Floats) -> tuple[float, Floats]:
+        phase = 6 * np.pi * theta[1]
+        value = 20 * theta[0] ** 2 + 0.05 * (1 - np.cos(phase))
+        return value, np.array([40 * theta[0], 0.3 * np.pi * np.sin(phase)])
+
+    first, second = (LocalOptimum(np.array([0.0, at]), 0.0, np.eye(2), True) for at in (0.0, 1.0))
+    assert share_mode(ridge, np.ones(2), first, second, error) == expected
+
+
+def test_a_ridge_of_four_hyperparameters_is_one_mode(codes: list[str]) -> None:
+    # As of y = a + b with two normal inputs.
+    with pm.Model() as model:
+        first, second = pm.Normal("first", 0, 1), pm.Normal("second", 0, 1)
+        sd = pm.HalfNormal("sd", 1, shape=2)
+        x = pm.Normal.dist(first + second, pm.math.sqrt((sd**2).sum()))
+        prb.Simulator("y", line, x, observed=line(X))
+    optimum = fit(model)
+    assert codes == ["not-identified"]
+    assert optimum.rivals == ()
+
+
+def mode(value: float, variance: Any) -> LocalOptimum:
+    covariance = np.diag(np.atleast_1d(np.asarray(variance, dtype=float)))
+    return LocalOptimum(np.zeros(len(covariance)), value, covariance, True)
+
+
+def test_weights_of_modes_are_those_of_laplace() -> None:
+    # exp(-value) times the square root of the covariance's determinant
+    weights = mode_weights([mode(3.0, [1.0, 4.0]), mode(3.0 + np.log(2), [4.0, 16.0])])
+    assert np.allclose(weights, [1 / 3, 2 / 3])
+    assert mode_weights([mode(1e4, 1.0)]).tolist() == [1.0]
+    assert mode_weights([mode(0.0, 1.0), mode(1e3, 1.0)]).tolist() == [1.0, 0.0]
+
+
+# -- what data do not identify -----------------------------------------------------------------------
+
+
+def test_hyperparameters_that_are_not_identified(codes: list[str]) -> None:
+    with pm.Model() as model:
+        first, second = pm.Normal("first", 0, 1), pm.Normal("second", 0, 1)
+        sigma = pm.HalfNormal("sigma", 1)
+        prb.Simulator("y", line, pm.Normal.dist(first + second, sigma), observed=line(X))
+    optimum = fit(model)
+    assert codes == ["not-identified"]
+    assert "do not identify first, second" in optimum.warnings[0]
+    assert optimum.stderr["first"] == optimum.stderr["second"] == np.inf
+    assert optimum.stderr["sigma"] == pytest.approx(X.std() / np.sqrt(2 * N), abs=2e-3)
+    total = optimum.point["first"] + optimum.point["second"]
+    assert total == pytest.approx(X.mean(), abs=1e-3)
+    assert optimum.converged
+
+
+def test_a_hyperparameter_without_influence(codes: list[str]) -> None:
+    with pm.Model() as model:
+        mu, spare = pm.Normal("mu", 0, 2), pm.Normal("spare", 0, 1)
+        prb.Simulator("y", line, pm.Normal.dist(mu + 0 * spare, 0.5), observed=line(X))
+    optimum = fit(model)
+    assert codes == ["not-identified"]
+    assert optimum.stderr["spare"] == np.inf
+    assert optimum.stderr["mu"] == pytest.approx(0.1, abs=1e-3)
+
+
+# -- moving supports ---------------------------------------------------------------------------------
+
+
+def test_an_end_of_a_support_at_the_largest_specimen(codes: list[str]) -> None:
+    x = np.random.default_rng(0).uniform(0, 2, N)
+    with pm.Model() as model:
+        end = pm.HalfNormal("end", 3)
+        prb.Simulator("y", lambda x: np.exp(x / 2), pm.Uniform.dist(0, end), observed=np.exp(x / 2))
+    optimum = fit(model)
+    assert codes == ["support-edge"]
+    assert optimum.point["end"] == pytest.approx(x.max(), abs=1e-3)
+    assert np.isnan(optimum.covariance).all()
+    assert np.isnan(optimum.stderr["end"])
+    assert not optimum.converged
+
+
+# -- options -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("most", [20, 100])
+def test_the_number_of_evaluations_is_limited(most: int) -> None:
+    optimum = fit(normal_model(), max_evaluations=most)
+    # A descent has ten evaluations at least, and the Hessian up to twelve of them.
+    assert optimum.n_evaluations <= most + 40
+    # The trace is that of the best descent.
+    assert len(optimum.trace["theta"]) <= optimum.n_evaluations
+
+
+@pytest.mark.long
+def test_the_number_of_starts() -> None:
+    model = normal_model()
+    few, many = fit(model, starts=1), fit(model, starts=8)
+    assert few.n_evaluations < many.n_evaluations
+    assert "from 1 starts" in few.message
+    assert few.point == pytest.approx(many.point, abs=1e-4)
+
+
+@pytest.mark.long
+def test_the_same_seed_gives_the_same_bits() -> None:
+    optima = [fit(normal_model(), random_seed=s) for s in (0, 0, 1)]
+    assert optima[0].theta.tolist() == optima[1].theta.tolist()
+    assert np.allclose(optima[0].theta, optima[2].theta, atol=1e-4)
+
+
+@pytest.mark.long
+def test_units_of_inputs_and_outputs_do_not_matter() -> None:
+    unit = 1e6
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0, 2 * unit), pm.HalfNormal("sigma", unit)
+        x = pm.Normal.dist(mu, sigma)
+        prb.Simulator("y", lambda x: line(x / unit) / unit, x, observed=line(X) / unit)
+    optimum = fit(model)
+    for name in ("mu", "sigma"):
+        assert optimum.point[name] / unit == pytest.approx(normal_optimum().point[name], abs=1e-4)
+        assert optimum.stderr[name] / unit == pytest.approx(normal_optimum().stderr[name], rel=1e-3)

@@ -1,0 +1,961 @@
+"""`minimize` against closed forms, brute force, and its own promises."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from first_use import first_use
+from four_metrics import METRICS, R256, same
+from scipy import optimize
+from scipy.stats import norm
+
+import prbayes as prb
+from prbayes._validate import Floats
+from prbayes.inference.refits import SamplingDistribution
+from prbayes.metrics.density import GaussianKDE
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.random_variable import nodes
+from prbayes.optimize import minimize as minimization
+from prbayes.optimize.convergence import Approach, Run, Search, Trace
+from prbayes.optimize.objective import Hold
+from prbayes.response.compile import PLAIN
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
+N, MEAN, SD = OBSERVED.size, float(OBSERVED.mean()), float(OBSERVED.std())
+# Largest error of 256 reweighted responses, in standard errors of the data: kinks cost the area
+# metric some.
+DESIGN_ERROR = {"kl": 0.03, "ll": 0.03, "pr": 0.03, "area": 0.08}
+METHODS = ("BFGS", "L-BFGS-B", "Nelder-Mead", "Powell", "CG")
+NORMAL = ("mu", "sigma")
+
+
+class Counting:
+    """A response that PyTensor variables cannot enter, with the number of its scalar responses.
+
+    A specimen by itself, computed to see that none depends on others, is no run.
+    """
+
+    def __init__(self) -> None:
+        self.calls = self.count = 0
+
+    def __call__(self, x: Any) -> Floats:
+        x = np.asarray(x, dtype=float)
+        if x.size > 1:
+            self.calls, self.count = self.calls + 1, self.count + x.size
+        return np.asarray(x)
+
+
+def normal_model(
+    metric: prb.Metric,
+    propagation: Any = R256,
+    response: Callable[..., Any] = same,
+    observed: Floats = OBSERVED,
+    **keywords: Any,
+) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", response, x, metric=metric, observed=observed, propagation=propagation, **keywords
+        )
+    return model
+
+
+def mean_model(metric: prb.Metric, **keywords: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        prb.Simulator("y", same, x, metric=metric, observed=OBSERVED, propagation=R256, **keywords)
+    return model
+
+
+def node(model: pm.Model) -> Any:
+    return next(iter(nodes(model).values()))
+
+
+@cache
+def fitted(name: str) -> prb.Optimum:
+    # A simplex where BFGS would walk along the kinks of the area metric: a third of the time.
+    return prb.minimize(
+        normal_model(METRICS[name]), method="Nelder-Mead" if name == "area" else None
+    )
+
+
+def pair(optimum: prb.Optimum) -> Floats:
+    return np.array([optimum.point[n] for n in NORMAL])
+
+
+def errors(optimum: prb.Optimum) -> Floats:
+    return np.array([optimum.stderr[n] for n in NORMAL])
+
+
+def simplex(f: Callable[..., float], start: Floats, size: float, tolerance: float = 1e-7) -> Floats:
+    vertices = np.vstack([start, start + size * np.eye(len(start))])
+    options = {"initial_simplex": vertices, "xatol": tolerance, "fatol": 1e-14, "maxiter": 500}
+    return np.asarray(optimize.minimize(f, start, method="Nelder-Mead", options=options).x)
+
+
+# -- where the optimum is
+# --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "tolerance"), [("kl", 0.03), ("ll", 0.1)])
+def test_a_normal_population_gets_mean_and_sd_of_the_data(name: str, tolerance: float) -> None:
+    # Kullback-Leibler with one bandwidth for both sides matches moments; the likelihood is smoothed
+    # at one side only, with a bandwidth that costs at most a tenth of a standard error.
+    optimum = fitted(name)
+    assert optimum.converged
+    assert (
+        np.abs(pair(optimum) - [MEAN, SD])
+        < tolerance * np.array([SD / N**0.5, SD / (2 * N) ** 0.5])
+    ).all()
+
+
+def residual(mu: Any, sigma: Any) -> Any:
+    """The probability residual of a normal population, in closed form, without grid or design."""
+    h = node(fitted("pr").model).target.cells.bandwidth
+    scale = _scale(h)
+    cross = norm.pdf(OBSERVED - mu[..., None], scale=np.sqrt(sigma**2 + 2 * h**2)[..., None]).mean(
+        axis=-1
+    )
+    data = norm.pdf(OBSERVED - OBSERVED[:, None], scale=np.sqrt(2) * h).mean()
+    return scale * (1 / np.sqrt(4 * np.pi * (sigma**2 + h**2)) - 2 * cross + data)
+
+
+@cache
+def _scale(h: float) -> Any:
+    z = np.linspace(-2, 4, 4001)
+    density = norm.pdf(z[:, None] - OBSERVED, scale=h).mean(axis=1)
+    return 100.0 ** -np.floor(np.log10(density.max()))
+
+
+def area(mu: Any, sigma: Any, observed: Floats = OBSERVED, points: int = 4000) -> Any:
+    """The area metric of a normal population from its inverse distribution function."""
+    u = (np.arange(points) + 0.5) / points
+    data = np.sort(observed)[(u * observed.size).astype(int)]
+    return np.abs(mu[..., None] + sigma[..., None] * norm.ppf(u) - data).mean(axis=-1)
+
+
+@pytest.mark.parametrize(("name", "brute"), [("pr", residual), ("area", area)])
+def test_the_optimum_is_that_of_a_brute_force_grid(name: str, brute: Callable[..., Any]) -> None:
+    optimum = fitted(name)
+    mu, sigma = np.meshgrid(np.linspace(0.5, 1.5, 41), np.linspace(0.2, 0.8, 41), indexing="ij")
+    best = int(np.argmin(brute(mu.ravel(), sigma.ravel())))
+    start = np.array(
+        [mu.ravel()[best], sigma.ravel()[best]]
+    )  # refined from the best node: one basin
+    expected = simplex(lambda p: float(brute(np.array(p[0]), np.array(p[1]))), start, 0.02)
+    assert (np.abs(pair(optimum) - start) < 0.025).all()
+    assert (np.abs(pair(optimum) - expected) < DESIGN_ERROR[name] * errors(optimum)).all()
+    at = brute(*(np.array(p) for p in pair(optimum)))
+    np.testing.assert_allclose(optimum.discrepancy, at, rtol=0.03 if name == "area" else 1e-2)
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_reweighting_256_responses_agrees_with_resimulating_thousands(name: str) -> None:
+    # 4096 points do for the area metric, whose standard errors would take a minute with more.
+    method, n = ("Nelder-Mead", 4096) if name == "area" else (None, 16384)
+    model = normal_model(METRICS[name], prb.Resimulated(n))
+    other = prb.minimize(model, method=method, start=fitted(name).point, tolerance=1e-4)
+    assert (
+        np.abs(pair(other) - pair(fitted(name))) < DESIGN_ERROR[name] * errors(fitted(name))
+    ).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_methods_agree(method: str) -> None:
+    best = fitted("pr")
+    other = prb.minimize(best.model, method=method, start={"mu": 0.3, "sigma": 1.0})
+    assert other.converged
+    assert (np.abs(pair(other) - pair(best)) < 1e-3 * errors(best)).all()
+    np.testing.assert_allclose(other.discrepancy, best.discrepancy, rtol=1e-6)
+
+
+def test_a_quadratic_case_with_everything_mixed_in() -> None:
+    # With a known sd and one bandwidth for both sides the divergence is (mu - mean)^2 / (2 (sd^2 +
+    # h^2)) plus a constant; the ordinary likelihood and the potential are quadratic as well.
+    extra = np.random.default_rng(2).normal(1.2, 0.5, 30)
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        x = pm.Normal.dist(mu, 0.5)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+        pm.Normal("z", mu, 0.5, observed=extra)
+        pm.Potential("pull", -5.0 * (mu - 3.0) ** 2)
+    precision = np.array(
+        [1 / (0.25 + node(model).target.cells.bandwidth ** 2), 30 / 0.25, 10.0, 1 / 4]
+    )
+    centers = np.array([MEAN, extra.mean(), 3.0, 0.0])
+    # In units of log-densities: discrepancy / epsilon, epsilon = 1/N
+    precision[0] *= N
+    for prior, terms in ((False, slice(3)), (True, slice(4))):
+        optimum = prb.minimize(model, prior=prior)
+        assert optimum.scales == {"y": pytest.approx(1 / N)}
+        expected = precision[terms] @ centers[terms] / precision[terms].sum()
+        np.testing.assert_allclose(optimum.point["mu"], expected, atol=1e-4)
+        assert (optimum.prior, "with the prior" in repr(optimum)) == (prior, prior)
+        assert optimum.to_datatree()["optimum"].attrs["prior"] == int(prior)
+
+
+def with_term(term: Callable[[Any], Any], epsilon: float | None = None) -> pm.Model:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        x = pm.Normal.dist(mu, 0.5)
+        prb.Simulator(
+            "y",
+            same,
+            x,
+            metric=METRICS["area"],
+            observed=OBSERVED,
+            epsilon=epsilon,
+            propagation=R256,
+        )
+        term(mu)
+    return model
+
+
+WEIGHING: dict[str, Callable[[Any], Any]] = {
+    "potential": lambda mu: pm.Potential("pull", -50.0 * (mu - 3.0) ** 2),
+    "likelihood": lambda mu: pm.Normal("z", mu, 0.1, observed=[3.0]),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("term", WEIGHING)
+def test_other_terms_are_weighed_by_epsilon_or_refused(term: str) -> None:
+    with pytest.raises(
+        ValueError, match=r"minimize: got other likelihood terms or potentials beside .*\['y'\]"
+    ):
+        prb.minimize(with_term(WEIGHING[term]))
+    for epsilon in (0.02, 0.2):
+        model = with_term(WEIGHING[term], epsilon)
+        optimum = prb.minimize(model, starts=0)
+        density = model.compile_logp(vars=model.observed_RVs + model.potentials, mode=PLAIN)
+        grid = np.linspace(MEAN - 1, 4, 401)
+        best = grid[np.argmax([density({"mu": mu}) for mu in grid])]
+        assert abs(optimum.point["mu"] - best) < 0.02
+
+
+def test_a_potential_that_only_excludes_needs_no_epsilon() -> None:
+    model = with_term(lambda mu: pm.Potential("positive", pm.math.switch(mu > 0, 0.0, -np.inf)))
+    plain = prb.minimize(with_term(lambda mu: None))
+    found = prb.minimize(model)
+    assert found.scales == plain.scales == {"y": 1.0}
+    assert abs(found.point["mu"] - plain.point["mu"]) < 0.1 * plain.stderr["mu"]
+
+
+def test_a_prior_without_epsilon_to_weigh_it_against_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"minimize: got minus the log prior .* without epsilon, \['y'\]"
+    ):
+        prb.minimize(with_term(lambda mu: None), prior=True)
+
+
+def test_prior_true_is_find_map() -> None:
+    model = fitted("kl").model
+    mode = pm.find_MAP(
+        model=model,
+        progressbar=False,
+        return_inferencedata=True,
+        jitter=False,
+        compile_kwargs={"mode": PLAIN},
+    ).posterior
+    optimum = prb.minimize(model, prior=True)
+    for name in NORMAL:
+        np.testing.assert_allclose(optimum.point[name], float(mode[name].squeeze()), rtol=1e-4)
+    assert abs(optimum.point["sigma"] - SD) > 1e-3  # the prior has an influence
+
+
+# -- several simulators
+# ----------------------------------------------------------------------------------
+
+
+def test_two_simulators_are_scaled_by_their_noise() -> None:
+    # The same specimens measured in metres and in millimetres: each counts the same, and the
+    # optimum is that of one.
+    with pm.Model() as model:
+        x = pm.Normal.dist(1.0, pm.HalfNormal("sigma", 2))
+        for name, unit in (("m", 1.0), ("mm", 1000.0)):
+            prb.Simulator(
+                name, lambda x, unit=unit: unit * x, x, metric=METRICS["area"], observed=unit * OBSERVED,
+                propagation=R256,
+            )  # fmt: skip
+    optimum = prb.minimize(model)
+    # Noise floors are means over 200 simulated data sets whose discrepancies vary by 40%: standard
+    # error 3%.
+    np.testing.assert_allclose(
+        optimum.scales["mm"] / optimum.scales["m"], 1000, rtol=5 * 0.03 * 2**0.5
+    )
+    np.testing.assert_allclose(
+        optimum.discrepancies["mm"] / optimum.discrepancies["m"], 1000, rtol=1e-6
+    )
+    expected = sum(optimum.discrepancies[n] / optimum.scales[n] for n in ("m", "mm"))
+    np.testing.assert_allclose(optimum.discrepancy, expected, rtol=1e-12)
+    alone = simplex(lambda p: float(area(np.array(1.0), np.array(p[0]))), np.array([0.4]), 0.05)
+    assert abs(optimum.point["sigma"] - alone[0]) < DESIGN_ERROR["area"] * optimum.stderr["sigma"]
+
+
+def test_given_epsilons_weigh_the_simulators() -> None:
+    other = np.random.default_rng(3).normal(2.0, 0.5, 20)
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        for name, data, epsilon in (("a", OBSERVED, 0.02), ("b", other, None)):
+            x = pm.Normal.dist(mu, 0.5)
+            prb.Simulator(
+                name,
+                same,
+                x,
+                metric=METRICS["kl"],
+                observed=data,
+                epsilon=epsilon,
+                propagation=R256,
+            )
+    h = [n.target.cells.bandwidth for n in nodes(model).values()]
+    precision = np.array([1 / 0.02, 20.0]) / (0.25 + np.square(h))  # unset: 1/N
+    optimum = prb.minimize(model)
+    np.testing.assert_allclose([optimum.scales["a"], optimum.scales["b"]], [0.02, 0.05])
+    np.testing.assert_allclose(
+        optimum.point["mu"], precision @ [MEAN, other.mean()] / precision.sum(), atol=3e-4
+    )
+    # Each gradient is linear in the mean of its data: the sandwich in closed form.
+    noise = (precision**2 * np.array([0.25 / N, 0.25 / 20])).sum()
+    np.testing.assert_allclose(optimum.stderr["mu"], noise**0.5 / precision.sum(), rtol=0.02)
+
+
+@pytest.mark.slow
+def test_vector_hyperparameters_of_a_multivariate_input() -> None:
+    covariance = np.array([[1.0, 0.5], [0.5, 1.0]])
+    data = np.random.default_rng(4).multivariate_normal([1.0, 2.0], covariance, 30)
+    with pm.Model(coords={"axis": ["a", "b"]}) as model:
+        mean = pm.MvNormal("mean", [0.0, 0.0], 4 * np.eye(2), dims="axis")
+        x = pm.MvNormal.dist(mean, covariance)
+        for i, name in enumerate(("first", "second")):
+            prb.Simulator(
+                name, lambda x, i=i: x[..., i], x, metric=METRICS["kl"], observed=data[:, i],
+                propagation=prb.Reweighted(64),
+            )  # fmt: skip
+        pm.Deterministic("gap", mean[1] - mean[0])
+    optimum = prb.minimize(model)
+    assert optimum.names == ["mean[a]", "mean[b]"]
+    assert optimum.point["mean"].shape == optimum.stderr["mean"].shape == (2,)
+    expected = data.mean(
+        axis=0
+    )  # a quadratic in each mean; correlation does not matter to marginal conditions
+    assert (np.abs(optimum.point["mean"] - expected) < 0.25 * optimum.stderr["mean"]).all()
+    np.testing.assert_allclose(optimum.stderr["mean"], 1 / 30**0.5, rtol=0.1)
+    np.testing.assert_allclose(optimum.point["gap"], np.diff(optimum.point["mean"])[0], rtol=1e-12)
+    tree = optimum.to_datatree()
+    assert tree["optimum"]["mean"].dims == ("axis",)
+    assert list(tree["optimum"]["axis"].values) == ["a", "b"]
+
+
+# -- supports and starts
+# ---------------------------------------------------------------------------------
+
+
+def priors(kind: str) -> tuple[Any, Any]:
+    if kind == "uniform":
+        return pm.Uniform("mu", 0, 5), pm.Uniform("sigma", 0.1, 2)
+    if kind == "beta":
+        return pm.Deterministic("mu", 3 * pm.Beta("share", 2, 2)), pm.Gamma("sigma", 2, 2)
+    return pm.Uniform("mu", 0, 5, default_transform=None), pm.HalfNormal(
+        "sigma", 1, default_transform=None
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["uniform", "beta", "untransformed"])
+def test_the_optimum_does_not_depend_on_how_hyperparameters_are_constrained(kind: str) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(*priors(kind))
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model)
+    assert (np.abs(pair(optimum) - [MEAN, SD]) < 0.03 * errors(fitted("kl"))).all()
+    np.testing.assert_allclose(errors(optimum), errors(fitted("kl")), rtol=0.02)
+
+
+@pytest.mark.parametrize("transform", ["default", None])
+def test_an_optimum_at_the_edge_of_a_support_stays_inside(transform: str | None) -> None:
+    keywords: dict[str, Any] = {} if transform else {"default_transform": None}
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Uniform("mu", 0, 0.9, **keywords), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model, method="Nelder-Mead")
+    assert 0.9 - 1e-3 < optimum.point["mu"] <= 0.9
+    # Moment matching around 0.9 instead of the mean.
+    np.testing.assert_allclose(optimum.point["sigma"], np.hypot(SD, MEAN - 0.9), atol=2e-3)
+    np.testing.assert_allclose(optimum.stderr["sigma"], errors(fitted("kl"))[1], rtol=0.1)
+
+
+def two_modes(x: Any, coin: Any) -> Any:
+    return x + np.where(coin < 0.5, -16.0, 16.0)
+
+
+def collapsing(spread: Callable[[], Any]) -> pm.Model:
+    """The log-likelihood's bandwidth follows the spread between the modes, and prefers a point in either."""
+    rng = np.random.default_rng(3)
+    observed = two_modes(rng.normal(1.5, 0.1, 20), rng.random(20))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), spread())
+        coin, propagation = pm.Uniform.dist(0, 1), prb.Resimulated(512)
+        prb.Simulator(
+            "y",
+            two_modes,
+            x,
+            coin,
+            metric=METRICS["ll"],
+            observed=observed,
+            propagation=propagation,
+        )
+    return model
+
+
+@pytest.mark.parametrize(
+    ("spread", "keywords"),
+    [
+        (lambda: pm.LogNormal("sigma", np.log(0.1), 4.0), {}),  # less than three spreads of it away
+        (lambda: pm.InverseGamma("sigma", 2, 0.3), {}),
+        (lambda: pm.HalfNormal("sigma", 0.3), {"tolerance": 1e-3}),
+        (lambda: pm.HalfNormal("sigma", 0.3), {"method": "Powell"}),
+    ],
+    ids=["wide", "inverse gamma", "coarse", "Powell"],
+)
+def test_a_collapsed_population_is_known_by_the_objective(
+    spread: Callable[[], Any], keywords: dict[str, Any]
+) -> None:
+    """Not by standard errors: curvature and its noise are rounding errors there, and their ratio is anything."""
+    optimum = prb.minimize(collapsing(spread), **keywords)
+    assert optimum.point["sigma"] < 3e-3
+    assert optimum.at_edge == ("sigma",)
+    assert not optimum.converged
+
+
+def test_a_hyperparameter_without_effect_is_at_no_edge_however_far_out() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        pm.Normal("idle", 3, 2)
+        prb.Simulator("y", same, x, metric=METRICS["pr"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model, start={"mu": 1.0, "idle": 60.0}, starts=0)
+    assert optimum.point["idle"] == pytest.approx(60.0)
+    assert optimum.at_edge == ()
+    assert optimum.converged
+
+
+def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() -> None:
+    model = collapsing(lambda: pm.HalfNormal("sigma", 0.3))
+    optimum = prb.minimize(model)
+    assert optimum.point["sigma"] < 1e-3
+    assert not optimum.converged
+    assert optimum.at_edge == ("sigma",)
+    assert np.isnan(errors(optimum)).all()
+    assert "sigma ran to the edge of the support" in repr(optimum)
+    assert optimum.message.endswith("sigma ran to the edge of the support.")
+    said = prb.diagnose(optimum).messages
+    assert "collapsed" in said[0]
+    assert not any("did not converge" in line for line in said)
+    for call in (
+        prb.calibrate_epsilon,
+        prb.bootstrap,
+        prb.cross_validate,
+        prb.validation.JointNull,
+    ):
+        with pytest.raises(ValueError, match=f"{call.__name__}: .*sigma ran to the edge"):
+            call(optimum)
+    with pytest.raises(ValueError, match=r"sample_smc: .*sigma ran to the edge .*adjustment=None"):
+        prb.sample_smc(50, chains=1, optimum=optimum, model=model, random_seed=1, progressbar=False)
+    tree = prb.sample_smc(
+        50, chains=1, epsilon=1 / 20, adjustment=None, optimum=optimum, model=model, random_seed=1
+    )
+    assert tree.posterior["sigma"].mean() > 10 * optimum.point["sigma"]
+
+
+@cache
+def lossy(name: str, seed: int, n: int) -> pm.Model:
+    """Model eq. 14 of the paper, which has no response where |x - 2| > 1."""
+
+    def response(x: Any, coin: Any) -> Any:
+        with np.errstate(invalid="ignore"):
+            return 10 + np.where(coin < 0.5, -16.0, 16.0) * np.sqrt(1 - (x - 2) ** 2)
+
+    rng = np.random.default_rng([seed, 20, 3])
+    x, coin = rng.normal(1.5, 0.1, 40), rng.random(40)
+    observed = response(x, coin)[:20]
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1.65, 0.5), pm.HalfNormal("sigma", 0.3))
+        coin, propagation = pm.Uniform.dist(0, 1), prb.Resimulated(n)
+        prb.Simulator(
+            "y", response, x, coin, metric=METRICS[name], observed=observed, propagation=propagation
+        )
+    return model
+
+
+START = {"mu": 1.65, "sigma": 0.15}
+
+
+@pytest.mark.parametrize(("name", "seed"), [("kl", 0), ("kl", 1), ("pr", 0)])
+def test_bfgs_steps_over_the_jumps_of_points_that_lose_their_response(name: str, seed: int) -> None:
+    model = lossy(name, seed, 4096)
+    simplex = prb.minimize(model, start=START, method="Nelder-Mead")
+    optimum = prb.minimize(model, start=START)
+    assert optimum.discrepancy < simplex.discrepancy * (1 + 1e-4)
+    assert optimum.converged
+
+
+def test_at_a_jump_there_are_no_standard_errors() -> None:
+    optimum = prb.minimize(lossy("kl", 1, 1024), start=START)
+    assert optimum.at_jump == ("y",)
+    assert np.isnan(errors(optimum)).all()
+    assert "the discrepancy jumps" in repr(optimum)
+    assert "points lose their response" in str(prb.diagnose(optimum))
+    with pytest.raises(ValueError, match=r"calibrate_epsilon: .* points lose their response"):
+        prb.calibrate_epsilon(optimum)
+
+
+def test_standard_errors_are_those_of_where_the_simplex_ended() -> None:
+    model = lossy("pr", 1, 4096)
+    optimum = prb.minimize(model, start=START)
+    assert "A simplex from there" in optimum.message
+    hood = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
+    np.testing.assert_allclose(optimum.covariance, hood.local.in_theta, rtol=1e-6)
+    np.testing.assert_array_equal(optimum.sampling().local.in_theta, hood.local.in_theta)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["kl", "pr"])
+def test_a_jump_that_hardly_matters_leaves_standard_errors_alone(name: str) -> None:
+    """A response that is lost beyond three standard deviations, from a hundred thousand points, and one that is not."""
+    found = []
+    for edge in (3.0, np.inf):
+        model = normal_model(
+            METRICS[name],
+            prb.Resimulated(100_000),
+            lambda x, e=edge: np.where(np.abs(x - MEAN) < e * SD, x, np.nan),
+        )
+        found.append(prb.minimize(model))
+    cut, whole = found
+    assert cut.converged
+    assert cut.at_jump == ()
+    np.testing.assert_allclose(
+        errors(cut), errors(whole), rtol=0.25
+    )  # a cut response does tell more about sigma
+
+
+@pytest.mark.parametrize("name", ["ll", "pr"])
+def test_an_optimum_far_outside_the_prior_is_not_taken_for_an_edge(name: str) -> None:
+    observed = 1.0 + 0.002 * (OBSERVED - 1.0)
+    # Of fewer responses a log-likelihood sees too little of the tails for standard errors.
+    model = normal_model(METRICS[name], prb.Resimulated(16384), observed=observed)
+    optimum = prb.minimize(model, start={"mu": 1.0, "sigma": 0.002})
+    assert optimum.converged
+    assert optimum.at_edge == ()
+    np.testing.assert_allclose(
+        optimum.point["sigma"], 0.002 * fitted(name).point["sigma"], rtol=0.1
+    )
+    np.testing.assert_allclose(errors(optimum), 0.002 * errors(fitted(name)), rtol=0.5)
+
+
+def test_the_start_is_honoured() -> None:
+    model = fitted("pr").model
+    optimum = prb.minimize(model, start={"mu": 0.5, "sigma": 0.9})
+    np.testing.assert_allclose(optimum.trace["theta"][0], [0.5, np.log(0.9)], rtol=1e-12)
+    assert optimum.n_screened == 0
+    assert fitted("pr").n_screened == 257
+    first = Evaluator(model)(optimum.trace["theta"][:1]).discrepancies[0, 0]
+    np.testing.assert_allclose(optimum.trace["discrepancy"][0], first, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("start", "error", "words"),
+    [
+        ({"mu": 1.0}, KeyError, "expected a value for each of \\['mu', 'sigma'\\]"),
+        ({"mu": 1.0, "sigma": 1.0, "tau": 1.0}, KeyError, "tau"),
+        ({"mu": 1.0, "sigma": -1.0}, ValueError, "inside the support"),
+        ({"mu": np.nan, "sigma": 1.0}, ValueError, "inside the support"),
+        ({"mu": [1.0, 2.0], "sigma": 1.0}, ValueError, "mu"),
+    ],
+)
+def test_a_start_that_does_not_fit_is_refused(
+    start: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        prb.minimize(fitted("pr").model, start=start)
+
+
+def test_a_start_out_of_an_untransformed_support_is_refused() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Uniform("mu", 0, 5, default_transform=None), 0.5)
+        prb.Simulator(
+            "y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=prb.Reweighted(64)
+        )
+    with pytest.raises(ValueError, match="inside the support"):
+        prb.minimize(model, start={"mu": 6.0})
+
+
+@pytest.mark.parametrize("name", ["pr", "kl", "area"])
+def test_data_that_no_population_reaches_are_no_convergence(name: str) -> None:
+    # All weight is on the outermost design point: nothing changes any more.
+    optimum = prb.minimize(
+        normal_model(METRICS[name], observed=OBSERVED + 1000), refine=False, starts=0
+    )
+    assert not optimum.converged
+    assert "try another start" in optimum.message
+
+
+@cache
+def from_the_data(name: str, propagation: Any) -> prb.Optimum:
+    start = {"mu": MEAN, "sigma": SD}
+    return prb.minimize(far_model(name, propagation), start=start, refine=False, starts=0)
+
+
+@pytest.mark.parametrize(
+    "propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"]
+)
+@pytest.mark.parametrize("name", ["pr", pytest.param("kl", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("start", [(-3.0, 0.5), (30.0, 0.1)])  # 8 sd of the data away, and 58
+def test_far_starts_converge(name: str, propagation: Any, start: tuple[float, float]) -> None:
+    model = far_model(name, propagation)
+    optimum = prb.minimize(
+        model, start=dict(zip(NORMAL, start, strict=True)), refine=False, starts=0
+    )
+    assert optimum.converged
+    assert "the area metric led from there" in optimum.message
+    best = from_the_data(name, propagation)
+    assert "the area metric" not in best.message
+    np.testing.assert_allclose(optimum.theta, best.theta, atol=1e-4)
+    assert optimum.n_evaluations == optimum.trace["evaluations"][-1] > len(optimum.trace["theta"])
+    if (
+        propagation is not R256
+    ):  # the first point is the start itself, and not a draw of the prior that costs nothing
+        np.testing.assert_allclose(
+            optimum.trace["theta"][0], [start[0], np.log(start[1])], rtol=1e-12
+        )
+    np.testing.assert_allclose(optimum.trace["discrepancy"].min(), optimum.discrepancy, rtol=1e-9)
+
+
+@cache
+def far_model(name: str, propagation: Any) -> pm.Model:
+    return normal_model(METRICS[name], propagation)
+
+
+@pytest.mark.parametrize(
+    "propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"]
+)
+def test_without_the_area_metric_a_far_start_does_not_arrive(
+    propagation: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        minimization, "approach", lambda search, theta, *_: Approach(theta, Trace())
+    )
+    optimum = prb.minimize(
+        far_model("pr", propagation), start={"mu": 30.0, "sigma": 0.1}, refine=False, starts=0
+    )
+    assert abs(optimum.point["mu"] - MEAN) > 1.0
+
+
+# -- standard errors
+# -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["kl", "ll"])
+def test_standard_errors_of_likelihoods_are_the_textbook_ones(name: str) -> None:
+    expected = SD / np.sqrt([N, 2 * N])
+    np.testing.assert_allclose(errors(fitted(name)), expected, rtol=0.05)
+
+
+@pytest.mark.long
+def test_standard_errors_of_the_area_metric_against_refitting_500_data_sets() -> None:
+    start, rng = pair(fitted("area")), np.random.default_rng(5)
+    u = (np.arange(500) + 0.5) / 500
+    z, step = norm.ppf(u), (u * N).astype(int)
+    fits = []
+    for _ in range(500):
+        data = np.sort(rng.normal(*start, N))[step]
+        fits.append(
+            simplex(
+                lambda p, data=data: float(np.abs(p[0] + p[1] * z - data).mean()), start, 0.04, 1e-4
+            )
+        )
+    # The sd of 500 fits has a relative standard error of 3.2%, that of 200 linearised fits one of
+    # 5%: 6% together.
+    np.testing.assert_allclose(errors(fitted("area")), np.std(fits, axis=0, ddof=1), rtol=4 * 0.06)
+
+
+@pytest.mark.slow
+def test_standard_errors_against_refitting_200_data_sets_with_minimize() -> None:
+    # Also the linearisation of the optimiser's own path: data sets from the population at the
+    # optimum.
+    for name in ("pr", "area"):
+        optimum = fitted(name)
+        mu, sigma = pair(optimum)
+        rng = np.random.default_rng(6)
+        fits = []
+        for _ in range(200):
+            model = normal_model(METRICS[name], observed=rng.normal(mu, sigma, N))
+            fits.append(
+                pair(prb.minimize(model, method="Nelder-Mead", start=optimum.point, refine=False))
+            )
+        # Both sides have a relative standard error of 5% for the area metric, one side has it for
+        # the residual.
+        np.testing.assert_allclose(errors(optimum), np.std(fits, axis=0, ddof=1), rtol=4 * 0.07)
+
+
+@pytest.mark.long
+def test_standard_errors_of_what_the_data_do_not_identify_are_infinite() -> None:
+    for metric in (METRICS["kl"], METRICS["area"]):
+        with pm.Model() as model:
+            mu, sigma = pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1)
+            pm.Normal("idle", 0, 1)
+            x = pm.Normal.dist(mu, sigma)
+            prb.Simulator("y", same, x, metric=metric, observed=OBSERVED, propagation=R256)
+        optimum = prb.minimize(model)
+        expected = errors(fitted("kl" if metric is METRICS["kl"] else "area"))
+        np.testing.assert_allclose(
+            errors(optimum), expected, rtol=0.05 if metric is METRICS["kl"] else 0.25
+        )
+        assert np.isinf(optimum.stderr["idle"])
+        assert optimum.n_responses <= 512  # an idle hyperparameter asks for no responses
+
+
+def test_standard_errors_are_carried_to_deterministics() -> None:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1)
+        pm.Deterministic("both", pm.math.stack([2 * mu, sigma**2]))
+        x = pm.Normal.dist(mu, sigma)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model)
+    np.testing.assert_allclose(
+        optimum.point["both"], [2 * optimum.point["mu"], optimum.point["sigma"] ** 2]
+    )
+    slopes = [2.0, 2 * optimum.point["sigma"]]
+    np.testing.assert_allclose(optimum.stderr["both"], slopes * errors(optimum), rtol=1e-3)
+
+
+# -- what it costs, and failure as a value
+# ---------------------------------------------------------------
+
+
+def test_responses_under_reweighted_are_those_of_the_design() -> None:
+    response = Counting()
+    model = normal_model(METRICS["kl"], response=response)
+    first_use(model)
+    assert response.count == 256
+    optimum = prb.minimize(model)
+    assert optimum.n_responses == response.count == node(model).bound.n_points
+    again = prb.minimize(model)  # the design is there already, and is part of this optimum as well
+    assert again.n_responses == response.count == optimum.n_responses
+    assert (
+        optimum.n_evaluations
+        == len(optimum.trace["discrepancy"])
+        == len(optimum.trace["theta"])
+        > 3
+    )
+
+
+def test_a_black_box_response_under_resimulated() -> None:
+    response = Counting()
+    model = normal_model(METRICS["pr"], prb.Resimulated(1024), response)
+    first_use(model)
+    probe = response.count  # a few responses at the first use, to check its shape
+    assert 0 < probe <= 16
+    optimum = prb.minimize(model)  # BFGS on finite differences
+    assert optimum.converged
+    assert optimum.n_responses == response.count - probe
+    assert optimum.n_evaluations * 1024 < optimum.n_responses < (optimum.n_evaluations + 20) * 1024
+    assert (np.abs(pair(optimum) - pair(fitted("pr"))) < 0.03 * errors(fitted("pr"))).all()
+    symbolic = prb.minimize(normal_model(METRICS["pr"], prb.Resimulated(1024)))
+    np.testing.assert_allclose(pair(optimum), pair(symbolic), atol=1e-5)
+    # Responses inside a graph are counted all the same, and a gradient costs no more than a value.
+    assert symbolic.n_evaluations < optimum.n_evaluations / 2
+    extra = optimum.n_responses - 1024 * optimum.n_evaluations
+    assert symbolic.n_responses == 1024 * symbolic.n_evaluations + extra
+
+
+@pytest.mark.parametrize("method", ["BFGS", "Nelder-Mead", "Powell"])
+def test_running_out_of_evaluations_is_a_value(method: str) -> None:
+    with fitted("pr").model:
+        optimum = prb.minimize(method=method, max_evaluations=2)
+    assert not optimum.converged
+    assert "max_evaluations = 2" in optimum.message
+    assert optimum.n_evaluations == len(optimum.trace["discrepancy"]) == 2
+    np.testing.assert_allclose(optimum.discrepancy, optimum.trace["discrepancy"].min(), rtol=1e-9)
+    assert optimum.to_datatree()["optimum"].attrs["converged"] == 0
+
+
+def test_fresh_draws_have_no_gradient_and_no_standard_errors() -> None:
+    model = normal_model(METRICS["area"], prb.Fresh(200))
+    with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
+        prb.minimize(model)
+    optimum = prb.minimize(
+        model, method="Nelder-Mead", start={"mu": 1.0, "sigma": 0.5}, max_evaluations=60
+    )
+    assert np.isnan(errors(optimum)).all()
+    assert (
+        abs(optimum.point["mu"] - MEAN) < 5 * 0.5 / 50**0.5
+    )  # the noise of 200 draws is half that of the data
+
+
+@pytest.mark.long
+def test_a_users_own_metric_is_minimised_and_has_standard_errors() -> None:
+    metric = prb.FunctionMetric(
+        lambda z, observed, w: (
+            ((z * w).sum(axis=-1) - observed.mean()) ** 2
+            + ((z**2 * w).sum(axis=-1) - (observed**2).mean()) ** 2
+        ),
+        weighted=True,
+    )
+    found = {}
+    for n in (256, 1024):
+        optimum = prb.minimize(normal_model(metric, prb.Reweighted(n)), method="Nelder-Mead")
+        found[n] = np.abs(pair(optimum) - [MEAN, SD])
+        # Those of the mean and of the standard deviation of 50 normal values.
+        expected = [SD / 50**0.5, SD / 100**0.5]
+        np.testing.assert_allclose(errors(optimum), expected, rtol=0.25)
+    # The minimiser is exact on its design, whose moments are not quite those of the population:
+    # a fortieth of a standard error from 256 points, and nothing to speak of from 1024.
+    assert (found[256] < 0.03 * errors(optimum)).all()
+    assert (found[1024] < 3e-4 * errors(optimum)).all()
+
+
+def test_no_simulator_and_no_model() -> None:
+    with pm.Model() as model:
+        pm.Normal("mu")
+    with pytest.raises(ValueError, match=r"expected at least one; add prb\.Simulator"):
+        prb.minimize(model)
+    with pytest.raises(TypeError, match="no model on the context"):
+        prb.minimize()
+
+
+# -- determinism and storage
+# -----------------------------------------------------------------------------
+
+
+def test_bit_identical_twice() -> None:
+    first, second = fitted("pr"), prb.minimize(normal_model(METRICS["pr"]))
+    assert first.point == second.point
+    assert first.stderr == second.stderr
+    for key in ("theta", "discrepancy"):
+        np.testing.assert_array_equal(first.trace[key], second.trace[key])
+
+
+def test_an_optimum_survives_storage(tmp_path: Path) -> None:
+    optimum = fitted("area")
+    tree = optimum.to_datatree()
+    tree.to_netcdf(tmp_path / "optimum.nc")
+    with xr.open_datatree(tmp_path / "optimum.nc") as loaded:
+        for group in ("optimum", "stderr", "trace", "calibration", "observed_data"):
+            xr.testing.assert_equal(loaded[group].to_dataset().load(), tree[group].to_dataset())
+        attrs = loaded["optimum"].attrs
+        assert attrs["message"] == optimum.message
+        assert attrs["n_responses"] == optimum.n_responses
+        assert float(loaded["optimum"]["mu"]) == optimum.point["mu"]
+        assert list(loaded["calibration"]["element"].values) == ["mu", "sigma_log__"]
+
+
+def test_the_scale_base_changes_the_residual_and_not_its_minimiser() -> None:
+    other = prb.minimize(normal_model(prb.ProbabilityResidual(GaussianKDE(), scale_base=10.0)))
+    np.testing.assert_allclose(pair(other), pair(fitted("pr")), atol=1e-5)
+    ratio = node(fitted("pr").model).target.scale_factor / node(other.model).target.scale_factor
+    np.testing.assert_allclose(ratio, 10.0)
+    np.testing.assert_allclose(fitted("pr").discrepancy, ratio * other.discrepancy, rtol=1e-6)
+
+
+@pytest.mark.long
+def test_a_search_is_held_where_the_data_do_not_tell_and_names_what_it_is() -> None:
+    """Of a ratio the quotient of means is known, and neither of them."""
+    rng = np.random.default_rng(1)
+    with pm.Model() as model:
+        mu_a = pm.Normal("mu_a", 10, 2)
+        mu_b = pm.Normal("mu_b", 2, 0.4)
+        a = pm.Normal.dist(mu_a, pm.HalfNormal("sd_a", 1))
+        b = pm.Normal.dist(mu_b, pm.HalfNormal("sd_b", 0.3))
+        pm.Deterministic("ratio", mu_a / mu_b)
+        observed = rng.normal(10, 0.5, 40) / rng.normal(2, 0.1, 40)
+        metric = prb.ProbabilityResidual()
+        prb.Simulator("y", lambda a, b: a / b, *(a, b), metric=metric, observed=observed)
+    optimum = prb.minimize(model, progressbar=False)
+    assert optimum.converged
+    assert "Along what the data do not tell the search was held" in optimum.message
+    for name in ("mu_a", "sd_a", "mu_b", "sd_b"):
+        assert np.isinf(optimum.stderr[name])
+        assert any("the data tell less than the prior" in w and name in w for w in optimum.warnings)
+        # Within the prior, where populations are supported.
+        prior = optimum.evaluator.constrained(optimum.evaluator.prior_thetas(1000, 1))[name]
+        low, high = np.quantile(prior, [0.01, 0.99])
+        assert low < optimum.point[name] < high
+    error = optimum.stderr["ratio"]
+    # The standard error of a mean, and a few per cent that the residual costs.
+    assert error == pytest.approx(observed.std() / np.sqrt(observed.size), rel=0.3)
+    assert abs(optimum.point["ratio"] - np.median(observed)) < error
+
+
+def test_where_a_gradient_is_no_number_the_search_goes_on() -> None:
+    # PyMC's gradient of a normal cut off on one side is NaN at what is cut off.
+    rng = np.random.default_rng(0)
+    values = rng.normal(1.0, 0.7, 400)
+    with pm.Model() as model:
+        mu, w = pm.Normal("mu", 1, 1), pm.HalfNormal("w", 2)
+        x = pm.TruncatedNormal.dist(mu, pm.HalfNormal("sd", 1), lower=mu - w)
+        data = values[values > 0][:40]
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=data, propagation=R256)
+    start = {"mu": 0.9, "w": 1.4, "sd": 0.5}
+    evaluator = Evaluator(model)
+    exact = evaluator.objective(prior=False, gradient=True)
+    value, gradient = exact(evaluator.unconstrained(start), np.ones(1))
+    assert np.isfinite(value)
+    assert np.isnan(gradient).any()
+    found = prb.minimize(model, start=start, starts=0, refine=False)
+    simplex = prb.minimize(model, start=start, starts=0, refine=False, method="Nelder-Mead")
+    assert found.discrepancy < 1.1 * simplex.discrepancy
+    assert found.discrepancy < 0.5 * value
+
+
+@pytest.mark.parametrize("supported", [True, False])
+def test_a_search_is_held_no_longer_than_designs_tell_nothing(
+    supported: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = normal_model(METRICS["kl"])
+    expected = prb.minimize(model, starts=0)
+    judged = minimization._judged
+    away = np.array([0.1, 0.1])
+
+    def held(plan: Any, state: Any, rounds: int) -> Any:
+        # As by a design that was too thin at first to tell anything.
+        if rounds == 0:
+            hold = Hold(expected.theta + away, np.eye(2), 10.0)
+            return replace(state, hold=hold, restart=hold.place)
+        if not supported:
+            monkeypatch.setattr(minimization, "shortcomings", lambda *_: {"y": "too few points"})
+        return judged(plan, state, rounds)
+
+    monkeypatch.setattr(minimization, "_judged", held)
+    found = prb.minimize(model, starts=0, refine=False)
+    if supported:
+        np.testing.assert_allclose(found.theta, expected.theta, atol=1e-4)
+        assert "was held" not in found.message
+        return
+    # It stays where it was held, and says so.
+    assert np.abs(found.theta - expected.theta).max() > 0.05
+    assert "was held" in found.message
+
+
+def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few points have a lower value by accident."""
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        few = prb.Reweighted(256, max_points=256)
+        prb.Simulator("y", same, x, metric=METRICS["area"], observed=OBSERVED, propagation=few)
+    expected = prb.minimize(model, starts=0)
+    begun = []
+
+    def astray(search: Search, run: Run) -> Run:
+        begun.append(run.best)
+        return replace(run, best=run.best + np.array([0.0, -8.0]), lowest=0.0)
+
+    monkeypatch.setattr(minimization, "settle", astray)
+    found = prb.minimize(model, starts=0)
+    np.testing.assert_allclose(found.theta, expected.theta, atol=0.01)
+    # It was tried twice from where the search had been.
+    np.testing.assert_array_equal(*begun)

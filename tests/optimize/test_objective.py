@@ -1,0 +1,107 @@
+"""The standardised objective: units, sign of the gradient, record, budget, progress."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from prbayes._validate import Floats
+from prbayes.optimize.objective import Hold, Objective, SpentError, StalledError
+
+
+def parabola(theta: Floats) -> Any:
+    return float((theta**2).sum()), 2 * theta, 3
+
+
+def objective(function: Any = parabola, **keywords: Any) -> Objective:
+    center, units = np.array([1.0, 2.0]), np.array([0.5, 4.0])
+    return Objective(function, center, units, 10.0, **({"gradient": True, "most": 100} | keywords))
+
+
+def test_value_and_gradient_are_in_units_of_size_and_parameters() -> None:
+    value, gradient = objective()(np.array([2.0, -0.25]))  # theta = (2, 1)
+    assert value == pytest.approx(0.5)
+    np.testing.assert_allclose(gradient, [2 * 2 * 0.5 / 10, 2 * 1 * 4.0 / 10])
+
+
+def test_points_are_recorded_with_their_cost_and_the_best_is_the_lowest() -> None:
+    found = objective()
+    np.testing.assert_array_equal(found.best, [1.0, 2.0])  # the center, as long as nothing is known
+    for t in ([0.0, 0.0], [-2.0, -0.5], [1.0, 1.0]):
+        found(np.array(t))
+    assert found.counts == [3, 6, 9]
+    np.testing.assert_array_equal(found.best, [0.0, 0.0])
+    assert found.lowest == 0.0
+
+
+def test_the_budget_is_not_exceeded() -> None:
+    found = objective(most=4)
+    found(np.zeros(2))
+    found(np.zeros(2))
+    with pytest.raises(SpentError):
+        found(np.zeros(2))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_where_there_is_no_value_a_line_search_is_led_back(bad: float) -> None:
+    def broken(theta: Floats) -> Any:
+        return bad, np.full(2, np.nan), 1
+
+    t = np.array([1.0, -2.0])
+    value, gradient = objective(broken)(t)
+    assert value > 1e9
+    np.testing.assert_array_equal(np.sign(gradient), np.sign(t))
+    assert np.isfinite(objective(broken, gradient=False)(t))
+    found = objective(broken)
+    found(t)
+    assert found.lowest == np.inf
+
+
+def test_a_line_search_without_progress_is_stopped() -> None:
+    found = Objective(
+        lambda t: (1.0, np.zeros(1), 1), np.zeros(1), np.ones(1), 1.0, gradient=True, most=100
+    )
+    found.patience = 4
+    for _ in range(5):
+        found(np.zeros(1))
+    with pytest.raises(StalledError):
+        found(np.zeros(1))
+
+
+def test_small_gains_count_as_progress_once_they_add_up() -> None:
+    values = iter([1.0, *(1 - 1e-3 * k for k in range(1, 40))])
+    found = Objective(
+        lambda t: (next(values), np.zeros(1), 1),
+        np.zeros(1),
+        np.ones(1),
+        1.0,
+        gradient=True,
+        most=99,
+    )
+    found.patience = 4
+    found.least_gain = 3.5e-3  # four steps together, within the patience
+    for _ in range(20):
+        found(np.zeros(1))
+    found.least_gain = 9e-3  # nine steps, beyond it
+    stalled = False
+    for _ in range(12):
+        try:
+            found(np.zeros(1))
+        except StalledError:
+            stalled = True
+    assert stalled
+
+
+def test_a_search_is_held_along_its_directions_alone() -> None:
+    units = np.array([0.5, 4.0])
+    direction = np.array([[0.6], [0.8]])
+    hold = Hold(np.array([1.0, 2.0]), direction, 10.0)
+    across = np.array([0.8, -0.6]) * units
+    along = direction[:, 0] * units
+    thetas = hold.place + np.array([across, along, 2 * along])
+    np.testing.assert_allclose(hold(thetas, units), [0.0, 5.0, 20.0], atol=1e-12)
+    # The gradient by differences.
+    at = hold.place + 0.3 * across + 0.7 * along
+    steps = 1e-6 * np.eye(2)
+    slope = (hold(at + steps, units) - hold(at - steps, units)) / 2e-6
+    np.testing.assert_allclose(hold.slope(at, units), slope, rtol=1e-6)

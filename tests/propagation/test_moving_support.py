@@ -1,0 +1,250 @@
+"""Densities whose support moves with the hyperparameters, under stored responses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from first_use import first_use
+
+import prbayes as prb
+from prbayes.model.evaluator import Evaluator
+from prbayes.propagation import moving_support as edges
+from prbayes.propagation.moving_support import (
+    averaged_log_density,
+    cells_around,
+    refuse_moving_atoms,
+)
+from prbayes.response.inputs import read_inputs
+
+METRICS = [
+    prb.ProbabilityResidual(),
+    prb.KullbackLeibler(),
+    prb.AreaMetric(),
+    prb.LogLikelihood(density=prb.GaussianKDE()),
+]
+
+
+def of_kind(metric: prb.Metric) -> str:
+    return type(metric).__name__
+
+
+def uniform(metric: prb.Metric, propagation: Any = None, n: int = 50, seed: int = 0) -> pm.Model:
+    observed = 2 + 3 * np.random.default_rng(seed).random(n)
+    with pm.Model() as model:
+        start = pm.Normal("start", 1, 2)
+        width = pm.HalfNormal("width", 4)
+        x = pm.Uniform.dist(start, start + width)
+        propagation = propagation or prb.Reweighted(256)
+        prb.Simulator(
+            "y", np.positive, x, metric=metric, observed=observed, propagation=propagation
+        )
+    return model
+
+
+def stored(dist: Callable[[], Any], **keywords: Any) -> Any:
+    with pm.Model() as model:
+        observed = np.linspace(0.5, 1.5, 20)
+        common = {"metric": prb.AreaMetric(), "observed": observed}
+        prb.Simulator("y", np.positive, dist(), propagation=prb.Reweighted(64), **common)
+    (node,) = first_use(model).values()
+    return node.bound
+
+
+def test_cells_meet_half_way_and_have_the_outermost_points_in_their_middle() -> None:
+    cells = cells_around(np.array([3.0, 0.0, 1.0, 7.0]), 1)
+    np.testing.assert_allclose(cells.lower, [2.0, -0.5, 0.5, 5.0])
+    np.testing.assert_allclose(cells.upper, [5.0, 0.5, 2.0, 9.0])
+
+
+def test_cells_of_each_element_are_those_of_its_own_column() -> None:
+    columns = np.random.default_rng(0).normal(size=(40, 2))
+    cells = cells_around(columns, 3)
+    alone = cells_around(columns[:, 1], 3)
+    np.testing.assert_array_equal(cells.lower[:, 1], alone.lower)
+    assert (cells.lower < columns).all()
+    assert (columns < cells.upper).all()
+
+
+def test_a_cell_that_an_edge_cuts_has_the_part_of_it_that_is_inside() -> None:
+    dist = pm.Uniform.dist(0.0, 2.0)
+    ends = pt.dvector("lower"), pt.dvector("upper")
+    x = pt.dvector("x")
+    graph = averaged_log_density(dist, x, *ends)
+    found = graph.eval({x: [1.0, 0.25, 2.5], ends[0]: [0.9, -0.5, 1.0], ends[1]: [1.1, 1.0, 4.0]})
+    inside = np.array([1.0, 1.0 / 1.5, 1.0 / 3.0])
+    np.testing.assert_allclose(np.exp(found), 0.5 * inside)
+
+
+def test_far_in_the_tail_it_is_the_density_at_the_point() -> None:
+    dist = pm.TruncatedNormal.dist(0.0, 1.0, lower=-1.0)
+    points = np.array([9.0, 12.0])
+    graph = averaged_log_density(dist, points, points - 0.1, points + 0.1)
+    np.testing.assert_allclose(graph.eval(), pm.logp(dist, points).eval())
+
+
+MOVING = {
+    "Uniform": lambda: pm.Uniform.dist(pm.Normal("a", 0, 0.3), 2.0),
+    "TruncatedNormal": lambda: pm.TruncatedNormal.dist(1.0, 1.0, lower=pm.Normal("a", 0, 0.3)),
+    "Pareto": lambda: pm.Pareto.dist(3.0, pm.HalfNormal("a", 1.0)),
+    "Triangular": lambda: pm.Triangular.dist(lower=pm.Normal("a", 0, 0.3), c=2.0, upper=3.0),
+    "vector": lambda: pm.Uniform.dist(pm.Normal("a", 0, 0.3), 2.0, shape=(1,)),
+}
+STAYING = {
+    "Normal": lambda: pm.Normal.dist(pm.Normal("a", 0, 0.3), 1.0),
+    "LogNormal": lambda: pm.LogNormal.dist(pm.Normal("a", 0, 0.3), 1.0),
+    "Gamma": lambda: pm.Gamma.dist(mu=1.0, sigma=pm.HalfNormal("a", 1.0)),
+    "Weibull": lambda: pm.Weibull.dist(2.0, pm.HalfNormal("a", 1.0)),
+    "TruncatedNormal": lambda: pm.TruncatedNormal.dist(pm.Normal("a", 0, 1), 1.0, lower=-1.0),
+    "Beta": lambda: pm.Beta.dist(2.0, pm.HalfNormal("a", 1.0)),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(set(MOVING) - {"vector"}))
+def test_a_support_that_moves_is_found(kind: str) -> None:
+    assert stored(MOVING[kind]).support_moves
+
+
+@pytest.mark.parametrize("kind", sorted(STAYING))
+def test_one_that_stays_is_not_taken_for_one_that_moves(kind: str) -> None:
+    assert not stored(STAYING[kind]).support_moves
+
+
+def test_an_input_without_hyperparameters_stays() -> None:
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("a", 0, 0.3), 1.0)
+        b = pm.Uniform.dist(0.0, 1.0)
+        prb.Simulator(
+            "y",
+            np.add,
+            a,
+            b,
+            metric=prb.AreaMetric(),
+            observed=np.arange(9.0),
+            propagation=prb.Reweighted(1024),
+        )
+    assert not Evaluator(model).nodes[0].bound.support_moves
+
+
+def test_a_discrete_support_that_moves_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"support that moves .*use propagation=prb\.Fresh\(\)"):
+        stored(lambda: pm.DiscreteUniform.dist(pm.Poisson("a", 3.0), 20))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("metric", METRICS, ids=of_kind)
+def test_the_gradient_is_that_of_the_discrepancy_where_an_edge_is(metric: prb.Metric) -> None:
+    evaluator = Evaluator(uniform(metric))
+    theta = evaluator.unconstrained({"start": 2.013, "width": 3.05})
+    _, gradient = evaluator.objective(prior=False, gradient=True)(theta, np.ones(1))
+    assert np.abs(gradient).min() > 1e-3
+    step = 1e-6
+    for i, unit in enumerate(np.eye(2)):
+        up, down = (evaluator.discrepancies((theta + s * unit)[None], 0) for s in (step, -step))
+        assert gradient[i] == pytest.approx(float(up[0] - down[0]) / (2 * step), rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("metric", METRICS, ids=of_kind)
+def test_the_optimum_and_its_standard_errors_are_those_of_a_fine_resimulation(
+    metric: prb.Metric,
+) -> None:
+    found = prb.minimize(uniform(metric), progressbar=False)
+    fine = prb.minimize(uniform(metric, prb.Resimulated(8192)), progressbar=False)
+    assert found.converged
+    for name in ("start", "width"):
+        error = float(found.stderr[name])
+        assert 0.03 < error < 0.4
+        assert abs(float(found.point[name]) - float(fine.point[name])) < 0.3 * error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("metric", METRICS, ids=of_kind)
+def test_data_sets_spread_optima_as_much_as_the_standard_errors_say(metric: prb.Metric) -> None:
+    optima, errors = [], []
+    for seed in range(60):
+        found = prb.minimize(uniform(metric, seed=seed), progressbar=False)
+        optima.append(float(found.point["start"]))
+        errors.append(float(found.stderr["start"]))
+    ratio = float(np.mean(errors) / np.std(optima))
+    assert 0.75 < ratio < 1.33
+
+
+def mixture_of_a_point(point: Any) -> Any:
+    return pm.Mixture.dist([0.3, 0.7], [pm.DiracDelta.dist(point), pm.Normal.dist(0.0, 1.0)])
+
+
+@pytest.mark.parametrize(
+    "dist", [mixture_of_a_point, pm.DiracDelta.dist], ids=["beside a density", "alone"]
+)
+def test_a_value_that_has_probability_and_moves_is_refused(dist: Callable[[Any], Any]) -> None:
+    with pytest.raises(TypeError, match=r"values that move .* have probability .*prb.Fresh\(\)"):
+        stored(lambda: dist(pm.Normal("a", 0, 1)))
+
+
+def test_a_value_that_has_probability_and_stays_has_its_share() -> None:
+    bound = stored(lambda: mixture_of_a_point(0.0 * pm.Normal("a", 0, 1) + 0.25))
+    values, weights = bound.populations([np.array([0.3])])
+    assert weights[values == 0.25].sum() == pytest.approx(0.3, abs=0.03)
+
+
+def test_values_that_meet_by_accident_are_no_atoms() -> None:
+    with pm.Model() as model:
+        inputs = read_inputs("y", [pm.Normal.dist(pm.Normal("a", 0, 1), 1.0)], model)
+    which = np.repeat(np.arange(512), 32)
+    x = np.random.default_rng(0).normal(size=which.size)
+    x[: 7 * 32] = np.repeat(np.arange(7.0), 32)
+    refuse_moving_atoms("y", inputs, [x], which)
+    x[: 8 * 32] = np.repeat(np.arange(8.0), 32)
+    with pytest.raises(TypeError, match="values that move"):
+        refuse_moving_atoms("y", inputs, [x], which)
+
+
+@pytest.mark.slow
+def test_nuts_agrees_with_itself_and_with_smc() -> None:
+    model = uniform(prb.KullbackLeibler())
+    nuts = pm.sample(
+        500, tune=500, chains=4, cores=1, model=model, random_seed=1, progressbar=False
+    )
+    assert float(az.rhat(nuts)["start"]) < 1.02
+    smc = prb.sample_smc(
+        500, chains=4, model=model, adjustment=None, random_seed=1, progressbar=False
+    )
+    spread = float(smc.posterior["start"].std())
+    shift = float(nuts.posterior["start"].mean() - smc.posterior["start"].mean())
+    assert abs(shift) < 0.2 * spread
+    assert float(nuts.posterior["start"].std()) == pytest.approx(spread, rel=0.15)
+
+
+def test_the_weights_follow_the_design_when_it_grows() -> None:
+    model = uniform(prb.AreaMetric(), prb.Reweighted(64))
+    evaluator = Evaluator(model)
+    theta = evaluator.unconstrained({"start": 2.0, "width": 3.0})[None]
+    prb.refine(model, np.array([[2.0, np.log(3.0)]]))
+    values, weights = evaluator.populations(theta, 0)
+    assert float(weights[0] @ values[0]) == pytest.approx(3.5, abs=0.02)
+    (mass,) = evaluator.support(theta)["y"]["mean_weight"]
+    assert mass == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("place", [0, 6])
+def test_a_support_that_moves_is_found_in_any_chunk_of_points(
+    monkeypatch: pytest.MonkeyPatch, place: int
+) -> None:
+    monkeypatch.setattr(edges, "AT_ONCE", 4)  # two points at a time
+    lower = np.array([0.0, 1.0])
+
+    def outside(lower: Any, x: Any) -> Any:
+        return (x < lower[:, None],)
+
+    points = np.full(7, 2.0)
+    assert not edges._is_outside_for_some(outside, 1, [lower], points)
+    points[place] = -1.0  # outside for all
+    assert not edges._is_outside_for_some(outside, 1, [lower], points)
+    points[place] = 0.5
+    assert edges._is_outside_for_some(outside, 1, [lower], points)

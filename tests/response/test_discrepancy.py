@@ -1,0 +1,152 @@
+"""A model inadequacy is what it says under each condition, and says where it extrapolates."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes.response.discrepancy import caveats_of, corrected
+
+TIMES = np.array([1.0, 2.0, 4.0])
+
+
+def line(x: Any) -> Any:
+    return 2.0 * x
+
+
+def curve(x: Any) -> Any:
+    return np.asarray(x)[..., None] * TIMES
+
+
+def powers(c: Any) -> Any:
+    return np.stack([c, c**2], axis=-1)
+
+
+def test_the_line_is_zero_at_the_lower_end_and_one_at_the_upper() -> None:
+    rise = prb.response.Additive([1000.0, 20.0, 500.0])
+    np.testing.assert_allclose(rise.value(3.0, [20.0, 510.0, 1000.0]), [0.0, 1.5, 3.0])
+    assert repr(rise) == "Additive over 20 to 1000"
+
+
+def test_an_additive_one_shifts_and_a_multiplicative_one_scales() -> None:
+    x, b = np.random.default_rng(1).normal(size=(2, 3, 5))
+    shifted = prb.response.Additive([0.0, 2.0]).of(line, 1.0)(x, b)
+    np.testing.assert_allclose(shifted, 2 * x + 0.5 * b)
+    scaled = prb.response.Multiplicative([0.0, 2.0]).of(line, 1.0)(x, b)
+    np.testing.assert_allclose(scaled, 2 * x * np.exp(0.5 * b))
+    assert (np.sign(scaled) == np.sign(x)).all()
+
+
+@pytest.mark.parametrize("batch", [(), (6,), (4, 6)])
+def test_each_output_has_its_condition(batch: tuple[int, ...]) -> None:
+    x, b = np.random.default_rng(2).normal(size=(2, *batch))
+    found = prb.response.Additive(TIMES).of(curve, TIMES)(x, b)
+    assert found.shape == (*batch, 3)
+    for i, time in enumerate(TIMES):
+        np.testing.assert_allclose(found[..., i], x * time + b * (time - 1) / 3)
+
+
+@pytest.mark.parametrize("batch", [(), (6,), (4, 6)])
+def test_several_coefficients_are_the_last_axis(batch: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(3)
+    x, b = rng.normal(size=batch), rng.normal(size=(*batch, 2))
+    bent = prb.response.Additive(TIMES, powers)
+    whole = bent.of(curve, TIMES)(x, b)
+    for i, time in enumerate(TIMES):
+        expected = b[..., 0] * time + b[..., 1] * time**2
+        np.testing.assert_allclose(whole[..., i], x * time + expected)
+        np.testing.assert_allclose(bent.of(line, time)(x, b), 2 * x + expected)
+
+
+@pytest.mark.parametrize("kind", [prb.response.Additive, prb.response.Multiplicative])
+def test_an_output_without_inadequacy_is_as_it_was(kind: Any) -> None:
+    found = kind(TIMES, np.sqrt).of(curve, [1.0, np.nan, 4.0])(np.ones(2), np.full(2, 7.0))
+    np.testing.assert_array_equal(found[:, 1], curve(np.ones(2))[:, 1])
+    assert (found[:, [0, 2]] > 7).all()
+
+
+@pytest.mark.parametrize("kind", [prb.response.Additive, prb.response.Multiplicative])
+def test_what_failed_stays_failed(kind: Any) -> None:
+    found = kind([0.0, 1.0]).of(lambda x: x, 1.0)(np.array([np.inf, np.nan]), np.full(2, -1.0))
+    np.testing.assert_array_equal(found, [np.inf, np.nan])
+
+
+def test_a_function_of_one_specimen_stays_one() -> None:
+    one = prb.scalar(lambda x: x**2 if x > 0 else 0.0)
+    both = prb.response.Additive([0.0, 1.0]).of(one, 1.0)
+    assert isinstance(both, prb.scalar)
+    assert corrected(both)
+    assert not corrected(one)
+    np.testing.assert_allclose(both([3.0, -1.0], [0.5, 0.5]), [9.5, 0.5])
+
+
+def test_a_mapping_is_refused() -> None:
+    named = prb.response.Additive([0.0, 1.0]).of(lambda x: {"a": x}, 1.0)
+    with pytest.raises(TypeError, match="got a mapping, expected an array of outputs"):
+        named(1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("condition", "outside"),
+    [(1.0, False), (4.0, False), ([1.0, np.nan, 4.0], False), (0.9, True), ([1.0, 2.0, 5.0], True)],
+)
+def test_it_says_where_it_extrapolates(condition: Any, outside: bool) -> None:
+    found = caveats_of(prb.response.Additive(TIMES).of(curve, condition))
+    assert bool(found) is outside
+    assert all("extrapolates its inadequacy, seen from 1 to 4" in text for text in found)
+
+
+def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture) -> None:
+    data = np.random.default_rng(4).normal(1.0, 0.3, 30)
+    drift = prb.response.Additive([0.0, 2.0])
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.3)
+        b = pm.Normal.dist(0.0, 0.1)
+        prb.Simulator(
+            *("y", drift.of(line, 1.0), x, b),
+            metric=prb.KullbackLeibler(), observed=data, propagation=prb.Resimulated(64),
+        )  # fmt: skip
+        optimum = prb.minimize(progressbar=False)
+    assert not caplog.records
+    inside = prb.predict(optimum, drift.of(line, 2.0), x, b, model=model, n_samples=50)
+    assert inside.attrs["caveats"] == []
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING, "prbayes"):
+        beyond = prb.predict(optimum, drift.of(line, 3.0), x, b, model=model, n_samples=50)
+    said = "line at 3: extrapolates its inadequacy, seen from 0 to 2"
+    assert beyond.attrs["caveats"] == [said]
+    assert [record.message for record in caplog.records] == [said]
+
+
+def test_it_can_be_pickled() -> None:
+    again = pickle.loads(pickle.dumps(prb.response.Additive(TIMES).of(curve, TIMES)))
+    np.testing.assert_allclose(again(1.0, 3.0), [1.0, 3.0, 7.0])
+
+
+@pytest.mark.parametrize(
+    ("condition", "response", "coefficients"),
+    [
+        # As many specimens as conditions, or as outputs: nothing may be broadcast by chance.
+        ([0.0, 1.0, 2.0], np.ones(3), np.ones(3)),
+        (1.0, np.ones((3, 3)), np.ones(3)),
+        ([0.0, 1.0, 2.0], np.ones((3, 2)), np.ones(3)),
+        (1.0, np.ones((4, 3)), np.float64(1.0)),
+    ],
+)
+def test_outputs_that_are_not_those_of_the_conditions_are_refused(
+    condition: Any, response: Any, coefficients: Any
+) -> None:
+    corrected = prb.response.Additive([0.0, 2.0]).of(lambda x: response, condition)
+    with pytest.raises(ValueError, match="one output, or one for each condition"):
+        corrected(0.0, coefficients)
+
+
+def test_a_response_that_is_the_same_for_all_specimens_has_its_inadequacy_too() -> None:
+    corrected = prb.response.Additive([0.0, 2.0]).of(lambda: 5.0, 2.0)
+    np.testing.assert_array_equal(corrected(np.array([1.0, 2.0])), [6.0, 7.0])

@@ -1,0 +1,466 @@
+"""A model behind an UM-Bridge server: a real one, and one that does to requests what it is told."""
+
+from __future__ import annotations
+
+import json
+import logging
+import pickle
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import um_models
+from um_server import Real
+
+import prbayes as prb
+from prbayes.model.random_variable import nodes
+from prbayes.response import umbridge as um_bridge
+
+# -- a server that is told what to do --------------------------------------------------------------
+
+SIZES = {"/InputSizes": {"inputSizes": [2]}, "/OutputSizes": {"outputSizes": [2]}}
+KNOWN: dict[str, Any] = {
+    "/Info": {"protocolVersion": 1.0, "models": ["forward"]},
+    "/ModelInfo": {"support": {"Evaluate": True}},
+    **SIZES,
+}
+
+
+class Told(BaseHTTPRequestHandler):
+    """Answers what it is told to, and counts."""
+
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+    server: Any
+
+    def setup(self) -> None:
+        super().setup()
+        self.server.connections += 1
+
+    def answer(self) -> None:
+        text = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        if self.path == "/Evaluate":
+            self.server.asked.append(json.loads(text))
+            self.server.evaluate(self, *self.server.asked[-1]["input"][0])
+        else:
+            known = self.server.known[self.path]
+            self.say(known if isinstance(known, str) else json.dumps(known))
+
+    do_GET = do_POST = answer  # noqa: N815 (names of the standard library)
+
+    def say(self, text: str, status: int = 200) -> None:
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(text)))
+        self.end_headers()
+        self.wfile.write(text.encode())
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def give(handler: Told, x: float, y: float) -> None:
+    """Answer as a model should."""
+    handler.say(json.dumps({"output": [[x - 2 * y, x * x * y]]}))
+
+
+class Telling(ThreadingHTTPServer):
+    """A server of the model `forward`."""
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, evaluate: Callable[..., None] = give, **known: Any) -> None:
+        super().__init__(("127.0.0.1", 0), Told)
+        self.evaluate, self.asked, self.connections = evaluate, list[Any](), 0
+        self.known = KNOWN | {f"/{path}": answer for path, answer in known.items()}
+        self.url = f"http://127.0.0.1:{self.server_port}"
+
+    def handle_error(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def telling(evaluate: Callable[..., None] = give, **known: Any) -> Iterator[Telling]:
+    with Telling(evaluate, **known) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+# -- a real server ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Real]:
+    server = Real(tmp_path_factory.mktemp("server"))
+    yield server
+    server.kill()
+
+
+def test_outputs_and_inputs_are_in_their_order_with_all_digits(real: Real) -> None:
+    x, y = np.random.default_rng(0).normal(size=(2, 3, 4)) * [1e-100, 1 / 3, 7.0, 1e100]
+    expected = np.stack([x - 2 * y, x * x * y], axis=-1)
+    np.testing.assert_array_equal(prb.umbridge(real.url, "beam")(x, y), expected)
+    doubled = prb.umbridge(f"{real.url}/", "beam", config={"scale": 2.0})(x, y)
+    np.testing.assert_array_equal(doubled, expected * [2.0, 1.0])
+
+
+def test_inputs_of_several_numbers_fill_the_vectors(real: Real) -> None:
+    model = prb.umbridge(real.url, "vectors").function
+    expected = [4.0, -1.0, 30.0]
+    np.testing.assert_array_equal(model(4.0, np.array([1.0, 2.0, 3.0])), expected)
+    np.testing.assert_array_equal(model(4.0, np.array([1.0, 2.0]), 3.0), expected)
+    with pytest.raises(
+        ValueError, match=r"got inputs of 3, 1 numbers.*input 1 would be cut in two"
+    ):
+        model(np.array([1.0, 2.0, 3.0]), 4.0)
+    with pytest.raises(ValueError, match=r"inputs of 1, 1 numbers.*sizes \[1, 3\].*\(4 in all\)"):
+        model(1.0, 2.0)
+
+
+def test_what_is_no_number_and_what_the_model_raises(real: Real) -> None:
+    moody = prb.umbridge(real.url, "moody")
+    np.testing.assert_array_equal(moody([3.0, 6.0, 7.0, 8.0]), [6.0, np.nan, np.inf, -np.inf])
+    with pytest.raises(RuntimeError, match=r"moody: the server answered 500, .* in its own log"):
+        moody(5.0)
+    assert moody(4.0) == 8
+
+
+@pytest.mark.long
+def test_a_request_that_never_returns_is_given_up_and_its_answer_is_nobody_s(real: Real) -> None:
+    moody = prb.umbridge(real.url, "moody", timeout=0.3)
+    clock = time.monotonic()
+    with pytest.raises(TimeoutError, match=r"moody: no response within timeout = 0.3 s from http"):
+        moody(-0.8)
+    assert time.monotonic() - clock < 0.7
+    # The late answer arrives meanwhile.
+    for x in np.linspace(1, 2, 100):
+        assert moody(x) == 2 * x
+        time.sleep(0.01)
+
+
+def test_requests_are_at_work_at_the_same_time(real: Real) -> None:
+    moody = prb.umbridge(real.url, "moody")
+    clock = time.monotonic()
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(moody, [-0.4] * 4)) == [-0.8] * 4
+    assert time.monotonic() - clock < 1.2
+
+
+@pytest.mark.slow
+def test_it_travels_to_processes_and_none_speaks_on_the_connection_of_another(real: Real) -> None:
+    beam = prb.umbridge(real.url, "beam")
+    assert beam(1.0, 2.0).tolist() == [-3.0, 2.0]
+    code = """
+import os, pickle, sys
+beam = pickle.load(sys.stdin.buffer)
+beam(1.0, 2.0)
+child = os.fork() if hasattr(os, "fork") else 1
+for x in range(200):
+    x += 1000 * (child == 0)
+    assert beam(x, 1.0).tolist() == [x - 2, x * x], (x, child)
+if child > 1:
+    assert os.waitpid(child, 0)[1] == 0
+"""
+    program = [sys.executable, "-W", "ignore", "-c", code]
+    subprocess.run(program, input=pickle.dumps(beam), check=True, timeout=60)
+
+
+def model_of(response: Any, **settings: Any) -> pm.Model:
+    """A model whose two outputs come from a server."""
+    x = np.random.default_rng(1).normal(1.0, 0.5, 12)
+    with pm.Model() as model:
+        prb.Simulator(
+            "y",
+            response,
+            pm.Normal.dist(pm.Normal("mu", 1.0, 0.3), 0.5),
+            2.0,
+            metric=prb.Joint(prb.AreaMetric()),
+            observed=np.stack([x - 4.0, 2 * x * x], axis=1),
+            propagation=prb.Reweighted(16, max_points=16, **settings),
+        )
+    return model
+
+
+def responses(response: Any, **settings: Any) -> tuple[np.ndarray[Any, Any], Any]:
+    (node,) = nodes(model_of(response, **settings)).values()
+    return node.bound.values, node
+
+
+@pytest.mark.long
+@pytest.mark.exact
+def test_a_server_that_dies_and_comes_back_in_mid_study_loses_nothing(tmp_path: Path) -> None:
+    server = Real(tmp_path)
+
+    def again() -> None:
+        server.start()
+
+    try:
+        reference, _ = responses(prb.umbridge(server.url, "beam"))
+        mortal = prb.umbridge(server.url, "mortal", patience=60)
+        nurse = threading.Thread(target=again)
+        nurse.start()
+        with ThreadPoolExecutor(3) as pool:
+            values, node = responses(mortal, executor=pool, store=tmp_path / "store")
+        nurse.join()
+        assert (tmp_path / "died").exists()
+        np.testing.assert_array_equal(values, reference)
+        assert node.bound.responses.computed == 16
+
+        # It dies, and nobody starts it: what was computed is kept for the next morning.
+        (tmp_path / "died").unlink()
+        server.kill()
+        server.start()
+        server.wait()
+        settings = {"store": tmp_path / "next", "version": "1"}
+        hasty = prb.umbridge(server.url, "mortal", patience=0.2)
+        with pytest.raises(
+            prb.response.ResponseError, match=r"is away for more than patience = 0.2 s"
+        ):
+            responses(hasty, **settings)
+        server.start()
+        server.wait()
+        values, node = responses(hasty, **settings)
+        np.testing.assert_array_equal(values, reference)
+        assert node.bound.responses.computed == 16 - (um_models.LIFETIME - 1)
+    finally:
+        server.kill()
+
+
+@pytest.mark.exact
+def test_a_specimen_that_fails_now_and_then_is_tried_again_by_policy() -> None:
+    seen: set[float] = set()
+
+    def evaluate(handler: Told, x: float, y: float) -> None:
+        if x in seen:
+            give(handler, x, y)
+        else:
+            seen.add(x)
+            handler.say("500 Internal Server Error", 500)
+
+    with telling(evaluate) as server:
+        retry = prb.response.Retry(1, then=prb.response.Abort())
+        values, node = responses(prb.umbridge(server.url), on_failure=retry)
+    x = node.design.batches.points[0]
+    np.testing.assert_array_equal(values, np.stack([x - 4.0, x * x * 2.0], axis=1))
+    assert node.bound.responses.computed == 32
+
+
+# -- what goes wrong -------------------------------------------------------------------------------
+
+
+def test_what_is_no_server_is_refused_at_once(real: Real) -> None:
+    for url in ("localhost:4242", "http://", "ftp://localhost", "http://localhost:port"):
+        with pytest.raises(ValueError, match=r"umbridge: url: got .*, expected the address of a"):
+            prb.umbridge(url)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        clock = time.monotonic()
+        with pytest.raises(ConnectionError, match=r"where no server answers /Info \(.*start it"):
+            prb.umbridge(f"http://127.0.0.1:{free.getsockname()[1]}")
+        assert time.monotonic() - clock < 5
+    with telling(Info="<html>") as server, pytest.raises(ConnectionError, match="something else"):
+        prb.umbridge(server.url)
+    with telling(Info={"hello": 1}) as server, pytest.raises(ConnectionError, match="something el"):
+        prb.umbridge(server.url)
+    with (
+        telling(Info={"protocolVersion": 2.0, "models": []}) as server,
+        pytest.raises(ValueError, match=r"speaks version 2.0 of the protocol .*, expected 1.0"),
+    ):
+        prb.umbridge(server.url)
+
+
+def test_models_that_are_not_there_and_arguments_of_another_kind_are_refused(real: Real) -> None:
+    with pytest.raises(ValueError, match=r"got 'forward', expected one of .* 'beam', 'mortal', 'v"):
+        prb.umbridge(real.url)
+    with pytest.raises(ValueError, match=r"got 'mute', which the server at .* cannot evaluate"):
+        prb.umbridge(real.url, "mute")
+    for config in ("level 2", {"level": {2}}):
+        with pytest.raises(TypeError, match=r"umbridge: config: got .*, expected"):
+            prb.umbridge(real.url, "beam", config=config)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"umbridge: timeout: got 0"):
+        prb.umbridge(real.url, "beam", timeout=0)
+    for sizes in ([], [0], "2", [1.5]):
+        with (
+            telling(OutputSizes={"outputSizes": sizes}) as server,
+            pytest.raises(ValueError, match=r"got outputSizes = .* of the model 'forward', expec"),
+        ):
+            prb.umbridge(server.url)
+
+
+def test_a_simulator_that_does_not_fit_is_refused_before_anything_is_computed() -> None:
+    with telling() as server, pm.Model():
+        response = prb.umbridge(server.url)
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1)
+        rng = np.random.default_rng(0)
+        for inputs, event, said in (
+            ((x,), (2,), r"y: got inputs of 1 numbers, expected such as fill vectors"),
+            ((x, 1.0, 2.0), (2,), r"y: got inputs of 1, 1, 1 numbers, .*\(2 in all\)"),
+            ((x, 1.0), (), r"y: observed: got shape \(N,\), expected \(N, 2\)"),
+            ((x, 1.0), (3,), r"y: observed: got shape \(N, 3\), expected \(N, 2\)"),
+        ):
+            with pytest.raises(ValueError, match=said):
+                prb.Simulator(
+                    "y",
+                    response,
+                    *inputs,
+                    metric=prb.Joint(prb.AreaMetric()) if event else prb.AreaMetric(),
+                    observed=rng.normal(size=(9, *event)),
+                    propagation=prb.Reweighted(16, on_failure=prb.response.Replace()),
+                )
+        with pytest.raises(ValueError, match=r"y: got inputs of 1 numbers, expected such as fill"):
+            prb.Surrogate.fit(response, {"x": (0, 1)}, 16, name="y")
+        assert not server.asked
+
+
+def test_a_thread_keeps_its_connection_and_opens_another_where_it_was_closed() -> None:
+    closing = threading.Event()
+
+    def evaluate(handler: Told, x: float, y: float) -> None:
+        handler.close_connection = closing.is_set()
+        give(handler, x, y)
+
+    with telling(evaluate) as server:
+        response = prb.umbridge(server.url)
+        for x in range(10):
+            assert response(x, 1.0)[0] == x - 2
+        assert server.connections == 1
+        # It closes after each answer without a word.
+        closing.set()
+        for x in range(10):
+            assert response(x, 1.0)[0] == x - 2
+        assert server.connections == 10
+
+
+def test_an_answer_in_drops_is_given_up_in_time() -> None:
+    def evaluate(handler: Told, *_: float) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Length", "1000")
+        handler.end_headers()
+        for _ in range(30):
+            handler.wfile.write(b" ")
+            time.sleep(0.1)
+
+    with telling(evaluate) as server:
+        clock = time.monotonic()
+        with pytest.raises(TimeoutError, match=r"within timeout = 0.5 s"):
+            prb.umbridge(server.url, timeout=0.5)(1.0, 2.0)
+        assert time.monotonic() - clock < 1.5
+
+
+def test_a_specimen_that_ends_its_server_is_sent_three_times() -> None:
+    def evaluate(handler: Told, x: float, y: float) -> None:
+        if x == 6:
+            handler.close_connection = True
+            handler.connection.shutdown(socket.SHUT_RDWR)
+        else:
+            give(handler, x, y)
+
+    with telling(evaluate) as server:
+        response = prb.umbridge(server.url)
+        # In a thread that has no connection yet, of which it could not know whether it is stale.
+        with ThreadPoolExecutor(1) as pool:
+            error = pool.submit(response, 6.0, 1.0).exception()
+        assert isinstance(error, ConnectionError)
+        assert "was lost 3 times while it was at work on this specimen" in str(error)
+        assert len(server.asked) == 3
+        assert response(5.0, 1.0)[1] == 25
+
+
+def test_an_answer_that_is_cut_off_is_asked_for_again() -> None:
+    def evaluate(handler: Told, x: float, y: float) -> None:
+        if handler.server.asked[1:]:
+            give(handler, x, y)
+        else:
+            handler.send_response(200)
+            handler.send_header("Content-Length", "100")
+            handler.end_headers()
+            handler.wfile.write(b'{"output": [[1')
+            handler.close_connection = True
+
+    with telling(evaluate) as server:
+        assert prb.umbridge(server.url)(7.0, 1.0)[1] == 49
+    assert len(server.asked) == 2
+
+
+def test_a_gateway_whose_server_is_away_is_asked_again(caplog: pytest.LogCaptureFixture) -> None:
+    def evaluate(handler: Told, x: float, y: float) -> None:
+        if handler.server.asked[3:]:
+            give(handler, x, y)
+        else:
+            handler.say("<html>503 Service Unavailable", 503)
+
+    with telling(evaluate) as server, caplog.at_level(logging.WARNING, "prbayes"):
+        assert prb.umbridge(server.url)(7.0, 1.0)[1] == 49
+    assert len(server.asked) == 4
+    (record,) = caplog.records
+    assert "is away (it answered 503); waiting" in record.getMessage()
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "said"),
+    [
+        (
+            '{"error": {"type": "InvalidInput", "message": "no"}}',
+            400,
+            r"answered InvalidInput: no$",
+        ),
+        ('{"error": "out of memory"}', 200, r"forward: the server answered out of memory$"),
+        ('{"output": [[1, 2]]}', 404, r"the server answered 404, '{"),
+        (
+            "Gateway Time-out",
+            504,
+            r"the server answered 504, 'Gateway Time-out', expected a result$",
+        ),
+        ("[1, 2]", 200, r"the server answered 200, '\[1, 2\]', expected a result$"),
+        ('{"output": [[1, 2], [3]]}', 200, r"got .*, expected vectors of numbers, of sizes \[2\]$"),
+        ('{"output": [[1, "x"]]}', 200, r"got \[\[1, 'x'\]\], expected vectors of numbers"),
+        ('{"output": [[[1, 2]]]}', 200, r"got \[\[\[1, 2\]\]\], expected vectors of numbers"),
+        ("{}", 200, r"got None, expected vectors of numbers"),
+    ],
+)
+def test_an_answer_that_is_no_result_is_told(text: str, status: int, said: str) -> None:
+    with telling(lambda handler, *_: handler.say(text, status)) as server:
+        response = prb.umbridge(server.url)
+        with pytest.raises(RuntimeError, match=said):
+            response(1.0, 2.0)
+
+
+def test_numbers_that_json_does_not_know_are_read_and_texts_are_left() -> None:
+    with telling(lambda handler, *_: handler.say('{"output": [[null, -inf]]}')) as server:
+        np.testing.assert_array_equal(prb.umbridge(server.url)(1.0, 2.0), [np.nan, np.nan])
+    text = '{"error": {"type": "nan", "message": "inf"}}'
+    with (
+        telling(lambda handler, *_: handler.say(text)) as server,
+        pytest.raises(RuntimeError, match="answered nan: inf"),
+    ):
+        prb.umbridge(server.url)(1.0, 2.0)
+
+
+def test_a_machine_that_is_gone_is_noticed_without_a_time_limit() -> None:
+    with telling() as server:
+        prb.umbridge(server.url)(1.0, 2.0)
+        ((_, kept),) = [(k, c) for k, c in um_bridge._own.connections.items() if server.url in k]
+        assert kept.http.sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+
+        # What the system says of a machine that does not answer is a loss, and not a time limit.
+        def gone(*_: object) -> Any:
+            raise TimeoutError(110, "Connection timed out")
+
+        kept.exchanged = gone  # type: ignore[method-assign]
+        assert prb.umbridge(server.url)(3.0, 2.0)[1] == 18

@@ -1,0 +1,171 @@
+"""Weighted distribution functions and quantiles: closed forms, ties, zero weights, +inf and NaN."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+import pytest
+
+from prbayes._stats import (
+    cumulated,
+    distribution_function,
+    quantile,
+    ranked,
+    reached,
+    summed_below,
+)
+from prbayes._validate import Floats
+
+INF, NAN = np.inf, np.nan
+VALUES = np.array([3.0, 1.0, 2.0, 1.0])
+WEIGHTS = np.array([0.1, 0.2, 0.3, 0.4])
+
+
+def sample(seed: int, *batch: int, n: int = 30) -> tuple[Floats, Floats]:
+    """Return values with ties and weights, some of them zero."""
+    rng = np.random.default_rng(seed)
+    weights = rng.dirichlet(np.ones(n), batch)
+    weights[..., ::7] = 0
+    return np.round(rng.normal(size=n), 1), weights
+
+
+def test_a_value_counts_from_itself_on() -> None:
+    at = np.array([0.9, 1.0, 1.5, 2.0, 2.999, 3.0, 9.0])
+    expected = [0.0, 0.6, 0.6, 0.9, 0.9, 1.0, 1.0]
+    np.testing.assert_allclose(distribution_function(VALUES, WEIGHTS, at), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("kind", ["stable", "quicksort"])
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3), (0,)])
+def test_it_is_the_sum_of_the_weights_that_are_not_above(kind: str, batch: tuple[int, ...]) -> None:
+    x, w = sample(1, *batch)
+    at = np.linspace(-2, 2, 9)
+    expected = ((x[:, None] <= at) * w[..., None]).sum(axis=-2)
+    found = distribution_function(x, w, at, kind=kind)  # type: ignore[arg-type]
+    assert found.shape == (*batch, 9)
+    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
+
+
+def test_rows_of_values_have_functions_of_their_own() -> None:
+    x, w = sample(2, 2, 3)
+    at = np.linspace(-1, 1, 5)
+    own = x + np.arange(6.0).reshape(2, 3, 1)
+    found = distribution_function(own, w, at)
+    expected = [[distribution_function(own[i, j], w[i, j], at) for j in range(3)] for i in range(2)]
+    np.testing.assert_array_equal(found, expected)
+    shared = distribution_function(np.broadcast_to(x, w.shape), w, at)
+    np.testing.assert_array_equal(shared, distribution_function(x, w, at))
+    np.testing.assert_array_equal(shared, distribution_function(np.tile(x, (2, 3, 1)), w, at))
+
+
+def test_infinite_values_are_above_all_points_and_nan_above_them() -> None:
+    x, w = np.array([NAN, 0.0, INF, -INF]), np.array([0.4, 0.3, 0.2, 0.1])
+    found = distribution_function(x, w, np.array([-1e300, 0.0, 1e300, INF, NAN]))
+    np.testing.assert_allclose(found, [0.1, 0.4, 0.4, 0.6, 1.0], rtol=1e-14)
+
+
+def test_a_value_of_weight_zero_changes_nothing() -> None:
+    x, w = sample(3)
+    at = np.linspace(-2, 2, 9)
+    found = distribution_function(np.append(x, at), np.append(w, np.zeros(9)), at)
+    np.testing.assert_array_equal(found, distribution_function(x, w, at))
+
+
+def test_the_order_of_the_values_does_not_matter() -> None:
+    x, w = sample(4)
+    order = np.random.default_rng(5).permutation(x.size)
+    at = np.linspace(-2, 2, 9)
+    found = distribution_function(x[order], w[order], at)
+    np.testing.assert_allclose(found, distribution_function(x, w, at), rtol=1e-13, atol=1e-15)
+    levels = [0.1, 0.5, 0.9]
+    np.testing.assert_allclose(quantile(x[order], w[order], levels), quantile(x, w, levels))
+
+
+def test_both_steps_work_on_symbols_too() -> None:
+    x, w = sample(6, 2)
+    w = w + 0.01  # the smallest value's too
+    at = np.linspace(-9, 2, 23)  # the first ones below all values
+    order, below = ranked(x, at)
+    assert below[0] == 0
+    symbol = pt.matrix("w")
+    graph = summed_below(symbol, order, below, pt)
+    found = pytensor.function([symbol], graph, mode=pytensor.compile.mode.Mode(linker="py"))(w)
+    np.testing.assert_array_equal(found, distribution_function(x, w, at))
+    np.testing.assert_array_equal(cumulated(w, order)[..., below], found)
+    assert cumulated(w, order).shape == (2, x.size + 1)
+    assert (cumulated(w, order)[:, 0] == 0).all()
+
+
+# -- quantiles
+# --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 2, 9])
+def test_with_equal_weights_quantiles_are_hazens(n: int) -> None:
+    x = np.random.default_rng(7).normal(size=n)
+    levels = np.linspace(0, 1, 11)
+    expected = np.quantile(x, levels, method="hazen")
+    found = quantile(x, np.full(n, 1 / n), levels)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_quantiles_by_hand() -> None:
+    # Steps at 0, 1, 3 of heights .2, .6, .2 have their middles at .1, .5, .9.
+    x, w = np.array([3.0, 0.0, 1.0]), np.array([0.2, 0.2, 0.6])
+    levels = [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0]
+    np.testing.assert_allclose(quantile(x, w, levels), [0, 0, 0.5, 1, 2, 3, 3], atol=1e-12)
+
+
+def test_quantiles_of_batches_are_those_of_each_row() -> None:
+    x, w = sample(8, 2, 3)
+    rows = x + np.arange(6.0).reshape(2, 3, 1)
+    found = quantile(rows, w, [0.2, 0.5])
+    assert found.shape == (2, 3, 2)
+    assert quantile(rows, w, 0.5).shape == (2, 3)
+    assert quantile(x, w, 0.5).shape == (2, 3)
+    assert quantile(x, w[0, 0], 0.5).shape == ()
+    np.testing.assert_array_equal(found[1, 2], quantile(rows[1, 2], w[1, 2], [0.2, 0.5]))
+    np.testing.assert_array_equal(found[..., 1], quantile(rows, w, 0.5))
+
+
+def test_quantiles_of_infinite_values_and_of_nan() -> None:
+    third = np.full(3, 1 / 3)
+    np.testing.assert_array_equal(
+        quantile(np.array([INF, 0, 1]), third, [0.5, 0.6, 1]), [1, INF, INF]
+    )
+    np.testing.assert_array_equal(
+        quantile(np.array([NAN, 0, 1]), third, [0.4, 1]) > 0, [True, False]
+    )
+    assert np.isnan(quantile(np.array([NAN, 0, 1]), third, 0.6))
+
+
+# -- where a running sum reaches a level
+# ------------------------------------------------------------
+
+
+def test_the_first_index_at_which_the_sum_reaches_a_level() -> None:
+    w = np.array([0.25, 0.0, 0.25, 0.5])
+    found = reached(w, np.array([0.0, 0.25, 0.26, 0.5, 0.51, 1.0, 1.1]))
+    np.testing.assert_array_equal(found, [0, 0, 2, 2, 3, 3, 3])
+    assert found.dtype == np.intp
+
+
+@pytest.mark.parametrize("normalized", [True, False])
+def test_levels_are_shares_of_the_sum_if_asked(normalized: bool) -> None:
+    w = np.array([[1.0, 3.0], [2.0, 2.0]])
+    found = reached(w, np.array([0.3, 0.9]), normalized=normalized)
+    np.testing.assert_array_equal(found, [[1, 1], [0, 1]] if normalized else [[0, 0], [0, 0]])
+
+
+def test_evenly_spaced_levels_repeat_points_in_proportion_to_their_weights() -> None:
+    w = np.array([[0.1, 0.2, 0.3, 0.4], [0.4, 0.4, 0.2, 0.0]])
+    levels = (np.arange(1000) + np.array([[0.3], [0.8]])) / 1000
+    found = reached(w, levels, normalized=True)
+    counts = [np.bincount(row, minlength=4) for row in found]
+    np.testing.assert_allclose(counts, 1000 * w, atol=1)
+
+
+def test_without_any_weight_the_last_index_stands_for_all() -> None:
+    found = reached(np.zeros(3), np.array([0.2, 0.7]), normalized=True)
+    np.testing.assert_array_equal(found, [2, 2])
