@@ -35,16 +35,12 @@ from prbayes.model.specimen_likelihood import (
     specimen_likelihoods,
 )
 from prbayes.propagation.base import Bound
-from prbayes.propagation.importance import CLOUD
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.importance import SIZES
+from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
 from prbayes.response.groups import is_group
 from prbayes.response.inputs import Inputs
-
-# Points of a design from which on an eighth of them serve on the way to an answer: those of the
-# smallest cloud.
-_LARGE = CLOUD
 
 
 @dataclass(frozen=True)
@@ -170,7 +166,7 @@ class Evaluator:
     @property
     def n_runs(self) -> int:
         """Runs of all designs; those that several simulators share count once."""
-        return self._once([0 if n.design is None else n.design.n_runs for n in self.nodes])
+        return self._once([0 if n.reweighted is None else n.bound.n_runs for n in self.nodes])
 
     def likelihood_of(self, measurement: Measurement) -> SpecimenLikelihood:
         """Return the log-likelihood of a simulator's specimens."""
@@ -396,7 +392,7 @@ class Evaluator:
             chosen = metric or node.metric
             target = chosen.against(observed, counted)
             bound = node.bound
-            targets.append(target.beside(bound.first_responses, bound.dimensions))
+            targets.append(target.beside(bound.first_responses, bound.inputs.dimensions))
         return self.with_targets(targets)
 
     def of_one(self, node: Node, k: int) -> Evaluator:
@@ -412,9 +408,12 @@ class Evaluator:
         """Return an evaluator with an eighth of the points of large designs; None if none is."""
         bounds: list[Bound] = []
         for node in self.nodes:
-            design = node.design
-            large = design is not None and design.n_points >= _LARGE
-            bounds.append(design.coarser() if design is not None and large else node.bound)
+            bound = node.reweighted
+            # An eighth of the points serves on the way to an answer.
+            if bound is not None and bound.n_points >= SIZES.first:
+                bounds.append(bound.copied(bound.design.rows(bound.blocks == 0)))
+            else:
+                bounds.append(node.bound)
         pairs = list(zip(self.nodes, bounds, strict=True))
         if all(node.bound is bound for node, bound in pairs):
             return None
@@ -430,8 +429,8 @@ class Evaluator:
             return self
         support = coarse.support(theta[None])
         is_sufficient = [
-            support[name]["weight_ess"][0] >= design.required_ess
-            for name, design in coarse.designs.items()
+            support[name]["weight_ess"][0] >= bound.required_ess
+            for name, bound in coarse.reweighted.items()
         ]
         return coarse if all(is_sufficient) else self
 
@@ -510,15 +509,15 @@ class Evaluator:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
         found = {}
         for k, node in enumerate(self.nodes):
-            design = node.design
-            if design is None:
+            bound = node.reweighted
+            if bound is None:
                 continue
             # Some populations at a time: their weights are held at all points.
-            step = max(1, IN_CACHE // design.n_points)
+            step = max(1, IN_CACHE // bound.n_points)
             parts = []
             for first in range(0, max(1, len(thetas)), step):
                 roots = self.roots(thetas[first : first + step], k)
-                parts.append(design.support(roots))
+                parts.append(bound.support(roots))
             found[node.name] = {
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]
             }
