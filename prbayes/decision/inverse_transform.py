@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from prbayes._validate import Floats
 from prbayes.numerics.points import inside
-from prbayes.propagation.new_specimens import through_inverses
+from prbayes.propagation.points import through_inverses
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs

@@ -25,7 +25,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.points import sobol
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.groups import refuse_groups
 from prbayes.response.inputs import read_inputs
 from prbayes.response.outputs import Outputs, lacking
@@ -142,9 +142,9 @@ class Populations:
             values = emulator(sample.points_of(responses.inputs))
             found = Told(self, k, sample, responses, values, None, emulator)
         else:
-            design = simulator.design
-            assert design is not None
-            found = Told(self, k, design, responses, design.values_of(responses), None)
+            bound = simulator.reweighted
+            assert bound is not None
+            found = Told(self, k, bound, responses, bound.values_of(responses), None)
         found.refuse_unsupported()
         return found
 
@@ -155,7 +155,7 @@ class Told:
 
     populations: Populations
     k: int  # which simulator has the design
-    design: Design | EmulatedSample
+    design: ReweightedBound | EmulatedSample
     responses: Responses
     every: Floats  # (n,) or (n, m): all outputs at the design's points
     place: int | None  # of the output; None where there is one
@@ -182,8 +182,7 @@ class Told:
     @property
     def points(self) -> list[Floats]:
         """The specimens, shapes (n, *event), by input."""
-        design = self.design
-        return list(design.contents.table.points if design.has_runs else design.points)
+        return list(self.design.points_of(self.design.inputs))
 
     def column(self, values: Floats) -> Floats:
         """Return the output, (..., n) or (..., n, m) -> (..., n)."""

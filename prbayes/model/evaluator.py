@@ -42,6 +42,9 @@ from prbayes.response.compile import compiled, ninf_for_invalid, untraced
 from prbayes.response.groups import is_group
 from prbayes.response.inputs import Inputs
 
+# Points of a design from which on an eighth of them serves on the way to an answer.
+_LARGE = SIZES.first
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -191,9 +194,9 @@ class Evaluator:
         return sum(node.bound.n_per_theta for node in self.nodes)
 
     @property
-    def designs(self) -> dict[str, Design]:
-        """The designs of the simulators that reweight stored responses, by name."""
-        return {n.name: n.design for n in self.nodes if n.design is not None}
+    def reweighted(self) -> dict[str, ReweightedBound]:
+        """The simulators that reweight the stored responses of a design, by name."""
+        return {n.name: n.reweighted for n in self.nodes if n.reweighted is not None}
 
     def _params(self) -> list[list[Any]]:
         """Return the simulators' roots as they stand in this model, which may be a clone."""
@@ -409,8 +412,7 @@ class Evaluator:
         bounds: list[Bound] = []
         for node in self.nodes:
             bound = node.reweighted
-            # An eighth of the points serves on the way to an answer.
-            if bound is not None and bound.n_points >= SIZES.first:
+            if bound is not None and bound.n_points >= _LARGE:
                 bounds.append(bound.copied(bound.design.rows(bound.blocks == 0)))
             else:
                 bounds.append(node.bound)

@@ -49,8 +49,8 @@ def supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
         return out
     good = np.ones(where.size, dtype=bool)
     for name, support in evaluator.support(thetas[where]).items():
-        design = evaluator.designs[name]
-        good &= supports_each(support, design.required_ess, design.config.max_lost, VISIBLE)
+        bound = evaluator.reweighted[name]
+        good &= supports_each(support, bound.required_ess, bound.max_lost, VISIBLE)
     out[where] = good
     return out
 

@@ -256,7 +256,7 @@ class _Population:
     def of(cls, evaluator: Evaluator, thetas: Floats, k: int) -> _Population:
         """Return the k-th simulator's population at thetas, one for all of them."""
         values, weights = evaluator.populations(thetas, k)
-        if evaluator.simulators[k].design is not None:  # whose points are all populations'
+        if evaluator.simulators[k].reweighted is not None:  # whose points are all populations'
             values = values[0]
             weights = weights.mean(axis=0)
         else:

@@ -602,8 +602,8 @@ class _Designs:
 def _computed(evaluator: Evaluator, thetas: Floats) -> _Designs:
     """Return the support of the designs as they are now."""
     needs = {}
-    for name, design in evaluator.designs.items():
-        needs[name] = _Needs(design.required_ess, design.config.max_lost, design.n_points)
+    for name, bound in evaluator.reweighted.items():
+        needs[name] = _Needs(bound.required_ess, bound.max_lost, bound.n_points)
     by_simulator = evaluator.support(thetas)
     names = list(by_simulator)
     stacked = {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -18,7 +17,7 @@ from prbayes.model.fingerprint import Level, require_same
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.reweighted import UntoldError
+from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import data_digest, in_order, serving, specimen_names
@@ -93,20 +92,21 @@ class JointNull(SimulatedNull):
         """Draw, calibrate, test."""
         require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
         sampling = self.optimum.sampling()
-        with ExitStack() as alone:
+        bounds = self.optimum.evaluator.reweighted.values()
+        with designs_restored(bounds):
             try:
                 served = [self._served(case, condition) for condition in case.conditions]
-            except UntoldError as untold:
+            except PoorEmulatorError as untold:
                 # All on the same points: those of the runs.
-                for design in self.optimum.evaluator.designs.values():
-                    alone.enter_context(design.alone())
+                for bound in bounds:
+                    bound.design = bound.design.runs_alone()
                 self._refuse_unsupported(untold)
                 served = [self._served(case, condition) for condition in case.conditions]
             found = self._replicates(case, served, sampling)
         # Designs are whole again before anyone else goes on.
         yield found
 
-    def _refuse_unsupported(self, untold: UntoldError) -> None:
+    def _refuse_unsupported(self, untold: PoorEmulatorError) -> None:
         """Raise if the runs by themselves are too few for the population at the optimum."""
         short = shortcomings(self.optimum.evaluator, self.optimum.theta[None])
         if short:
@@ -204,8 +204,8 @@ class JointNull(SimulatedNull):
                 "has, expected its .dist() objects; only then is it known which responses belong "
                 "to the specimens of the calibration"
             )
-        assert node.design is not None
-        return _Served(condition, nodes.index(node), node.design.values_of(called))
+        assert node.reweighted is not None
+        return _Served(condition, nodes.index(node), node.reweighted.values_of(called))
 
     def _own_simulator(self, case: Case, condition: Condition) -> int:
         """Return the simulator that a condition without a response stands for."""
