@@ -387,10 +387,10 @@ def test_a_failure_inside_is_undone_too() -> None:
 
 
 def test_designs_of_the_same_points() -> None:
-    a, b, c = (n.bound for n in pair(None, None).nodes)
+    a, b, c = pair(None, None).reweighted.values()
     assert a.same_points(b)
     assert not a.same_points(c)
-    with b.undone():
+    with designs_restored([b]):
         b.add([np.zeros(3)])
         assert not a.same_points(b)
     assert a.same_points(b)

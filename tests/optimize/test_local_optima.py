@@ -342,7 +342,7 @@ class Landscape:
     """A discrepancy that is a formula, in place of a model."""
 
     formula: Any
-    designs: dict[str, Any] = field(default_factory=dict)
+    reweighted: dict[str, Any] = field(default_factory=dict)
     nodes: tuple[Any, ...] = ()
 
     def total(self, thetas: Floats, scales: Floats) -> Floats:
