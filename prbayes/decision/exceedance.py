@@ -29,7 +29,7 @@ from prbayes.decision.populations import Populations, Told, output_place
 from prbayes.decision.quantities import Exceedance
 from prbayes.model.fingerprint import as_attributes, identity_of_model
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.propagation.base import MAX_LOST, N_BLOCKS, DesignError
@@ -46,7 +46,7 @@ _EMULATED_AT = 400
 _FEWEST_POINTS = 100
 
 
-@in_turn
+@locked
 def exceedance(
     result: Optimum | xr.DataTree,
     response: Callable[..., Any],
@@ -265,8 +265,8 @@ class _Asked:
                 "prb.decision.Interval"
             )
         evaluator = self.populations.evaluator
-        values = evaluator.constrained(self.populations.thetas)
-        center = evaluator.constrained(self.populations.center[None])
+        values = evaluator.hyperparameters.constrained(self.populations.thetas)
+        center = evaluator.hyperparameters.constrained(self.populations.center[None])
         names = [str(rv.name) for rv in responses.inputs.roots]
         specimens = Specimens(responses.name, responses.inputs, [center[name] for name in names])
         sign = -1.0 if self.below else 1.0

@@ -101,9 +101,8 @@ def of_a_specimen(told: Told, metric: Metric | None) -> Floats:
     design = told.design
     bound = design.telling(told.every, target.beside(told.every, design.dimensions))
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
-    sampling = SamplingDistribution.of(
-        evaluator.of_one(alone, told.k), center, np.ones(1), _FAINTEST
-    )
+    simulator_alone = replace(evaluator, nodes=(alone,), has_graph=False)
+    sampling = SamplingDistribution.of(simulator_alone, center, np.ones(1), _FAINTEST)
     local = sampling.local
     if not local.identified.size:
         return np.zeros((center.size, center.size))
@@ -120,7 +119,7 @@ def fisher_information(told: Told) -> Floats:
     """
     evaluator = told.populations.evaluator
     center = told.populations.center
-    unit = evaluator.prior_sd
+    unit = evaluator.hyperparameters.prior_sd
     step = _LOG_WEIGHT_STEP * unit
     around = cross(center, step)
     _, weights = told.design.populations(evaluator.roots(around, told.k))

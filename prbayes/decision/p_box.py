@@ -15,7 +15,7 @@ from prbayes.decision.interval import intervals, variants
 from prbayes.decision.populations import Populations, Told
 from prbayes.model.fingerprint import as_attributes, identity_of_model
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.response.response import refuse_uncallable
 
@@ -26,7 +26,7 @@ _PLACES = 200
 _BEYOND_PLACES = 1e-4
 
 
-@in_turn
+@locked
 def p_box(
     result: Optimum | xr.DataTree,
     response: Callable[..., Any],

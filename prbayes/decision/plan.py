@@ -17,7 +17,7 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.model.elements import split_elements, told_elements
 from prbayes.model.fingerprint import as_attributes, identity_of_model
 from prbayes.model.labels import labelled, versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, identity_in
 
 # Draws that are made narrower: standard deviations are then known to two percent.
@@ -28,7 +28,7 @@ _MOST_SPECIMENS = 1_000_000
 _QUANTITY = "quantity"
 
 
-@in_turn
+@locked
 def plan(
     result: Optimum | xr.DataTree,
     candidates: Mapping[str, Condition],
@@ -122,9 +122,9 @@ def plan(
     if quantity is not None:
         decided = populations.told(quantity.response, quantity.inputs, quantity.output)
         decided.refuse_failed(quantity)
-    belief = Belief.of(populations.thetas, evaluator.prior_sd)
+    belief = Belief.of(populations.thetas, evaluator.hyperparameters.prior_sd)
     outlook = _Outlook(populations, belief, quantity, decided)
-    now = outlook.sd(np.zeros((evaluator.size, evaluator.size)))
+    now = outlook.sd(np.zeros((evaluator.hyperparameters.size, evaluator.hyperparameters.size)))
     _refuse_target(target, list(now))
     told = {
         label: populations.all_outputs(one.response, one.inputs)
@@ -169,7 +169,7 @@ class _Outlook:
         """Return standard deviations by name, after so much information, (d, d)."""
         thetas = self.belief.after(information)
         evaluator = self.populations.evaluator
-        own = evaluator.constrained(thetas)
+        own = evaluator.hyperparameters.constrained(thetas)
         values = labelled(evaluator, own, {"draw": len(thetas)}).data_vars
         elements = split_elements(values)
         found = {name: float(elements[name].std()) for name in told_elements(values)}

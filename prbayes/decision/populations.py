@@ -66,11 +66,13 @@ class Populations:
         if isinstance(result, Optimum):
             thetas = _normal_thetas(result, draws, caller)
             own = model is result.model
-            evaluator = result.evaluator if own else Evaluator(model)
+            evaluator = result.evaluator if own else Evaluator.of(model)
             return cls(evaluator, thetas, result.theta, caller, drawn=False)
         points, _ = populations_of(result, model, draws, caller)
-        evaluator = Evaluator(model)
-        thetas = evaluator.thetas_of([points[str(rv.name)] for rv in model.free_RVs])
+        evaluator = Evaluator.of(model)
+        thetas = evaluator.hyperparameters.thetas_of(
+            [points[str(rv.name)] for rv in model.free_RVs]
+        )
         return cls(evaluator, thetas, np.median(thetas, axis=0), caller, drawn=True)
 
     def responses(

@@ -21,7 +21,7 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.decision.scatter import scatter
 from prbayes.model.fingerprint import as_attributes, identity_of_model
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.numerics.points import sobol
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.response.inputs import aleatory_names
@@ -36,7 +36,7 @@ _WEIGHT_STEP = 0.02
 _LEFT_OUT = 0.01
 
 
-@in_turn
+@locked
 def sensitivity(
     result: Optimum | xr.DataTree,
     quantity: Quantity,
@@ -154,11 +154,14 @@ def sensitivity(
         for key in (name, f"{name}_error"):
             both = [getattr(own, key), getattr(inputs.indices, key)]
             columns[key] = ("factor", np.concatenate(both))
-    kinds = ["hyperparameter"] * evaluator.size + ["input"] * len(names)
+    kinds = ["hyperparameter"] * evaluator.hyperparameters.size + ["input"] * len(names)
     identity = identity_in(result) or identity_of_model(evaluator.model)
     return xr.Dataset(
         columns,
-        coords={"factor": [*evaluator.readable_names, *names], "kind": ("factor", kinds)},
+        coords={
+            "factor": [*evaluator.hyperparameters.readable_names, *names],
+            "kind": ("factor", kinds),
+        },
         attrs={
             "quantity": repr(quantity),
             "value": float(told.at(quantity, populations.center[None])[0]),
@@ -177,7 +180,7 @@ def sensitivity(
 def _of_hyperparameters(told: Told, quantity: Quantity, samples: int, seed: int) -> Indices:
     """Return the indices of the elements of theta."""
     copula = Copula.of(told.populations.thetas)
-    d = told.populations.evaluator.size
+    d = told.populations.evaluator.hyperparameters.size
     n = samples // REPLICATES
     nets = [ndtri(sobol(n, 2 * d, seed + 7919 * r)) for r in range(REPLICATES)]
     here, fresh = np.split(np.array(nets), 2, axis=-1)

@@ -15,9 +15,9 @@ from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.inference.resampling import DataSets, specimens
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.validation.scores import Scoring
@@ -27,7 +27,7 @@ _ADVICE = ", so that the model cannot be calibrated anew"
 _FOLDS = 5
 
 
-@in_turn
+@locked
 def cross_validate(
     optimum: Optimum,
     *,
@@ -226,7 +226,7 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
 
     Arguments are those of `_discrepancies`.
     """
-    by_name = evaluator.specimen_log_likelihoods(thetas)
+    by_name = specimen_log_likelihoods(evaluator, thetas)
     columns = []
     for simulator, weights in zip(evaluator.emulated, data, strict=True):
         likelihood, measurement = simulator.likelihood, simulator.measurement

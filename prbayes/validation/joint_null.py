@@ -247,7 +247,7 @@ class _Served:
         return own if self.values is None else self.values
 
 
-def _measuring_first(nodes: list[Node], condition: Condition) -> list[Node]:
+def _measuring_first(nodes: Sequence[Node], condition: Condition) -> list[Node]:
     """Return the simulators, first those that measured a condition's specimens."""
     labels = set(condition.labels or ())
 
@@ -258,7 +258,7 @@ def _measuring_first(nodes: list[Node], condition: Condition) -> list[Node]:
 
 
 def _specimen_numbers(
-    nodes: list[Node], served: list[_Served]
+    nodes: Sequence[Node], served: list[_Served]
 ) -> tuple[list[NDArray[np.intp]], int]:
     """Return the specimens of each condition, those of the calibration by their numbers.
 
@@ -298,7 +298,7 @@ def _specimen_numbers(
     return numbers, more
 
 
-def _groups_of(nodes: list[Node]) -> dict[int, int]:
+def _groups_of(nodes: Sequence[Node]) -> dict[int, int]:
     """Return the group of each simulator; the points of a group are drawn together."""
     found: dict[int, int] = {}
     for number, group in enumerate(groups(nodes)):
@@ -306,7 +306,9 @@ def _groups_of(nodes: list[Node]) -> dict[int, int]:
     return found
 
 
-def _known_specimens(nodes: list[Node], own: list[NDArray[np.intp]]) -> dict[str, tuple[int, int]]:
+def _known_specimens(
+    nodes: Sequence[Node], own: list[NDArray[np.intp]]
+) -> dict[str, tuple[int, int]]:
     """Return number and group of the specimens of the calibration, by label."""
     group_of = _groups_of(nodes)
     known = {}
