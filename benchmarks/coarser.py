@@ -50,8 +50,8 @@ def sampled(optimum: Any, large: int, seed: int) -> tuple[float, Any]:
     import prbayes as prb
     from prbayes.model import evaluator
 
-    before = evaluator.CLOUD
-    evaluator.CLOUD = large
+    before = evaluator._LARGE
+    evaluator._LARGE = large
     clock = time.process_time()
     try:
         tree = prb.sample_smc(
@@ -62,7 +62,7 @@ def sampled(optimum: Any, large: int, seed: int) -> tuple[float, Any]:
             progressbar=False,
         )
     finally:
-        evaluator.CLOUD = before
+        evaluator._LARGE = before
     seconds = time.process_time() - clock
     names = [rv.name for rv in optimum.model.free_RVs]
     return seconds, np.array([tree.posterior[name].values.ravel() for name in names])
@@ -70,12 +70,12 @@ def sampled(optimum: Any, large: int, seed: int) -> tuple[float, Any]:
 
 def compared(optimum: Any) -> dict[str, Any]:
     """Return the ratio of times, and how far draws are from each other, in half lengths."""
-    from prbayes.model.evaluator import CLOUD
+    from prbayes.model.evaluator import _LARGE
 
     runs: dict[str, list[Any]] = {"whole": [], "eighth": []}
     for seed in SEEDS:
         runs["whole"].append(sampled(optimum, 1 << 40, seed))
-        runs["eighth"].append(sampled(optimum, CLOUD, seed))
+        runs["eighth"].append(sampled(optimum, _LARGE, seed))
     seconds = {way: [spent for spent, _ in found] for way, found in runs.items()}
     middles, lengths = {}, {}
     for way, found in runs.items():

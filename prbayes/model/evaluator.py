@@ -37,6 +37,9 @@ from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
 from prbayes.response.groups import is_group
 
+# Points of a design from which on samplers start with an eighth of them.
+_LARGE = CLOUD
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -471,7 +474,7 @@ def coarser_evaluator(evaluator: Evaluator) -> Evaluator | None:
     bounds: list[Bound] = []
     for node in evaluator.nodes:
         design = node.design
-        is_large = design is not None and design.n_points >= CLOUD
+        is_large = design is not None and design.n_points >= _LARGE
         bounds.append(design.coarser() if design is not None and is_large else node.bound)
     pairs = list(zip(evaluator.nodes, bounds, strict=True))
     if all(node.bound is bound for node, bound in pairs):
