@@ -26,9 +26,9 @@ from prbayes.plots.responses import plot_responses
 from prbayes.plots.sensitivity import plot_sensitivity
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
-from prbayes.reports.decision import kind_of_decision
 from prbayes.reports.images import image
 from prbayes.reports.material import Material
+from prbayes.reports.schema import kind_of_decision
 from prbayes.reports.section import Section
 
 _log = logging.getLogger("prbayes")
