@@ -12,8 +12,8 @@ from prbayes._validate import Floats
 ENVELOPED = 999
 
 
-def envelope(replicates: Floats, level: float) -> tuple[Floats, Floats]:
-    """Return bounds of sorted values within which a share 1 - level of replicates lies entirely.
+def envelope(replicates: Floats, alpha: float) -> tuple[Floats, Floats]:
+    """Return bounds of sorted values within which a share 1 - alpha of replicates lies entirely.
 
     The bounds of all n leave out the same number of replicates on either side, the largest that
     will do. This is the simulation of Säilynoja, Bürkner and Vehtari [1]_, with ranks among
@@ -24,7 +24,7 @@ def envelope(replicates: Floats, level: float) -> tuple[Floats, Floats]:
     Parameters
     ----------
     replicates : ndarray, shape (r, n)
-    level : float
+    alpha : float
 
     Returns
     -------
@@ -49,6 +49,6 @@ def envelope(replicates: Floats, level: float) -> tuple[Floats, Floats]:
         depth = np.minimum(depth, nearer)
     # The share to be left out is that of the farthest ones.
     depth.sort()
-    outermost = int(level * size)
+    outermost = int(alpha * size)
     k = max(1, int(depth[outermost]))
     return columns[k - 1], columns[size - k]
