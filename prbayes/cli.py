@@ -172,7 +172,7 @@ def _validity_test(path: Path, dataset: xr.Dataset) -> ValidityTest:
     from prbayes.model.fingerprint import from_attributes
     from prbayes.validation.area_test import ValidityTest
 
-    numbers = ("statistic", "critical_value", "p_value", "level")
+    numbers = ("statistic", "critical_value", "p_value", "alpha")
     try:
         return ValidityTest(
             **{key: float(dataset[key]) for key in numbers},

@@ -121,8 +121,9 @@ def _posterior(m: Material) -> Request:
     if m.model is None:
         names = _first(m.posteriors)["posterior"].data_vars
         own = _own_labels(m, names)
-        return Call((_first(m.posteriors), _first(m.found)), {"model": None, **own})
-    return _labelled(m, (_first(m.posteriors), _first(m.found)), {"model": m.model})
+        return Call((_first(m.posteriors),), {"optimum": _first(m.found), "model": None, **own})
+    keywords = {"optimum": _first(m.found), "model": m.model}
+    return _labelled(m, (_first(m.posteriors),), keywords)
 
 
 def _stages(m: Material) -> Request:
