@@ -60,6 +60,7 @@ __all__ = [  # noqa: F405
     "posterior",
     "predict",
     "propagation",
+    "rank",
     "refine",
     "reports",
     "response",

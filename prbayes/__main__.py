@@ -248,7 +248,7 @@ def _test_of(path: Path, dataset: xr.Dataset) -> ValidityTest:
         return ValidityTest(
             **{
                 key: float(dataset[key])
-                for key in ("statistic", "critical_value", "p_value", "level")
+                for key in ("statistic", "critical_value", "p_value", "alpha")
             },
             null=str(dataset.attrs["null"]),
             folded=bool(dataset["folded"]),

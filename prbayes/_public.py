@@ -59,3 +59,4 @@ from prbayes.results.diagnose import diagnose as diagnose
 from prbayes.results.predict import predict as predict
 from prbayes.validation.area_test import area_test as area_test
 from prbayes.validation.cross_validation import cross_validate as cross_validate
+from prbayes.validation.model_comparison import rank as rank

@@ -125,8 +125,8 @@ def decisions() -> dict[str, xr.Dataset]:
     condition = prb.decision.Condition(lambda x: 2 * x, x)
     return {
         "above 7.nc": prb.exceedance(optimum, lambda x: 2 * x, 7.0, x, requirement=0.5),
-        "mean.nc": prb.sensitivity(optimum, quantity, samples=64),
-        "more.nc": prb.plan(optimum, {"here": condition}, [5], quantity=quantity),
+        "mean.nc": prb.sensitivity(optimum, quantity, n_samples=64),
+        "more.nc": prb.plan(optimum, {"here": condition}, k=[5], quantity=quantity),
     }
 
 
@@ -150,7 +150,7 @@ def test_a_damaged_decision_gets_one_line(folder: Path, capsys: pytest.CaptureFi
         less.to_netcdf(folder / name, engine="h5netcdf")
     assert main(["report", "o.nc", "above 7.nc", "--no-pictures"]) == 2
     error = capsys.readouterr().err
-    assert "above 7.nc: got no ['lower', 'limit', 'below', 'level']" in error
+    assert "above 7.nc: got no ['lower', 'limit', 'below', 'prob']" in error
     assert main(["report", "o.nc", "mean.nc", "--no-pictures"]) == 2
     assert "expected a table of prb.sensitivity" in capsys.readouterr().err
 

@@ -231,7 +231,7 @@ def validity(m: Material) -> list[Section]:
             "the areas of u and of |2u - 1|."
         )
     if len(m.tests) > 1:
-        levels = sum(test.level for test in m.tests.values())
+        levels = sum(test.alpha for test in m.tests.values())
         about += (
             f" A right model is rejected by one or more of these {len(m.tests)} tests in up to "
             f"{percentage(min(levels, 1.0))} of cases."
@@ -292,7 +292,7 @@ def _tested(test: ValidityTest) -> dict[str, Any]:
         "area": f"{test.statistic:.4f}",
         "critical value": f"{test.critical_value:.4f}",
         "p-value": probability(test.p_value).removeprefix("= "),
-        "level": percentage(test.level),
+        "level": percentage(test.alpha),
     }
 
 

@@ -73,7 +73,7 @@ def _risk(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
             "bound": str(bound),
             "probability": number(float(value), 2),
             "its error": number(float(error), 1),
-            f"{percentage(table.attrs['level'])} interval": interval,
+            f"{percentage(table.attrs['prob'])} interval": interval,
             **_required(table),
         }
         for bound, value, error in zip(bounds, values, errors, strict=True)

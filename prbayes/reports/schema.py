@@ -20,11 +20,11 @@ _OF_POSTERIOR = {
 _OF_STAGES = ("beta", "accept_rate", "n_steps")
 _OF_OPTIMUM = {"calibration": ("discrepancy", "metric"), "stderr": ()}
 _OF_DECISION = {
-    "risk": ("lower", "upper", "limit", "below", "level"),
+    "risk": ("lower", "upper", "limit", "below", "prob"),
     "sensitivity": ("factor", "kind", "first_error", "total_error", "quantity", "value", "sd"),
     "plan": ("name", "candidate", "k"),
 }
-_OF_TEST = ("statistic", "critical_value", "p_value", "level", "folded")
+_OF_TEST = ("statistic", "critical_value", "p_value", "alpha", "folded")
 
 
 def complaints(tree: xr.DataTree) -> Iterator[str]:

@@ -96,7 +96,7 @@ def verdict(label: str, test: ValidityTest, m: Material) -> str:
     sign = ">" if test.statistic > test.critical_value else "≤"
     return (
         f"{who}On {aspect} of {specimens} ({values}), the calibrated model {found} "
-        f"at level {percentage(test.level)} "
+        f"at level {percentage(test.alpha)} "
         f"({area} {test.statistic:.3f} {sign} critical {test.critical_value:.3f}, "
         f"p {probability(test.p_value)})."
     )
@@ -147,7 +147,7 @@ def _risks(m: Material) -> list[str]:
     for label, table in m.decisions.items():
         if kind_of_decision(table) != "risk" or table.probability.ndim:
             continue
-        level = percentage(table.attrs["level"])
+        level = percentage(table.attrs["prob"])
         said = (
             f"{label}: probability {number(float(table.probability), 2)} ({level} interval "
             f"{interval_of(table)})"

@@ -194,7 +194,7 @@ class Responses:
                 if version is not None and outputs.keys:
                     # In another order they are other numbers.
                     version = f"{version} ({', '.join(outputs.names)})"
-            opened = Store(store, name, columns, version=version, outputs=n_outputs)
+            opened = Store(store, name, columns=columns, version=version, outputs=n_outputs)
         self.name = name
         self.outputs = outputs
         self.function = function

@@ -342,7 +342,7 @@ def test_workers_that_end_whatever_they_do_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("threads", "text"), [({}, ", and there is no worker"), ({"a": 1}, "")])
-def test_silence_is_failure_text(
+def test_silence_is_told(
     threads: dict[str, int],
     text: str,
     monkeypatch: pytest.MonkeyPatch,
