@@ -57,11 +57,12 @@ LAYERS = (
     ("plots",),
     ("reports",),
     ("surrogate",),
-    ("_demo", "__main__", "_public"),
+    ("cli",),
+    ("__main__",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
-# Rooms of one floor that may import each other: the ground floor, and the command line's two files.
-TOGETHER = (set(_GROUND), {"_demo", "__main__"})
+# Rooms of one floor that may import each other.
+TOGETHER = (set(_GROUND),)
 CEILINGS = json.loads((ROOT / "tests" / "structure_ceilings.json").read_text(encoding="utf-8"))
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.

@@ -12,7 +12,6 @@ import xarray as xr
 from prbayes._stats import INTERVAL
 from prbayes.plots._names import named
 from prbayes.plots.validity import in_directions
-from prbayes.reports.decision import CALLED, kind_of_decision
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import (
     alike,
@@ -24,6 +23,7 @@ from prbayes.reports.numbers import (
     span,
 )
 from prbayes.reports.problem import described
+from prbayes.reports.schema import CALLED, kind_of_decision
 from prbayes.reports.section import Section
 from prbayes.reports.summary import verdict
 from prbayes.reports.tables import rows_table

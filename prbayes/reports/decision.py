@@ -11,6 +11,7 @@ import xarray as xr
 from prbayes.plots._names import named
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import number, percentage, plus_minus
+from prbayes.reports.schema import kind_of_decision
 from prbayes.reports.section import Section
 from prbayes.reports.tables import rows_table
 
@@ -49,16 +50,6 @@ def refuse_decisions(given: Any) -> None:
                 f"Report: decision: got {type(table).__name__}, expected the Dataset of "
                 "prb.exceedance, prb.sensitivity or prb.plan, or several by name"
             )
-
-
-def kind_of_decision(table: Any) -> str | None:
-    """Return of which function a table is; None if of none."""
-    if not isinstance(table, xr.Dataset):
-        return None
-    for kind, variables in _VARIABLES.items():
-        if variables <= set(table.data_vars):
-            return kind
-    return None
 
 
 def _risk(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -133,13 +124,6 @@ def _plan(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
     return rows
 
 
-_VARIABLES = {
-    "risk": {"probability", "by_draw", "error"},
-    "sensitivity": {"first", "total", "derivative"},
-    "plan": {"sd", "now"},
-}
-# The functions whose tables they are.
-CALLED = {"risk": "exceedance", "sensitivity": "sensitivity", "plan": "plan"}
 _Rows = Callable[[xr.Dataset, Mapping[str, str]], list[dict[str, Any]]]
 _KINDS: dict[str, tuple[str, str, _Rows]] = {
     "risk": (

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes.reports.decision import CALLED, kind_of_decision
+_VARIABLES = {
+    "risk": {"probability", "by_draw", "error"},
+    "sensitivity": {"first", "total", "derivative"},
+    "plan": {"sd", "now"},
+}
+# The functions whose tables they are.
+CALLED = {"risk": "exceedance", "sensitivity": "sensitivity", "plan": "plan"}
 
 # What a group has to have for those who report it, where there is such a group.
 _OF_POSTERIOR = {
@@ -25,6 +31,16 @@ _OF_DECISION = {
     "plan": ("name", "candidate", "k"),
 }
 _OF_TEST = ("statistic", "critical_value", "p_value", "alpha", "folded")
+
+
+def kind_of_decision(table: Any) -> str | None:
+    """Return of which function a table is; None if of none."""
+    if not isinstance(table, xr.Dataset):
+        return None
+    for kind, variables in _VARIABLES.items():
+        if variables <= set(table.data_vars):
+            return kind
+    return None
 
 
 def complaints(tree: xr.DataTree) -> Iterator[str]:

@@ -17,9 +17,10 @@ from prbayes.model.elements import (
 from prbayes.plots._names import named
 from prbayes.plots._objective import metric_label
 from prbayes.plots.validity import in_directions
-from prbayes.reports.decision import interval_of, kind_of_decision
+from prbayes.reports.decision import interval_of
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus, probability
+from prbayes.reports.schema import kind_of_decision
 from prbayes.validation.area_test import ValidityTest
 
 # More hyperparameters than this make a list, which a table shows better: by judgement.
