@@ -2,7 +2,6 @@
 
 from prbayes.validation.area_test import ValidityTest, u_values
 from prbayes.validation.joint_null import JointNull
-from prbayes.validation.model_comparison import compare_candidates
 from prbayes.validation.nulls import ExactModel, PosteriorNull
 
 __all__ = [
@@ -10,6 +9,5 @@ __all__ = [
     "JointNull",
     "PosteriorNull",
     "ValidityTest",
-    "compare_candidates",
     "u_values",
 ]

@@ -31,7 +31,7 @@ class ValidityTest:
     critical_value : float
         The largest area that is not rejected.
     p_value : float
-    level : float
+    alpha : float
     null : str
         The null hypothesis.
     folded : bool
@@ -40,7 +40,7 @@ class ValidityTest:
         Of all conditions, one after the other.
     envelope : ndarray, shape (2, n)
         Bounds of the sorted values that are tested; under the null all of them are between the
-        bounds with probability 1 - ``level``.
+        bounds with probability 1 - ``alpha``.
     conditions, specimens : ndarray of str, shape (n,)
         The condition and the specimen of each u-value.
     identity : Identity or None
@@ -50,7 +50,7 @@ class ValidityTest:
     statistic: float
     critical_value: float
     p_value: float
-    level: float
+    alpha: float
     null: str
     folded: bool
     u_values: Floats
@@ -61,8 +61,8 @@ class ValidityTest:
 
     @property
     def rejected(self) -> bool:
-        """Whether the model is rejected at the level."""
-        return self.p_value <= self.level
+        """Whether the model is rejected at the significance level."""
+        return self.p_value <= self.alpha
 
     @property
     def of_conditions(self) -> list[str]:
@@ -79,7 +79,7 @@ class ValidityTest:
         n_directions = np.unique(self.conditions).size
         directions = f", seen in {n_directions} directions" if n_directions > n_conditions else ""
         return (
-            f"ValidityTest: {verdict} at level {self.level:g}\n"
+            f"ValidityTest: {verdict} at level {self.alpha:g}\n"
             f"  {area} {self.statistic:.4f}, critical value {self.critical_value:.4f}, "
             f"p-value {self.p_value:.3g}\n"
             f"  {self.u_values.size} values of {n_specimens} specimens, {conditions}{directions}\n"
@@ -102,7 +102,7 @@ class ValidityTest:
                 "critical_value": self.critical_value,
                 "p_value": self.p_value,
                 "rejected": self.rejected,
-                "level": self.level,
+                "alpha": self.alpha,
                 "folded": self.folded,
             },
             coords={
@@ -118,7 +118,7 @@ def area_test(
     observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
     predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
     *,
-    level: float = 0.05,
+    alpha: float = 0.05,
     null: Null | None = None,
     specimens: ArrayLike
     | Mapping[str, ArrayLike | None]
@@ -149,7 +149,7 @@ def area_test(
     predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
         Leading axes are draws of the posterior, the last one specimens, (..., S, m) with m outputs.
         NaN are left out.
-    level : float
+    alpha : float
         Probability of rejecting a right model.
     null : Null, optional
         `PosteriorNull` by default; with one population only, and one value per specimen,
@@ -161,7 +161,7 @@ def area_test(
         are of different specimens.
     folded : bool
         Whether to test ``|2u - 1|``, which a right model makes uniform as well: responses too far
-        out, or too close to the middle. Two tests at ``level`` / 2 look at both mean and spread.
+        out, or too close to the middle. Two tests at ``alpha`` / 2 look at both mean and spread.
     randomize, random_seed
         As in `u_values`.
     progressbar : bool
@@ -200,7 +200,7 @@ def area_test(
             "prb.validation.PosteriorNull(), prb.validation.ExactModel() or "
             "prb.validation.JointNull(optimum)"
         )
-    level = share(level, "level")
+    alpha = share(alpha, "alpha")
     case = read_case(
         observed,
         predicted,
@@ -219,13 +219,13 @@ def area_test(
     u = case.u_values()
     statistic = float(case.statistic(u))
     with shown(progressbar):
-        judgement = null.judge(case, statistic, level)
+        judgement = null.judge(case, statistic, alpha)
     names = [c.name for c in case.conditions]
     return ValidityTest(
         statistic=statistic,
         critical_value=judgement.critical_value,
         p_value=judgement.p_value,
-        level=level,
+        alpha=alpha,
         null=null.describe(case),
         u_values=u,
         folded=folded,

@@ -319,7 +319,7 @@ class Comparable:
         return is_number / np.maximum(is_number.sum(axis=1, keepdims=True), 1)
 
 
-def comparables(measured: Any, predicted: Any, caller: str) -> list[Comparable]:
+def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
     """Return data and predictions of the same conditions as pairs of one output each.
 
     Of many outputs there are eight, three rows of panels. Raises TypeError or ValueError if
@@ -327,28 +327,28 @@ def comparables(measured: Any, predicted: Any, caller: str) -> list[Comparable]:
     """
     if not isinstance(predicted, Mapping):
         name = str(getattr(predicted, "name", None) or "response")
-        measured, predicted = {name: measured}, {name: predicted}
+        observed, predicted = {name: observed}, {name: predicted}
     for name, prediction in predicted.items():
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
             raise TypeError(
                 f"{caller}: {name}: predicted: got {called(prediction)}, expected the DataArray of "
                 "prb.predict"
             )
-    if not isinstance(measured, Mapping) or list(map(str, measured)) != list(map(str, predicted)):
-        got = list(measured) if isinstance(measured, Mapping) else called(measured)
+    if not isinstance(observed, Mapping) or list(map(str, observed)) != list(map(str, predicted)):
+        got = list(observed) if isinstance(observed, Mapping) else called(observed)
         raise ValueError(
-            f"{caller}: measured: got {got}, expected values under the names of the predictions, "
+            f"{caller}: observed: got {got}, expected values under the names of the predictions, "
             f"{list(predicted)}"
         )
     pairs: list[Comparable] = []
-    for name, prediction in zip(measured, predicted.values(), strict=True):
-        values = real_array(measured[name], f"{caller}: {name}: measured")
+    for name, prediction in zip(observed, predicted.values(), strict=True):
+        values = real_array(observed[name], f"{caller}: {name}: observed")
         dims = [dim for dim in prediction.dims if dim not in _SAMPLE_DIMS]
         event = tuple(prediction.sizes[dim] for dim in dims)
         if values.ndim != 1 + len(event) or values.shape[1:] != event or not values.size:
             expected = ", ".join(["n", *map(str, event)])
             raise ValueError(
-                f"{caller}: {name}: measured: got shape {values.shape}, expected ({expected}): a "
+                f"{caller}: {name}: observed: got shape {values.shape}, expected ({expected}): a "
                 "value for each specimen and output"
             )
         samples = prediction.values.reshape(-1, prediction.sizes["sample"], *event)

@@ -36,7 +36,7 @@ def cross_validate(
     discrepancies of the same metric, data and folds: between families, responses or inputs, not
     between metrics. Minimisations start at the optimum and, with `Reweighted`, compute no response.
 
-    `prb.validation.compare_candidates` compares several models by the scores of the specimens.
+    `prb.rank` compares several models by the scores of the specimens.
 
     Parameters
     ----------

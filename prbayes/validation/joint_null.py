@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -76,6 +76,7 @@ class JointNull(Null):
     own_specimens: ClassVar[bool] = True
 
     optimum: Optimum = field(repr=False)
+    _: KW_ONLY
     responses: tuple[Any, ...] | Mapping[str, tuple[Any, ...]] | None = field(
         default=None, repr=False
     )
@@ -89,9 +90,9 @@ class JointNull(Null):
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)
 
-    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+    def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Count the observed data among the replicates."""
-        return judge_by_replicates([self._u_values(case)], case, statistic, level)
+        return judge_by_replicates([self._u_values(case)], case, statistic, alpha)
 
     def describe(self, case: Case) -> str:
         """Return the null hypothesis in a phrase."""

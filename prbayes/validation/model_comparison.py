@@ -12,10 +12,10 @@ from prbayes._validate import Floats, Seed, called, flag, positive_integer, seed
 from prbayes.optimize.optimum import Optimum
 from prbayes.validation.cross_validation import cross_validate, most_folds
 
-_CALLER = "compare_candidates"
+_CALLER = "rank"
 
 
-def compare_candidates(
+def rank(
     candidates: Mapping[str, Optimum | xr.Dataset],
     *,
     folds: int | None = None,
@@ -87,7 +87,7 @@ def compare_candidates(
     ...         x = family.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
     ...         y = prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), observed=data)
     ...     optima[family.__name__] = prb.minimize(model)
-    >>> table = prb.validation.compare_candidates(optima)
+    >>> table = prb.rank(optima)
     >>> table.candidate.values.tolist(), bool(table.told_apart[1])
     (['LogNormal', 'Normal'], True)
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from importlib.resources import files
 from typing import ClassVar
@@ -42,7 +42,7 @@ class Null(ABC):
     own_specimens: ClassVar[bool] = False  # whether the calibration's own specimens may be tested
 
     @abstractmethod
-    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+    def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Return p-value, critical value and envelope."""
 
     @abstractmethod
@@ -51,7 +51,7 @@ class Null(ABC):
 
 
 def judge_by_replicates(
-    replicates: Iterable[Floats], case: Case, statistic: float, level: float
+    replicates: Iterable[Floats], case: Case, statistic: float, alpha: float
 ) -> Judgement:
     r"""Count the observed data among replicates, blocks of u-values of shapes (r, n).
 
@@ -70,15 +70,15 @@ def judge_by_replicates(
     areas = np.sort(np.concatenate(blocks))
     total = areas.size + 1
     # Replicates that may be as large in a rejection; rounding must not make .05 * 20 less than one.
-    allowed = int(np.floor(level * total + 1e-9)) - 1
+    allowed = int(np.floor(alpha * total + 1e-9)) - 1
     if allowed < 0:
         raise ValueError(
-            f"level: got {level} with {areas.size} replicates, expected at least "
+            f"alpha: got {alpha} with {areas.size} replicates, expected at least "
             f"1 / ({areas.size} + 1); pass a null with more replicates"
         )
     # Rounding must not make a tie a difference.
     n_as_large = np.sum(areas >= statistic * (1 - 1e-12))
-    lower, upper = envelope(enveloped, level)
+    lower, upper = envelope(enveloped, alpha)
     return Judgement(
         p_value=float((1 + n_as_large) / total),
         critical_value=float(areas[areas.size - allowed - 1]),
@@ -109,15 +109,16 @@ class PosteriorNull(Null):
     """
 
     replicates: int = 9999
+    _: KW_ONLY
     random_seed: int = 0
 
     def __post_init__(self) -> None:
         positive_integer(self.replicates, "PosteriorNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "PosteriorNull: random_seed", minimum=0)
 
-    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+    def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Count the observed data among the replicates."""
-        return judge_by_replicates(self.replicates_of(case), case, statistic, level)
+        return judge_by_replicates(self.replicates_of(case), case, statistic, alpha)
 
     def replicates_of(self, case: Case) -> Iterator[Floats]:
         """Draw u-values of replicates, in blocks of shapes (r, n)."""
@@ -226,11 +227,11 @@ class ExactModel(Null):
     0.1298
     """
 
-    def critical_value(self, n: int, level: float = 0.05) -> float:
-        """Return the area that is exceeded with probability ``level`` by n uniform numbers."""
+    def critical_value(self, n: int, alpha: float = 0.05) -> float:
+        """Return the area that is exceeded with probability ``alpha`` by n uniform numbers."""
         n = positive_integer(n, "n")
-        level = share(level, "level")
-        scaled = np.interp(-np.log(level), table().logs, table().at(n))
+        alpha = share(alpha, "alpha")
+        scaled = np.interp(-np.log(alpha), table().logs, table().at(n))
         return float(scaled / np.sqrt(n))
 
     def p_value(self, statistic: float, n: int) -> float:
@@ -248,7 +249,7 @@ class ExactModel(Null):
         slope = (logs[-1] - logs[-8]) / (last_squared - quantiles[-8] ** 2)
         return float(np.exp(-(logs[-1] + slope * (scaled**2 - last_squared))))
 
-    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+    def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Look up p-value and critical value; simulate the envelope."""
         if case.is_dependent:
             raise ValueError(
@@ -267,10 +268,10 @@ class ExactModel(Null):
                     "known exactly; pass a larger n_samples"
                 )
         uniform = np.random.default_rng(0).random((ENVELOPED, case.size))
-        lower, upper = envelope(uniform, level)
+        lower, upper = envelope(uniform, alpha)
         return Judgement(
             p_value=self.p_value(statistic, case.size),
-            critical_value=self.critical_value(case.size, level),
+            critical_value=self.critical_value(case.size, alpha),
             lower=lower,
             upper=upper,
         )

@@ -48,15 +48,15 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
         False,
     )
 
-    def judged(statistic: float, level: float) -> tuple[float, float]:
-        found = judge_by_replicates([u], case, statistic, level)
+    def judged(statistic: float, alpha: float) -> tuple[float, float]:
+        found = judge_by_replicates([u], case, statistic, alpha)
         return found.p_value, found.critical_value
 
     areas = area(u)  # falling
     assert judged(0.5, 0.05) == (1 / 20, areas[0])
     assert judged(areas[0], 0.05)[0] == 2 / 20
     assert judged(0.0, 0.10) == (1.0, areas[1])
-    with pytest.raises(ValueError, match=r"level: got 0\.01 with 19 replicates"):
+    with pytest.raises(ValueError, match=r"alpha: got 0\.01 with 19 replicates"):
         judge_by_replicates([u], case, 0.5, 0.01)
 
 
@@ -183,9 +183,9 @@ def test_the_limit_for_many_values() -> None:
 
 def test_one_value_has_a_closed_form() -> None:
     # A = 1/4 + (u - 1/2)^2
-    for level in (0.5, 0.1, 0.05, 0.01):
-        assert EXACT.critical_value(1, level) == pytest.approx(
-            0.25 + ((1 - level) / 2) ** 2, abs=1e-4
+    for alpha in (0.5, 0.1, 0.05, 0.01):
+        assert EXACT.critical_value(1, alpha) == pytest.approx(
+            0.25 + ((1 - alpha) / 2) ** 2, abs=1e-4
         )
     assert EXACT.p_value(0.25 + 0.3**2, 1) == pytest.approx(0.4, abs=2e-3)
 
@@ -194,9 +194,9 @@ def test_one_value_has_a_closed_form() -> None:
 def test_the_table_against_simulation(n: int) -> None:
     size = 100_000
     found = area(np.random.default_rng(n).random((size, n)))
-    for level in (0.9, 0.5, 0.1, 0.05, 0.01, 0.001):
-        share = float((found > EXACT.critical_value(n, level)).mean())
-        assert abs(share - level) < 4.5 * np.sqrt(level * (1 - level) / size)
+    for alpha in (0.9, 0.5, 0.1, 0.05, 0.01, 0.001):
+        share = float((found > EXACT.critical_value(n, alpha)).mean())
+        assert abs(share - alpha) < 4.5 * np.sqrt(alpha * (1 - alpha) / size)
 
 
 @pytest.mark.long
@@ -217,8 +217,8 @@ def test_the_table_is_monotone() -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 8, 20, 77, 1000, 5000])
 def test_p_values_and_critical_values_belong_together(n: int) -> None:
-    for level in (0.2, 0.05, 0.01, 1e-4):
-        assert EXACT.p_value(EXACT.critical_value(n, level), n) == pytest.approx(level, rel=1e-6)
+    for alpha in (0.2, 0.05, 0.01, 1e-4):
+        assert EXACT.p_value(EXACT.critical_value(n, alpha), n) == pytest.approx(alpha, rel=1e-6)
     p = [EXACT.p_value(a, n) for a in np.linspace(0, 0.5, 200)]
     assert (np.diff(p) <= 0).all()
     assert p[0] > 0.999
@@ -232,8 +232,8 @@ def test_the_far_tail_falls_like_that_of_a_brownian_bridge() -> None:
 
 
 def test_sizes_between_those_of_the_table_lie_between_them() -> None:
-    for level in (0.5, 0.05, 1e-3):
-        scaled = [np.sqrt(n) * EXACT.critical_value(n, level) for n in (22, 23, 24, 25)]
+    for alpha in (0.5, 0.05, 1e-3):
+        scaled = [np.sqrt(n) * EXACT.critical_value(n, alpha) for n in (22, 23, 24, 25)]
         falls = np.diff(scaled)
         assert (falls > 0).all() or (falls < 0).all()
 
