@@ -297,7 +297,7 @@ def validity(case: tuple[Any, ...], random_seed: int) -> dict[str, Any]:
     fresh = np.sinh(1.3 + 0.6 * rng.standard_normal(12))
     best = prb.predict(optimum, surface, x, model=model)
     predicted = prb.predict(posterior, surface, x, model=model)
-    joint = prb.validation.JointNull(optimum, (surface, x), replicates=199)
+    joint = prb.validation.JointNull(optimum, responses=(surface, x), replicates=199)
     tests = [
         prb.area_test(fresh, predicted),
         prb.area_test(fresh, best),
@@ -405,7 +405,7 @@ def after_first(problem: Problem, half: Any, before: dict[str, Any]) -> dict[str
 def result_of_first(found: Any) -> list[Any]:
     """Return all of an optimum that what follows rests on, digit by digit."""
     optimum = found[0] if isinstance(found, tuple) else found
-    units = optimum.evaluator.prior_sd
+    units = optimum.evaluator.hyperparameters.prior_sd
     parts = [
         optimum.theta,
         optimum.covariance,

@@ -28,10 +28,9 @@ from prbayes.propagation.importance import (
 from prbayes.propagation.moving_support import averaged_log_density, cells_around, moving_inputs
 from prbayes.propagation.points import Mixture, MixtureSampler
 from prbayes.response.compile import compile_batched
-from prbayes.response.deduplication import Known, once_each
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import Responses
+from prbayes.response.response import Known, Responses, once_each
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +281,7 @@ def _responses_at(points: Sequence[Floats], responses: Responses, design: Design
     """Return the responses at points; those known to this or another design are reused."""
     values = responses.runs.at(points)
     if values is not None:
-        responses.find(len(values))
+        responses.count_reused(len(values))
         return values
     known = None if design is None else Known(design.runs.points, design.runs.values)
     values = once_each(responses, points, known)

@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -43,12 +43,17 @@ from prbayes.propagation.importance import (
     fit_emulator,
 )
 from prbayes.propagation.ops import CompactOp, OpaqueOp
-from prbayes.response.costs import Demand
-from prbayes.response.deduplication import Known, once_each
+from prbayes.response.budget import RunCost
 from prbayes.response.distributions import prior_draws, refuse_without_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import lacking
-from prbayes.response.response import Responses, refuse_coarse, refuse_other_number
+from prbayes.response.response import (
+    Known,
+    Responses,
+    once_each,
+    refuse_coarse,
+    refuse_other_number,
+)
 
 _log = logging.getLogger("prbayes")
 
@@ -126,6 +131,7 @@ class Reweighted(Propagation):
     """
 
     n: int = 1024
+    _: KW_ONLY
     random_seed: int = 0
     max_lost: float = MAX_LOST
     max_points: int | None = None
@@ -148,13 +154,13 @@ class Reweighted(Propagation):
             )
 
     @property
-    def demand(self) -> Demand:
-        """No run for a value of the hyperparameters; more where a design does not support it."""
-        decides = (
+    def cost(self) -> RunCost:
+        """Runs that this propagation needs: no run for a value of the hyperparameters."""
+        growth = (
             f"up to {self.most} in all, where the calibrated populations are not supported, or "
             "another design would answer differently"
         )
-        return Demand(0, self.most, decides)
+        return RunCost(self.n, 0, self.most, growth)
 
     @property
     def emulator_runs(self) -> int | None:

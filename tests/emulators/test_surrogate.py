@@ -126,7 +126,7 @@ def test_a_response_that_raises_stops_or_is_left_out(tmp_path: Path) -> None:
         ({"model": "gp"}, TypeError, "expected prb.surrogate.RadialBasis"),
         ({"outside": Retry()}, TypeError, r"expected prb.response.Replace\(\) or"),
         ({"store": 3}, TypeError, "expected the path of a folder"),
-        ({"coverage": 99.0}, ValueError, "a number between 0 and 1"),
+        ({"prob": 99.0}, ValueError, "a number between 0 and 1"),
         ({"points": "sobol"}, ValueError, r"points: got 'sobol', expected one of \('even'"),
         ({"points": "predictive"}, ValueError, "got 'predictive' for inputs that are ranges"),
         ({"response": 3}, TypeError, "expected a function"),
@@ -334,7 +334,7 @@ def test_outputs_keep_their_names_also_from_a_store(tmp_path: Path) -> None:
             propagation=prb.Reweighted(64, emulator=None),
             progressbar=False,
         )
-    values = Evaluator(model).nodes[0].bound.known_responses
+    values = Evaluator.of(model).nodes[0].bound.known_responses
     assert 15 < values[:, 0].mean() < 25
     assert 1 < values[:, 1].mean() < 2
 

@@ -247,7 +247,7 @@ def test_after_an_error_the_next_use_tries_again(
     model = build(response, propagation)
     for _ in range(2):
         with pytest.raises(prb.response.ResponseError, match=r"^y: .*FileNotFoundError"):
-            Evaluator(model)
+            Evaluator.of(model)
     response.file.touch()
     (node,) = first_use(model).values()
     counts = node.bound.responses
@@ -307,7 +307,7 @@ def test_what_would_waste_the_runs_is_refused_before() -> None:
     with pytest.raises(TypeError, match="tolerance: got"):
         prb.minimize(build(response), tolerance="small", **QUIET)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"thetas: got shape \(1, 1\)"):
-        prb.refine(build(response), np.zeros((1, 1)), **QUIET)
+        prb.refine(build(response), thetas=np.zeros((1, 1)), **QUIET)
     assert response.runs == 0
 
 

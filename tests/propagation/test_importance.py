@@ -59,7 +59,7 @@ def build(response: Any = smooth, n: int = 64, *, known: bool = False, **keyword
 
 
 def design_of(model: pm.Model) -> tuple[Evaluator, ReweightedBound]:
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     return evaluator, evaluator.reweighted["y"]
 
 
@@ -124,7 +124,7 @@ def test_the_prior_stays_in_reach() -> None:
     far = theta_of(evaluator) + np.array([1.0, 1.0, -2.0, -2.0])
     for _ in range(3):
         bound.reach(evaluator.roots(np.repeat(far, 16, axis=0), 0))
-    prior = evaluator.prior_thetas(200, 1)
+    prior = evaluator.hyperparameters.prior_thetas(200, 1)
     assert np.median(evaluator.support(prior)["y"]["mean_weight"]) == pytest.approx(1, abs=0.05)
 
 
@@ -238,7 +238,7 @@ def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() ->
     assert float(predicted.std()) == pytest.approx(1.0, abs=0.15)
     # The cloud is there again.
     np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[1], weights)
-    null = prb.validation.JointNull(optimum, (rough, *inputs), replicates=99)
+    null = prb.validation.JointNull(optimum, responses=(rough, *inputs), replicates=99)
     test = prb.area_test(rough(*np.full((2, 20), 1.0) + np.arange(20)), predicted, null=null)
     assert 0 < test.p_value <= 1
     np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[0], values)
@@ -251,7 +251,7 @@ def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
     with pytest.raises(DesignError, match=r"weight effective sample size of .* stored=False"):
         prb.predict(optimum, rough, *inputs, n_samples=100, random_seed=1)
     fresh = prb.predict(optimum, rough, *inputs, n_samples=500, random_seed=1, stored=False)
-    null = prb.validation.JointNull(optimum, (rough, *inputs), replicates=99)
+    null = prb.validation.JointNull(optimum, responses=(rough, *inputs), replicates=99)
     before = optimum.evaluator(optimum.theta[None]).discrepancies
     with pytest.raises(
         DesignError, match=r"JointNull: y: .* not told .* runs alone do not support"
@@ -388,7 +388,7 @@ def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
                 propagation=stored,
                 specimens=specimens,
             )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     assert aligned(evaluator.nodes)
     far = theta_of(evaluator) + np.array([0.5, -1.5, 0.5, -1.5])
     _reach(evaluator, far, {"one"})
@@ -435,7 +435,7 @@ def test_clouds_are_of_populations_that_matter_and_the_prior_stays() -> None:
 
 def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
     evaluator, bound = design_of(build())
-    thetas = evaluator.prior_thetas(2, 0)
+    thetas = evaluator.hyperparameters.prior_thetas(2, 0)
     shares = np.array([0.125, 0.875])
     sampler = MixtureSampler("y", bound.inputs, PointDensity(bound.inputs))
     _, mixture = sampler.draw(evaluator.roots(thetas, 0), 1024, 3, shares)
