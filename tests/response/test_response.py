@@ -392,7 +392,9 @@ def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinemen
     prb.refine(model, thetas=np.full((1, 1), 2.0))
     node.reweighted.add([np.array([0.9, 0.95])])
     assert sum(response.asked) <= 17 + 4
-    np.testing.assert_array_equal(node.reweighted.design.sample.values, 2.0 * node.reweighted.design.runs.points[0])
+    np.testing.assert_array_equal(
+        node.reweighted.design.sample.values, 2.0 * node.reweighted.design.runs.points[0]
+    )
     optimum = prb.minimize(model, progressbar=False)
     assert optimum.n_computed <= 17 + 4
     assert optimum.n_responses == node.bound.n_points
