@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._finding import Finding, report
 from prbayes._validate import (
     Floats,
     Seed,
@@ -34,8 +34,6 @@ from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.propagation.base import MAX_LOST, N_BLOCKS, DesignError
 from prbayes.response.response import refuse_uncallable
-
-_log = logging.getLogger("prbayes")
 
 # Error of a probability, as a share of it, from which on it is said that points are needed. By
 # judgement: a probability is then known to a factor of two, with two errors to either side.
@@ -340,11 +338,10 @@ def _tell(response: Any, means: Floats, errors: Floats, points: int) -> None:
     worst = int(np.argmax(errors - _ROUGH * means))
     name = response_name(response)
     more = f"more than points={points}" if points else "points=1000, which computes as many"
-    _log.warning(
-        "%s: a probability of %.2g has a standard error of %.2g; pass %s responses where the "
-        "limit is exceeded",
-        name,
-        means[worst],
-        errors[worst],
-        more,
+    report(
+        Finding(
+            "rough-probability",
+            f"{name}: a probability of {means[worst]:.2g} has a standard error of "
+            f"{errors[worst]:.2g}; pass {more} responses where the limit is exceeded.",
+        )
     )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import split_elements
@@ -33,7 +34,7 @@ def posterior_tree(
     sampler: Mapping[str, Any],
     sample_stats: xr.Dataset | None = None,
     adjustment: str = "none",
-    warnings: tuple[str, ...] = (),
+    findings: tuple[Finding, ...] = (),
     errors: Floats | None = None,
     missing: Mapping[str, Mapping[str, float]] | None = None,
     stopped: str = "",
@@ -60,7 +61,7 @@ def posterior_tree(
         Statistics of another sampler than SMC, in place of those by stage.
     adjustment : str
         "estimate" of draws given the estimate, else "none".
-    warnings : tuple of str
+    findings : tuple of Finding
     errors : ndarray, shape (k,), or None
         Monte Carlo errors of the discrepancies.
     missing : mapping, optional
@@ -81,7 +82,7 @@ def posterior_tree(
         "adjustment": adjustment,
         **sampler,
         "stopped": stopped,
-        "warnings": "\n".join(warnings),
+        "findings": as_json(findings),
         **versions(),
     }
     if errors is None:

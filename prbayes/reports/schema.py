@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._finding import from_json
 from prbayes.reports.decision import CALLED, kind_of_decision
 
 # What a group has to have for those who report it, where there is such a group.
@@ -106,6 +107,10 @@ def _of_attributes(group: str, attrs: Mapping[Any, Any]) -> Iterator[str]:
         value = np.asarray(attrs.get(name, 0.0))
         if value.size != 1 or value.dtype.kind not in "fiu" or np.isnan(value).any():
             yield f"{group}: {name}: got {attrs[name]!r:.60}, expected a number"
+    try:
+        from_json(str(attrs.get("findings", "[]")))
+    except ValueError as error:
+        yield f"{group}: {error}"
 
 
 def _not_numbers(group: str, variables: Mapping[Any, xr.DataArray]) -> Iterator[str]:

@@ -7,7 +7,6 @@ with one.
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from prbayes._finding import Finding, report
 from prbayes._progress import progress
 from prbayes._validate import Floats
 from prbayes.response.budget import BudgetError, budget
@@ -26,8 +26,6 @@ from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.outputs import ONE, Outputs, lacking, outputs_of_result
 from prbayes.response.store import Store, StoreError
 from prbayes.response.time_limit import limited
-
-_log = logging.getLogger("prbayes")
 
 Rows = NDArray[np.intp]
 
@@ -405,7 +403,7 @@ def _settled(
     if policy.replacement is not None:
         tally.failures += n_bad
         text = f"{n_bad} of {bad.size} responses failed, replaced by {policy.replacement}"
-        _log.warning("%s: %s; the first: %s", calling.name, text, first)
+        report(Finding("responses-replaced", f"{calling.name}: {text}; the first: {first}"))
         tally.note(points, dict.fromkeys(map(int, np.flatnonzero(bad)), "it is NaN"))
         values[bad] = policy.replacement
     return values

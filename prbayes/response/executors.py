@@ -6,7 +6,6 @@ that others may change, stands here, and `tests/test_contracts.py` tests it on r
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import (
@@ -24,10 +23,9 @@ from traceback import walk_tb
 from typing import Any
 from weakref import WeakKeyDictionary
 
+from prbayes._finding import Finding, report
 from prbayes._validate import called, positive_number
 from prbayes.response.failures import ResponseError
-
-_log = logging.getLogger("prbayes")
 
 
 @dataclass(frozen=True)
@@ -211,13 +209,8 @@ class Pool:
             absent = _threads(self.executor) == {}
             absences = absences + 1 if absent else 0
             workers = ", and there is no worker" if absent else ""
-            _log.warning(
-                "%s: no response for %.0f s; %d chunks are at work%s",
-                self.name,
-                silent,
-                len(waiting),
-                workers,
-            )
+            text = f"{self.name}: no response for {silent:.0f} s; {len(waiting)} chunks are at work"
+            report(Finding("no-response-yet", f"{text}{workers}."))
             if absences == _ABSENCES:
                 for future in waiting:
                     future.cancel()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import logging
 import os
 import re
 import socket
@@ -22,11 +21,10 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
+from prbayes._finding import Finding, report
 from prbayes._validate import Floats, called, plain_text, positive_number
 from prbayes.response.call import scalar
 from prbayes.response.outputs import Outputs
-
-_log = logging.getLogger("prbayes")
 
 # Seconds for a connection to be made: by judgement, longer than any network takes.
 _CONNECTING = 10.0
@@ -362,7 +360,8 @@ class _Server:
                 why = f"{type(error).__name__}: {error}"
             if not until:
                 until = time.monotonic() + self.patience
-                _log.warning("%s: the server at %s is away (%s); waiting", name, self.url, why)
+                text = f"{name}: the server at {self.url} is away ({why}); waiting."
+                report(Finding("server-away", text))
             if time.monotonic() > until:
                 raise ConnectionError(
                     f"{name}: the server at {self.url} is away for more than patience = "
