@@ -53,9 +53,9 @@ def exceedance(
     model: pm.Model | None = None,
     output: Any = None,
     below: bool = False,
-    level: float = 0.9,
+    prob: float = 0.89,
     requirement: float | None = None,
-    draws: int = 2000,
+    n_draws: int = 2000,
     points: int = 0,
     steps: int = 5,
     executor: Executor | None = None,
@@ -87,12 +87,12 @@ def exceedance(
         Which output, where a run of the response gives several.
     below : bool
         Whether to look below the limit.
-    level : float
+    prob : float
         Probability of the interval.
     requirement : float, optional
         The largest probability that is accepted. It is met if the whole interval is below it, not
         met if all of it is above, and not decided in between.
-    draws : int
+    n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     points : int
         How many responses are computed where they matter, for each place in the intervals; 0, or
@@ -112,7 +112,7 @@ def exceedance(
         ``draw``. With intervals ``probability`` and ``error`` have the dimension ``bound``,
         "lower" and "upper"; ``lower`` and ``upper`` are the ends over all places, ``by_draw`` has
         ``bound`` too, and the attribute ``at`` says where in the intervals the bounds are.
-        Attributes: ``level``, ``responses`` (how many were computed), ``source``, ``identity``, and
+        Attributes: ``prob``, ``responses`` (how many were computed), ``source``, ``identity``, and
         with a requirement ``requirement`` and ``verdict``: "met", "not met" or "not decided".
 
     Raises
@@ -156,22 +156,22 @@ def exceedance(
     refuse_uncallable(caller, response)
     limit = finite_number(limit, "limit")
     flag(below, "below")
-    level = share(level, "level")
+    prob = share(prob, "prob")
     if requirement is not None:
         requirement = share(requirement, "requirement")
-    positive_integer(draws, "draws", minimum=2)
+    positive_integer(n_draws, "n_draws", minimum=2)
     positive_integer(points, "points", minimum=0)
     if 0 < points < _FEWEST_POINTS:
         raise ValueError(f"points: got {points}, expected 0, or at least {_FEWEST_POINTS}")
     positive_integer(steps, "steps", minimum=2)
     executes(executor, "executor")
     seed = seed_number(random_seed)
-    populations = Populations.of(result, model, draws, caller)
+    populations = Populations.of(result, model, n_draws, caller)
     asked = _Asked(populations, response, limit, output, below, points, executor, seed)
     places = variants(inputs, steps)
     found = [asked.at(place) for place in places]
     by_draw = np.array([one.by_draw for one in found])
-    tails = [(1 - level) / 2, (1 + level) / 2]
+    tails = [(1 - prob) / 2, (1 + prob) / 2]
     low, high = np.quantile(by_draw, tails, axis=1)
     means = by_draw.mean(axis=1)
     ends = [int(means.argmin()), int(means.argmax())]
@@ -179,7 +179,7 @@ def exceedance(
     _tell(response, means[ends], errors[ends], points)
     identity = identity_in(result) or identity_of_model(populations.evaluator.model)
     attrs = {
-        "level": level,
+        "prob": prob,
         "limit": limit,
         "below": int(below),
         "responses": sum(one.responses for one in found),

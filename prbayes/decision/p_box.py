@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._envelope import ENVELOPED, envelope
+from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, positive_integer, share
 from prbayes.decision.interval import intervals, variants
 from prbayes.decision.populations import Populations, Told
@@ -33,13 +33,13 @@ def p_box(
     *inputs: Any,
     model: pm.Model | None = None,
     output: Any = None,
-    level: float = 0.9,
-    draws: int = ENVELOPED,
+    prob: float = 0.89,
+    n_draws: int = ENVELOPED,
     steps: int = 5,
 ) -> xr.Dataset:
     r"""Return bounds of the distribution function of a response over the population.
 
-    Two bands from the same draws of the posterior. The *pointwise* one holds the share ``level``
+    Two bands from the same draws of the posterior. The *pointwise* one holds the share ``prob``
     of the populations' distribution functions at each place by itself. The *simultaneous* one holds
     that share of them entirely: with this posterior probability the true one is nowhere outside.
 
@@ -58,9 +58,9 @@ def p_box(
         That of the optimum, or the one on the context, by default.
     output : label, optional
         Which output, where a run of the response gives several.
-    level : float
+    prob : float
         Probability of the bands.
-    draws : int
+    n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     steps : int
         Places in each interval, its ends among them; at least 2.
@@ -70,7 +70,7 @@ def p_box(
     xarray.Dataset
         Dimensions ``y``, in units of the response, and ``band``, "pointwise" and "simultaneous".
         Variables ``lower`` and ``upper``, distribution functions; ``mean``, that of a new specimen,
-        with intervals between ``mean`` and ``mean_upper``. Attributes: ``level``, ``responses``
+        with intervals between ``mean`` and ``mean_upper``. Attributes: ``prob``, ``responses``
         (how many were computed) and ``identity``.
 
     Raises
@@ -102,17 +102,17 @@ def p_box(
     """
     caller = "prb.decision.p_box"
     refuse_uncallable(caller, response)
-    level = share(level, "level")
-    positive_integer(draws, "draws", minimum=2)
+    prob = share(prob, "prob")
+    positive_integer(n_draws, "n_draws", minimum=2)
     positive_integer(steps, "steps", minimum=2)
-    populations = Populations.of(result, model, draws, caller)
+    populations = Populations.of(result, model, n_draws, caller)
     told = [populations.told(response, place, output) for place in variants(inputs, steps)]
     y = _places(told)
     lows, highs, means = [], [], []
     for one in told:
         functions = _functions(one, y)
-        low, high = np.quantile(functions, [(1 - level) / 2, (1 + level) / 2], axis=0)
-        lowest, highest = envelope(functions, 1 - level)
+        low, high = np.quantile(functions, [(1 - prob) / 2, (1 + prob) / 2], axis=0)
+        lowest, highest = envelope(functions, 1 - prob)
         lows.append([low, lowest])
         highs.append([high, highest])
         means.append(functions.mean(axis=0))
@@ -130,7 +130,7 @@ def p_box(
         data,
         coords={"y": y, "band": ["pointwise", "simultaneous"]},
         attrs={
-            "level": level,
+            "prob": prob,
             "responses": sum(one.responses.count for one in told),
             **as_attributes(identity),
             **versions(),

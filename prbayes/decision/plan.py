@@ -32,8 +32,8 @@ _QUANTITY = "quantity"
 def plan(
     result: Optimum | xr.DataTree,
     candidates: Mapping[str, Condition],
-    k: int | Sequence[int] = (5, 10, 20, 50),
     *,
+    k: int | Sequence[int] = (5, 10, 20, 50),
     model: pm.Model | None = None,
     quantity: Quantity | None = None,
     target: Mapping[str, float] | None = None,

@@ -42,7 +42,7 @@ def sensitivity(
     quantity: Quantity,
     *,
     model: pm.Model | None = None,
-    samples: int = 1024,
+    n_samples: int = 1024,
     computed: bool = False,
     random_seed: Seed = 0,
 ) -> xr.Dataset:
@@ -71,11 +71,11 @@ def sensitivity(
         `predict` did that before.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
-    samples : int
+    n_samples : int
         Populations from which those of each share are made, and a quarter of the specimens; the
         error falls with their number.
     computed : bool
-        Whether the response is called at new specimens to share out its scatter, 4 ``samples``
+        Whether the response is called at new specimens to share out its scatter, 4 ``n_samples``
         times (1 + 2 inputs + 2 numbers of a specimen) of them; by default emulators say it, or with
         one input the runs.
     random_seed : int, sequence of int, numpy.random.Generator or None
@@ -138,14 +138,14 @@ def sensitivity(
     """
     caller = "prb.sensitivity"
     refuse_quantity(quantity, caller)
-    samples = positive_integer(samples, "samples", minimum=2 * REPLICATES)
+    n_samples = positive_integer(n_samples, "n_samples", minimum=2 * REPLICATES)
     flag(computed, "computed")
     seed = seed_number(random_seed)
     populations = Populations.of(result, model, _DRAWS, caller)
     told = populations.told(quantity.response, quantity.inputs, quantity.output)
     told.refuse_failed(quantity)
-    own = _of_hyperparameters(told, quantity, samples, seed)
-    inputs = scatter(told, quantity, samples, seed, computed=computed)
+    own = _of_hyperparameters(told, quantity, n_samples, seed)
+    inputs = scatter(told, quantity, n_samples, seed, computed=computed)
     evaluator = populations.evaluator
     simulator = evaluator.simulators[told.k]
     names = aleatory_names(simulator.inputs, simulator.responses.function)
@@ -174,11 +174,11 @@ def sensitivity(
     )
 
 
-def _of_hyperparameters(told: Told, quantity: Quantity, samples: int, seed: int) -> Indices:
+def _of_hyperparameters(told: Told, quantity: Quantity, n_samples: int, seed: int) -> Indices:
     """Return the indices of the elements of theta."""
     copula = Copula.of(told.populations.thetas)
     d = told.populations.evaluator.size
-    n = samples // REPLICATES
+    n = n_samples // REPLICATES
     nets = [ndtri(sobol(n, 2 * d, seed + 7919 * r)) for r in range(REPLICATES)]
     here, fresh = np.split(np.array(nets), 2, axis=-1)
     z = here @ copula.root.T

@@ -127,7 +127,7 @@ class Surrogate:
         coarse: Callable[..., Any] | None = None,
         outside: OnFailure | None = None,
         points: str = "even",
-        coverage: float = 0.999,
+        prob: float = 0.999,
         name: str = "surrogate",
         executor: Executor | None = None,
         store: str | PathLike[str] | None = None,
@@ -150,7 +150,7 @@ class Surrogate:
         inputs : mapping or sequence
             One entry per argument of the response, in its order, by name if you like: ``(low,
             high)``, in the input's own units; a ``.dist()`` or a variable of the model on the
-            context, which covers the central ``coverage`` of its prior predictive distribution; or
+            context, which covers the central ``prob`` of its prior predictive distribution; or
             a number, which stays as it is.
         n : int
             Number of design points. With the same seed those of a smaller n are among them.
@@ -172,7 +172,7 @@ class Surrogate:
         points : {"even", "predictive"}
             Where the design is: evenly in all ranges, or each input by its own prior predictive
             distribution, inside its range; those that are given as a range evenly.
-        coverage : float
+        prob : float
         name : str
             For messages, and of the store.
         executor, store, version, on_failure, retry_failed
@@ -206,9 +206,9 @@ class Surrogate:
         _refuse_wrong(name, response, model, outside, points)
         refuse_calling(executor, store, version, policy)
         flag(retry_failed, f"{name}: retry_failed")
-        share(coverage, f"{name}: coverage")
+        share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
-        domain, predictive = read_ranges(name, inputs, coverage, seed)
+        domain, predictive = read_ranges(name, inputs, prob, seed)
         refuse_misfit(name, response, lambda: [one.size for one in domain.inputs], None)
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
@@ -217,7 +217,9 @@ class Surrogate:
         design = _designed(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
         # First, as what is wrong with it then costs no run.
         beside = None if coarse is None else _first_coarse(name, coarse, domain, design)
-        kept = None if store is None else Store(store, name, design.shape[1], version=version)
+        kept = (
+            None if store is None else Store(store, name, columns=design.shape[1], version=version)
+        )
         calling = Calling(name, response, executor, kept, policy, retry_failed, outputs=None)
         tally = Tally()
         at = Points(domain.arguments(design), domain.varying)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -67,6 +67,7 @@ class MarginalCorrelation(LiftedMetric):
     True
     """
 
+    _: KW_ONLY
     weights: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ class FunctionMetric(Metric):
     """
 
     function: Callable[..., Any]
+    _: KW_ONLY
     weighted: bool = False
 
     def __post_init__(self) -> None:

@@ -86,8 +86,8 @@ from prbayes.response.inputs import model_on_context
 @in_turn
 def refine(
     model: pm.Model | None = None,
-    thetas: Floats | None = None,
     *,
+    thetas: Floats | None = None,
     max_seconds: float | None = None,
     max_runs: int | None = None,
     progressbar: bool = True,

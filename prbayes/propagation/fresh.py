@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -55,6 +55,7 @@ class Fresh(Propagation):
 
     is_random: ClassVar[bool] = True
     n: int = 1024
+    _: KW_ONLY
     random_seed: int = 0
     max_lost: float = field(default=MAX_LOST, repr=False)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
@@ -61,6 +61,7 @@ class Resimulated(Propagation):
 
     calls_response: ClassVar[bool] = True
     n: int = 1024
+    _: KW_ONLY
     random_seed: int = 0
     points: str | Callable[[int, int, int], Floats] = field(default="sobol", repr=False)
     max_lost: float = field(default=MAX_LOST, repr=False)

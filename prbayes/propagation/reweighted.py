@@ -9,7 +9,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, Literal, Self
 
@@ -156,6 +156,7 @@ class Reweighted(Propagation):
     """
 
     n: int = 1024
+    _: KW_ONLY
     random_seed: int = 0
     max_lost: float = MAX_LOST
     max_points: int | None = None

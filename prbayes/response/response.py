@@ -206,7 +206,7 @@ class Responses:
         if store is not None:
             size = None if outputs is None else max(1, len(outputs.labels))
             named = _with_names(version, outputs)
-            kept = Store(store, name, _columns(inputs), version=named, outputs=size)
+            kept = Store(store, name, columns=_columns(inputs), version=named, outputs=size)
         self.name = name
         self.outputs = outputs
         self.function = function

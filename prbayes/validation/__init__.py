@@ -3,7 +3,6 @@
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.exact_null import ExactModel
 from prbayes.validation.joint_null import JointNull
-from prbayes.validation.model_comparison import compare_candidates
 from prbayes.validation.nulls import PosteriorNull
 from prbayes.validation.probability_transform import u_values
 
@@ -12,6 +11,5 @@ __all__ = [
     "JointNull",
     "PosteriorNull",
     "ValidityTest",
-    "compare_candidates",
     "u_values",
 ]

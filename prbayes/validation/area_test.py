@@ -32,7 +32,7 @@ class ValidityTest:
     critical_value : float
         The largest area that is not rejected.
     p_value : float
-    level : float
+    alpha : float
     null : str
         What was held to be true.
     folded : bool
@@ -41,7 +41,7 @@ class ValidityTest:
         Of all conditions, one after the other.
     envelope : ndarray, shape (2, n)
         Bounds of the sorted values that are tested; under the null they hold all of them with
-        probability 1 - ``level``.
+        probability 1 - ``alpha``.
     conditions, specimens : ndarray of str, shape (n,)
         Where each u-value comes from.
     identity : Identity or None
@@ -51,7 +51,7 @@ class ValidityTest:
     statistic: float
     critical_value: float
     p_value: float
-    level: float
+    alpha: float
     null: str
     folded: bool
     u_values: Floats
@@ -62,8 +62,8 @@ class ValidityTest:
 
     @property
     def rejected(self) -> bool:
-        """Whether the model is rejected at the level."""
-        return self.p_value <= self.level
+        """Whether the model is rejected at the significance level."""
+        return self.p_value <= self.alpha
 
     @property
     def of_conditions(self) -> list[str]:
@@ -81,7 +81,7 @@ class ValidityTest:
         directions = np.unique(self.conditions).size
         seen = f", seen in {directions} directions" if directions > conditions else ""
         return (
-            f"ValidityTest: {verdict} at level {self.level:g}\n"
+            f"ValidityTest: {verdict} at level {self.alpha:g}\n"
             f"  {what} {self.statistic:.4f}, critical value {self.critical_value:.4f}, "
             f"p-value {self.p_value:.3g}\n"
             f"  {values} values of {specimens} specimens, {under}{seen}\n"
@@ -107,7 +107,7 @@ class ValidityTest:
                 "critical_value": self.critical_value,
                 "p_value": self.p_value,
                 "rejected": self.rejected,
-                "level": self.level,
+                "alpha": self.alpha,
                 "folded": self.folded,
             },
             coords={
@@ -123,7 +123,7 @@ def area_test(
     observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
     predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
     *,
-    level: float = 0.05,
+    alpha: float = 0.05,
     null: Null | None = None,
     specimens: ArrayLike
     | Mapping[str, ArrayLike | None]
@@ -154,7 +154,7 @@ def area_test(
     predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
         Leading axes are draws of the posterior, the last one specimens, (..., S, m) with m outputs.
         NaN are left out.
-    level : float
+    alpha : float
         Probability of rejecting a right model.
     null : Null, optional
         `PosteriorNull` by default; with one population only, and one value per specimen,
@@ -166,7 +166,7 @@ def area_test(
         values are of different specimens.
     folded : bool
         Whether to test ``|2u - 1|``, which a right model makes uniform as well: responses too far
-        out, or too close to the middle. Two tests at ``level`` / 2 look at both mean and spread.
+        out, or too close to the middle. Two tests at ``alpha`` / 2 look at both mean and spread.
     randomize, random_seed
         As in `u_values`.
     progressbar : bool
@@ -201,7 +201,7 @@ def area_test(
     True
     """
     _refuse_null(null)
-    level = share(level, "level")
+    alpha = share(alpha, "alpha")
     case = read_case(
         observed,
         predicted,
@@ -222,7 +222,7 @@ def area_test(
     u = case.u_values()
     statistic = float(case.statistic(u))
     with shown(progressbar):
-        judged = null.judge(case, statistic, level)
+        judged = null.judge(case, statistic, alpha)
 
     # Where each value comes from.
     conditions = np.repeat(
@@ -234,7 +234,7 @@ def area_test(
         statistic=statistic,
         critical_value=judged.critical_value,
         p_value=judged.p_value,
-        level=level,
+        alpha=alpha,
         null=null.describe(case),
         u_values=u,
         folded=folded,

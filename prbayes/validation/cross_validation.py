@@ -43,7 +43,7 @@ def cross_validate(
     responses or inputs, not between metrics. Minimisations start at the optimum and, with
     `Reweighted`, compute no response.
 
-    Each specimen left out has a score as well, by which `prb.validation.compare_candidates` tells
+    Each specimen left out has a score as well, by which `prb.rank` tells
     which of several models predicts better, and whether the data can tell.
 
     Parameters

@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from prbayes._envelope import ENVELOPED, envelope
+from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import Floats, positive_integer, positive_number, share
 from prbayes.validation.conditions import Case
 from prbayes.validation.nulls import Judgement, Null
@@ -59,12 +59,12 @@ class ExactModel(Null):
     0.1298
     """
 
-    def critical_value(self, n: int, level: float = 0.05) -> float:
-        """Return the area that is exceeded with probability ``level`` by n uniform numbers."""
+    def critical_value(self, n: int, alpha: float = 0.05) -> float:
+        """Return the area that is exceeded with probability ``alpha`` by n uniform numbers."""
         n = positive_integer(n, "n")
-        level = share(level, "level")
+        alpha = share(alpha, "alpha")
         quantiles = table().at(n)
-        scaled = np.interp(-np.log(level), table().logs, quantiles)
+        scaled = np.interp(-np.log(alpha), table().logs, quantiles)
         return float(scaled / np.sqrt(n))
 
     def p_value(self, statistic: float, n: int) -> float:
@@ -87,15 +87,15 @@ class ExactModel(Null):
         log = logs[-1] + slope * (scaled**2 - last_squared)
         return float(np.exp(-log))
 
-    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+    def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Look up p-value and critical value; simulate the envelope."""
         _refuse_dependent(case)
         _refuse_few(case)
         uniform = np.random.default_rng(0).random((ENVELOPED, case.size))
-        lower, upper = envelope(uniform, level)
+        lower, upper = envelope(uniform, alpha)
         return Judgement(
             p_value=self.p_value(statistic, case.size),
-            critical_value=self.critical_value(case.size, level),
+            critical_value=self.critical_value(case.size, alpha),
             lower=lower,
             upper=upper,
         )

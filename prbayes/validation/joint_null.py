@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -76,6 +76,7 @@ class JointNull(SimulatedNull):
     own_specimens: ClassVar[bool] = True
 
     optimum: Optimum = field(repr=False)
+    _: KW_ONLY
     responses: tuple[Any, ...] | Mapping[str, tuple[Any, ...]] | None = field(
         default=None, repr=False
     )

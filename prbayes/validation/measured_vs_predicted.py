@@ -31,7 +31,7 @@ class Comparable:
         return known / count
 
 
-def comparables(measured: Any, predicted: Any, caller: str) -> list[Comparable]:
+def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
     """Return what a caller was given as pairs of one output each.
 
     Raises
@@ -41,7 +41,7 @@ def comparables(measured: Any, predicted: Any, caller: str) -> list[Comparable]:
     """
     if not isinstance(predicted, Mapping):
         name = getattr(predicted, "name", None) or "response"
-        measured = {str(name): measured}
+        observed = {str(name): observed}
         predicted = {str(name): predicted}
     for name, prediction in predicted.items():
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
@@ -49,29 +49,29 @@ def comparables(measured: Any, predicted: Any, caller: str) -> list[Comparable]:
                 f"{caller}: {name}: predicted: got {called(prediction)}, expected the DataArray of "
                 "prb.predict"
             )
-    if not isinstance(measured, Mapping) or list(map(str, measured)) != list(map(str, predicted)):
-        got = list(measured) if isinstance(measured, Mapping) else called(measured)
+    if not isinstance(observed, Mapping) or list(map(str, observed)) != list(map(str, predicted)):
+        got = list(observed) if isinstance(observed, Mapping) else called(observed)
         raise ValueError(
-            f"{caller}: measured: got {got}, expected values under the names of the predictions, "
+            f"{caller}: observed: got {got}, expected values under the names of the predictions, "
             f"{list(predicted)}"
         )
     found: list[Comparable] = []
-    for (name, values), prediction in zip(measured.items(), predicted.values(), strict=True):
+    for (name, values), prediction in zip(observed.items(), predicted.values(), strict=True):
         found += _of_condition(str(name), values, prediction, caller)
     return found
 
 
 def _of_condition(
-    name: str, measured: Any, predicted: xr.DataArray, caller: str
+    name: str, observed: Any, predicted: xr.DataArray, caller: str
 ) -> list[Comparable]:
     """Return the outputs of one condition."""
-    values = real_array(measured, f"{caller}: {name}: measured")
+    values = real_array(observed, f"{caller}: {name}: observed")
     others = [dim for dim in predicted.dims if dim not in ("chain", "draw", "sample")]
     event = tuple(predicted.sizes[dim] for dim in others)
     if values.ndim != 1 + len(event) or values.shape[1:] != event or not values.size:
         expected = ", ".join(["n", *map(str, event)])
         raise ValueError(
-            f"{caller}: {name}: measured: got shape {values.shape}, expected ({expected}): a value "
+            f"{caller}: {name}: observed: got shape {values.shape}, expected ({expected}): a value "
             "for each specimen and output"
         )
     samples = predicted.values.reshape(-1, predicted.sizes["sample"], *event)

@@ -16,12 +16,12 @@ from prbayes.validation.cross_validation import cross_validate, most_folds
 # Share of comparisons of candidates that predict alike in which one is said to be better.
 _CLAIMED = 0.05
 _EXAMPLE = "expected a mapping such as {'normal': optimum, 'lognormal': other}"
-_CALLER = "compare_candidates"
+_CALLER = "rank"
 # Of which nine in ten calibrate: nearly as many as there are.
 _COMPARED_BY = 10
 
 
-def compare_candidates(
+def rank(
     candidates: Mapping[str, Optimum | xr.Dataset],
     *,
     folds: int | None = None,
@@ -93,7 +93,7 @@ def compare_candidates(
     ...         x = family.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
     ...         y = prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), observed=data)
     ...     optima[family.__name__] = prb.minimize(model)
-    >>> table = prb.validation.compare_candidates(optima)
+    >>> table = prb.rank(optima)
     >>> table.candidate.values.tolist(), bool(table.told_apart[1])
     (['LogNormal', 'Normal'], True)
     """

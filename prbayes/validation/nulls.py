@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._envelope import ENVELOPED, envelope
 from prbayes._progress import progress
+from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.validation.conditions import Case, Condition
 from prbayes.validation.predictive import Predictive, between
@@ -41,7 +41,7 @@ class Null(ABC):
     own_specimens: ClassVar[bool] = False  # whether the calibration's own specimens may be tested
 
     @abstractmethod
-    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+    def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Return p-value, critical value and envelope."""
 
     @abstractmethod
@@ -56,7 +56,7 @@ class SimulatedNull(Null):
     def replicates_of(self, case: Case) -> Iterator[Floats]:
         """Yield u-values of replicates, shapes (r, n)."""
 
-    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+    def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         r"""Count the observed data among the replicates.
 
         .. math:: p = (1 + \#\{A_r \ge A\}) / (1 + r)
@@ -65,15 +65,15 @@ class SimulatedNull(Null):
         total = areas.size + 1
         # The largest number of replicates, less the observed data, that a rejection allows to be as
         # large; rounding must not make .05 * 20 less than one.
-        allowed = int(np.floor(level * total + 1e-9)) - 1
+        allowed = int(np.floor(alpha * total + 1e-9)) - 1
         if allowed < 0:
             raise ValueError(
-                f"level: got {level} with {areas.size} replicates, expected at least "
+                f"alpha: got {alpha} with {areas.size} replicates, expected at least "
                 f"1 / ({areas.size} + 1); pass a null with more replicates"
             )
         # Nor must rounding make a tie a difference.
         as_large = np.sum(areas >= statistic * (1 - 1e-12))
-        lower, upper = envelope(some, level)
+        lower, upper = envelope(some, alpha)
         return Judgement(
             p_value=float((1 + as_large) / total),
             critical_value=float(areas[areas.size - allowed - 1]),
@@ -118,6 +118,7 @@ class PosteriorNull(SimulatedNull):
     """
 
     replicates: int = 9999
+    _: KW_ONLY
     random_seed: int = 0
 
     def __post_init__(self) -> None:

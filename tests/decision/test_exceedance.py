@@ -17,7 +17,7 @@ MU, SIGMA = (posterior().posterior[name].values[0] for name in ("mu", "sigma"))
 THINNED = np.unique(np.linspace(0, 3999, 2000).round().astype(int))
 
 
-def exact(limit: float, level: float = 0.9) -> tuple[float, Any]:
+def exact(limit: float, level: float = 0.89) -> tuple[float, Any]:
     """Return the probability of a new specimen, and the interval over the posterior."""
     each = ndtr((MU[THINNED] - limit) / SIGMA[THINNED])
     return float(each.mean()), np.quantile(each, [(1 - level) / 2, (1 + level) / 2])
@@ -51,7 +51,7 @@ def test_from_points_where_it_matters() -> None:
 
 
 def test_the_error_counts_that_draws_are_few() -> None:
-    few, many = (ask(2.8, points=2000, draws=draws) for draws in (50, 2000))
+    few, many = (ask(2.8, points=2000, n_draws=n) for n in (50, 2000))
     scatter = float(few.by_draw.std(ddof=1)) / np.sqrt(50)
     assert float(few.error) > scatter > 2 * float(many.error)
     assert abs(float(few.probability) - exact(2.8)[0]) < 3 * float(few.error)

@@ -28,7 +28,7 @@ def functions(y: Any) -> Any:
 
 @pytest.mark.parametrize("level", [0.9, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_bands_hold_what_they_say(level: float) -> None:
-    found = box(level=level)
+    found = box(prob=level)
     each = functions(found.y.values)
     pointwise = found.sel(band="pointwise")
     expected = np.quantile(each, [(1 - level) / 2, (1 + level) / 2], axis=0)

@@ -18,7 +18,7 @@ def table() -> xr.Dataset:
             lambda x: np.abs(x - 1.0), x, metric=prb.LogLikelihood(density=prb.GaussianKDE())
         ),
     }
-    return prb.plan(optimum(), candidates, [N, 3 * N], quantity=quantity)
+    return prb.plan(optimum(), candidates, k=[N, 3 * N], quantity=quantity)
 
 
 def test_specimens_of_the_same_kind_narrow_by_their_number(table: xr.Dataset) -> None:
@@ -40,7 +40,7 @@ def test_the_number_that_reaches_a_target() -> None:
     condition = {"same": prb.decision.Condition(same, x)}
     target = {"mu": 0.03, "quantity": 1e-9, "sigma": 9.0}
     quantity = prb.decision.Quantile(same, x, probability=0.95)
-    table = prb.plan(optimum(), condition, 5, quantity=quantity, target=target)
+    table = prb.plan(optimum(), condition, k=5, quantity=quantity, target=target)
     needed = table.specimens.sel(candidate="same")
     now = float(table.now.sel(name="mu"))
     assert float(needed.sel(name="mu")) == pytest.approx(N * ((now / 0.03) ** 2 - 1), rel=0.1)
@@ -48,11 +48,11 @@ def test_the_number_that_reaches_a_target() -> None:
     assert float(needed.sel(name="quantity")) == np.inf
     # It is the least.
     k = int(needed.sel(name="mu"))
-    around = prb.plan(optimum(), condition, [k - 1, k]).sd.sel(candidate="same", name="mu")
+    around = prb.plan(optimum(), condition, k=[k - 1, k]).sd.sel(candidate="same", name="mu")
     assert float(around[1]) <= 0.03 < float(around[0])
 
 
 def test_a_target_that_is_in_no_table_is_refused() -> None:
     condition = {"same": prb.decision.Condition(same, normal()[1])}
     with pytest.raises(KeyError, match=r"got 'quantity', expected one of \['mu', 'sigma'\]"):
-        prb.plan(optimum(), condition, 5, target={"quantity": 1.0})
+        prb.plan(optimum(), condition, k=5, target={"quantity": 1.0})

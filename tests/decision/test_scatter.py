@@ -63,7 +63,7 @@ def test_two_inputs_that_act_together_emulated_and_called() -> None:
     alone = np.array([1.0, slope**2])
     for computed in (False, True):
         quantity = prb.decision.Mean(together, a, b)
-        table = prb.sensitivity(optimum, quantity, samples=512, computed=computed)
+        table = prb.sensitivity(optimum, quantity, n_samples=512, computed=computed)
         own = table.sel(factor=["a", "b"])
         for key, part in (("first", alone), ("total", alone + 1)):
             off = np.abs(own[key] - part / (alone.sum() + 1))
@@ -105,7 +105,7 @@ def test_derivatives_bound_a_linear_response_as_tightly_as_they_can() -> None:
 def test_without_an_emulator_nothing_tells_what_is_between_the_runs() -> None:
     optimum, inputs = problem(None, 4096)
     quantity = prb.decision.Mean(ishigami, *inputs)
-    table = prb.sensitivity(optimum, quantity, samples=64)
+    table = prb.sensitivity(optimum, quantity, n_samples=64)
     assert np.isnan(table["first"].sel(factor="a"))
     assert "computed=True" in table.attrs["inputs"]
 
@@ -128,7 +128,7 @@ def test_where_the_nearest_run_failed_a_line_ends() -> None:
 def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     optimum, inputs = problem()
     quantity = prb.decision.Mean(ishigami, *inputs)
-    before = prb.sensitivity(optimum, quantity, samples=64, computed=True)
+    before = prb.sensitivity(optimum, quantity, n_samples=64, computed=True)
     monkeypatch.setattr(module, "_SCORE_STEP", factor * module._SCORE_STEP)
-    after = prb.sensitivity(optimum, quantity, samples=64, computed=True)
+    after = prb.sensitivity(optimum, quantity, n_samples=64, computed=True)
     np.testing.assert_allclose(after.derivative[1:], before.derivative[1:], rtol=0.01)

@@ -65,7 +65,7 @@ def test_errors_fall_with_the_samples_and_seeds_matter() -> None:
     model, x = normal()
     quantity = prb.decision.Exceedance(same, x, limit=2.0)
     few, again, many = [
-        prb.sensitivity(posterior(), quantity, model=model, samples=n, random_seed=seed)
+        prb.sensitivity(posterior(), quantity, model=model, n_samples=n, random_seed=seed)
         for n, seed in ((64, 1), (64, 1), (1024, 2))
     ]
     xr.testing.assert_identical(few, again)
@@ -82,9 +82,9 @@ def test_errors_fall_with_the_samples_and_seeds_matter() -> None:
 def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     model, x = normal()
     quantity = prb.decision.Quantile(same, x, probability=0.9)
-    before = prb.sensitivity(posterior(), quantity, model=model, samples=256)
+    before = prb.sensitivity(posterior(), quantity, model=model, n_samples=256)
     monkeypatch.setattr(influence, "_WEIGHT_STEP", factor * influence._WEIGHT_STEP)
-    after = prb.sensitivity(posterior(), quantity, model=model, samples=256)
+    after = prb.sensitivity(posterior(), quantity, model=model, n_samples=256)
     own = ["mu", "sigma"]
     np.testing.assert_allclose(
         after.derivative.sel(factor=own), before.derivative.sel(factor=own), atol=0.01

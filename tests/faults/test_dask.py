@@ -140,7 +140,7 @@ def study(code: str, folder: Path, executor: Any, n: int) -> Tally:
     make, formula, outputs, start, _ = CODES[code]
     x = 1.0 + np.arange(n) / n
     points = Points([x, start + 3 * x], [True, True])
-    store, tally = Store(folder, "y", 2, version="1", outputs=2), Tally()
+    store, tally = Store(folder, "y", columns=2, version="1", outputs=2), Tally()
     making = make(folder)
     response = next(making)
     try:

@@ -142,7 +142,7 @@ def test_a_value_between_responses_far_apart_is_told_of(largest: float, said: bo
     found = between_runs(evaluator, np.array([0.0, np.log(0.3)]))
     assert len(found) == said
     if said:
-        assert "1 of 60 observed values (9) lie between responses" in found[0]
+        assert "1 of 60 observed values (9) lie between responses" in found[0].text
     # A metric that smooths both sides takes no value by itself.
     with pm.Model() as model:
         x = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))

@@ -197,7 +197,7 @@ def test_responses_that_are_done_while_the_disk_is_busy_are_stored_together(
         add(self, parts)
 
     monkeypatch.setattr(Store, "add_all", slow)
-    store = Store(tmp_path, "y", 2)
+    store = Store(tmp_path, "y", columns=2)
     with ThreadPoolExecutor(4) as pool:
         calling = Calling("y", prb.scalar(lambda x, a: time.sleep(0.01) or a * x), pool, store)
         found = respond(calling, line(40), Tally())
@@ -552,7 +552,7 @@ def test_another_constant_is_another_input(tmp_path: Path) -> None:
 def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
     with pytest.raises(prb.response.ResponseError, match=r"\d+ responses are kept in"):
         model(prb.scalar(fails_above_two), store=tmp_path)
-    kept = len(Store(tmp_path, "y", 2))
+    kept = len(Store(tmp_path, "y", columns=2))
     found = model(prb.scalar(times), store=tmp_path)
     np.testing.assert_array_equal(stored(found), EXPECTED)
     assert responses(found).computed == N - kept + 1  # one of those that are kept
@@ -618,7 +618,7 @@ def test_what_is_being_computed_when_one_fails_is_kept(
             return super().submit(work, *job, **keywords)
 
     points = Points([np.arange(12.0)], [True])
-    store = Store(tmp_path, "y", 1)
+    store = Store(tmp_path, "y", columns=1)
     with Pool(2) as pool, pytest.raises(prb.response.ResponseError, match="too steep"):
         respond(Calling("y", prb.scalar(function), pool, store), points, Tally())
     values, known = store.find(points.keys())

@@ -101,7 +101,7 @@ def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinemen
         )
     (node,) = nodes(model).values()
     assert sum(response.asked) <= 17 + 4
-    prb.refine(model, np.full((1, 1), 2.0))
+    prb.refine(model, thetas=np.full((1, 1), 2.0))
     node.design.add([np.array([0.9, 0.95])])
     assert sum(response.asked) <= 17 + 4
     np.testing.assert_array_equal(node.design.values, 2.0 * node.design.batches.points[0])

@@ -12,7 +12,7 @@ from arviz_stats.utils import ELPDData
 
 import prbayes as prb
 
-compare = prb.validation.compare_candidates
+compare = prb.rank
 SKEWED = np.exp(np.random.default_rng(0).normal(0.0, 0.7, 60))
 NARROW = np.random.default_rng(2).normal(1.0, 0.1, 30)
 QUIET = {"progressbar": False}

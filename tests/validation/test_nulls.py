@@ -49,15 +49,15 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
         False,
     )
 
-    def judged(statistic: float, level: float) -> tuple[float, float]:
-        found = Fixed().judge(case, statistic, level)
+    def judged(statistic: float, alpha: float) -> tuple[float, float]:
+        found = Fixed().judge(case, statistic, alpha)
         return found.p_value, found.critical_value
 
     areas = area(AREAS[:, None])  # falling
     assert judged(0.5, 0.05) == (1 / 20, areas[0])
     assert judged(areas[0], 0.05)[0] == 2 / 20
     assert judged(0.0, 0.10) == (1.0, areas[1])
-    with pytest.raises(ValueError, match=r"level: got 0\.01 with 19 replicates"):
+    with pytest.raises(ValueError, match=r"alpha: got 0\.01 with 19 replicates"):
         Fixed().judge(case, 0.5, 0.01)
 
 
