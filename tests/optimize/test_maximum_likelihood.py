@@ -46,9 +46,9 @@ def codes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return the codes of findings, as they are reported."""
     reported: list[str] = []
 
-    def recorded(findings: list[Finding]) -> tuple[Finding, ...]:
+    def recorded(*findings: Finding) -> tuple[Finding, ...]:
         reported.extend(finding.code for finding in findings)
-        return report(findings)
+        return report(*findings)
 
     monkeypatch.setattr("prbayes.optimize.maximum_likelihood.report", recorded)
     return reported
