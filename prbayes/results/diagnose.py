@@ -29,7 +29,7 @@ from prbayes.model.elements import (
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.caveats import small_simulators
 from prbayes.optimize.optimum import NO_RESPONSE, TOLD_SHARE, Optimum, compared_in, require_of_model
 from prbayes.response.inputs import model_on_context
@@ -99,7 +99,7 @@ class Diagnosis:
         return view(f"Diagnosis: {count} problem{'s' if count > 1 else ''}", sentences=sentences)
 
 
-@in_turn
+@locked
 def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) -> Diagnosis:
     """Report in sentences what is wrong with a result of any sampler or optimiser, and what to do.
 
@@ -368,12 +368,12 @@ def _diagnose_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         designs = _stored_coverage(result["calibration"].to_dataset())
         is_by_specimen = _is_by_specimen(result)
         if model is not None and is_by_specimen:
-            evaluator = Evaluator(model)
+            evaluator = Evaluator.of(model)
             thetas = _thetas(posterior, evaluator)
     else:
         model = model_on_context(model, "prb.diagnose")
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         thetas = _thetas(posterior, evaluator)
         designs = _computed_coverage(evaluator, thetas)
         is_by_specimen = not evaluator.nodes
@@ -561,7 +561,7 @@ def _thetas(posterior: Any, evaluator: Evaluator) -> Floats:
     missing = [name for name in names if name not in posterior]
     if missing:
         raise KeyError(f"posterior: got no {missing}, expected the model's free variables {names}")
-    return evaluator.thetas_of(list(finite_draws(posterior, names).values()))
+    return evaluator.hyperparameters.thetas_of(list(finite_draws(posterior, names).values()))
 
 
 # -- designs ---------------------------------------------------------------------------------

@@ -18,7 +18,8 @@ from hostile import processes
 
 import prbayes as prb
 from prbayes.response import fmi
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.executors import Pool
 from prbayes.response.store import Store
 
