@@ -28,7 +28,7 @@ from scipy.special import ndtr, ndtri
 
 import prbayes as prb
 from benchmarks import record
-from prbayes._envelope import envelope
+from prbayes._stats import envelope
 
 OUT = record.RESULTS / "risk.json"
 DRAWS = 200

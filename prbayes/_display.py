@@ -1,11 +1,9 @@
-"""How results show themselves in a notebook: a heading, a table, sentences."""
+"""HTML of results in a notebook: a heading, a table, sentences."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Iterable, Sequence
-
-_CELL = "padding: .2em .9em .2em 0"
 
 
 def view(
@@ -15,25 +13,18 @@ def view(
     rows: Iterable[Sequence[str]] = (),
     sentences: Iterable[str] = (),
 ) -> str:
-    """Return HTML of a result, without a colour of its own: it suits light and dark.
+    """Return HTML without colours, which suits light and dark; all texts are escaped.
 
-    The first cell of a row is its name; the others stand to the right, as numbers do. All texts are
-    escaped.
+    The first cell of a row is its name; the others are aligned right, as numbers are.
     """
+    cell = "padding: .2em .9em .2em 0"
+    table = ""
+    for name, *values in (map(html.escape, row) for row in rows):
+        cells = "".join(f'<td style="{cell}; text-align: right">{value}</td>' for value in values)
+        table += f'<tr><th scope="row" style="{cell}; text-align: left">{name}</th>{cells}</tr>'
     parts = [f"<p><b>{html.escape(heading)}</b></p>"]
-    body = [_row(row) for row in rows]
-    if body:
-        names = "".join(f'<th scope="col" style="{_CELL}">{html.escape(n)}</th>' for n in header)
-        parts.append(
-            f"<table><thead><tr>{names}</tr></thead><tbody>{''.join(body)}</tbody></table>"
-        )
+    if table:
+        names = "".join(f'<th scope="col" style="{cell}">{html.escape(n)}</th>' for n in header)
+        parts.append(f"<table><thead><tr>{names}</tr></thead><tbody>{table}</tbody></table>")
     parts += [f"<p>{html.escape(sentence)}</p>" for sentence in sentences]
     return f'<div style="max-width: 60em">{"".join(parts)}</div>'
-
-
-def _row(row: Sequence[str]) -> str:
-    """Return one row of a table."""
-    name, *values = map(html.escape, row)
-    right = f"{_CELL}; text-align: right"
-    cells = "".join(f'<td style="{right}">{value}</td>' for value in values)
-    return f'<tr><th scope="row" style="{_CELL}; text-align: left">{name}</th>{cells}</tr>'

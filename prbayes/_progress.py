@@ -15,7 +15,6 @@ from rich.errors import LiveError
 from rich.progress import (
     BarColumn,
     Progress,
-    ProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -25,10 +24,12 @@ from prbayes._validate import flag
 
 _log = logging.getLogger("prbayes")
 
-# Expected seconds from which there is a bar. By judgement: as long as one waits without wondering.
+# Expected seconds from which a bar appears: shorter work needs none.
 _SHOWN_FROM = 2.0
-# Seconds between lines where no bar can move. By judgement: a log of a night is not all bars.
+# Seconds between lines where no bar can move, as in the log of a night.
 _LINE_EVERY = 60.0
+
+_hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 
 def _in_kernel() -> bool:
@@ -50,7 +51,7 @@ def _console() -> Console:
     return Console(stderr=True, force_jupyter=False, force_terminal=forced)
 
 
-CONSOLE = _console()  # one for all, so that a bar inside another is drawn below it
+CONSOLE = _console()  # one for all bars, so that an inner bar is drawn below an outer one
 
 
 def live() -> bool:
@@ -62,7 +63,7 @@ def live() -> bool:
 
 
 def lines() -> Callable[[str], None]:
-    """Return a function that writes a text where no bar can move, as in a log, once in a minute.
+    """Return a function that writes a text once a minute where no bar can move, as in a log.
 
     In a notebook without widgets, such as an executed page, it writes nothing.
     """
@@ -79,12 +80,9 @@ def lines() -> Callable[[str], None]:
     return write
 
 
-_hidden: ContextVar[bool] = ContextVar("hidden", default=False)
-
-
 @contextmanager
 def shown(visible: bool) -> Iterator[bool]:
-    """Show bars inside only if ``visible`` here and in all outer calls; gives whether they show."""
+    """Show inner bars only if ``visible`` here and in all outer calls; yield whether they show."""
     flag(visible, "progressbar")
     token = _hidden.set(_hidden.get() or not visible)
     try:
@@ -94,66 +92,48 @@ def shown(visible: bool) -> Iterator[bool]:
 
 
 @contextmanager
-def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str], None]]:
-    """Give a function (done, note) to be called as work gets done; only long work shows a bar.
+def progress(name: str, total: int | None = None) -> Iterator[Callable[[int, str], None]]:
+    """Yield a function of (newly done, note) that shows a bar, called ``name``, for long work.
 
-    The bar appears when two seconds are expected. Without a total nothing is known of what is left,
-    and it appears when two seconds have passed. Where no bar can move there is a line each minute.
-
-    Parameters
-    ----------
-    what : str
-        Stands before the bar.
-    total : int, optional
-        How much work there is, in the units of ``done``.
+    The bar appears when two seconds are expected; without a ``total``, after two seconds. Where no
+    bar can move there is a line each minute.
     """
-    bar = Progress(*_columns(what, total), console=CONSOLE)
+    of_total = "" if total is None else "/{task.total}"
+    bar = Progress(
+        TextColumn(name),
+        BarColumn(),
+        TextColumn(f"{{task.completed}}{of_total}"),
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn() if total is None else TimeRemainingColumn(),
+        console=CONSOLE,
+    )
     task = bar.add_task("", total=total, note="")
     clock = time.perf_counter()
     completed = 0
-    of_total = "" if total is None else f"/{total}"
     write = lines()
-    settled = _hidden.get() or not live()  # whether there is a bar, or never will be
+    is_settled = _hidden.get() or not live()  # whether there is a bar, or never will be
 
-    def advance(done: int, note: str) -> None:
-        nonlocal completed, settled
-        completed += done
-        bar.update(task, advance=done, note=note)
-        write(f"{what} {completed}{of_total} {note}".rstrip())
+    def advance(n: int, note: str) -> None:
+        nonlocal completed, is_settled
+        completed += n
+        bar.update(task, advance=n, note=note)
+        whole = "" if total is None else f"/{total}"
+        write(f"{name} {completed}{whole} {note}".rstrip())
         elapsed = time.perf_counter() - clock
-        if not settled and _expected(elapsed, completed, total) > _SHOWN_FROM:
-            settled = True
-            _start(bar, what)
+        if not is_settled and _expected(elapsed, completed, total) > _SHOWN_FROM:
+            is_settled = True
+            try:
+                bar.start()
+            except LiveError:  # older versions of rich draw one bar at a time
+                _log.debug("%s: no second progress bar", name)
 
     try:
         yield advance
     finally:
-        if bar.live.is_started:  # else a line would be printed where there is no terminal
+        if bar.live.is_started:  # stopping would print a line where there is no terminal
             bar.stop()
 
 
-def _columns(what: str, total: int | None) -> list[ProgressColumn]:
-    """Return what stands beside each other in a bar's line."""
-    name = TextColumn(what)
-    note = TextColumn("{task.fields[note]}")
-    if total is None:
-        done = TextColumn("{task.completed}")
-        return [name, BarColumn(), done, note, TimeElapsedColumn()]
-    done = TextColumn("{task.completed}/{task.total}")
-    return [name, BarColumn(), done, note, TimeRemainingColumn()]
-
-
 def _expected(elapsed: float, completed: int, total: int | None) -> float:
-    """Return the seconds that are left at the pace so far; those passed without a total."""
-    if total is None:
-        return elapsed
-    left = total / max(completed, 1) - 1
-    return elapsed * left
-
-
-def _start(bar: Progress, what: str) -> None:
-    """Show a bar, unless there is one already and this version of rich draws one at a time."""
-    try:
-        bar.start()
-    except LiveError:
-        _log.debug("%s: no second progress bar", what)
+    """Return the remaining seconds at the pace so far; the elapsed ones without a total."""
+    return elapsed if total is None else elapsed * (total / max(completed, 1) - 1)

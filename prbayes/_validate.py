@@ -1,12 +1,14 @@
-"""Coercion and checks of samples, weights and shapes.
+"""Validation of arguments: samples, weights, numbers, seeds, paths.
 
 Every message says what was got, what was expected, and what to do.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,93 +17,54 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
-# Numbers held at a time where work is done in parts: 32 MiB. It bounds memory; where the parts
-# leave a trace in an answer, that place says so.
+# Numbers in memory at a time where work is done in blocks: 32 MiB. Where the blocks leave a trace
+# in an answer, that place says so.
 AT_ONCE = 1 << 22
 # Numbers of arrays that stay in the cache of a processor: 2 MiB.
 IN_CACHE = 1 << 18
+# Squares of measured values, and sums of them, are finite up to here.
+_LARGEST = 1e152
+
+
+def called(value: object) -> str:
+    """Return type and value of an argument for a message, on one line."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    return f"{type(value).__name__} {' '.join(repr(value).split()):.60}"
+
+
+# -- arrays ----------------------------------------------------------------------------------
 
 
 def real_array(values: ArrayLike, name: str) -> Floats:
-    """Return ``values`` as a float array, or raise a `TypeError` that says what was got.
-
-    Parameters
-    ----------
-    values : array_like of real numbers
-    name : str
-        How the message calls the argument.
-    """
+    """Return ``values`` as a float array, or raise a `TypeError` if they are not real numbers."""
     try:
         array = np.asarray(values)
     except ValueError as error:
         raise TypeError(
             f"{name}: got a ragged sequence, expected a regular array of numbers"
         ) from error
+    if array.dtype.kind in "fiu":
+        return np.asarray(array, dtype=np.float64)
     if array.dtype.kind == "c":
         raise TypeError(
             f"{name}: got complex numbers, expected real ones; pass the real part or the modulus"
         )
-    if array.dtype.kind not in "fiu":
-        array = _numbers_in_objects(values, array, name)
-    return np.asarray(array, dtype=np.float64)
-
-
-def _numbers_in_objects(values: object, array: NDArray[Any], name: str) -> Floats:
-    """Return the numbers that an array of Python objects holds, or raise for any other array."""
-    # NumPy would read numbers out of texts, and NaN out of None; in a list that is one missing.
-    lone = array.ndim == 0 and values is None
-    if array.dtype.kind == "O" and not lone and not any(map(_is_no_number, array.flat)):
-        try:
+    # NumPy would read numbers out of texts, and NaN out of None; None in a list is a missing value.
+    is_convertible = array.dtype.kind == "O" and values is not None
+    if is_convertible and not any(isinstance(x, bool | np.bool_ | str | bytes) for x in array.flat):
+        with suppress(TypeError, ValueError, OverflowError):
             return array.astype(np.float64)
-        except (TypeError, ValueError, OverflowError):
-            pass
-    got = _describe(values, array)
+    got = f"an array of dtype {array.dtype}" if array.ndim else called(values)
     raise TypeError(f"{name}: got {got}, expected real numbers")
-
-
-def _is_no_number(value: object) -> bool:
-    return isinstance(value, bool | np.bool_ | str | bytes)
-
-
-def _describe(values: object, array: NDArray[Any]) -> str:
-    """Return what was passed, in words for a message."""
-    if array.ndim == 0:
-        return called(values)
-    return f"an array of dtype {array.dtype}"
-
-
-def called(value: object) -> str:
-    """Return what an argument is, for a message: on one line, also of an array or a table."""
-    if isinstance(value, type):
-        return f"the class {value.__name__}"
-    words = repr(value).split()
-    on_one_line = " ".join(words)
-    return f"{type(value).__name__} {on_one_line:.60}"
 
 
 def observed_sample(
     values: ArrayLike, name: str = "observed", *, minimum: int = 1, failures: bool = False
 ) -> Floats:
-    """Check measured responses: one-dimensional, at least ``minimum`` of them, and finite.
+    """Return measured responses, shape (N,), or raise if they are not finite or too few.
 
-    Parameters
-    ----------
-    values : array_like, shape (N,)
-    name : str
-    minimum : int
-    failures : bool
-        Whether specimens may have failed, +inf, besides the minimum.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-
-    Raises
-    ------
-    TypeError
-        If the values are not real numbers.
-    ValueError
-        If they are not one-dimensional, too few, or not finite.
+    With ``failures``, specimens may have failed, +inf, besides the ``minimum``.
     """
     if np.ma.is_masked(values):
         raise ValueError(f"{name}: got masked values, expected none; leave missing specimens out")
@@ -111,48 +74,34 @@ def observed_sample(
             f"{name}: got an array of shape {array.shape}, expected one dimension, (N,); "
             "several outputs of a specimen, (N, m), take prb.Joint(metric), or one Simulator each"
         )
-    failed = np.isposinf(array)
-    bad = int((~np.isfinite(array)).sum() - (failed.sum() if failures else 0))
-    if bad:
-        what = ""
+    n_failed = int(np.isposinf(array).sum())
+    n_invalid = int((~np.isfinite(array)).sum()) - (n_failed if failures else 0)
+    if n_invalid:
+        advice = ""
         if failures:
-            what = ", and give those that had failed as +inf"
-        elif failed.any():
-            what = "; a specimen that failed, +inf, takes a metric that counts it"
+            advice = ", and give those that had failed as +inf"
+        elif n_failed:
+            advice = "; a specimen that failed, +inf, takes a metric that counts it"
         raise ValueError(
-            f"{name}: got {bad} NaN or infinite among {array.size} values, expected finite ones; "
-            f"leave missing specimens out{what}"
+            f"{name}: got {n_invalid} NaN or infinite among {array.size} values, expected finite "
+            f"ones; leave missing specimens out{advice}"
         )
     _refuse_huge(array, name)
-    number = array.size - int(failed.sum())
-    if number < minimum:
-        few = {0: "no values", 1: "one value"}.get(number, f"{number} values")
-        besides = f" besides {failed.sum()} of specimens that failed" if failed.any() else ""
+    n_finite = array.size - n_failed
+    if n_finite < minimum:
+        got = {0: "no values", 1: "one value"}.get(n_finite, f"{n_finite} values")
+        besides = f" besides {n_failed} of specimens that failed" if n_failed else ""
         raise ValueError(
-            f"{name}: got {few}{besides}, expected at least {minimum} measured responses"
+            f"{name}: got {got}{besides}, expected at least {minimum} measured responses"
         )
     return array
 
 
 def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
-    """Check measured responses of several outputs: (N, m), no row and no column without a number.
+    """Return measured responses of several outputs, shape (N, m), or raise.
 
-    Parameters
-    ----------
-    values : array_like, shape (N, m)
-        NaN, or a mask, is an output that was not measured; +inf a specimen that failed there.
-    name : str
-
-    Returns
-    -------
-    ndarray, shape (N, m)
-
-    Raises
-    ------
-    TypeError
-        If the values are not real numbers.
-    ValueError
-        If they have another shape, or an output or a specimen has no value, or no finite one.
+    NaN, or a mask, is an output that was not measured; +inf a specimen that failed there. Every
+    specimen needs an output, and every output a finite value.
     """
     masked = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else None
     array = real_array(np.ma.getdata(values) if masked is not None else values, name)
@@ -170,44 +119,36 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
         )
     _refuse_huge(array, name)
     missing = np.isnan(array)
-    _refuse_empty(missing.all(axis=1), name, "specimens", "row", "without any output")
-    _refuse_empty(missing.all(axis=0), name, "outputs", "column", "that no specimen has")
-    without = ~np.isfinite(array).any(axis=0)
-    _refuse_empty(without, name, "outputs", "column", "in which every specimen failed")
+    for empty, problem, line in (
+        (missing.all(axis=1), "specimens without any output", "row"),
+        (missing.all(axis=0), "outputs that no specimen has", "column"),
+        (~np.isfinite(array).any(axis=0), "outputs in which every specimen failed", "column"),
+    ):
+        if empty.any():
+            raise ValueError(
+                f"{name}: got {empty.sum()} {problem} ({line} {empty.argmax()} is one, counted "
+                "from 0), expected a number in each; leave them out"
+            )
     return array
 
 
-# Squares of measured values, and sums of them, are numbers up to here.
-_HUGE = 1e152
-
-
 def _refuse_huge(array: Floats, name: str) -> None:
-    """Raise if values are so large that their squares are none: rather a mistake than a unit."""
+    """Raise if the squares of values overflow: rather a mistake than a unit."""
     largest = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
-    if largest > _HUGE:
+    if largest > _LARGEST:
         raise ValueError(
-            f"{name}: got values of up to {largest:.3g}, expected at most {_HUGE:g} in size; look "
-            "at what they are, or take another unit"
-        )
-
-
-def _refuse_empty(empty: NDArray[np.bool_], name: str, what: str, place: str, without: str) -> None:
-    """Raise if there are rows or columns that hold nothing."""
-    where = np.flatnonzero(empty)
-    if where.size:
-        raise ValueError(
-            f"{name}: got {where.size} {what} {without} ({place} {where[0]} is one, counted from "
-            "0), expected a number in each; leave them out"
+            f"{name}: got values of up to {largest:.3g}, expected at most {_LARGEST:g} in size; "
+            "look at what they are, or take another unit"
         )
 
 
 def simulated_sample(
     values: ArrayLike, name: str = "simulated", *, event: tuple[int, ...] = ()
 ) -> Floats:
-    """Check simulated responses, (..., n, *event): no NaN or -inf; +inf is a failed specimen."""
+    """Return simulated responses, (..., n, *event), or raise if NaN or -inf; +inf has failed."""
     array = real_array(values, name)
-    before = array.shape[: max(0, array.ndim - len(event))]
-    if not before or before[-1] == 0 or array.shape[len(before) :] != event:
+    batch = array.shape[: max(0, array.ndim - len(event))]
+    if not batch or batch[-1] == 0 or array.shape[len(batch) :] != event:
         expected = "".join(f", {size}" for size in event)
         raise ValueError(
             f"{name}: got shape {array.shape}, expected (..., n{expected}) with n >= 1"
@@ -221,20 +162,7 @@ def simulated_sample(
 
 
 def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> Floats:
-    """Return weights of the last axis that sum to one; ``None`` means equal weights.
-
-    Parameters
-    ----------
-    weights : array_like, shape (..., n), or None
-        Non-negative, finite, with a positive sum along the last axis.
-    n : int
-        Expected length of the last axis.
-    name : str
-
-    Returns
-    -------
-    ndarray, shape (..., n)
-    """
+    """Return weights, shape (..., n), whose last axis sums to one; ``None`` is equal weights."""
     if weights is None:
         return np.full(n, 1.0 / n)
     array = real_array(weights, name)
@@ -250,51 +178,94 @@ def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> 
     return np.asarray(array / total)
 
 
-def positive_number(value: object, name: str) -> float:
-    """Return ``value`` as a float, or raise if it is not a positive finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise TypeError(
-            f"{name}: got {type(value).__name__} {value!r:.60}, expected a positive number"
+def sample_labels(values: ArrayLike, n: int, name: str) -> NDArray[Any]:
+    """Return labels of n specimens, shape (n,): texts or numbers, none of them missing."""
+    # As objects: NumPy would make the text 'nan' of a label that is missing.
+    labels = np.asarray(values, dtype=object)
+    if labels.shape != (n,):
+        raise ValueError(
+            f"{name}: got shape {labels.shape}, expected ({n},), one label per observation"
         )
-    if not np.isfinite(value) or value <= 0:
-        raise ValueError(f"{name}: got {value!r}, expected a positive finite number")
-    return float(value)
+    for label in labels:
+        is_number = isinstance(label, int | float | np.number) and not isinstance(label, bool)
+        if not (np.isfinite(label) if is_number else isinstance(label, str | np.datetime64)):
+            raise ValueError(
+                f"{name}: got {called(label)} as a label, expected texts or numbers; give a "
+                "specimen that has no label one of its own"
+            )
+    return np.asarray(values)
+
+
+def refuse_single_precision(caller: str, dtype: str) -> None:
+    """Raise if hyperparameters are numbers of single precision."""
+    if dtype in ("float16", "float32"):
+        raise TypeError(
+            f"{caller}: got hyperparameters of {dtype}, expected float64, without which "
+            "differences between populations are lost in rounding; set "
+            'pytensor.config.floatX = "float64" before the model is made, and leave out dtype='
+        )
+
+
+# -- numbers ---------------------------------------------------------------------------------
+
+
+def number(
+    value: object,
+    name: str,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    closed: bool = True,
+    whole: bool = False,
+) -> float:
+    """Return a finite number between two ends, or raise; an int if ``whole``.
+
+    The ends themselves are allowed if ``closed``.
+    """
+    if whole:
+        expected = f"an integer >= {low:g}"
+    elif high < math.inf:
+        expected = f"a number between {low:g} and {high:g}"
+    else:
+        expected = "a positive finite number" if low == 0 else "a finite number"
+    kinds = int | np.integer if whole else int | float | np.integer | np.floating
+    if isinstance(value, bool) or not isinstance(value, kinds):
+        raise TypeError(f"{name}: got {called(value)}, expected {expected}")
+    is_inside = low <= value <= high if closed else low < value < high
+    if not is_inside or not (whole or np.isfinite(value)):
+        raise ValueError(f"{name}: got {value!r}, expected {expected}")
+    return int(value) if whole else float(value)
 
 
 def finite_number(value: object, name: str) -> float:
     """Return ``value`` as a float, or raise if it is not a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise TypeError(f"{name}: got {called(value)}, expected a number")
-    if not np.isfinite(value):
-        raise ValueError(f"{name}: got {value!r}, expected a finite number")
-    return float(value)
+    return number(value, name)
+
+
+def positive_number(value: object, name: str) -> float:
+    """Return ``value`` as a float, or raise if it is not a positive finite number."""
+    return number(value, name, low=0, closed=False)
+
+
+def share(value: object, name: str) -> float:
+    """Return ``value`` as a float, or raise if it is not between 0 and 1, ends excluded."""
+    return number(value, name, low=0, high=1, closed=False)
 
 
 def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:
     """Return ``value`` as an int, or raise if it is not an integer of at least ``minimum``."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(
-            f"{name}: got {type(value).__name__} {value!r:.60}, expected an integer >= {minimum}"
-        )
-    if value < minimum:
-        raise ValueError(f"{name}: got {value}, expected an integer >= {minimum}")
-    return int(value)
+    return int(number(value, name, low=minimum, whole=True))
 
 
-# What PyMC takes for a seed.
+# What PyMC accepts as a seed.
 type Seed = int | Sequence[int] | np.random.Generator | np.random.RandomState | None
 
 
 def seed_number(random_seed: object, name: str = "random_seed") -> int:
-    """Return a seed as an integer, of all that PyMC takes for one.
+    """Return an integer for anything that PyMC accepts as a seed, or raise.
 
-    An integer is itself. A generator is asked for its next number, a sequence of integers makes
-    one, and None one that no other call has.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is none of these, or a negative integer.
+    A generator gives its next number, a sequence of integers one number, and None a new one at
+    every call.
     """
     match random_seed:
         case None:
@@ -311,30 +282,12 @@ def seed_number(random_seed: object, name: str = "random_seed") -> int:
         case int() | np.integer():
             return positive_integer(random_seed, name, minimum=0)
     raise TypeError(
-        f"{name}: got {type(random_seed).__name__} {random_seed!r:.60}, expected an integer >= 0, "
-        "a sequence of them, a numpy.random.Generator or None"
+        f"{name}: got {called(random_seed)}, expected an integer >= 0, a sequence of them, a "
+        "numpy.random.Generator or None"
     )
 
 
-def refuse_single_precision(caller: str, dtype: str) -> None:
-    """Raise if hyperparameters are numbers of single precision."""
-    if dtype in ("float16", "float32"):
-        raise TypeError(
-            f"{caller}: got hyperparameters of {dtype}, expected float64, without which "
-            "differences between populations are lost in rounding; set "
-            'pytensor.config.floatX = "float64" before the model is made, and leave out dtype='
-        )
-
-
-def share(value: object, name: str) -> float:
-    """Return ``value`` as a float, or raise if it is no number between 0 and 1, ends excluded."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise TypeError(
-            f"{name}: got {type(value).__name__} {value!r:.60}, expected a number between 0 and 1"
-        )
-    if not 0 < value < 1:
-        raise ValueError(f"{name}: got {value!r}, expected a number between 0 and 1")
-    return float(value)
+# -- flags, texts, paths, executors ----------------------------------------------------------
 
 
 def flag(value: object, name: str) -> bool:
@@ -344,15 +297,8 @@ def flag(value: object, name: str) -> bool:
     return bool(value)
 
 
-def random_seed(value: object, name: str = "random_seed", *, optional: bool = False) -> None:
-    """Raise if ``value`` is no seed: an integer >= 0, or, where it is optional, None."""
-    if value is None and optional:
-        return
-    positive_integer(value, name, minimum=0)
-
-
 def plain_text(value: object, name: str, *, empty: bool = False) -> str:
-    """Return ``value``, or raise if it is no text, or one without a letter."""
+    """Return ``value``, or raise if it is no text, or blank unless ``empty`` is allowed."""
     if not isinstance(value, str):
         raise TypeError(f"{name}: got {called(value)}, expected a text")
     if not empty and not value.strip():
@@ -363,24 +309,24 @@ def plain_text(value: object, name: str, *, empty: bool = False) -> str:
 def texts(value: object, name: str) -> None:
     """Raise if ``value`` is no mapping of texts to texts."""
     pairs = list(value.items()) if isinstance(value, Mapping) else [(value, None)]
-    if not all(isinstance(one, str) for pair in pairs for one in pair):
+    if not all(isinstance(text, str) for pair in pairs for text in pair):
         raise TypeError(
             f"{name}: got {called(value)}, expected a mapping of names to texts, such as "
             '{"mu": "mean stiffness"}'
         )
 
 
-def stated_path(value: object, name: str, what: str) -> Path:
+def stated_path(value: object, name: str, kind: str) -> Path:
     """Return ``value`` as the path of a file or folder, or raise if it is none."""
     if not isinstance(value, str | os.PathLike) or isinstance(os.fspath(value), bytes):
-        raise TypeError(f"{name}: got {called(value)}, expected the path of a {what}")
+        raise TypeError(f"{name}: got {called(value)}, expected the path of a {kind}")
     if not os.fspath(value):
-        raise ValueError(f"{name}: got {value!r}, expected the path of a {what}")
+        raise ValueError(f"{name}: got {value!r}, expected the path of a {kind}")
     return Path(value)
 
 
 def folder_path(value: object, name: str) -> Path:
-    """Return the path of a folder that is there or can be made, or raise."""
+    """Return the path of a folder that exists or can be made, or raise."""
     path = stated_path(value, name, "folder")
     if path.exists() and not path.is_dir():
         raise ValueError(f"{name}: got {path}, which is a file, expected a folder")
@@ -388,7 +334,7 @@ def folder_path(value: object, name: str) -> Path:
 
 
 def file_path(value: object, name: str) -> Path:
-    """Return the path of a file that is there or can be written, or raise."""
+    """Return the path of a file that exists or can be written, or raise."""
     path = stated_path(value, name, "file")
     if path.is_dir():
         raise ValueError(f"{name}: got {path}, which is a folder, expected a file")
@@ -397,33 +343,9 @@ def file_path(value: object, name: str) -> Path:
 
 def executes(value: object, name: str) -> None:
     """Raise if ``value`` is neither None nor an executor."""
-    known = callable(getattr(value, "submit", None)) and callable(getattr(value, "map", None))
-    if value is not None and (isinstance(value, type) or not known):
+    is_executor = callable(getattr(value, "submit", None)) and callable(getattr(value, "map", None))
+    if value is not None and (isinstance(value, type) or not is_executor):
         raise TypeError(
             f"{name}: got {called(value)}, expected a concurrent.futures.Executor, such as "
             "ProcessPoolExecutor(4)"
         )
-
-
-def sample_labels(values: ArrayLike, n: int, name: str) -> NDArray[Any]:
-    """Return labels of n specimens, shape (n,): texts or numbers, none of them missing."""
-    # As objects: NumPy would make the text 'nan' of a label that is missing.
-    labels = np.asarray(values, dtype=object)
-    if labels.shape != (n,):
-        raise ValueError(
-            f"{name}: got shape {labels.shape}, expected ({n},), one label per observation"
-        )
-    for label in labels:
-        if not _is_label(label):
-            raise ValueError(
-                f"{name}: got {called(label)} as a label, expected texts or numbers; give a "
-                "specimen that has no label one of its own"
-            )
-    return np.asarray(values)
-
-
-def _is_label(value: object) -> bool:
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if number:
-        return bool(np.isfinite(value))  # type: ignore[call-overload]
-    return isinstance(value, str | np.datetime64)

@@ -403,7 +403,7 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "epsilon string": (
         simulator(epsilon="a"),
         TypeError,
-        r"y: epsilon: got str 'a', expected a positive number",
+        r"y: epsilon: got str 'a', expected a positive finite number",
     ),
     "metric class": (
         simulator(metric=prb.AreaMetric),

@@ -34,7 +34,6 @@ README_SCRIPT, LIKELIHOOD_SCRIPT = re.findall(
 # Rooms below everything else, which may import each other.
 _GROUND = (
     "_validate",
-    "_envelope",
     "_finding",
     "_display",
     "_pages",

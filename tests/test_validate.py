@@ -192,7 +192,7 @@ def test_positive_number_refuses(value: Any) -> None:
 @pytest.mark.parametrize("value", ["1", None, True, 1j, [1.0], np.ones(1), np.True_])
 def test_positive_number_refuses_other_types(value: Any) -> None:
     with pytest.raises(
-        TypeError, match=f"^h: got {type(value).__name__} .*expected a positive number"
+        TypeError, match=f"^h: got {type(value).__name__} .*expected a positive finite number"
     ):
         positive_number(value, "h")
 

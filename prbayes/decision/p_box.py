@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._envelope import ENVELOPED, envelope
+from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, positive_integer, share
 from prbayes.decision.interval import intervals, variants
 from prbayes.decision.populations import Populations, Told

@@ -11,7 +11,6 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from scipy.special import logsumexp
 
 from prbayes._validate import Floats, positive_integer, share
-from prbayes._validate import random_seed as refuse_seed
 from prbayes.model.evaluator import Evaluation, Evaluator
 from prbayes.posterior.importance import LogDensity
 from prbayes.posterior.initial_particles import starting_thetas
@@ -75,7 +74,8 @@ class BatchedKernel(SMC_KERNEL):
     ) -> None:
         # PyMC's constructor compiles functions of single particles, which this kernel never calls.
         self.draws = positive_integer(draws, "draws")
-        refuse_seed(random_seed, optional=True)
+        if random_seed is not None:
+            positive_integer(random_seed, "random_seed", minimum=0)
         self.start = start
         self.threshold = share(threshold, "threshold")
         model = model_on_context(model, "BatchedKernel")

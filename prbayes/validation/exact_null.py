@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from prbayes._envelope import ENVELOPED, envelope
+from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import Floats, positive_integer, positive_number, share
 from prbayes.validation.conditions import Case
 from prbayes.validation.nulls import Judgement, Null

@@ -14,8 +14,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._envelope import ENVELOPED, envelope
 from prbayes._progress import progress
+from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.validation.conditions import Case, Condition
 from prbayes.validation.predictive import Predictive, between

@@ -112,7 +112,7 @@ def test_bandwidths_that_are_not_positive(bandwidth: float) -> None:
     ):
         GaussianKDE(lambda x, w: bandwidth).cells(OBSERVED, EQUAL)
     with pytest.raises(
-        TypeError, match="bandwidth: got str 'silverman', expected a positive number"
+        TypeError, match="bandwidth: got str 'silverman', expected a positive finite number"
     ):
         GaussianKDE("silverman")  # type: ignore[arg-type]
 

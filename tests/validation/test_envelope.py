@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtri
 
 import prbayes as prb
-from prbayes._envelope import envelope
+from prbayes._stats import envelope
 
 Posterior = Callable[..., Any]
 QUICK = prb.validation.PosteriorNull(999)
