@@ -99,7 +99,7 @@ def of_a_specimen(told: Told, metric: Metric | None) -> Floats:
     sample = _ideal(told, n)
     target = (metric or node.metric).against(sample)
     design = told.design
-    bound = design.telling(told.every, target.beside(told.every, design.dimensions))
+    bound = design.telling(told.every, target.metric.beside(target, told.every, design.dimensions))
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
     sampling = SamplingDistribution.of(
         evaluator.of_one(alone, told.k), center, np.ones(1), _FAINTEST

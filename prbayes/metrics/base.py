@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, ClassVar, Self
 
@@ -73,7 +73,7 @@ class Part:
     target: Discrepancy
     share: float
     label: str
-    view: View = View()
+    view: View = field(default_factory=View)
 
     def of(self, simulated: Any, xp: Any = np) -> Any:
         """Return the projection, (..., n, m) -> (..., n); NaN where an output is NaN."""

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from prbayes._validate import AT_ONCE, Floats
 
-
 # The four uniform cubic B-splines that reach a point at fraction t between two nodes: coefficients
 # of 1, t, t^2, t^3 (any textbook on splines).
 _SPLINE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6

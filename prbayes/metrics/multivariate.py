@@ -138,13 +138,13 @@ class CompositeDiscrepancy(Discrepancy):
         return total
 
 
-def compared(target: Discrepancy) -> str:
+def components_summary(target: Discrepancy) -> str:
     """Return what principal components leave out, for a reader; empty if there are none."""
     components = target.components if isinstance(target, CompositeDiscrepancy) else ()
     return "; ".join(c.summary for c in components)
 
 
-def structure_missed(target: Discrepancy) -> str:
+def components_missed(target: Discrepancy) -> str:
     """Return the structure of the data that principal components leave out; empty if none."""
     components = target.components if isinstance(target, CompositeDiscrepancy) else ()
     return "; ".join(c.missed for c in components if c.missed)

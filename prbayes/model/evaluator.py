@@ -396,7 +396,7 @@ class Evaluator:
             chosen = metric or node.metric
             target = chosen.against(observed, counted)
             bound = node.bound
-            targets.append(target.beside(bound.first_responses, bound.dimensions))
+            targets.append(target.metric.beside(target, bound.first_responses, bound.dimensions))
         return self.with_targets(targets)
 
     def of_one(self, node: Node, k: int) -> Evaluator:

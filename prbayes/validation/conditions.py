@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats, Seed, flag, real_array, sample_labels, seed_number
-from prbayes.metrics.base import View
+from prbayes.metrics.views import View
 from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
 from prbayes.response.outputs import Outputs, read_observed
 from prbayes.results.predict import specimen_names

@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import Floats
 from prbayes.metrics.base import Discrepancy, Metric, Part
-from prbayes.metrics.density import GaussianKDE, spread
+from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, spread
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
 
@@ -74,8 +74,8 @@ class Scoring:
 
 def _logs(part: Part, points: Floats, simulated: Floats, weights: Floats) -> Floats:
     """Return the log density of a population at points, (n',), with its share spread widely."""
-    cells = part.target.density_cells
-    assert cells is not None  # a log-likelihood has cells
+    assert isinstance(part.target, DensityDiscrepancy)  # as a log-likelihood is
+    cells = part.target.cells
     # The population is that of the points with a response.
     known = np.where(np.isnan(simulated), 0.0, weights)
     density = cells.density(simulated, known) / known.sum()

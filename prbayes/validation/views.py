@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.metrics.directions import directions, enough
-from prbayes.metrics.lifted import failure_caps
-from prbayes.metrics.multivariate import Centered, Projection
+from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
+from prbayes.metrics.views import Centered, Projection
 from prbayes.metrics.whitening import whitening
 
 # Specimens of the prediction that tell its coordinates: their correlations are then known to .02,
@@ -32,5 +31,5 @@ def views(pool: Floats) -> list[Projection]:
     equal = np.full(len(some), 1 / len(some))
     white = whitening(some, equal, every)
     centered = Centered(every, caps, white.center)
-    number = max(1, enough(m))
+    number = max(1, sufficient_directions(m))
     return [Projection(centered, white.axes @ u) for u in directions(m, number, 0)]
