@@ -297,7 +297,7 @@ def validity(case: tuple[Any, ...], random_seed: int) -> dict[str, Any]:
     fresh = np.sinh(1.3 + 0.6 * rng.standard_normal(12))
     best = prb.predict(optimum, surface, x, model=model)
     predicted = prb.predict(posterior, surface, x, model=model)
-    joint = prb.validation.JointNull(optimum, (surface, x), replicates=199)
+    joint = prb.validation.JointNull(optimum, responses=(surface, x), replicates=199)
     tests = [
         prb.area_test(fresh, predicted),
         prb.area_test(fresh, best),

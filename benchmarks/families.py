@@ -1,7 +1,7 @@
 """Normal or lognormal: how often the right family is told from cross-validated scores, and whether their error is right.
 
 The input's truth is normal or lognormal, with mean 1 and a coefficient of variation; N responses
-are calibrated as both families with a metric, and `prb.validation.compare_candidates` says which
+are calibrated as both families with a metric, and `prb.rank` says which
 predicts better. Counted are the data sets in which it names the right family, says that it cannot
 tell, and names the wrong one. z is the difference between right and wrong family, less its mean
 over all data sets, in units of the standard error that is stated: its standard deviation is one
@@ -95,7 +95,7 @@ def compared(optima: dict[str, prb.Optimum], data: Any, truth: str) -> tuple[flo
         family: replace(one, evaluator=one.evaluator.observing({"y": data}), identity=None)
         for family, one in optima.items()
     }
-    table = prb.validation.compare_candidates(anew, progressbar=False)
+    table = prb.rank(anew, progressbar=False)
     sign = 1.0 if table.candidate.values[0] == truth else -1.0
     other = table.isel(candidate=1)
     return sign * float(other["difference"]), float(other["stderr"]), bool(other["told_apart"])

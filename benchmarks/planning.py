@@ -140,7 +140,7 @@ def planned(problem: Problem, data: dict[str, Any]) -> Any:
         name: prb.decision.Condition(response, x) for name, response in problem.conditions.items()
     }
     quantity = prb.decision.Quantile(problem.decided, x, probability=problem.probability)
-    return prb.plan(posterior, candidates, [problem.more], model=model, quantity=quantity)
+    return prb.plan(posterior, candidates, k=[problem.more], model=model, quantity=quantity)
 
 
 def repetition(problem: Problem, seed: int) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def errors(repetitions: int) -> dict[str, Any]:
                     *(posterior, response, limit, *inputs),
                     model=model,
                     points=points,
-                    draws=DRAWS,
+                    n_draws=DRAWS,
                     random_seed=seed,
                 )
                 row = [p, float(table.probability), float(table.error)]
@@ -160,7 +160,7 @@ def coverage(data_sets: int) -> dict[str, Any]:
             500, chains=2, model=model, optimum=optimum, random_seed=seed, progressbar=False
         )
         for name, response, back in (("response", line, line), ("another", later, np.log)):
-            box = prb.decision.p_box(posterior, response, x, model=model, level=0.9)
+            box = prb.decision.p_box(posterior, response, x, model=model, prob=0.9)
             truth = ndtr((back(box.y.values) - TRUE_MU) / TRUE_SIGMA)
             inside = (box.lower <= truth) & (truth <= box.upper)
             held.setdefault(f"{name}/simultaneous", []).append(
@@ -174,7 +174,7 @@ def coverage(data_sets: int) -> dict[str, Any]:
             held.setdefault(f"{name}/pointwise", []).append(
                 float(inside.sel(band="pointwise").values[even].mean())
             )
-        table = prb.exceedance(posterior, line, limit, x, model=model, level=0.9)
+        table = prb.exceedance(posterior, line, limit, x, model=model, prob=0.9)
         held.setdefault("probability of 1e-3", []).append(bool(table.lower <= 1e-3 <= table.upper))
         if seed % 50 == 49:
             print(seed + 1, {key: np.mean(rows).round(3) for key, rows in held.items()}, flush=True)

@@ -331,7 +331,7 @@ def study():
     plan = prb.plan(
         posterior,
         candidates(inputs),
-        [10, 50],
+        k=[10, 50],
         model=model,
         quantity=quantity,
         target={"quantity": spread / 2},

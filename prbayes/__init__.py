@@ -1,100 +1,148 @@
 """Statistical model calibration in PyMC: optimiser and ABC on one model, with one metric."""
 
-from functools import cache
 from importlib import import_module
 from importlib.metadata import version
-from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from prbayes._public import *  # noqa: F403
+    from prbayes import datasets as datasets
+    from prbayes import decision as decision
+    from prbayes import metrics as metrics
+    from prbayes import plots as plots
+    from prbayes import posterior as posterior
+    from prbayes import propagation as propagation
+    from prbayes import reports as reports
+    from prbayes import response as response
+    from prbayes import surrogate as surrogate
+    from prbayes import validation as validation
+    from prbayes.decision.exceedance import exceedance as exceedance
+    from prbayes.decision.plan import plan as plan
+    from prbayes.decision.sensitivity import sensitivity as sensitivity
+    from prbayes.emulators.surrogate import Surrogate as Surrogate
+    from prbayes.metrics.area import AreaMetric as AreaMetric
+    from prbayes.metrics.base import Metric as Metric
+    from prbayes.metrics.correlation import MarginalCorrelation as MarginalCorrelation
+    from prbayes.metrics.custom import FunctionMetric as FunctionMetric
+    from prbayes.metrics.density import GaussianKDE as GaussianKDE
+    from prbayes.metrics.density import Histogram as Histogram
+    from prbayes.metrics.divergence import KullbackLeibler as KullbackLeibler
+    from prbayes.metrics.joint import Joint as Joint
+    from prbayes.metrics.likelihood import LogLikelihood as LogLikelihood
+    from prbayes.metrics.residual import ProbabilityResidual as ProbabilityResidual
+    from prbayes.model.cost import cost as cost
+    from prbayes.model.epsilon import set_epsilon as set_epsilon
+    from prbayes.model.pymc_distance import abc_distance as abc_distance
+    from prbayes.model.simulator import Simulator as Simulator
+    from prbayes.optimize.minimize import minimize as minimize
+    from prbayes.optimize.minimize import refine as refine
+    from prbayes.optimize.optimum import Optimum as Optimum
+    from prbayes.plots.comparison import plot_comparison as plot_comparison
+    from prbayes.plots.landscape import plot_landscape as plot_landscape
+    from prbayes.plots.optimizer import plot_optimizer as plot_optimizer
+    from prbayes.plots.outputs import plot_outputs as plot_outputs
+    from prbayes.plots.population import plot_population as plot_population
+    from prbayes.plots.posterior import plot_posterior as plot_posterior
+    from prbayes.plots.responses import plot_responses as plot_responses
+    from prbayes.plots.stages import plot_stages as plot_stages
+    from prbayes.plots.validity import plot_validity as plot_validity
+    from prbayes.posterior.bootstrap import bootstrap as bootstrap
+    from prbayes.posterior.epsilon import calibrate_epsilon as calibrate_epsilon
+    from prbayes.posterior.sample import sample as sample
+    from prbayes.posterior.sbc import simulation_based_calibration as simulation_based_calibration
+    from prbayes.posterior.smc import sample_smc as sample_smc
+    from prbayes.propagation.fresh import Fresh as Fresh
+    from prbayes.propagation.resimulated import Resimulated as Resimulated
+    from prbayes.propagation.reweighted import Reweighted as Reweighted
+    from prbayes.reports.document import Report as Report
+    from prbayes.response.call import scalar as scalar
+    from prbayes.response.command import command as command
+    from prbayes.response.fmu import fmu as fmu
+    from prbayes.response.umbridge import umbridge as umbridge
+    from prbayes.results.compare import compare as compare
+    from prbayes.results.diagnose import Diagnosis as Diagnosis
+    from prbayes.results.diagnose import diagnose as diagnose
+    from prbayes.results.predict import predict as predict
+    from prbayes.validation.area_test import area_test as area_test
+    from prbayes.validation.cross_validation import cross_validate as cross_validate
+    from prbayes.validation.model_comparison import rank as rank
 
 __version__ = version("prbayes")
 
-# Names of `_public`, each imported when it is asked for.
-__all__ = [  # noqa: F405
-    "AreaMetric",
-    "Diagnosis",
-    "Fresh",
-    "FunctionMetric",
-    "GaussianKDE",
-    "Histogram",
-    "Joint",
-    "KullbackLeibler",
-    "LogLikelihood",
-    "MarginalCorrelation",
-    "Metric",
-    "Optimum",
-    "ProbabilityResidual",
-    "Report",
-    "Resimulated",
-    "Reweighted",
-    "Simulator",
-    "Surrogate",
-    "abc_distance",
-    "area_test",
-    "bootstrap",
-    "calibrate_epsilon",
-    "command",
-    "compare",
-    "cost",
-    "cross_validate",
+# Public names by module; a module is imported when one of its names is used.
+_NAMES = {
+    "decision.exceedance": ("exceedance",),
+    "decision.plan": ("plan",),
+    "decision.sensitivity": ("sensitivity",),
+    "emulators.surrogate": ("Surrogate",),
+    "metrics.area": ("AreaMetric",),
+    "metrics.base": ("Metric",),
+    "metrics.correlation": ("MarginalCorrelation",),
+    "metrics.custom": ("FunctionMetric",),
+    "metrics.density": ("GaussianKDE", "Histogram"),
+    "metrics.divergence": ("KullbackLeibler",),
+    "metrics.joint": ("Joint",),
+    "metrics.likelihood": ("LogLikelihood",),
+    "metrics.residual": ("ProbabilityResidual",),
+    "model.cost": ("cost",),
+    "model.epsilon": ("set_epsilon",),
+    "model.pymc_distance": ("abc_distance",),
+    "model.simulator": ("Simulator",),
+    "optimize.minimize": ("minimize", "refine"),
+    "optimize.optimum": ("Optimum",),
+    "plots.comparison": ("plot_comparison",),
+    "plots.landscape": ("plot_landscape",),
+    "plots.optimizer": ("plot_optimizer",),
+    "plots.outputs": ("plot_outputs",),
+    "plots.population": ("plot_population",),
+    "plots.posterior": ("plot_posterior",),
+    "plots.responses": ("plot_responses",),
+    "plots.stages": ("plot_stages",),
+    "plots.validity": ("plot_validity",),
+    "posterior.bootstrap": ("bootstrap",),
+    "posterior.epsilon": ("calibrate_epsilon",),
+    "posterior.sample": ("sample",),
+    "posterior.sbc": ("simulation_based_calibration",),
+    "posterior.smc": ("sample_smc",),
+    "propagation.fresh": ("Fresh",),
+    "propagation.resimulated": ("Resimulated",),
+    "propagation.reweighted": ("Reweighted",),
+    "reports.document": ("Report",),
+    "response.call": ("scalar",),
+    "response.command": ("command",),
+    "response.fmu": ("fmu",),
+    "response.umbridge": ("umbridge",),
+    "results.compare": ("compare",),
+    "results.diagnose": ("Diagnosis", "diagnose"),
+    "results.predict": ("predict",),
+    "validation.area_test": ("area_test",),
+    "validation.cross_validation": ("cross_validate",),
+    "validation.model_comparison": ("rank",),
+}
+_NAMESPACES = (
     "datasets",
     "decision",
-    "diagnose",
-    "exceedance",
-    "fmu",
     "metrics",
-    "minimize",
-    "plan",
-    "plot_comparison",
-    "plot_landscape",
-    "plot_optimizer",
-    "plot_outputs",
-    "plot_population",
-    "plot_posterior",
-    "plot_responses",
-    "plot_stages",
-    "plot_validity",
     "plots",
     "posterior",
-    "predict",
     "propagation",
-    "refine",
     "reports",
     "response",
-    "sample",
-    "sample_smc",
-    "scalar",
-    "sensitivity",
-    "set_epsilon",
-    "simulation_based_calibration",
     "surrogate",
-    "umbridge",
     "validation",
-]
+)
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
+__all__ = sorted([*_MODULES, *_NAMESPACES])
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is asked for, and no module that it does not need."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = _modules()[name]
-    if module == __name__:
+    """Import a public name at its first use, and no module that it does not need."""
+    if name in _NAMESPACES:
         return import_module(f"{__name__}.{name}")
-    return getattr(import_module(module), name)
-
-
-@cache
-def _modules() -> dict[str, str]:
-    """Return the module of each public name, from the imports in the source of `_public`."""
-    import ast
-
-    tree = ast.parse(files(__name__).joinpath("_public.py").read_text(encoding="utf-8"))
-    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
-    return {alias.name: str(node.module) for node in imports for alias in node.names}
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    """Return what there is, for completion."""
+    """Return all names, for completion."""
     return [*globals(), *__all__]

@@ -57,11 +57,12 @@ LAYERS = (
     ("plots",),
     ("reports",),
     ("surrogate",),
-    ("_demo", "__main__", "_public"),
+    ("cli",),
+    ("__main__",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
-# Rooms of one floor that may import each other: the ground floor, and the command line's two files.
-TOGETHER = (set(_GROUND), {"_demo", "__main__"})
+# Rooms of one floor that may import each other.
+TOGETHER = (set(_GROUND),)
 CEILINGS = json.loads((ROOT / "tests" / "structure_ceilings.json").read_text(encoding="utf-8"))
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
@@ -247,11 +248,11 @@ SLOW = (
     "cross_validate",
     "minimize",
     "predict",
+    "rank",
     "refine",
     "sample",
     "sample_smc",
     "simulation_based_calibration",
-    "validation.compare_candidates",
 )
 SIGNATURES = {
     name: inspect.signature(value)
@@ -277,6 +278,45 @@ def test_public_functions_have_their_arguments_in_one_order() -> None:
     assert not violations
 
 
+# Words that say one thing each: those on the left are spelled as those on the right.
+ONE_WORD = {
+    "alpha": ("level", "size", "significance"),
+    "n_draws": ("num_draws",),
+    "n_samples": ("samples", "num_samples"),
+    "observed": ("measured", "data", "measurements"),
+    "prob": ("level", "coverage", "ci_prob", "hdi_prob"),
+    "random_seed": ("seed", "rng"),
+}
+# A section of a report has a heading of some level, and a title, a text and a table by position.
+OTHER_VOICE = {"reports.Section": {"level", "table"}}
+
+
+def test_arguments_speak_in_one_voice() -> None:
+    """One word for one thing, and options are keywords: at most one positional argument has a default."""
+    unwanted = {word for words in ONE_WORD.values() for word in words}
+    violations = []
+    for name, value in (PUBLIC | {"Surrogate.fit": prbayes.Surrogate.fit}).items():
+        if not callable(value) or name.split(".")[-1] in WITHOUT_EXAMPLE | {"Surrogate"}:
+            continue
+        parameters = inspect.signature(value).parameters
+        violations += [
+            f"{name}: {key}" for key in parameters.keys() & unwanted - OTHER_VOICE.get(name, set())
+        ]
+        positional = [
+            key
+            for key, p in parameters.items()
+            if p.kind is p.POSITIONAL_OR_KEYWORD and p.default is not p.empty
+        ]
+        violations += [
+            f"{name}: {key} is positional"
+            for key in positional[1:]
+            if key not in OTHER_VOICE.get(name, set())
+        ]
+        if "result" in parameters and next(iter(parameters)) != "result":
+            violations.append(f"{name}: result is not the first argument")
+    assert not violations
+
+
 def test_what_is_slow_has_a_progress_bar_that_can_be_left_out() -> None:
     with_bar = [name for name, s in SIGNATURES.items() if "progressbar" in s.parameters]
     assert sorted(with_bar) == list(SLOW)
@@ -290,8 +330,7 @@ def test_seeds_are_zero_by_default() -> None:
         if isinstance(value, type) and issubclass(value, Exception):
             continue
         parameters = inspect.signature(value).parameters
-        # The directions of a metric are part of what it is: no call of it is random.
-        assert "seed" not in parameters or name == "Joint"
+        assert "seed" not in parameters
         if "random_seed" in parameters:
             assert parameters["random_seed"].default == 0, name
 

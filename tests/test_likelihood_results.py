@@ -173,7 +173,7 @@ def test_area_test(problem: Problem, posterior: xr.DataTree) -> None:
 @pytest.mark.usefixtures("no_run")
 def test_exceedance(problem: Problem, optimum: prb.Optimum) -> None:
     limit = float(np.exp(0.5 * (optimum.point["mu"] + optimum.point["sigma"])))
-    risk = prb.exceedance(optimum, problem.growth, limit, problem.x, draws=200)
+    risk = prb.exceedance(optimum, problem.growth, limit, problem.x, n_draws=200)
     assert risk.attrs["responses"] == 0
     thetas = optimum.theta + norm.ppf(0.5 + np.zeros((1, 2)))  # the centre
     mu, sigma = thetas[0, 0], np.exp(thetas[0, 1])
@@ -186,7 +186,7 @@ def test_exceedance(problem: Problem, optimum: prb.Optimum) -> None:
 @pytest.mark.usefixtures("no_run")
 def test_sensitivity_and_plan(problem: Problem, posterior: xr.DataTree) -> None:
     mean = prb.decision.Mean(problem.growth, problem.x)
-    shares = prb.sensitivity(posterior, mean, model=problem.model, samples=128)
+    shares = prb.sensitivity(posterior, mean, model=problem.model, n_samples=128)
     assert float(shares["first"].sel(factor="mu")) > 0.5
     plan = prb.plan(
         posterior,
@@ -405,11 +405,8 @@ def test_cost_before_and_after(problem: Problem, optimum: prb.Optimum) -> None:
     before = prb.cost(fresh.model)
     assert fresh.growth.runs == 0
     assert before.runs == 128
-    assert "128 to compute" in str(before)
-    assert prb.cost(lambda: build(data)).runs == 128
-    tried = prb.cost(fresh.model, dry_run=True)
-    assert fresh.growth.runs == 1
-    assert tried.seconds > 0
+    assert "128 runs, 0 of them computed" in str(before)
+    assert prb.cost(lambda: build(data).model).runs == 128
     assert prb.cost(problem.model).runs == 0
 
 
@@ -423,8 +420,8 @@ def test_plots(problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree) -
         prb.plot_population(optimum, **look),
         prb.plot_population(posterior, model=problem.model, **look),
         prb.plot_responses(optimum, **look),
-        prb.plot_responses(posterior, model=problem.model, draws=20, **look),
-        prb.plot_posterior(posterior, optimum, model=problem.model, **look),
+        prb.plot_responses(posterior, model=problem.model, n_draws=20, **look),
+        prb.plot_posterior(posterior, optimum=optimum, model=problem.model, **look),
         prb.plot_optimizer(optimum, **look),
         prb.plot_stages(posterior, **look),
         prb.plot_comparison(prb.compare({"a": optimum, "b": posterior}), **look),

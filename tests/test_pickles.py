@@ -62,10 +62,10 @@ MAKE: dict[str, Callable[[], Any]] = {
     "FunctionMetric": lambda: prb.FunctionMetric(np.mean),
     "GaussianKDE": lambda: prb.GaussianKDE(0.3),
     "Histogram": lambda: prb.Histogram(9),
-    "Joint": lambda: prb.Joint(prb.KullbackLeibler(), 5),
+    "Joint": lambda: prb.Joint(prb.KullbackLeibler(), directions=5),
     "KullbackLeibler": prb.KullbackLeibler,
     "LogLikelihood": lambda: prb.LogLikelihood(density=prb.GaussianKDE()),
-    "MarginalCorrelation": lambda: prb.MarginalCorrelation(prb.AreaMetric(), (1.0, 2.0)),
+    "MarginalCorrelation": lambda: prb.MarginalCorrelation(prb.AreaMetric(), weights=(1.0, 2.0)),
     "Metric": lambda: prb.ProbabilityResidual(density=prb.Histogram(4)),
     "Optimum": optimum,
     "ProbabilityResidual": prb.ProbabilityResidual,
@@ -85,7 +85,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "response.Abort": prb.response.Abort,
     "response.Additive": lambda: prb.response.Additive([20.0, 1000.0]),
     "response.BudgetError": lambda: prb.response.BudgetError("max_seconds = 1 was reached"),
-    "response.Cost": lambda: prb.cost(optimum().model, dry_run=True),
+    "response.Cost": lambda: prb.cost(optimum().model),
     "response.Multiplicative": lambda: prb.response.Multiplicative([20.0, 1000.0]),
     "response.Replace": lambda: prb.response.Replace(1.0),
     "response.ResponseError": lambda: prb.response.ResponseError("y: it raised"),
@@ -120,9 +120,7 @@ RESULTS: dict[str, Callable[[], Any]] = {
     "bootstrap": lambda: prb.bootstrap(optimum(), 10, **QUIET),
     "compare": lambda: prb.compare({"optimum": optimum(), "ABC": posterior()}),
     "cross_validate": lambda: prb.cross_validate(optimum(), **QUIET),
-    "compare_candidates": lambda: prb.validation.compare_candidates(
-        {"a": optimum(), "b": optimum()}, **QUIET
-    ),
+    "rank": lambda: prb.rank({"a": optimum(), "b": optimum()}, **QUIET),
     "sampling": lambda: optimum().sampling(),
     "to_datatree": lambda: optimum().to_datatree(),
 }
@@ -150,6 +148,6 @@ def test_functions_travel_by_their_names() -> None:
 
 
 def test_a_store_travels_without_what_it_has_open(tmp_path: Any) -> None:
-    store = prb.response.Store(tmp_path, "y", 1)
+    store = prb.response.Store(tmp_path, "y", columns=1)
     store.add(np.array([[1.0]]), np.array([2.0]))
     assert len(pickle.loads(pickle.dumps(store))) == 1

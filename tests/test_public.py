@@ -1,12 +1,13 @@
-"""The package loads what users type when the first of it is asked for."""
+"""The package loads a public name when it is used, and type checkers know all of them."""
 
+import ast
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import prbayes as prb
-from prbayes import _public
 
 
 @pytest.mark.long
@@ -31,6 +32,16 @@ def test_what_there_is_not_is_told_by_the_package_s_own_name() -> None:
     assert not hasattr(prb, "Nothing")
 
 
-def test_all_names_that_are_loaded_are_public_and_no_others() -> None:
-    loaded = {name for name in vars(_public) if not name.startswith("_")}
-    assert loaded == set(prb.__all__)
+def test_type_checkers_see_the_names_of_the_table() -> None:
+    tree = ast.parse(Path(str(prb.__file__)).read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    imports = {
+        alias.name: str(node.module)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert set(imports) == set(prb.__all__)
+    for name, module in imports.items():
+        if module != "prbayes":
+            assert getattr(prb, name).__module__ == module

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,7 @@ class GaussianProcess(Surface):
     """
 
     kernel: str = "squared_exponential"
+    _: KW_ONLY
     lengths: tuple[float, ...] | None = None
     nugget: float | None = None
 
@@ -132,7 +133,7 @@ class GaussianProcess(Surface):
                 best = found
         assert best is not None
         *lengths, nugget = np.exp(best.x).tolist()
-        return GaussianProcess(self.kernel, tuple(lengths), nugget)
+        return GaussianProcess(self.kernel, lengths=tuple(lengths), nugget=nugget)
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the mean of the process given the points."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from itertools import product
 from math import comb
 from typing import Any
@@ -116,6 +116,7 @@ class RadialBasis(Surface):
     """
 
     kernel: str = "cubic"
+    _: KW_ONLY
     degree: int | None = None
     smoothing: float = 0.0
 

@@ -30,7 +30,8 @@ from prbayes.emulators.multifidelity import Followed, Following, followed
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.numerics.points import sobol
-from prbayes.response.call import Calling, Points, Tally, compute, respond
+from prbayes.response.call import Points, compute
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
@@ -126,7 +127,7 @@ class Surrogate:
         coarse: Callable[..., Any] | None = None,
         outside: OnFailure | None = None,
         points: str = "even",
-        coverage: float = 0.999,
+        prob: float = 0.999,
         name: str = "surrogate",
         executor: Executor | None = None,
         store: str | PathLike[str] | None = None,
@@ -149,7 +150,7 @@ class Surrogate:
         inputs : mapping or sequence
             One entry per argument of the response, in its order, by name if you like: ``(low,
             high)``, in the input's own units; a ``.dist()`` or a variable of the model on the
-            context, which covers the central ``coverage`` of its prior predictive distribution; or
+            context, which covers the central ``prob`` of its prior predictive distribution; or
             a number, which stays as it is.
         n : int
             Number of design points. With the same seed those of a smaller n are among them.
@@ -171,7 +172,7 @@ class Surrogate:
         points : {"even", "predictive"}
             Where the design is: evenly in all ranges, or each input by its own prior predictive
             distribution, inside its range; those that are given as a range evenly.
-        coverage : float
+        prob : float
         name : str
             For messages, and of the store.
         executor, store, version, on_failure, retry_failed
@@ -205,9 +206,9 @@ class Surrogate:
         _refuse_wrong(name, response, model, outside, points)
         refuse_calling(executor, store, version, policy)
         flag(retry_failed, f"{name}: retry_failed")
-        share(coverage, f"{name}: coverage")
+        share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
-        domain, predictive = read_ranges(name, inputs, coverage, seed)
+        domain, predictive = read_ranges(name, inputs, prob, seed)
         refuse_misfit(name, response, lambda: [one.size for one in domain.inputs], None)
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
@@ -216,7 +217,9 @@ class Surrogate:
         design = _designed(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
         # First, as what is wrong with it then costs no run.
         beside = None if coarse is None else _first_coarse(name, coarse, domain, design)
-        kept = None if store is None else Store(store, name, design.shape[1], version=version)
+        kept = (
+            None if store is None else Store(store, name, columns=design.shape[1], version=version)
+        )
         calling = Calling(name, response, executor, kept, policy, retry_failed, outputs=None)
         tally = Tally()
         at = Points(domain.arguments(design), domain.varying)
@@ -604,10 +607,10 @@ def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
     keys, values = store.known()
     if values.ndim == 1:
         return
-    usable = np.flatnonzero(_usable(values) & points.with_same_constants(keys))[:1]
+    usable = np.flatnonzero(_usable(values) & points.have_same_constants(keys))[:1]
     if not usable.size:
         return
-    (again,) = respond(replace(calling, store=None), points.read(keys[usable]), tally)
+    (again,) = respond(replace(calling, store=None), points.from_keys(keys[usable]), tally)
     (stored,) = values[usable]
     moved = np.allclose(np.sort(again), np.sort(stored)) and not np.allclose(again, stored)
     if tally.named is not None and moved:

@@ -164,6 +164,6 @@ def of_another_family(probability: float) -> list[str]:
         f"the data are farther from the best population than {1 - probability:.1%} or more of data "
         "sets that the model draws there are from theirs: the inputs probably have another family, "
         "or the response an error; look at prb.plot_responses, at outliers, and at other families, "
-        "by prb.validation.compare_candidates"
+        "by prb.rank"
         f"{more_in('choosing_metric.md#a-wrong-family')}"
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -66,6 +66,7 @@ class MarginalCorrelation(LiftedMetric):
     True
     """
 
+    _: KW_ONLY
     weights: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:

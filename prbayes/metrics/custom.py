@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -41,6 +41,7 @@ class FunctionMetric(Metric):
     """
 
     function: Callable[..., Any]
+    _: KW_ONLY
     weighted: bool = False
     symbolic: ClassVar[bool] = False
 

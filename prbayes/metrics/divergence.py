@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
 from prbayes._validate import Floats, flag
@@ -48,6 +48,7 @@ class KullbackLeibler(Metric):
     """
 
     density: DensityEstimator = field(default_factory=GaussianKDE)
+    _: KW_ONLY
     reverse: bool = False
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     counts_failures: ClassVar[bool] = True

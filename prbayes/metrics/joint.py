@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ class Joint(LiftedMetric):
         More than eight outputs, such as curves, are replaced by their scores on principal
         components of data and design together: as many as leave out a hundredth of the variance of
         either. Fewer outputs are if a number is given. All are then to be in one unit.
-    seed : int
+    random_seed : int
         Of the directions; those of two outputs do without.
 
     Notes
@@ -91,9 +91,10 @@ class Joint(LiftedMetric):
     True
     """
 
+    _: KW_ONLY
     directions: int | None = None
     components: int | None = None
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,7 +102,7 @@ class Joint(LiftedMetric):
             positive_integer(self.directions, "directions")
         if self.components is not None:
             positive_integer(self.components, "components")
-        positive_integer(self.seed, "seed", minimum=0)
+        positive_integer(self.random_seed, "random_seed", minimum=0)
 
     def beside(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
         """Return the discrepancy with principal components of data and design together.
@@ -140,7 +141,7 @@ class Joint(LiftedMetric):
             which = ""
             if outputs.size < observed.shape[1]:
                 which = f" of outputs {', '.join(map(str, outputs.tolist()))}"
-            for k, direction in enumerate(directions(m, number, self.seed)):
+            for k, direction in enumerate(directions(m, number, self.random_seed)):
                 view = Projection(centered, white.axes @ direction)
                 values, index = view.observed_of(observed)
                 target = self.metric.against(values, weights[index])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -57,6 +57,7 @@ class ProbabilityResidual(Metric):
     """
 
     density: DensityEstimator = field(default_factory=GaussianKDE)
+    _: KW_ONLY
     scale_base: float = 100.0
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     counts_failures: ClassVar[bool] = True

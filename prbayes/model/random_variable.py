@@ -46,8 +46,8 @@ from prbayes.model.first_look import tell_far_data
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
+from prbayes.response.budget import duration
 from prbayes.response.compile import PLAIN
-from prbayes.response.costs import in_words
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import ONE, Outputs
 from prbayes.response.response import Responses
@@ -266,8 +266,8 @@ def _log_first_runs(
     propagation: Propagation, responses: Responses, runs: int, seconds: float
 ) -> None:
     """Log how many runs there are, and how long they take, from the time of one run, or NaN."""
-    demand = propagation.demand
-    if demand.each and np.isnan(seconds):
+    cost = propagation.cost
+    if cost.each and np.isnan(seconds):
         return  # known after the first call
     responses.on_start = None
 
@@ -275,7 +275,7 @@ def _log_first_runs(
         total = ceil(number / responses.workers) * seconds
         if not number or np.isnan(total):
             return str(number)
-        return f"{number}, {f'about {in_words(total)}' if total >= 1 else 'less than 1 s'}"
+        return f"{number}, {f'about {duration(total)}' if total >= 1 else 'less than 1 s'}"
 
     setting = type(propagation).__name__
     if hasattr(propagation, "n"):
@@ -285,9 +285,9 @@ def _log_first_runs(
         "another number in propagation=%s; more: %s",
         responses.name,
         with_duration(runs),
-        with_duration(demand.each),
+        with_duration(cost.each),
         setting,
-        demand.decides,
+        cost.growth,
     )
 
 

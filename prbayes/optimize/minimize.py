@@ -89,8 +89,8 @@ _log = logging.getLogger("prbayes")
 @in_turn
 def refine(
     model: pm.Model | None = None,
-    thetas: Floats | None = None,
     *,
+    thetas: Floats | None = None,
     max_seconds: float | None = None,
     max_runs: int | None = None,
     progressbar: bool = True,

@@ -98,15 +98,15 @@ def distribution_functions(values: Floats, weights: Floats, grid: Floats) -> Flo
     return np.ascontiguousarray(distribution_function(values, weights, grid))
 
 
-def pointwise_band(curves: Floats, level: float) -> tuple[Floats, Floats]:
-    """Return the sides between which the share ``level`` of curves, (P, g), lies at each point."""
-    low, high = np.quantile(curves, central_levels(level), axis=0)
+def pointwise_band(curves: Floats, prob: float) -> tuple[Floats, Floats]:
+    """Return the sides between which the share ``prob`` of curves, (P, g), lies at each point."""
+    low, high = np.quantile(curves, central_levels(prob), axis=0)
     return low, high
 
 
-def central_levels(level: float) -> tuple[float, float]:
-    """Return the levels of the two quantiles that hold the share ``level`` between them."""
-    return (1 - level) / 2, (1 + level) / 2
+def central_levels(prob: float) -> tuple[float, float]:
+    """Return the levels of the two quantiles that hold the share ``prob`` between them."""
+    return (1 - prob) / 2, (1 + prob) / 2
 
 
 def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, float]:

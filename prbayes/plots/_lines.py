@@ -97,7 +97,7 @@ def draw_lines(
     shown: Ensemble,
     after: Floats,
     before: Floats | None,
-    level: float,
+    prob: float,
     what: str,
 ) -> Limits:
     """Draw measured lines, and the median and most of the population; return what the axis covers.
@@ -110,7 +110,7 @@ def draw_lines(
     after : ndarray, shape (P, 3, m)
         Quantiles at `LEVELS` of the populations of ``shown.every``.
     before : ndarray, shape (3, m), or None
-    level : float
+    prob : float
         Share of the populations within the band of the median.
     what : str
         What is before.
@@ -122,7 +122,7 @@ def draw_lines(
 
     # Where the specimens of a line have failed it leaves the picture
     of_populations = _cut(of_populations, ylim)
-    lower, median, upper = (calibrated(of_populations[:, i], shown, level) for i in range(3))
+    lower, median, upper = (calibrated(of_populations[:, i], shown, prob) for i in range(3))
     x = axis.x
     text = f"{INTERVAL:.0%} of the calibrated population"
     panel.band("population", x, (lower.middle, upper.middle), BLUE, alpha=0.25, legend=text)
@@ -132,7 +132,7 @@ def draw_lines(
         at, y = _one_line(x, _cut(earlier, ylim))
         panel.line("before", at, y, VERMILION, style=DASHED, legend=f"before: {what}")
     if median.band is not None:
-        text = f"{level:.0%} band of the {shown.spread}"
+        text = f"{prob:.0%} band of the {shown.spread}"
         panel.band("band", x, median.band, BLUE, alpha=0.55, legend=text)
     text = f"median, calibrated: {shown.label}"
     panel.line("after", x, median.middle, BLUE, width=2.2, legend=text)

@@ -27,7 +27,7 @@ class Calibrated:
         return max(top, float(upper.max()))
 
 
-def calibrated(curves: Floats, shown: Ensemble, level: float) -> Calibrated:
+def calibrated(curves: Floats, shown: Ensemble, prob: float) -> Calibrated:
     """Return the optimum's curve, or else the mean of the posterior's, and the band of the others.
 
     Parameters
@@ -35,22 +35,22 @@ def calibrated(curves: Floats, shown: Ensemble, level: float) -> Calibrated:
     curves : ndarray, shape (P, g)
         Of ``shown.every``: the first is the optimum's, if there is one.
     shown : Ensemble
-    level : float
+    prob : float
         Share of the curves within the band, at each point.
     """
     count = len(shown.center)
     others = curves[count:]
     middle = curves[0] if count else others.mean(axis=0)
-    band = pointwise_band(others, level) if len(others) else None
+    band = pointwise_band(others, prob) if len(others) else None
     return Calibrated(middle, band)
 
 
 def draw_calibrated(
-    panel: Panel, grid: Floats, found: Calibrated, shown: Ensemble, level: float
+    panel: Panel, grid: Floats, found: Calibrated, shown: Ensemble, prob: float
 ) -> None:
     """Draw the calibrated curve in its band."""
     if found.band is not None:
-        text = f"{level:.0%} band of the {shown.spread}"
+        text = f"{prob:.0%} band of the {shown.spread}"
         panel.band("band", grid, found.band, BLUE, legend=text)
     text = f"calibrated: {shown.label}"
     panel.line("after", grid, found.middle, BLUE, width=2.2, legend=text)

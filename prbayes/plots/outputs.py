@@ -44,7 +44,7 @@ def plot_outputs(
     simulator: str | None = None,
     outputs: Sequence[Any] | None = None,
     before: Mapping[str, Any] | bool | None = None,
-    draws: int | None = None,
+    n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
     backend: str | None = None,
     **pc_kwargs: Any,
@@ -69,7 +69,7 @@ def plot_outputs(
         names; by default all that vary, but of more than five four, from the first to the last.
     before : dict or bool, optional
         As in `plot_responses`.
-    draws : int, optional
+    n_draws : int, optional
         Number of populations of a posterior; 200 where they cost no response (`Reweighted`), 40
         elsewhere, where each costs n responses.
     labels : mapping, optional
@@ -118,9 +118,9 @@ def plot_outputs(
     ['life, load']
     """
     refuse_look(labels, backend, pc_kwargs)
-    if draws is not None:
-        positive_integer(draws, "draws")
-    shown = read_result(result, model, "prb.plot_outputs", draws)
+    if n_draws is not None:
+        positive_integer(n_draws, "n_draws")
+    shown = read_result(result, model, "prb.plot_outputs", n_draws)
     evaluator = shown.evaluator
     start, what = read_before(result, evaluator, before)
     k = _simulator(evaluator, simulator)

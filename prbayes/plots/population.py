@@ -32,8 +32,8 @@ def plot_population(
     *,
     model: pm.Model | None = None,
     inputs: Sequence[Any] | None = None,
-    level: float = 0.89,
-    draws: int | None = None,
+    prob: float = 0.89,
+    n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
     backend: str | None = None,
     **pc_kwargs: Any,
@@ -42,10 +42,10 @@ def plot_population(
 
     Of a multivariate input each margin has a panel, and so has each pair of its first three
     elements: outlines of the smallest regions that hold half of the population, and the share
-    ``level``.
+    ``prob``.
 
     The curve is the posterior predictive density of the input, or its density at the optimum; the
-    band holds the share ``level`` of the densities at each value. It computes no response.
+    band holds the share ``prob`` of the densities at each value. It computes no response.
 
     Parameters
     ----------
@@ -56,8 +56,8 @@ def plot_population(
     inputs : sequence, optional
         Names, or ``.dist()`` objects; all by default. An input is called as the response's argument
         that takes it.
-    level : float
-    draws : int, optional
+    prob : float
+    n_draws : int, optional
         Number of populations in the band; 200 by default.
     labels : mapping, optional
         What a reader calls an input, by its name, with units.
@@ -90,10 +90,10 @@ def plot_population(
     ['load']
     """
     refuse_look(labels, backend, pc_kwargs)
-    if draws is not None:
-        positive_integer(draws, "draws")
-    share(level, "level")
-    shown = read_result(result, model, "prb.plot_population", draws, free=True)
+    if n_draws is not None:
+        positive_integer(n_draws, "n_draws")
+    share(prob, "prob")
+    shown = read_result(result, model, "prb.plot_population", n_draws, free=True)
     wanted = chosen(margins(shown.evaluator), inputs)
     found = margin_densities(shown.evaluator, wanted, shown.every)
     names = [margin.name for margin in wanted]
@@ -104,13 +104,13 @@ def plot_population(
     for margin in wanted:
         panel = canvas.panel(margin.name)
         grid, curves = found[margin.name]
-        after = calibrated(curves, shown, level)
-        draw_calibrated(panel, grid, after, shown, level)
+        after = calibrated(curves, shown, prob)
+        draw_calibrated(panel, grid, after, shown, prob)
         y = "probability" if margin.discrete else "density"
         panel.axes(x=named(margin.name, labels), y=y)
     for name, (x, other) in pairs.items():
         panel = canvas.panel(name)
-        correlation = _draw_pair(panel, shown, x, other, level)
+        correlation = _draw_pair(panel, shown, x, other, prob)
         panel.axes(
             x=named(x.name, labels),
             y=named(other.name, labels),
@@ -132,7 +132,7 @@ def _pairs(wanted: list[Margin]) -> dict[str, tuple[Margin, Margin]]:
     return found
 
 
-def _draw_pair(panel: Panel, shown: Ensemble, x: Margin, y: Margin, level: float) -> float:
+def _draw_pair(panel: Panel, shown: Ensemble, x: Margin, y: Margin, prob: float) -> float:
     """Draw the outlines of regions of a population, the posterior's mixture of them, or one.
 
     Return the correlation within it.
@@ -147,7 +147,7 @@ def _draw_pair(panel: Panel, shown: Ensemble, x: Margin, y: Margin, level: float
     points = np.column_stack([values[(..., *margin.index)].ravel() for margin in (x, y)])
     points = points[np.isfinite(points).all(axis=1)]
     weights = np.full(len(points), 1 / len(points))
-    drawn = {"half": (0.5, DASHED), "region": (level, SOLID)}
+    drawn = {"half": (0.5, DASHED), "region": (prob, SOLID)}
     lines = outlines(points, weights, tuple(held for held, _ in drawn.values()))
     for (visual, (held, style)), line in zip(drawn.items(), lines, strict=True):
         across, up = line

@@ -42,11 +42,11 @@ from prbayes.plots._ticks import round_ticks
 
 def plot_posterior(
     posterior: xr.DataTree,
-    optimum: Optimum | None = None,
     *,
+    optimum: Optimum | None = None,
     model: pm.Model | None = None,
     var_names: Sequence[str] | None = None,
-    level: float = 0.89,
+    prob: float = 0.89,
     labels: Mapping[str, str] | None = None,
     backend: str | None = None,
     **pc_kwargs: Any,
@@ -68,7 +68,7 @@ def plot_posterior(
         their prior; by default all variables that posterior and optimum share.
     var_names : sequence of str, optional
         Variables that are drawn, or elements of them, such as ``"mu[Adler]"``; all by default.
-    level : float
+    prob : float
         Probability of the intervals.
     labels : mapping, optional
         What a reader calls a hyperparameter, by its name, with units.
@@ -102,19 +102,20 @@ def plot_posterior(
     ...     posterior = prb.sample_smc(
     ...         100, chains=2, optimum=optimum, random_seed=1, progressbar=False
     ...     )
-    >>> list(prb.plot_posterior(posterior, optimum, model=model, backend="none").viz["posterior"])
+    >>> pc = prb.plot_posterior(posterior, optimum=optimum, model=model, backend="none")
+    >>> list(pc.viz["posterior"])
     ['mu']
     """
     refuse_look(labels, backend, pc_kwargs)
     _check_results(posterior, optimum, model)
-    share(level, "level")
+    share(prob, "prob")
     found = _wanted(_read_hyperparameters(posterior, optimum, model), var_names)
     evaluator = None if model is None else Evaluator(model)
     refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
     canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
     for name, hyperparameter in found.items():
         panel = canvas.panel(name)
-        top = _draw(panel, hyperparameter, level)
+        top = _draw(panel, hyperparameter, prob)
         x = named(name, labels)
         panel.axes(x=x, y="density", yticks=round_ticks(0.0, top))
     return canvas.finish()
@@ -216,7 +217,7 @@ def _read_hyperparameters(
     return found
 
 
-def _draw(panel: Panel, hyperparameter: _Hyperparameter, level: float) -> float:
+def _draw(panel: Panel, hyperparameter: _Hyperparameter, prob: float) -> float:
     """Draw densities, and the intervals below them; return how high the posterior reaches."""
     draws = hyperparameter.draws
     best = hyperparameter.best
@@ -231,16 +232,16 @@ def _draw(panel: Panel, hyperparameter: _Hyperparameter, level: float) -> float:
         panel.line("prior", grid, y, GREY, style=DOTTED, legend="prior")
 
     panel.line("posterior", grid, density, BLUE, width=2.2, legend="posterior")
-    interval = np.quantile(draws, central_levels(level))
+    interval = np.quantile(draws, central_levels(prob))
     row = np.repeat(posterior_row, 2)
-    text = f"{level:.0%} intervals"
+    text = f"{prob:.0%} intervals"
     panel.line("interval", interval, row, BLUE, width=3, legend=text)
     mean = draws.mean()
     panel.points("mean", mean, posterior_row, BLUE, size=90, legend="posterior mean")
 
     if best is not None:
         if hyperparameter.error is not None:
-            _draw_normal(panel, grid, best, hyperparameter.error, level, optimum_row)
+            _draw_normal(panel, grid, best, hyperparameter.error, prob, optimum_row)
         panel.points(
             "optimum",
             best,
@@ -254,11 +255,11 @@ def _draw(panel: Panel, hyperparameter: _Hyperparameter, level: float) -> float:
 
 
 def _draw_normal(
-    panel: Panel, grid: Floats, best: float, error: float, level: float, row: float
+    panel: Panel, grid: Floats, best: float, error: float, prob: float, row: float
 ) -> None:
     """Draw the normal distribution of the optimum's standard error, and its interval."""
     normal = norm(best, error)
     text = "normal with the optimum's standard error"
     panel.line("normal", grid, normal.pdf(grid), VERMILION, style=DASHED, legend=text)
-    ends = normal.ppf(central_levels(level))
+    ends = normal.ppf(central_levels(prob))
     panel.line("stderr", ends, np.repeat(row, 2), VERMILION, width=3)

@@ -20,14 +20,14 @@ from prbayes.plots._curves import (
     staircase,
 )
 from prbayes.plots._names import named, refuse_labels
-from prbayes.validation.measured_vs_predicted import Comparable, comparables
+from prbayes.validation.conditions import Comparable, comparables
 
 
 def plot_prediction(
-    measured: Any,
+    observed: Any,
     predicted: xr.DataArray | Mapping[str, xr.DataArray],
     *,
-    level: float = INTERVAL,
+    prob: float = INTERVAL,
     labels: Mapping[str, str] | None = None,
     backend: str | None = None,
     **pc_kwargs: Any,
@@ -35,17 +35,17 @@ def plot_prediction(
     """Draw the distribution functions of measured responses and of what was predicted of them.
 
     The steps are those of the measured values; the curve is the predicted distribution of all
-    populations together, and the band holds the share ``level`` of the populations at each
+    populations together, and the band holds the share ``prob`` of the populations at each
     response. Steps that leave the band over a long stretch are what `area_test` tests. Specimens
     that failed (+inf) are what the steps lack of one at the right.
 
     Parameters
     ----------
-    measured : array_like, shape (n,) or (n, m), or a mapping of such
+    observed : array_like, shape (n,) or (n, m), or a mapping of such
         Of specimens that were not used in the calibration; by condition, if by name.
     predicted : xarray.DataArray, or a mapping of such
         From `predict`: dims (chain, draw, sample), and one of outputs; by the same names.
-    level : float
+    prob : float
         Share of the populations in the band.
     labels : mapping, optional
         What a reader calls a condition or an output, by its name, with units.
@@ -78,14 +78,14 @@ def plot_prediction(
     ['later']
     """
     refuse_look(labels, backend, pc_kwargs)
-    level = share(level, "level")
-    found = comparables(measured, predicted, "plot_prediction")
+    prob = share(prob, "prob")
+    found = comparables(observed, predicted, "plot_prediction")
     names = [one.name for one in found]
     refuse_labels(labels, names)
     canvas = Canvas(names, size=(5.0, 3.9), backend=backend, pc_kwargs=pc_kwargs)
     for one in found:
         panel = canvas.panel(one.name)
-        _draw(panel, _Distributions.of(one), level)
+        _draw(panel, _Distributions.of(one), prob)
         failed = np.count_nonzero(np.isinf(one.measured))
         title = f"{one.measured.size} measured values" + (f", {failed} failed" if failed else "")
         panel.axes(x=named(one.name, labels), y="share of specimens", title=title)
@@ -115,11 +115,11 @@ class _Distributions:
         return cls(grid, curves, staircase(one.measured, equal, grid[0], grid[-1]))
 
 
-def _draw(panel: Panel, found: _Distributions, level: float) -> None:
+def _draw(panel: Panel, found: _Distributions, prob: float) -> None:
     """Draw the band and the curve of what was predicted, and the steps of what was measured."""
     if len(found.of_populations) > 1:
-        band = pointwise_band(found.of_populations, level)
-        text = f"{level:.0%} of the populations"
+        band = pointwise_band(found.of_populations, prob)
+        text = f"{prob:.0%} of the populations"
         panel.band("band", found.grid, band, BLUE, legend=text)
     middle = found.of_populations.mean(axis=0)
     panel.line("predicted", found.grid, middle, BLUE, width=2.2, legend="predicted")

@@ -40,8 +40,8 @@ def plot_responses(
     model: pm.Model | None = None,
     before: Mapping[str, Any] | bool | None = None,
     ecdf: bool = False,
-    level: float = 0.89,
-    draws: int | None = None,
+    prob: float = 0.89,
+    n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
     backend: str | None = None,
     **pc_kwargs: Any,
@@ -50,7 +50,7 @@ def plot_responses(
 
     Measured responses are a histogram, in outline, with a mark for each, or steps. The calibrated
     curve is the posterior predictive distribution, or the optimum's population. The band holds the
-    share ``level`` of the populations at each response: those of the posterior's draws, or of the
+    share ``prob`` of the populations at each response: those of the posterior's draws, or of the
     optimum's sampling distribution where it is known.
 
     Of several outputs each has a panel, with those that were measured. A curve, of which the
@@ -72,8 +72,8 @@ def plot_responses(
     ecdf : bool
         Draw distribution functions, which need no bandwidth, in place of densities; of no effect
         on lines.
-    level : float
-    draws : int, optional
+    prob : float
+    n_draws : int, optional
         Number of populations in the band; 200 where they cost no response (`Reweighted`), 40
         elsewhere, where each costs n responses per simulator.
     labels : mapping, optional
@@ -118,10 +118,10 @@ def plot_responses(
     """
     refuse_look(labels, backend, pc_kwargs)
     flag(ecdf, "ecdf")
-    if draws is not None:
-        positive_integer(draws, "draws")
-    share(level, "level")
-    shown = read_result(result, model, "prb.plot_responses", draws)
+    if n_draws is not None:
+        positive_integer(n_draws, "n_draws")
+    share(prob, "prob")
+    shown = read_result(result, model, "prb.plot_responses", n_draws)
     start, what = read_before(result, shown.evaluator, before)
     if len(start) and not supported(shown.evaluator, start)[0]:
         _log.warning(
@@ -135,7 +135,7 @@ def plot_responses(
     lines = any(in_one_panel(node.outputs) for node in shown.evaluator.simulators)
     size = (7.2, 4.8) if lines else (5.4, 4.2)
     canvas = Canvas(names, size=size, backend=backend, pc_kwargs=pc_kwargs)
-    drawing = _Drawing(shown, what, level, labels, ecdf=ecdf)
+    drawing = _Drawing(shown, what, prob, labels, ecdf=ecdf)
     covered: dict[str, tuple[float, float]] = {}
     drawn = []
     for k, panels in enumerate(by_simulator):
@@ -164,7 +164,7 @@ class _Drawing:
 
     shown: Ensemble
     what: str  # is before
-    level: float
+    prob: float
     labels: Mapping[str, str] | None
     ecdf: bool
 
@@ -181,7 +181,7 @@ class _Drawing:
         grid = np.linspace(*covered, GRID_POINTS)
 
         curves = after.curves(grid, ecdf=self.ecdf)
-        found = calibrated(curves, self.shown, self.level)
+        found = calibrated(curves, self.shown, self.prob)
         data_top = _draw_measured(panel, observed, weights, covered, ecdf=self.ecdf)
         ylim = None
         if earlier is not None:
@@ -189,7 +189,7 @@ class _Drawing:
             text = f"before: {self.what}"
             panel.line("before", grid, y, VERMILION, style=DASHED, legend=text)
             ylim = _cut(y, max(data_top, found.top))
-        draw_calibrated(panel, grid, found, self.shown, self.level)
+        draw_calibrated(panel, grid, found, self.shown, self.prob)
         failed = np.count_nonzero(np.isinf(observed))
         panel.axes(
             x=output.text(self.labels),
@@ -208,7 +208,7 @@ class _Drawing:
         if earlier is not None:
             (start,) = quantiles(earlier.values, earlier.weights, LEVELS)
         found = quantiles(after.values, after.weights, LEVELS)
-        ylim = draw_lines(panel, axis, self.shown, found, start, self.level, self.what)
+        ylim = draw_lines(panel, axis, self.shown, found, start, self.prob, self.what)
         observed = output.node.observed
         incomplete = np.count_nonzero(np.isnan(observed).any(axis=1))
         failed = np.count_nonzero(np.isinf(observed).any(axis=1))

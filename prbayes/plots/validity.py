@@ -35,7 +35,7 @@ def plot_validity(
     """Draw the ECDF of the u-values against the identity, the area between them, the verdict.
 
     The shaded area is the statistic. The title has the critical value and the verdict; the band
-    holds the whole ECDF with probability 1 - level if the null is true, calibration uncertainty
+    holds the whole ECDF with probability 1 - alpha if the null is true, calibration uncertainty
     included.
 
     Of several outputs there is a thin line for each direction in which they are seen, dotted ones
@@ -167,7 +167,7 @@ def _title(name: str, test: ValidityTest) -> str:
     if name:
         first = f"{name}, p = {test.p_value:.2g}"
     else:
-        first = f"p = {test.p_value:.2g}, level {test.level:.0%}"
+        first = f"p = {test.p_value:.2g}, level {test.alpha:.0%}"
     sign, verdict = "<", "not rejected"
     if test.rejected:
         sign, verdict = ">", "rejected"

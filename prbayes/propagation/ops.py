@@ -16,7 +16,7 @@ from pytensor.graph.replace import _vectorize_node
 from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy, DensitySum
 from prbayes.metrics.grid import Cells
-from prbayes.response.broadcasting import batch_shape, broadcast_batch
+from prbayes.response.inputs import batch_shape, broadcast_batch
 from prbayes.response.response import Responses
 
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every

@@ -9,7 +9,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, Literal, Self
 
@@ -55,9 +55,8 @@ from prbayes.propagation.moving_support import (
     refuse_moving_atoms,
 )
 from prbayes.propagation.ops import stored_discrepancy
+from prbayes.response.budget import RunCost
 from prbayes.response.compile import compile_batched
-from prbayes.response.costs import Demand
-from prbayes.response.deduplication import Known, once_each
 from prbayes.response.distributions import (
     PopulationSampler,
     log_density,
@@ -67,7 +66,13 @@ from prbayes.response.distributions import (
 )
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import lacking
-from prbayes.response.response import Responses, refuse_coarse, refuse_other_number
+from prbayes.response.response import (
+    Known,
+    Responses,
+    once_each,
+    refuse_coarse,
+    refuse_other_number,
+)
 
 _log = logging.getLogger("prbayes")
 
@@ -157,6 +162,7 @@ class Reweighted(Propagation):
     """
 
     n: int = 1024
+    _: KW_ONLY
     random_seed: int = 0
     max_lost: float = MAX_LOST
     max_points: int | None = None
@@ -179,13 +185,13 @@ class Reweighted(Propagation):
             )
 
     @property
-    def demand(self) -> Demand:
-        """No run for a value of the hyperparameters; more where a design does not support it."""
-        decides = (
+    def cost(self) -> RunCost:
+        """Runs that this propagation needs: no run for a value of the hyperparameters."""
+        growth = (
             f"up to {self.most} in all, where the calibrated populations are not supported, or "
             "another design would answer differently"
         )
-        return Demand(0, self.most, decides)
+        return RunCost(self.n, 0, self.most, growth)
 
     @property
     def emulator_runs(self) -> int | None:
@@ -883,12 +889,12 @@ class Design(Bound):
             for rows in before.rows():
                 known = [x[rows] for x in before.points]
                 if all(map(np.array_equal, known, points)):
-                    self.responses.find(len(points[0]))
+                    self.responses.count_reused(len(points[0]))
                     return before.values[rows]
         runs = self.responses.runs
         shared = runs.at(points)
         if shared is not None:
-            self.responses.find(len(shared))
+            self.responses.count_reused(len(shared))
             return shared
         stored = self._contents
         own = None if stored is None else Known(stored.batches.points, stored.batches.values)

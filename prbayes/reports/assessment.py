@@ -12,7 +12,6 @@ import xarray as xr
 from prbayes._stats import INTERVAL
 from prbayes.plots._names import named
 from prbayes.plots.validity import in_directions
-from prbayes.reports.decision import CALLED, kind_of_decision
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import (
     alike,
@@ -24,12 +23,13 @@ from prbayes.reports.numbers import (
     span,
 )
 from prbayes.reports.problem import described
+from prbayes.reports.schema import CALLED, kind_of_decision
 from prbayes.reports.section import Section
 from prbayes.reports.summary import verdict
 from prbayes.reports.tables import rows_table
 from prbayes.results.diagnose import Diagnosis
 from prbayes.validation.area_test import ValidityTest
-from prbayes.validation.measured_vs_predicted import Comparable, comparables
+from prbayes.validation.conditions import Comparable, comparables
 
 # -- comparison ------------------------------------------------------------------------------
 
@@ -231,7 +231,7 @@ def validity(m: Material) -> list[Section]:
             "the areas of u and of |2u - 1|."
         )
     if len(m.tests) > 1:
-        levels = sum(test.level for test in m.tests.values())
+        levels = sum(test.alpha for test in m.tests.values())
         about += (
             f" A right model is rejected by one or more of these {len(m.tests)} tests in up to "
             f"{percentage(min(levels, 1.0))} of cases."
@@ -292,7 +292,7 @@ def _tested(test: ValidityTest) -> dict[str, Any]:
         "area": f"{test.statistic:.4f}",
         "critical value": f"{test.critical_value:.4f}",
         "p-value": probability(test.p_value).removeprefix("= "),
-        "level": percentage(test.level),
+        "level": percentage(test.alpha),
     }
 
 

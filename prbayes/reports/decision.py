@@ -11,6 +11,7 @@ import xarray as xr
 from prbayes.plots._names import named
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import number, percentage, plus_minus
+from prbayes.reports.schema import kind_of_decision
 from prbayes.reports.section import Section
 from prbayes.reports.tables import rows_table
 
@@ -51,16 +52,6 @@ def refuse_decisions(given: Any) -> None:
             )
 
 
-def kind_of_decision(table: Any) -> str | None:
-    """Return of which function a table is; None if of none."""
-    if not isinstance(table, xr.Dataset):
-        return None
-    for kind, variables in _VARIABLES.items():
-        if variables <= set(table.data_vars):
-            return kind
-    return None
-
-
 def _risk(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return the rows of a probability, one for each bound."""
     values, errors = (np.atleast_1d(table[key].values) for key in ("probability", "error"))
@@ -73,7 +64,7 @@ def _risk(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
             "bound": str(bound),
             "probability": number(float(value), 2),
             "its error": number(float(error), 1),
-            f"{percentage(table.attrs['level'])} interval": interval,
+            f"{percentage(table.attrs['prob'])} interval": interval,
             **_required(table),
         }
         for bound, value, error in zip(bounds, values, errors, strict=True)
@@ -133,13 +124,6 @@ def _plan(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
     return rows
 
 
-_VARIABLES = {
-    "risk": {"probability", "by_draw", "error"},
-    "sensitivity": {"first", "total", "derivative"},
-    "plan": {"sd", "now"},
-}
-# The functions whose tables they are.
-CALLED = {"risk": "exceedance", "sensitivity": "sensitivity", "plan": "plan"}
 _Rows = Callable[[xr.Dataset, Mapping[str, str]], list[dict[str, Any]]]
 _KINDS: dict[str, tuple[str, str, _Rows]] = {
     "risk": (

@@ -26,9 +26,9 @@ from prbayes.plots.responses import plot_responses
 from prbayes.plots.sensitivity import plot_sensitivity
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
-from prbayes.reports.decision import kind_of_decision
 from prbayes.reports.images import image
 from prbayes.reports.material import Material
+from prbayes.reports.schema import kind_of_decision
 from prbayes.reports.section import Section
 
 _log = logging.getLogger("prbayes")
@@ -121,8 +121,9 @@ def _posterior(m: Material) -> Request:
     if m.model is None:
         names = _first(m.posteriors)["posterior"].data_vars
         own = _own_labels(m, names)
-        return Call((_first(m.posteriors), _first(m.found)), {"model": None, **own})
-    return _labelled(m, (_first(m.posteriors), _first(m.found)), {"model": m.model})
+        return Call((_first(m.posteriors),), {"optimum": _first(m.found), "model": None, **own})
+    keywords = {"optimum": _first(m.found), "model": m.model}
+    return _labelled(m, (_first(m.posteriors),), keywords)
 
 
 def _stages(m: Material) -> Request:

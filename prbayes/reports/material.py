@@ -28,9 +28,8 @@ from prbayes.plots._names import refuse_labels
 from prbayes.response.outputs import ONE, Outputs, read_observed
 from prbayes.results.compare import compare
 from prbayes.results.diagnose import Diagnosis, diagnose
-from prbayes.validation.area_test import ValidityTest
-from prbayes.validation.measured_vs_predicted import comparables
-from prbayes.validation.probability_transform import u_values
+from prbayes.validation.area_test import ValidityTest, u_values
+from prbayes.validation.conditions import comparables
 
 # Measured values are rounded, or predicted ones for a test: by far less than this in half of the
 # u-values, while those of other data are apart by .3 on average.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from prbayes.plots.validity import in_directions
-from prbayes.reports.decision import kind_of_decision
 from prbayes.reports.material import Material
+from prbayes.reports.schema import kind_of_decision
 
 # More steps than these are a plan, which nobody carries out from a summary: by judgement.
 _MOST_NEXT = 4

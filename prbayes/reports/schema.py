@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes.reports.decision import CALLED, kind_of_decision
+_VARIABLES = {
+    "risk": {"probability", "by_draw", "error"},
+    "sensitivity": {"first", "total", "derivative"},
+    "plan": {"sd", "now"},
+}
+# The functions whose tables they are.
+CALLED = {"risk": "exceedance", "sensitivity": "sensitivity", "plan": "plan"}
 
 # What a group has to have for those who report it, where there is such a group.
 _OF_POSTERIOR = {
@@ -20,11 +26,21 @@ _OF_POSTERIOR = {
 _OF_STAGES = ("beta", "accept_rate", "n_steps")
 _OF_OPTIMUM = {"calibration": ("discrepancy", "metric"), "stderr": ()}
 _OF_DECISION = {
-    "risk": ("lower", "upper", "limit", "below", "level"),
+    "risk": ("lower", "upper", "limit", "below", "prob"),
     "sensitivity": ("factor", "kind", "first_error", "total_error", "quantity", "value", "sd"),
     "plan": ("name", "candidate", "k"),
 }
-_OF_TEST = ("statistic", "critical_value", "p_value", "level", "folded")
+_OF_TEST = ("statistic", "critical_value", "p_value", "alpha", "folded")
+
+
+def kind_of_decision(table: Any) -> str | None:
+    """Return of which function a table is; None if of none."""
+    if not isinstance(table, xr.Dataset):
+        return None
+    for kind, variables in _VARIABLES.items():
+        if variables <= set(table.data_vars):
+            return kind
+    return None
 
 
 def complaints(tree: xr.DataTree) -> Iterator[str]:

@@ -70,6 +70,7 @@ class Section(_Content):
         title: str,
         text: str | Sequence[str] = (),
         table: Any = None,
+        *,
         picture: Any = None,
         alt: str = "",
         caption: str = "",

@@ -17,9 +17,10 @@ from prbayes.model.elements import (
 from prbayes.plots._names import named
 from prbayes.plots._objective import metric_label
 from prbayes.plots.validity import in_directions
-from prbayes.reports.decision import interval_of, kind_of_decision
+from prbayes.reports.decision import interval_of
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus, probability
+from prbayes.reports.schema import kind_of_decision
 from prbayes.validation.area_test import ValidityTest
 
 # More hyperparameters than this make a list, which a table shows better: by judgement.
@@ -96,7 +97,7 @@ def verdict(label: str, test: ValidityTest, m: Material) -> str:
     sign = ">" if test.statistic > test.critical_value else "≤"
     return (
         f"{who}On {aspect} of {specimens} ({values}), the calibrated model {found} "
-        f"at level {percentage(test.level)} "
+        f"at level {percentage(test.alpha)} "
         f"({area} {test.statistic:.3f} {sign} critical {test.critical_value:.3f}, "
         f"p {probability(test.p_value)})."
     )
@@ -147,7 +148,7 @@ def _risks(m: Material) -> list[str]:
     for label, table in m.decisions.items():
         if kind_of_decision(table) != "risk" or table.probability.ndim:
             continue
-        level = percentage(table.attrs["level"])
+        level = percentage(table.attrs["prob"])
         said = (
             f"{label}: probability {number(float(table.probability), 2)} ({level} interval "
             f"{interval_of(table)})"

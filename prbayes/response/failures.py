@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
 
@@ -144,6 +144,7 @@ class Retry(OnFailure):
     """
 
     times: int = 1
+    _: KW_ONLY
     then: OnFailure = field(default_factory=Replace)
 
     def __post_init__(self) -> None:

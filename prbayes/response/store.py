@@ -120,7 +120,7 @@ class Store:
     --------
     >>> import tempfile, numpy as np
     >>> folder = tempfile.mkdtemp()
-    >>> store = Store(folder, "y", 2)
+    >>> store = Store(folder, "y", columns=2)
     >>> store.add(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([10.0, 20.0]))
     >>> store.find(np.array([[3.0, 4.0], [5.0, 6.0]]))
     (array([20., nan]), array([ True, False]))
@@ -132,8 +132,8 @@ class Store:
         self,
         folder: str | os.PathLike[str],
         name: str,
-        columns: int | None = None,
         *,
+        columns: int | None = None,
         version: str | None = None,
         outputs: int | None = None,
     ) -> None:

@@ -121,9 +121,7 @@ def compare(
     try:
         identity = require_together(identities, "compare", model=model)
     except ValueError as error:
-        raise ValueError(
-            f"{error}; models of the same data are compared by prb.validation.compare_candidates"
-        ) from None
+        raise ValueError(f"{error}; models of the same data are compared by prb.rank") from None
     naming = model or _model_among(results)
     columns = {label: _column(label, result, naming) for label, result in results.items()}
     every = _shared(list(columns.values()), model)

@@ -57,7 +57,7 @@ def predict(
     *inputs: Any,
     model: pm.Model | None = None,
     n_samples: int = 500,
-    draws: int = 400,
+    n_draws: int = 400,
     stored: bool = True,
     max_lost: float | None = None,
     name: str | None = None,
@@ -95,11 +95,11 @@ def predict(
         That of the optimum, or the one on the context, by default.
     n_samples : int
         Specimens from each population.
-    draws : int
+    n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     stored : bool
         Whether design points or an emulator may serve. With False the response is computed for
-        draws x n_samples specimens.
+        n_draws x n_samples specimens.
     max_lost : float, optional
         Largest share of the predicted responses that may be NaN; by default what the model's
         simulators allow, the largest.
@@ -142,7 +142,7 @@ def predict(
 
     Notes
     -----
-    With the same ``result``, inputs, ``n_samples``, ``draws`` and ``random_seed``, sample i of a
+    With the same ``result``, inputs, ``n_samples``, ``n_draws`` and ``random_seed``, sample i of a
     draw is the same specimen, whatever the response: predictions of several conditions can be set
     against repeated measurements. Where two simulators of the model have designs of their own, pass
     ``stored=False``.
@@ -160,7 +160,7 @@ def predict(
     """
     refuse_uncallable("prb.predict", response)
     positive_integer(n_samples, "n_samples", minimum=2)
-    positive_integer(draws, "draws")
+    positive_integer(n_draws, "n_draws")
     flag(stored, "stored")
     if max_lost is not None:
         refuse_max_lost(max_lost, "prb.predict")
@@ -169,7 +169,7 @@ def predict(
     refuse_calling(executor, store, version, Abort())
     label = _label(response, name, store)
     model = model_of(result, model, "prb.predict")
-    points, coords = populations_of(result, model, draws, "prb.predict")
+    points, coords = populations_of(result, model, n_draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
     simulators = population_simulators(model)
     before = sum(each.responses.count for each in simulators)

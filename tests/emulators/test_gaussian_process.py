@@ -27,7 +27,7 @@ def test_the_mean_is_that_of_scikit_learn(kernel: str, nu: float) -> None:
     same = process.GaussianProcessRegressor(shape, alpha=nugget, optimizer=None)
     same.fit(x, y - y.mean())
     at = np.random.default_rng(2).standard_normal((2000, 3))
-    found = GaussianProcess(kernel, lengths, nugget).through(x, y)(at)
+    found = GaussianProcess(kernel, lengths=lengths, nugget=nugget).through(x, y)(at)
     np.testing.assert_allclose(found, y.mean() + same.predict(at), atol=1e-9)
 
 
@@ -98,4 +98,4 @@ def test_settings_that_are_none_are_refused(arguments: Any, told: str) -> None:
 def test_lengths_are_as_many_as_inputs() -> None:
     x = np.random.default_rng(0).random((20, 3))
     with pytest.raises(ValueError, match="got 2, expected one for each of 3 inputs"):
-        GaussianProcess("matern", (1.0, 2.0), 0.0).through(x, x[:, 0])
+        GaussianProcess("matern", lengths=(1.0, 2.0), nugget=0.0).through(x, x[:, 0])

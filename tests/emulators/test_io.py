@@ -103,9 +103,9 @@ def test_what_is_no_surrogate_is_refused(tmp_path: Path) -> None:
 
 def test_settings_make_the_same_surface_again() -> None:
     surfaces = (
-        prb.surrogate.RadialBasis("quintic", 2, 0.1),
+        prb.surrogate.RadialBasis("quintic", degree=2, smoothing=0.1),
         prb.surrogate.Polynomial(4),
-        prb.surrogate.GaussianProcess("matern", (0.5, 1.5), 1e-6),
+        prb.surrogate.GaussianProcess("matern", lengths=(0.5, 1.5), nugget=1e-6),
     )
     for model in surfaces:
         # As JSON has them.

@@ -58,7 +58,7 @@ def test_what_varies_over_short_distances_tells_rho() -> None:
     def trend(x: Floats) -> Floats:
         return coarse(x) + 4 * np.tanh(x[:, 0])
 
-    tuned = GaussianProcess("matern", (1.0, 1.0), 1e-6)
+    tuned = GaussianProcess("matern", lengths=(1.0, 1.0), nugget=1e-6)
     for model in (tuned, RadialBasis()):
         rho = followed(model, X, trend(X), coarse(X), joined=False).rho
         assert rho == pytest.approx(1, abs=0.2)
@@ -146,7 +146,7 @@ def test_too_few_coarse_responses_are_none() -> None:
 def test_a_constant_coarse_response_tells_nothing() -> None:
     surface = followed(GaussianProcess(), X, fine(X), np.full(64, 3.0), joined=False)
     assert surface.rho == pytest.approx(0, abs=1e-12)
-    model = GaussianProcess("matern", (1.0, 1.0, 1.0), 1e-6)
+    model = GaussianProcess("matern", lengths=(1.0, 1.0, 1.0), nugget=1e-6)
     constant = np.full(64, 3.0)
     following = Following(model, model, joined=True)
     found = predicted(following, X, fine(X), AT, constant, np.full(len(AT), 3.0))

@@ -49,7 +49,7 @@ def test_ranges_cover_the_prior_predictive_and_the_sd_is_its() -> None:
     with pm.Model():
         x = pm.Normal.dist(pm.Normal("mu", 5, 2), 1.0)
         found = prb.Surrogate.fit(
-            lambda x: 2 * x, [x], 20, model=prb.surrogate.Polynomial(1), coverage=0.9
+            lambda x: 2 * x, [x], 20, model=prb.surrogate.Polynomial(1), prob=0.9
         )
     low, high = found.ranges[found.names[0]]
     # 512 populations: se of the mean 0.09, of the sd 3%

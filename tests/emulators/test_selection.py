@@ -114,7 +114,7 @@ def test_of_many_runs_only_processes_are_tried() -> None:
 def test_a_process_without_a_block_is_that_of_the_other_runs(kernel: str, bad: float) -> None:
     # The short way, from one inverse, against a process that is made of each rest by itself. With a
     # nugget that leaves ten digits to both.
-    model = GaussianProcess(kernel, (1.5, 1.5), 1e-6)
+    model = GaussianProcess(kernel, lengths=(1.5, 1.5), nugget=1e-6)
 
     def response(x: Floats) -> Floats:
         return np.where(x[:, :1] > 1, bad, np.sin(2 * x[:, :1]) + x[:, 1:])

@@ -118,7 +118,7 @@ def test_surfaces_are_fitted_to_responses_of_mean_0_and_spread_1() -> None:
     [("linear", None, 1), ("cubic", None, 3), ("quintic", None, 6), ("cubic", 3, 10)],
 )
 def test_terms_of_two_inputs(kernel: str, degree: int | None, terms: int) -> None:
-    assert prb.surrogate.RadialBasis(kernel, degree).terms(2) == terms
+    assert prb.surrogate.RadialBasis(kernel, degree=degree).terms(2) == terms
 
 
 def test_refusals() -> None:

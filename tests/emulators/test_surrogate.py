@@ -126,7 +126,7 @@ def test_a_response_that_raises_stops_or_is_left_out(tmp_path: Path) -> None:
         ({"model": "gp"}, TypeError, "expected prb.surrogate.RadialBasis"),
         ({"outside": Retry()}, TypeError, r"expected prb.response.Replace\(\) or"),
         ({"store": 3}, TypeError, "expected the path of a folder"),
-        ({"coverage": 99.0}, ValueError, "a number between 0 and 1"),
+        ({"prob": 99.0}, ValueError, "a number between 0 and 1"),
         ({"points": "sobol"}, ValueError, r"points: got 'sobol', expected one of \('even'"),
         ({"points": "predictive"}, ValueError, "got 'predictive' for inputs that are ranges"),
         ({"response": 3}, TypeError, "expected a function"),

@@ -19,7 +19,8 @@ from um_server import Real
 
 import prbayes as prb
 from prbayes.model.random_variable import nodes
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.executors import Capacity, capacity
 from prbayes.response.outputs import Outputs
 from prbayes.response.store import Store
@@ -140,7 +141,7 @@ def study(code: str, folder: Path, executor: Any, n: int) -> Tally:
     make, formula, outputs, start, _ = CODES[code]
     x = 1.0 + np.arange(n) / n
     points = Points([x, start + 3 * x], [True, True])
-    store, tally = Store(folder, "y", 2, version="1", outputs=2), Tally()
+    store, tally = Store(folder, "y", columns=2, version="1", outputs=2), Tally()
     making = make(folder)
     response = next(making)
     try:

@@ -17,7 +17,8 @@ import pytest
 from hostile import ENDING, EXECUTORS, REASONS, hostile
 
 import prbayes as prb
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.failures import OnFailure, ResponseError
 from prbayes.response.store import Store
 
@@ -57,7 +58,7 @@ def test_hostile_responses_cost_their_points(
     x = points.arguments[0]
     expected = np.where(np.isin(x, list(REASONS)), -1.0, 2 * x)
     tally = Tally()
-    store = Store(tmp_path, "y", 1)
+    store = Store(tmp_path, "y", columns=1)
     with EXECUTORS[where]() as executor:
         calling = Calling(
             "y",
@@ -138,7 +139,7 @@ def test_a_response_that_ends_its_worker_aborts_where_the_policy_says_so(
     def repaired(x: float) -> float:
         return 2 * x
 
-    store = Store(tmp_path, "y", 1, version="1")
+    store = Store(tmp_path, "y", columns=1, version="1")
     with EXECUTORS[where]() as executor:
         points = Points([np.array([0.0, 10.0, 11.0, 6.0, 12.0])], [True])
         for policy in (Abort(), Retry(1, then=Abort())):
@@ -213,7 +214,7 @@ class Unlucky(ThreadPoolExecutor):
 
 
 def test_no_response_is_blamed_for_workers_that_end_by_themselves(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", 1)
+    store = Store(tmp_path, "y", columns=1)
     with pytest.raises(ResponseError, match=r"y: a worker was lost .*also without a response at w"):
         respond(Calling("y", twice, Unlucky(), store, Replace()), line(4), Tally())
     assert len(store) == 0
@@ -222,7 +223,7 @@ def test_no_response_is_blamed_for_workers_that_end_by_themselves(tmp_path: Path
 def test_an_executor_that_is_closed_meanwhile_is_told_of_and_nothing_finished_is_lost(
     tmp_path: Path,
 ) -> None:
-    store, points = Store(tmp_path, "y", 1), line(8)
+    store, points = Store(tmp_path, "y", columns=1), line(8)
     pool = ThreadPoolExecutor(1)
 
     def response(x: float) -> float:

@@ -24,7 +24,7 @@ def test_two_processes_of_two_threads_lose_nothing_and_find_all(tmp_path: Path) 
     for process in processes:
         assert process.communicate()[0] == "600\n"
         assert process.returncode == 0
-    keys, values = Store(tmp_path, "y", 2).known()
+    keys, values = Store(tmp_path, "y", columns=2).known()
     assert len(keys) == 600
     np.testing.assert_array_equal(values, keys @ [1e6, 1.0])
 
@@ -40,7 +40,7 @@ def in_child(store: Store) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_store_survives_a_fork(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", 1)
+    store = Store(tmp_path, "y", columns=1)
     store.add(np.array([[1.0]]), np.array([10.0]))
     process = get_context("fork").Process(target=in_child, args=(store,))
     process.start()

@@ -46,7 +46,7 @@ PACKAGE = str(Path(prbayes.__file__).parent)
 
 def sound_store(folder: Path) -> Path:
     """Make a store of some responses of y and z, closed, and return its file."""
-    store, other = Store(folder, "y", 3), Store(folder, "z", 1)
+    store, other = Store(folder, "y", columns=3), Store(folder, "z", columns=1)
     for rows in np.array_split(np.arange(ROWS), ROWS // CHUNK):
         store.add(KEYS[rows], VALUES[rows])
     other.add(KEYS[:40, :1], VALUES[:40])
@@ -69,7 +69,7 @@ def found_in(store: Store) -> str:
 def opened(folder: Path) -> str:
     """Return what becomes of a store that is opened."""
     try:
-        store = Store(folder, "y", 3)
+        store = Store(folder, "y", columns=3)
         outcome = found_in(store)
         store.close()
     except StoreError as error:
@@ -160,9 +160,9 @@ def log_attack(damage: Callable[..., Any]) -> Attack:
 
     def attack(folder: Path, rng: np.random.Generator, n: int) -> Iterator[str]:
         path = sound_store(folder / "open")
-        store = Store(folder / "open", "y", 3)
+        store = Store(folder / "open", "y", columns=3)
         path.unlink()
-        store = Store(folder / "open", "y", 3)
+        store = Store(folder / "open", "y", columns=3)
         for rows in np.array_split(np.arange(ROWS), ROWS // CHUNK):
             store.add(KEYS[rows], VALUES[rows])
         log = path.with_name(path.name + "-wal")
@@ -257,7 +257,7 @@ def killed_writers(folder: Path, rng: np.random.Generator, n: int) -> Iterator[s
 def committed(folder: Path, said: list[list[int]]) -> str:
     """Return whether all is there that processes said they had written, and nothing else."""
     try:
-        store = Store(folder, "y", 2)
+        store = Store(folder, "y", columns=2)
         for number, chunks in enumerate(said):
             points = 5.0 * np.array(chunks)[:, None] + np.arange(5) if chunks else np.empty((0, 5))
             keys = np.column_stack([np.full(points.size, float(number)), points.ravel()])
@@ -280,7 +280,7 @@ def committed(folder: Path, said: list[list[int]]) -> str:
 
 def threads_that_write(folder: Path, rng: np.random.Generator, n: int) -> Iterator[str]:
     """Write with four threads on two stores of one folder at once, each of them n / 4 chunks."""
-    stores = [Store(folder, "y", 2) for _ in range(2)]
+    stores = [Store(folder, "y", columns=2) for _ in range(2)]
     said: list[list[int]] = [[], [], [], []]
 
     def write(number: int) -> None:
@@ -324,7 +324,7 @@ def _filled(folder: Path, size: int) -> str:
     written = 0
     try:
         with room_for(size):
-            store = Store(folder, "y", 3)
+            store = Store(folder, "y", columns=3)
             for rows in chunks:
                 store.add(KEYS[rows], VALUES[rows])
                 written += 1
@@ -334,7 +334,7 @@ def _filled(folder: Path, size: int) -> str:
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     try:
-        store = Store(folder, "y", 3)
+        store = Store(folder, "y", columns=3)
         if len(store) != written * CHUNK:
             return f"{len(store)} of {written * CHUNK} responses"
         for rows in chunks[written:]:

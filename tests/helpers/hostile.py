@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 import prbayes as prb
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.failures import OnFailure, ResponseError
 from prbayes.response.store import Store
 
@@ -134,7 +135,7 @@ def on_workers(
             continue
         points = Points([rng.permutation([float(bad), *rng.uniform(20, 30, 5)])], [True])
         x = points.arguments[0]
-        store, tally = Store(folder, f"{where}, {policy}, {bad}", 1), Tally()
+        store, tally = Store(folder, f"{where}, {policy}, {bad}", columns=1), Tally()
         timeout = None if safe else 0.5
         calling = Calling("y", prb.scalar(hostile), executor, store, policy, timeout=timeout)
         try:

@@ -29,7 +29,10 @@ def test_it_is_the_value_of_the_function(draw: Callable[..., tuple[Floats, ...]]
 
 
 def test_nothing_is_assumed_of_it() -> None:
-    plain, weighted = FunctionMetric(mean_difference), FunctionMetric(mean_difference, True)
+    plain, weighted = (
+        FunctionMetric(mean_difference),
+        FunctionMetric(mean_difference, weighted=True),
+    )
     assert plain.minimum is Minimum.UNKNOWN
     assert not plain.likelihood
     assert [plain.takes_weights, weighted.takes_weights] == [False, True]

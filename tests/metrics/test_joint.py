@@ -131,7 +131,7 @@ def test_an_inner_metric_of_ones_own_gives_standard_features() -> None:
 def test_slices_of_the_residual_have_one_factor() -> None:
     y = np.random.default_rng(0).standard_normal((60, 2))
     metric = ProbabilityResidual(GaussianKDE(0.05))
-    d = Joint(metric, 12).against(y)
+    d = Joint(metric, directions=12).against(y)
     alone = {metric.against(part.observed_of(y)[0]).scale_factor for part in d.parts}  # type: ignore[attr-defined]
     assert len(alone) > 1, "there are slices of different factors"
     assert {part.target.scale_factor for part in d.parts} == {min(alone)}  # type: ignore[attr-defined]

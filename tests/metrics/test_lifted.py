@@ -70,17 +70,16 @@ def test_every_metric_declares_what_its_inner_one_does() -> None:
             assert getattr(joint, name) == getattr(metric, name)
         d = joint.against(sample(30))
         assert joint.takes_outputs
-        assert (is_likelihood(d), joint.likelihood, is_additive(d)) == (
-            False,
-            False,
-            metric.additive,
-        )
-    assert Joint(AreaMetric(), 5).like(KullbackLeibler()) == Joint(KullbackLeibler(), 5)
+        assert (is_likelihood(d), is_additive(d)) == (False, metric.additive)
+        assert not joint.likelihood
+    assert Joint(AreaMetric(), directions=5).like(KullbackLeibler()) == Joint(
+        KullbackLeibler(), directions=5
+    )
     assert AreaMetric().like(KullbackLeibler()) == KullbackLeibler()
-    assert hash(Joint(AreaMetric(), 5)) != hash(Joint(AreaMetric(), 6))
+    assert hash(Joint(AreaMetric(), directions=5)) != hash(Joint(AreaMetric(), directions=6))
     assert (
-        repr(Joint(AreaMetric(), 5))
-        == "Joint(metric=AreaMetric(), directions=5, components=None, seed=0)"
+        repr(Joint(AreaMetric(), directions=5))
+        == "Joint(metric=AreaMetric(), directions=5, components=None, random_seed=0)"
     )
 
 

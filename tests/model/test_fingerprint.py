@@ -509,7 +509,7 @@ PAIRS: dict[str, tuple[Level, Callable[[str], Any]]] = {
     ),
     "plot_posterior: posterior, optimum": (
         Level.POPULATIONS,
-        lambda change: prb.plot_posterior(posterior(), other_optimum(change), **PICTURE),
+        lambda change: prb.plot_posterior(posterior(), optimum=other_optimum(change), **PICTURE),
     ),
     "plot_posterior: posterior, model": (
         Level.PRIORS,

@@ -307,7 +307,7 @@ def test_what_would_waste_the_runs_is_refused_before() -> None:
     with pytest.raises(TypeError, match="tolerance: got"):
         prb.minimize(build(response), tolerance="small", **QUIET)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"thetas: got shape \(1, 1\)"):
-        prb.refine(build(response), np.zeros((1, 1)), **QUIET)
+        prb.refine(build(response), thetas=np.zeros((1, 1)), **QUIET)
     assert response.runs == 0
 
 

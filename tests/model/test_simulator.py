@@ -499,7 +499,7 @@ def test_simulators_of_one_response_share_their_design_s_runs() -> None:
     first, second = Evaluator(model).nodes
     np.testing.assert_array_equal(first.design.values, second.design.values)
     narrow = np.array([[2.0, np.log(0.05)]])
-    prb.refine(model, narrow)
+    prb.refine(model, thetas=narrow)
     assert first.design.n_points == second.design.n_points > 128
     assert sum(asked) == first.design.n_points
     assert prb.minimize(model, progressbar=False).n_computed == sum(asked)

@@ -178,7 +178,7 @@ def pictures(
         "ecdf": lambda **k: prb.plot_responses(optimum, ecdf=True, **k),
         "outputs": lambda **k: prb.plot_outputs(pair.posterior, model=pair.model, **k),
         "population": lambda **k: prb.plot_population(posterior, model=model, **k),
-        "posterior": lambda **k: prb.plot_posterior(posterior, optimum, model=model, **k),
+        "posterior": lambda **k: prb.plot_posterior(posterior, optimum=optimum, model=model, **k),
         "optimizer": lambda **k: prb.plot_optimizer(optimum, **k),
         "landscape": lambda **k: prb.plot_landscape(optimum, points=21, **k),
         "curve": lambda **k: prb.plot_landscape(optimum, pair="sigma", points=21, **k),

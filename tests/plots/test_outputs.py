@@ -113,7 +113,7 @@ def pairs(pc: Any) -> list[str]:
 
 @pytest.mark.long
 def test_pairs_are_a_triangle(several: SimpleNamespace) -> None:
-    how: dict[str, Any] = {"model": several.model, "before": False, "draws": 4}
+    how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4}
     pc = prb.plot_outputs(several.posterior, outputs=["p", "r/s", "u"], backend="matplotlib", **how)
     assert pairs(pc) == ["r\u2215s, p", "u, p", "u, r\u2215s"]
     axes = np.array(pc.viz["figure"].item().axes, dtype=object).reshape(2, 2)
@@ -125,7 +125,7 @@ def test_pairs_are_a_triangle(several: SimpleNamespace) -> None:
 
 
 def test_of_a_curve_some_places_are_drawn(several: SimpleNamespace) -> None:
-    how: dict[str, Any] = {"model": several.model, "before": False, "draws": 4, "backend": "none"}
+    how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4, "backend": "none"}
     pc = prb.plot_outputs(several.posterior, simulator="curve", **how)
     assert pairs(pc)[-1] == "5.5, 3.5"
     assert len(pairs(pc)) == 6
@@ -155,4 +155,4 @@ def test_a_model_of_single_outputs_is_told_of_another_picture(
     posterior: xr.DataTree, build: Callable[..., pm.Model]
 ) -> None:
     with pytest.raises(ValueError, match=r"got simulators \['y'\] of one .* prb.plot_responses"):
-        prb.plot_outputs(posterior, model=build(prb.Resimulated(64)), draws=4)
+        prb.plot_outputs(posterior, model=build(prb.Resimulated(64)), n_draws=4)

@@ -16,7 +16,7 @@ def test_the_population_is_the_closed_form(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
     pc = prb.plot_population(
-        posterior, model=optimum.model, draws=300, level=0.8, backend="matplotlib"
+        posterior, model=optimum.model, n_draws=300, prob=0.8, backend="matplotlib"
     )
     x, y = read.xy(pc, "after", "x")
     each = stats.norm.pdf(x, known.mu.reshape(-1, 1), known.sigma.reshape(-1, 1))
@@ -35,8 +35,8 @@ def test_the_population_is_the_closed_form(
 def test_wrong_arguments_are_refused(optimum: prb.Optimum) -> None:
     with pytest.raises(TypeError, match="got int, expected an Optimum"):
         prb.plot_population(3, model=optimum.model)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"level: got 1\.0"):
-        prb.plot_population(optimum, level=1.0)
+    with pytest.raises(ValueError, match=r"prob: got 1\.0"):
+        prb.plot_population(optimum, prob=1.0)
 
 
 def correlated() -> pm.Model:
@@ -66,7 +66,7 @@ def test_a_multivariate_input_has_its_pairs(read: SimpleNamespace) -> None:
         }
     )
     posterior = xr.DataTree.from_dict({"posterior": draws})
-    pc = prb.plot_population(posterior, model=correlated(), level=0.89, backend="matplotlib")
+    pc = prb.plot_population(posterior, model=correlated(), prob=0.89, backend="matplotlib")
     pairs = ["loads[1], loads[0]", "loads[2], loads[0]", "loads[2], loads[1]"]
     assert list(pc.viz["region"].data_vars) == list(pc.viz["half"].data_vars) == pairs
     # The ellipse of 89%: as far out as the root of a chi-square quantile, and as inclined.

@@ -18,7 +18,7 @@ def test_the_posterior_stands_against_the_optimum(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
     pc = prb.plot_posterior(
-        posterior, optimum, model=optimum.model, level=0.8, backend="matplotlib"
+        posterior, optimum=optimum, model=optimum.model, prob=0.8, backend="matplotlib"
     )
     for name, draws in (("mu", known.mu), ("sigma", known.sigma)):
         x, y = read.xy(pc, "posterior", name)
@@ -57,7 +57,7 @@ def test_a_posterior_alone(optimum: prb.Optimum, posterior: xr.DataTree) -> None
     pc = prb.plot_posterior(posterior, backend="matplotlib")
     assert not {"optimum", "normal", "prior"} & set(pc.viz.children)
     blind = replace(optimum, stderr={"mu": np.inf, "sigma": np.nan})
-    pc = prb.plot_posterior(posterior, blind, backend="matplotlib")
+    pc = prb.plot_posterior(posterior, optimum=blind, backend="matplotlib")
     assert "optimum" in pc.viz
     assert "normal" not in pc.viz
 
@@ -99,9 +99,9 @@ def test_wrong_arguments_are_refused(optimum: prb.Optimum, posterior: xr.DataTre
     with pytest.raises(TypeError, match="got Optimum, expected a DataTree"):
         prb.plot_posterior(optimum)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="optimum: got int, expected an Optimum"):
-        prb.plot_posterior(posterior, 3)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"level: got 2\.0"):
-        prb.plot_posterior(posterior, level=2.0)
+        prb.plot_posterior(posterior, optimum=3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"prob: got 2\.0"):
+        prb.plot_posterior(posterior, prob=2.0)
     constant = xr.DataTree.from_dict({"posterior": posterior["posterior"].to_dataset() * 0})
     with pytest.raises(ValueError, match=r"got a posterior of \['mu', 'sigma'\]"):
         prb.plot_posterior(constant)

@@ -31,7 +31,7 @@ def test_steps_and_curve_are_distribution_functions(read: SimpleNamespace) -> No
 
 
 def test_the_band_holds_its_share_of_the_populations(read: SimpleNamespace) -> None:
-    pc = prb.plots.plot_prediction(MEASURED, PREDICTED, level=0.5, backend="matplotlib")
+    pc = prb.plots.plot_prediction(MEASURED, PREDICTED, prob=0.5, backend="matplotlib")
     x, _ = read.xy(pc, "predicted", "later")
     at = x[[100, 128, 150]]
     low, high = read.sides(pc, "band", "later", at)

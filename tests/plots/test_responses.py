@@ -18,7 +18,7 @@ import prbayes as prb
 def test_responses_are_the_closed_forms(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_responses(posterior, model=optimum.model, draws=300, backend="matplotlib")
+    pc = prb.plot_responses(posterior, model=optimum.model, n_draws=300, backend="matplotlib")
     x, y = read.xy(pc, "after", "y")
     h = 0.9 * 0.5 * 700**-0.2  # about Silverman's for the weights' effective number
     each = stats.norm.pdf(x, known.mu.reshape(-1, 1), np.hypot(known.sigma.reshape(-1, 1), h))
@@ -31,7 +31,7 @@ def test_responses_are_the_closed_forms(
     truth = stats.norm.pdf(some, 1, 0.5)
     assert ((low - 0.02 <= truth) & (truth <= high + 0.02)).all()
     narrow = prb.plot_responses(
-        posterior, model=optimum.model, draws=300, level=0.5, backend="matplotlib"
+        posterior, model=optimum.model, n_draws=300, prob=0.5, backend="matplotlib"
     )
     inner = read.sides(narrow, "band", "y", some)
     assert np.ptp(inner, axis=0).max() < 0.6 * (high - low).max()
@@ -54,7 +54,7 @@ def test_the_legend_says_what_is_before_and_after(
         "89% band of the posterior",
         "calibrated: posterior predictive",
     ]
-    pc = pictures["ecdf"](backend="matplotlib", level=0.5)
+    pc = pictures["ecdf"](backend="matplotlib", prob=0.5)
     assert read.texts(pc)[2:] == ["50% band of the standard error", "calibrated: optimum"]
     before, after = (read.artist(pc, name, "y") for name in ("before", "after"))
     assert before.get_linestyle() != after.get_linestyle()
@@ -151,8 +151,8 @@ def test_a_narrow_peak_before_does_not_flatten_the_data(
 def test_wrong_arguments_are_refused(optimum: prb.Optimum) -> None:
     with pytest.raises(TypeError, match="got int, expected an Optimum"):
         prb.plot_responses(3, model=optimum.model)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"level: got 1\.5"):
-        prb.plot_responses(optimum, level=1.5)
+    with pytest.raises(ValueError, match=r"prob: got 1\.5"):
+        prb.plot_responses(optimum, prob=1.5)
 
 
 def test_each_output_has_a_panel_with_what_was_measured_of_it(

@@ -231,7 +231,7 @@ def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() ->
     assert float(predicted.std()) == pytest.approx(1.0, abs=0.15)
     # The cloud is there again.
     np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[1], weights)
-    null = prb.validation.JointNull(optimum, (rough, *inputs), replicates=99)
+    null = prb.validation.JointNull(optimum, responses=(rough, *inputs), replicates=99)
     test = prb.area_test(rough(*np.full((2, 20), 1.0) + np.arange(20)), predicted, null=null)
     assert 0 < test.p_value <= 1
     np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[0], values)
@@ -244,7 +244,7 @@ def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
     with pytest.raises(DesignError, match=r"weight effective sample size of .* stored=False"):
         prb.predict(optimum, rough, *inputs, n_samples=100, random_seed=1)
     fresh = prb.predict(optimum, rough, *inputs, n_samples=500, random_seed=1, stored=False)
-    null = prb.validation.JointNull(optimum, (rough, *inputs), replicates=99)
+    null = prb.validation.JointNull(optimum, responses=(rough, *inputs), replicates=99)
     before = optimum.evaluator(optimum.theta[None]).discrepancies
     with pytest.raises(
         DesignError, match=r"JointNull: y: .* not told .* runs alone do not support"

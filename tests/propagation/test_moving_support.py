@@ -225,7 +225,7 @@ def test_the_weights_follow_the_design_when_it_grows() -> None:
     model = uniform(prb.AreaMetric(), prb.Reweighted(64))
     evaluator = Evaluator(model)
     theta = evaluator.unconstrained({"start": 2.0, "width": 3.0})[None]
-    prb.refine(model, np.array([[2.0, np.log(3.0)]]))
+    prb.refine(model, thetas=np.array([[2.0, np.log(3.0)]]))
     values, weights = evaluator.populations(theta, 0)
     assert float(weights[0] @ values[0]) == pytest.approx(3.5, abs=0.02)
     (mass,) = evaluator.support(theta)["y"]["mean_weight"]

@@ -359,7 +359,7 @@ def test_refinement_of_two_correlated_inputs(caplog: pytest.LogCaptureFixture) -
     ess = evaluator.support(thetas)["sum"]["weight_ess"]
     assert np.median(ess) < 50  # a single batch from the prior predictive does not do
     with caplog.at_level(logging.INFO, logger="prbayes"):
-        points = prb.refine(model, thetas)
+        points = prb.refine(model, thetas=thetas)
     assert "to 1024 runs" in caplog.text
     assert not shortcomings(evaluator, thetas)
     for name, response in zip(("sum", "difference"), responses, strict=True):
@@ -369,7 +369,7 @@ def test_refinement_of_two_correlated_inputs(caplog: pytest.LogCaptureFixture) -
         support = evaluator.support(thetas)[name]
         assert np.median(support["weight_ess"]) > 250
         np.testing.assert_allclose(np.median(support["mean_weight"]), 1.0, atol=0.03)
-    assert prb.refine(model, thetas) == points  # nothing more to do: no more responses
+    assert prb.refine(model, thetas=thetas) == points  # nothing more to do: no more responses
     # The refined design integrates: means and sds of the conditions at the truth.
     x, w = evaluator.populations(np.array([[1.0, 2.0, np.log(0.6), np.log(3.0)]]), 0)
     mean = (x * w).sum()
@@ -594,8 +594,8 @@ def test_refine_without_a_design_and_with_one_that_is_good() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu"), 1.0)
         prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED, propagation=prb.Resimulated(16))
-    assert prb.refine(model, np.zeros((1, 1))) == {}
-    assert prb.refine(once(), np.array([[0.0, 0.0]])) == {"y": 256}
+    assert prb.refine(model, thetas=np.zeros((1, 1))) == {}
+    assert prb.refine(once(), thetas=np.array([[0.0, 0.0]])) == {"y": 256}
 
 
 def test_a_design_that_can_never_do_is_refused() -> None:
@@ -607,7 +607,7 @@ def test_a_design_that_can_never_do_is_refused() -> None:
         prb.propagation.DesignError,
         match=r"y: the design does not support the answer.*now 144 runs in all",
     ):
-        prb.refine(model, thetas)
+        prb.refine(model, thetas=thetas)
 
 
 # -- diagnose

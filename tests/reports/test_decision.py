@@ -19,8 +19,8 @@ def questions() -> dict[str, xr.Dataset]:
     return {
         "risk": prb.exceedance(optimum(), same, 2.0, x, requirement=0.1),
         "bounds": prb.exceedance(optimum(), lambda x, by: x + by, 2.0, x, interval, steps=2),
-        "influence": prb.sensitivity(optimum(), prb.decision.Mean(same, x), samples=64),
-        "plan": prb.plan(optimum(), {"same": prb.decision.Condition(same, x)}, [5, 20]),
+        "influence": prb.sensitivity(optimum(), prb.decision.Mean(same, x), n_samples=64),
+        "plan": prb.plan(optimum(), {"same": prb.decision.Condition(same, x)}, k=[5, 20]),
     }
 
 
@@ -56,7 +56,7 @@ def test_each_kind_of_question_has_a_table() -> None:
 def test_the_summary_has_the_probability_and_whether_it_is_accepted() -> None:
     said = report(decision=questions()).sections[0].text
     (risk,) = [line for line in said if line.startswith("risk: ")]
-    assert risk.startswith("risk: probability 0.0069 (90% interval 0.00")
+    assert risk.startswith("risk: probability 0.0069 (89% interval 0.00")
     assert risk.endswith("; the requirement, at most 0.1, is met.")
 
 

@@ -288,7 +288,7 @@ def test_labels_reach_the_pictures_that_know_the_names(
     names = {i.function.__name__ for i in illustrations.ILLUSTRATIONS}
     drawn_by(monkeypatch, {name: drawn(name) for name in names})
     x = pm.Normal.dist(model["mu"], model["sigma"])
-    later = prb.predict(posterior, np.positive, x, model=model, draws=20)
+    later = prb.predict(posterior, np.positive, x, model=model, n_draws=20)
     warm = np.array([1.0, 2.0, 2.5])
     test = prb.area_test(warm, later, null=prb.validation.PosteriorNull(199))
     labels = {"mu": "mean", "y": "stiffness (N/mm)", "hot": "at 200 °C"}

@@ -17,7 +17,7 @@ def draws(values: Any) -> xr.Dataset:
 
 
 def validity(**changes: Any) -> xr.DataTree:
-    numbers = dict.fromkeys(("statistic", "critical_value", "p_value", "level", "folded"), 0.5)
+    numbers = dict.fromkeys(("statistic", "critical_value", "p_value", "alpha", "folded"), 0.5)
     u = {"u": ("observation", [0.1, 0.9])}
     ends = {"lower": ("rank", [0.0, 0.1]), "upper": ("rank", [0.5, 1.0])}
     return xr.DataTree(xr.Dataset(numbers | u | ends | changes))

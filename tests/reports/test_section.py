@@ -30,7 +30,7 @@ def test_a_picture_is_kept_as_bytes_of_its_kind(picture_bytes: bytes) -> None:
 def test_a_section_is_immutable_and_replaced_as_a_whole(picture_bytes: bytes) -> None:
     table = pd.DataFrame({"a": [1.0]})
     made = prb.reports.Section(
-        "x", "one", table, picture_bytes, alt="A line.", caption="c", level=3
+        "x", "one", table, picture=picture_bytes, alt="A line.", caption="c", level=3
     )
     with pytest.raises(dataclasses.FrozenInstanceError):
         made.title = "y"  # type: ignore[misc]

@@ -147,13 +147,13 @@ FAR = np.array([[4.0, 0.0]])
 
 def test_refine_goes_on_with_the_design_that_has_grown() -> None:
     whole, node = build(prb.Reweighted(16))
-    prb.refine(whole, FAR, **QUIET)
+    prb.refine(whole, thetas=FAR, **QUIET)
     parts, other = build(prb.Reweighted(16))
     expected = r"prb\.refine: max_runs = 20 was reached .*the model's designs"
     with pytest.raises(BudgetError, match=expected):
-        prb.refine(parts, FAR, max_runs=20, **QUIET)
+        prb.refine(parts, thetas=FAR, max_runs=20, **QUIET)
     assert other.bound.n_points == 32 < node.bound.n_points
-    prb.refine(parts, FAR, **QUIET)
+    prb.refine(parts, thetas=FAR, **QUIET)
     assert np.array_equal(other.bound.known_responses, node.bound.known_responses)
 
 

@@ -27,16 +27,8 @@ from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.random_variable import nodes
-from prbayes.response.call import (
-    Calling,
-    Points,
-    Tally,
-    checked,
-    chunk_size,
-    chunks,
-    compute,
-    respond,
-)
+from prbayes.response.call import Points, checked, compute
+from prbayes.response.chunks import Calling, Tally, chunk_size, chunks, respond
 from prbayes.response.executors import has_slipped
 from prbayes.response.failures import Abort, OnFailure, Replace
 from prbayes.response.store import Store
@@ -197,7 +189,7 @@ def test_responses_that_are_done_while_the_disk_is_busy_are_stored_together(
         add(self, parts)
 
     monkeypatch.setattr(Store, "add_all", slow)
-    store = Store(tmp_path, "y", 2)
+    store = Store(tmp_path, "y", columns=2)
     with ThreadPoolExecutor(4) as pool:
         calling = Calling("y", prb.scalar(lambda x, a: time.sleep(0.01) or a * x), pool, store)
         found = respond(calling, line(40), Tally())
@@ -234,9 +226,9 @@ def test_the_size_of_a_chunk(
 
 def test_a_tally_forgets_old_chunks_slowly() -> None:
     tally = Tally()
-    tally.take(10, 5.0)
+    tally.count(10, 5.0)
     assert tally == Tally(computed=10, seconds=0.5)
-    tally.take(2, 3.0)
+    tally.count(2, 3.0)
     assert tally.computed == 12
     assert tally.seconds == pytest.approx(0.7 * 0.5 + 0.3 * 1.5)
 
@@ -552,7 +544,7 @@ def test_another_constant_is_another_input(tmp_path: Path) -> None:
 def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
     with pytest.raises(prb.response.ResponseError, match=r"\d+ responses are kept in"):
         model(prb.scalar(fails_above_two), store=tmp_path)
-    kept = len(Store(tmp_path, "y", 2))
+    kept = len(Store(tmp_path, "y", columns=2))
     found = model(prb.scalar(times), store=tmp_path)
     np.testing.assert_array_equal(stored(found), EXPECTED)
     assert responses(found).computed == N - kept + 1  # one of those that are kept
@@ -618,7 +610,7 @@ def test_what_is_being_computed_when_one_fails_is_kept(
             return super().submit(work, *job, **keywords)
 
     points = Points([np.arange(12.0)], [True])
-    store = Store(tmp_path, "y", 1)
+    store = Store(tmp_path, "y", columns=1)
     with Pool(2) as pool, pytest.raises(prb.response.ResponseError, match="too steep"):
         respond(Calling("y", prb.scalar(function), pool, store), points, Tally())
     values, known = store.find(points.keys())

@@ -18,7 +18,8 @@ from hostile import processes
 
 import prbayes as prb
 from prbayes.response import fmi
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.executors import Pool
 from prbayes.response.store import Store
 
@@ -169,7 +170,7 @@ def test_a_unit_that_ends_or_hangs_its_process_costs_its_specimen_and_instances_
     x = np.arange(1.0, 21.0)
     x[5] = stiffness
     points, tally = Points([x, 2 * x], [True, True]), Tally()
-    store, policy = Store(tmp_path, "y", 2), prb.response.Replace(-1.0)
+    store, policy = Store(tmp_path, "y", columns=2), prb.response.Replace(-1.0)
     with processes() as executor:
         calling = Calling("y", response, executor, store, policy, timeout=timeout)
         found = respond(calling, points, tally)

@@ -23,7 +23,7 @@ PACKAGE = str(Path(prbayes.__file__).parent)
 def folder(tmp_path: Path) -> Path:
     """A store of 300 responses of y and 40 of z, closed."""
     path = tmp_path / "store"
-    store, other = Store(path, "y", 3), Store(path, "z", 1)
+    store, other = Store(path, "y", columns=3), Store(path, "z", columns=1)
     for rows in np.array_split(np.arange(300), 6):
         store.add(KEYS[rows], VALUES[rows])
     other.add(KEYS[:40, :1], VALUES[:40])
@@ -51,21 +51,21 @@ def all_right(store: Store) -> bool:
 
 
 def test_what_was_added_is_found_by_this_store_and_the_next(folder: Path) -> None:
-    store = Store(folder, "y", 3)
+    store = Store(folder, "y", columns=3)
     assert all_right(store)
     assert len(store) == 300
-    assert len(Store(folder, "z", 1)) == 40
+    assert len(Store(folder, "z", columns=1)) == 40
     elsewhere = KEYS + 1e-15 * np.sign(KEYS)
     values, known = store.find(elsewhere[(elsewhere != KEYS).any(axis=1)])
     assert not known.any()
     assert np.isnan(values).all()
     store.add(elsewhere[:1], np.array([7.0]))
     assert len(store) == 301
-    assert Store(folder, "y", 3).find(elsewhere[:1])[0] == 7.0
+    assert Store(folder, "y", columns=3).find(elsewhere[:1])[0] == 7.0
 
 
 def test_nothing_is_found_in_a_new_store_nor_for_no_inputs(tmp_path: Path) -> None:
-    store = Store(tmp_path / "a" / "b", "y", 2)
+    store = Store(tmp_path / "a" / "b", "y", columns=2)
     values, known = store.find(np.zeros((2, 2)))
     np.testing.assert_array_equal(known, [False, False])
     np.testing.assert_array_equal(values, [np.nan, np.nan])
@@ -78,34 +78,34 @@ def test_every_bit_of_inputs_and_responses_survives(tmp_path: Path) -> None:
     payload = np.array([0x7FF8000000000123, 0xFFF8000000000001], dtype="<u8").view("<f8")
     special = [0.0, -0.0, np.inf, -np.inf, 5e-324, -1.7976931348623157e308, 0.1, np.nan, *payload]
     values = np.array(special)
-    store = Store(tmp_path, "y", 1)
+    store = Store(tmp_path, "y", columns=1)
     store.add(values[:, None], values[::-1])
     for found, known in (
         store.find(values[:, None]),
-        Store(tmp_path, "y", 1).find(values[:, None]),
+        Store(tmp_path, "y", columns=1).find(values[:, None]),
     ):
         assert known.all()
         np.testing.assert_array_equal(found.view(np.uint64), values[::-1].view(np.uint64))
 
 
 def test_columns_are_told_apart(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", 2)
+    store = Store(tmp_path, "y", columns=2)
     store.add(np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([12.0, 21.0]))
     values, _ = store.find(np.array([[2.0, 1.0], [1.0, 2.0]]))
     np.testing.assert_array_equal(values, [21.0, 12.0])
 
 
 def test_the_last_of_two_responses_at_one_point_holds(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", 1)
+    store = Store(tmp_path, "y", columns=1)
     for value in (1.0, 2.0):
         store.add(np.array([[0.5]]), np.array([value]))
-    for again in (store, Store(tmp_path, "y", 1)):
+    for again in (store, Store(tmp_path, "y", columns=1)):
         assert again.find(np.array([[0.5]]))[0] == 2.0
         assert len(again) == 1
 
 
 def test_why_a_response_failed_is_kept(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", 1)
+    store = Store(tmp_path, "y", columns=1)
     store.add(np.arange(3.0)[:, None], np.array([1.0, np.nan, np.nan]), {1: "no licence"})
     with sqlite3.connect(store.path) as connection:
         found = connection.execute("SELECT state, reason FROM run ORDER BY id").fetchall()
@@ -117,9 +117,9 @@ def test_why_a_response_failed_is_kept(tmp_path: Path) -> None:
 def test_names_of_any_kind_have_their_own_responses(tmp_path: Path) -> None:
     names = ["y", "Y", "y ", "größe/2", "a'); DROP TABLE run; --", "../y"]
     for i, name in enumerate(names):
-        Store(tmp_path / "s", name, 1).add(np.zeros((1, 1)), np.array([float(i)]))
+        Store(tmp_path / "s", name, columns=1).add(np.zeros((1, 1)), np.array([float(i)]))
     for i, name in enumerate(names):
-        assert Store(tmp_path / "s", name, 1).find(np.zeros((1, 1)))[0] == i
+        assert Store(tmp_path / "s", name, columns=1).find(np.zeros((1, 1)))[0] == i
     assert {p.name.split("-")[0] for p in (tmp_path / "s").iterdir()} == {"responses.sqlite"}
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
 
@@ -128,11 +128,11 @@ def test_names_of_any_kind_have_their_own_responses(tmp_path: Path) -> None:
 def test_files_of_an_older_version_are_refused_and_not_ignored(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"prbayes1")
     with pytest.raises(StoreError, match=rf"y/1: store: .*beside {name}.*older version.*move it"):
-        Store(tmp_path, "y/1", 2)
+        Store(tmp_path, "y/1", columns=2)
     assert (tmp_path / name).read_bytes() == b"prbayes1"
-    assert len(Store(tmp_path, "z", 2)) == 0
+    assert len(Store(tmp_path, "z", columns=2)) == 0
     (tmp_path / name).unlink()
-    assert len(Store(tmp_path, "y/1", 2)) == 0
+    assert len(Store(tmp_path, "y/1", columns=2)) == 0
 
 
 def test_responses_go_to_other_programs_as_a_data_set(folder: Path, tmp_path: Path) -> None:
@@ -141,13 +141,13 @@ def test_responses_go_to_other_programs_as_a_data_set(folder: Path, tmp_path: Pa
         np.testing.assert_array_equal(data["inputs"], KEYS)
         np.testing.assert_array_equal(data["response"], VALUES)
         assert data.attrs["simulator"] == "y"
-    assert Store(tmp_path / "new", "y", 2).to_dataset()["inputs"].shape == (0, 2)
+    assert Store(tmp_path / "new", "y", columns=2).to_dataset()["inputs"].shape == (0, 2)
 
 
 @pytest.mark.long
 def test_a_hundred_thousand_responses_take_a_second_or_two(tmp_path: Path) -> None:
     keys = np.random.default_rng(2).normal(size=(100_000, 5))
-    store = Store(tmp_path, "y", 5)
+    store = Store(tmp_path, "y", columns=5)
     clock = time.process_time()
     for i in range(0, len(keys), 1000):
         store.add(keys[i : i + 1000], keys[i : i + 1000, 0])
@@ -162,13 +162,13 @@ def test_a_hundred_thousand_responses_take_a_second_or_two(tmp_path: Path) -> No
 
 
 def test_a_pickled_store_is_folder_and_name(folder: Path) -> None:
-    text = pickle.dumps(Store(folder, "y", 3))
+    text = pickle.dumps(Store(folder, "y", columns=3))
     assert len(text) < 500
     assert all_right(pickle.loads(text))
 
 
 def test_a_store_that_was_closed_opens_again(folder: Path) -> None:
-    store = Store(folder, "y", 3)
+    store = Store(folder, "y", columns=3)
     store.close()
     store.close()
     assert [p.name for p in folder.iterdir()] == ["responses.sqlite"]
@@ -176,12 +176,12 @@ def test_a_store_that_was_closed_opens_again(folder: Path) -> None:
 
 
 def test_a_store_that_was_removed_begins_anew(folder: Path) -> None:
-    store = Store(folder, "y", 3)
+    store = Store(folder, "y", columns=3)
     assert all_right(store)
     for path in folder.iterdir():
         path.unlink()
     store.add(KEYS[:2], VALUES[:2])
-    assert len(store) == len(Store(folder, "y", 3)) == 2
+    assert len(store) == len(Store(folder, "y", columns=3)) == 2
     assert (folder / "responses.sqlite-wal").exists()  # not deleted with the file before
 
 
@@ -192,7 +192,7 @@ def refused(folder: Path, match: str) -> None:
     """A store that is refused, with a sentence, and left as it is."""
     before = file_of(folder).read_bytes()
     with pytest.raises(StoreError, match=rf"y: store: got .*responses.sqlite, {match}"):
-        Store(folder, "y", 3)
+        Store(folder, "y", columns=3)
     assert file_of(folder).read_bytes() == before
 
 
@@ -243,7 +243,7 @@ def test_a_response_of_another_name_is_noticed(folder: Path) -> None:
 
 
 def test_damage_that_happens_during_a_run_is_noticed(folder: Path) -> None:
-    store = Store(folder, "y", 3)
+    store = Store(folder, "y", columns=3)
     connection = sqlite3.connect(file_of(folder))
     with connection:
         connection.execute(
@@ -268,11 +268,11 @@ def test_what_is_no_store_is_refused(folder: Path, tmp_path: Path) -> None:
     path.unlink()
     path.mkdir()
     with pytest.raises(StoreError, match=r"responses\.sqlite"):
-        Store(folder, "y", 3)
+        Store(folder, "y", columns=3)
     connection.close()
     (tmp_path / "file").touch()
     with pytest.raises(StoreError, match=r"got .*file, which is a file, expected a folder"):
-        Store(tmp_path / "file", "y", 3)
+        Store(tmp_path / "file", "y", columns=3)
 
 
 def test_another_layout_is_refused(folder: Path) -> None:
@@ -289,8 +289,8 @@ def test_other_inputs_are_refused(folder: Path) -> None:
         StoreError,
         match=r"y: store: .* holds inputs of 3 values for simulator 'y', expected 2 values; no",
     ):
-        Store(folder, "y", 2)
-    assert all_right(Store(folder, "y", 3))
+        Store(folder, "y", columns=2)
+    assert all_right(Store(folder, "y", columns=3))
     with pytest.raises(
         StoreError, match=r"no responses of simulator 'x', expected one of \['y', 'z'\]"
     ):
@@ -301,7 +301,7 @@ def test_other_inputs_are_refused(folder: Path) -> None:
 
 
 def test_a_full_disk_is_named_and_the_store_works_again_with_space(folder: Path) -> None:
-    store = Store(folder, "y", 3)
+    store = Store(folder, "y", columns=3)
     connection = store._read().connection
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     (most,) = connection.execute(f"PRAGMA max_page_count = {pages + 1}").fetchone()
@@ -312,12 +312,12 @@ def test_a_full_disk_is_named_and_the_store_works_again_with_space(folder: Path)
     ):
         store.add(more, more[:, 0])
     # Nothing of the chunk is there, all else is; also for another process.
-    for again in (store, Store(folder, "y", 3)):
+    for again in (store, Store(folder, "y", columns=3)):
         assert all_right(again)
         assert len(again) == 300
     connection.execute("PRAGMA max_page_count = 1000000")
     store.add(more, more[:, 0])
-    values, known = Store(folder, "y", 3).find(more)
+    values, known = Store(folder, "y", columns=3).find(more)
     assert known.all()
     np.testing.assert_array_equal(values, more[:, 0])
     assert len(store) == 1300
@@ -325,7 +325,7 @@ def test_a_full_disk_is_named_and_the_store_works_again_with_space(folder: Path)
 
 def test_a_writer_that_hangs_is_told_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("prbayes.response.database.PATIENCE", 0.05)
-    store = Store(folder, "y", 3)
+    store = Store(folder, "y", columns=3)
     hanging = sqlite3.connect(file_of(folder), isolation_level=None)
     hanging.execute("BEGIN IMMEDIATE")
     assert all_right(store)  # readers do not wait

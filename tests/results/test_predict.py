@@ -119,10 +119,10 @@ def test_draws_are_thinned_evenly_and_keep_their_coordinates() -> None:
     many = xr.DataTree.from_dict(
         {"posterior": many["posterior"].to_dataset().assign_coords(draw=np.arange(101) * 10)}
     )
-    found = prb.predict(many, same, x, model=model, draws=10, n_samples=200, random_seed=1)
+    found = prb.predict(many, same, x, model=model, n_draws=10, n_samples=200, random_seed=1)
     assert found.draw.values.tolist() == [0, 250, 500, 750, 1000]
     np.testing.assert_allclose(found.mean("sample")[0], [0.5, 0.75, 1.0, 1.25, 1.5], atol=0.05)
-    assert prb.predict(many, same, x, model=model, draws=1, n_samples=9).shape == (2, 1, 9)
+    assert prb.predict(many, same, x, model=model, n_draws=1, n_samples=9).shape == (2, 1, 9)
 
 
 @pytest.mark.slow
@@ -396,7 +396,10 @@ def test_refusals() -> None:
         prb.predict(POSTERIOR, same, 1.0, model=model)
     with pytest.raises(ResponseError, match="the response raised ZeroDivisionError"):
         prb.predict(POSTERIOR, lambda x: 1 // 0, x, model=model)
-    for keywords, match in (({"n_samples": 1}, "n_samples: got 1"), ({"draws": 0}, "draws: got 0")):
+    for keywords, match in (
+        ({"n_samples": 1}, "n_samples: got 1"),
+        ({"n_draws": 0}, "n_draws: got 0"),
+    ):
         with pytest.raises(ValueError, match=match):
             prb.predict(POSTERIOR, same, x, model=model, **keywords)
 

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
-from prbayes.validation.statistic import area
+from prbayes.validation.probability_transform import area
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
@@ -45,7 +45,7 @@ def test_a_statistic_beyond_the_critical_value_is_one_with_a_small_p_value(
 ) -> None:
     y = np.random.default_rng(6).normal(shift, 1, 20)
     for predicted in (posterior(), GRID):
-        test = prb.area_test(y, predicted, level=0.1, null=QUICK)
+        test = prb.area_test(y, predicted, alpha=0.1, null=QUICK)
         assert test.rejected == (test.p_value <= 0.1) == (test.statistic > test.critical_value)
         assert test.statistic == area(test.u_values)
 
@@ -130,7 +130,7 @@ def test_the_result_is_readable_and_saved(tmp_path: Path, posterior: Posterior) 
     assert dataset.condition.values.tolist() == ["a"] * 5 + ["b"] * 7
     assert float(dataset.p_value) == test.p_value == 1 / 1000
     with pytest.raises(AttributeError):
-        test.level = 0.1  # type: ignore[misc]
+        test.alpha = 0.1  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_the_result_is_readable_and_saved(tmp_path: Path, posterior: Posterior) 
         ([1.0], np.array(1.0), {}, r"predicted: got shape \(\)"),
         ([1.0], xr.DataArray(GRID, dims="x"), {}, r"got a DataArray with dims \('x',\)"),
         ([1.0] * 10, GRID[::20], {}, "predicted: got 50 values for 10 observed ones"),
-        ([1.0], GRID, {"level": 1.0}, "level: got 1.0, expected a number between"),
+        ([1.0], GRID, {"alpha": 1.0}, "alpha: got 1.0, expected a number between"),
         ([1.0], GRID, {"specimens": [1, 2]}, r"specimens: got shape \(2,\), expected \(1,\)"),
         ([1.0, 2.0], GRID, {"specimens": [1, 1], "null": EXACT}, "2 values of 1 specimens"),
         (

@@ -74,11 +74,11 @@ def test_few_specimens_have_fewer_folds() -> None:
     few = prb.minimize(model)
     assert prb.cross_validate(few).sizes["fold"] == 4
     assert prb.cross_validate(optimum()).sizes["fold"] == 5
-    table = prb.validation.compare_candidates({"one": few, "other": few})
+    table = prb.rank({"one": few, "other": few})
     assert table.attrs["folds"] == 4
     # Those that are there already say how many.
     three = prb.cross_validate(few, folds=3)
-    table = prb.validation.compare_candidates({"one": three, "other": few})
+    table = prb.rank({"one": three, "other": few})
     assert table.attrs["folds"] == 3
 
 

@@ -56,7 +56,7 @@ def test_own_data_take_the_joint_null() -> None:
 @pytest.mark.long
 def test_own_specimens_under_another_condition_are_as_close_as_under_their_own() -> None:
     optimum, x = calibrated(labelled=True)
-    null = prb.validation.JointNull(optimum, (double, x), replicates=199)
+    null = prb.validation.JointNull(optimum, responses=(double, x), replicates=199)
     own = prb.area_test(
         DATA, prb.predict(optimum, same, x), null=prb.validation.JointNull(optimum, replicates=199)
     )
@@ -102,8 +102,8 @@ def test_a_resimulated_model_has_a_joint_null_too() -> None:
         prb.area_test(
             2 * DATA,
             2 * predicted,
-            null=prb.validation.JointNull(optimum, (double, x), replicates=19),
-            level=0.1,
+            null=prb.validation.JointNull(optimum, responses=(double, x), replicates=19),
+            alpha=0.1,
         )
 
 
@@ -111,14 +111,14 @@ def test_refusals_of_the_joint_null(posterior: Posterior) -> None:
     optimum, x = calibrated()
     null = prb.validation.JointNull(optimum, replicates=19)
     with pytest.raises(ValueError, match="got 400 draws, expected the one population"):
-        prb.area_test(DATA, posterior(), null=null, level=0.1)
+        prb.area_test(DATA, posterior(), null=null, alpha=0.1)
     with pytest.raises(ValueError, match="distribution function differs by"):
-        prb.area_test(DATA, prb.predict(optimum, double, x), null=null, level=0.1)
+        prb.area_test(DATA, prb.predict(optimum, double, x), null=null, alpha=0.1)
     two = prb.predict(optimum, same, x, random_seed=1)
     with pytest.raises(
         ValueError, match=r"condition 'late', expected the name of a simulator, \['y'\]"
     ):
-        prb.area_test({"late": DATA, "y": DATA}, {"late": two, "y": two}, null=null, level=0.1)
+        prb.area_test({"late": DATA, "y": DATA}, {"late": two, "y": two}, null=null, alpha=0.1)
     with pytest.raises(TypeError, match="got str, expected an Optimum"):
         prb.validation.JointNull("optimum")  # type: ignore[arg-type]
     with pm.Model() as model:

@@ -199,6 +199,7 @@ class Report(_Document):
         self,
         title: str,
         sections: Sequence[Section] = (),
+        *,
         author: str = "",
         date: str = "",
         model: pm.Model | None = None,

@@ -33,7 +33,7 @@ def hostile(picture_bytes: bytes) -> prb.Report:
                 HOSTILE[3],
                 tuple(HOSTILE),
                 table,
-                picture_bytes,
+                picture=picture_bytes,
                 alt='"><script>alert(2)',
                 caption=HOSTILE[1],
             ),

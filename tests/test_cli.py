@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.__main__ import main
+from prbayes.cli import main
 
 
 def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -106,9 +106,9 @@ def test_several_posteriors_are_compared_by_the_names_of_their_files(folder: Pat
 
 
 def test_a_saved_validity_test_comes_back_whole(folder: Path) -> None:
-    from prbayes.__main__ import _opened, _test_of
+    from prbayes.cli import _opened, _validity_test
 
-    found = _test_of(Path("v.nc"), _opened(Path("v.nc")).to_dataset()).to_dataset()
+    found = _validity_test(Path("v.nc"), _opened(Path("v.nc")).to_dataset()).to_dataset()
     xr.testing.assert_identical(found.drop_attrs(), results()["v.nc"].drop_attrs())
     assert found.attrs["null"] == results()["v.nc"].attrs["null"]
 
@@ -125,8 +125,8 @@ def decisions() -> dict[str, xr.Dataset]:
     condition = prb.decision.Condition(lambda x: 2 * x, x)
     return {
         "above 7.nc": prb.exceedance(optimum, lambda x: 2 * x, 7.0, x, requirement=0.5),
-        "mean.nc": prb.sensitivity(optimum, quantity, samples=64),
-        "more.nc": prb.plan(optimum, {"here": condition}, [5], quantity=quantity),
+        "mean.nc": prb.sensitivity(optimum, quantity, n_samples=64),
+        "more.nc": prb.plan(optimum, {"here": condition}, k=[5], quantity=quantity),
     }
 
 
@@ -150,7 +150,7 @@ def test_a_damaged_decision_gets_one_line(folder: Path, capsys: pytest.CaptureFi
         less.to_netcdf(folder / name, engine="h5netcdf")
     assert main(["report", "o.nc", "above 7.nc", "--no-pictures"]) == 2
     error = capsys.readouterr().err
-    assert "above 7.nc: got no ['lower', 'limit', 'below', 'level']" in error
+    assert "above 7.nc: got no ['lower', 'limit', 'below', 'prob']" in error
     assert main(["report", "o.nc", "mean.nc", "--no-pictures"]) == 2
     assert "expected a table of prb.sensitivity" in capsys.readouterr().err
 
@@ -192,7 +192,6 @@ def test_mistakes_get_one_line_and_exit_code_2(
         assert message in err, arguments
         assert err.startswith("prbayes: ")
         assert err.count("\n") == 1
-    assert main(["demo", "--out", "p.nc/x"]) == 2
     assert not (folder / "report.html").exists()
 
 
@@ -211,58 +210,27 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, expected in (
         (["--help"], "report"),
         (["report", "--help"], "prbayes report results.nc optimum.nc validity.nc --title"),
-        (["demo", "--help"], "prbayes demo --out demo"),
         (["--version"], f"prbayes {prb.__version__}"),
     ):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 0
         assert expected in capsys.readouterr().out
-    for arguments in (
-        [],
-        ["report"],
-        ["demo", "--draws", "3"],
-        ["demo", "--draws", "many"],
-        ["nothing"],
-    ):
+    for arguments in ([], ["report"], ["nothing"]):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2
         assert "usage:" in capsys.readouterr().err
 
 
-def test_demo(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
-    """What it does is in test_demo.py; here, what it is asked for."""
-    asked = []
-
-    def run_demo(out: Path, **keywords: int) -> list[Path]:
-        asked.append((out, keywords))
-        return [out / "results.nc", out / "report.html"]
-
-    monkeypatch.setattr("prbayes._demo.run_demo", run_demo)
-    assert main(["demo", "--out", "here", "--draws", "50", "--chains", "2", "--seed", "3"]) == 0
-    assert main(["demo", "--quiet"]) == 0
-    first, second = asked
-    assert first == (Path("here"), {"draws": 50, "chains": 2, "seed": 3})
-    assert second == (Path("prbayes-demo"), {"draws": 1000, "chains": 4, "seed": 1})
-    assert (folder / "here").is_dir()
-    written = capsys.readouterr().out.splitlines()
-    assert written[:2] == [str(Path("here", n)) for n in ("results.nc", "report.html")]
-
-
 @pytest.mark.parametrize(("options", "level"), [([], logging.INFO), (["-q"], logging.WARNING)])
 def test_what_is_logged_goes_to_stderr(
-    options: list[str], level: int, monkeypatch: Any, tmp_path: Path, capsys: Any
+    options: list[str], level: int, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def run_demo(out: Path, **_: int) -> list[Path]:
-        logging.getLogger("prbayes").info("sampling")
-        return []
-
-    monkeypatch.setattr("prbayes._demo.run_demo", run_demo)
-    assert main(["demo", "--out", str(tmp_path), *options]) == 0
+    assert main(["report", "v.nc", "--out", "r.html", "--no-pictures", *options]) == 0
+    logging.getLogger("prbayes").info("sampling")
     assert logging.getLogger("prbayes").level == level
-    out, err = capsys.readouterr()
-    assert (out, err) == ("", "" if options else "prbayes: sampling\n")
+    assert capsys.readouterr() == ("r.html\n", "" if options else "prbayes: sampling\n")
 
 
 @pytest.mark.parametrize(
@@ -298,12 +266,12 @@ def test_crafted_attributes_get_no_traceback(
 def test_help_is_there_before_anything_heavy_is_loaded() -> None:
     code = (
         "import sys\n"
-        "from prbayes.__main__ import main\n"
+        "from prbayes.cli import main\n"
         "try:\n"
         "    main(['--help'])\n"
         "except SystemExit:\n"
         "    pass\n"
-        "heavy = {'pymc', 'pytensor', 'xarray', 'numpy', 'scipy', 'prbayes._public'}\n"
+        "heavy = {'pymc', 'pytensor', 'xarray', 'numpy', 'scipy'}\n"
         "assert not heavy & set(sys.modules)\n"
     )
     took = []
