@@ -30,7 +30,7 @@ from prbayes.decision.populations import (
     output_column,
 )
 from prbayes.decision.quantities import Exceedance, interval_grid, interval_values
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum
 from prbayes.propagation.base import MAX_LOST, N_BLOCKS, DesignError
@@ -39,7 +39,7 @@ from prbayes.response.response import Responses, refuse_uncallable
 _log = logging.getLogger("prbayes")
 
 
-@in_turn
+@locked
 def exceedance(
     result: Optimum | xr.DataTree,
     response: Callable[..., Any],
@@ -249,8 +249,8 @@ def _rare_probability(
             "prb.decision.Interval"
         )
     evaluator = populations.evaluator
-    values = evaluator.constrained(populations.thetas)
-    center = evaluator.constrained(populations.center[None])
+    values = evaluator.hyperparameters.constrained(populations.thetas)
+    center = evaluator.hyperparameters.constrained(populations.center[None])
     names = [str(rv.name) for rv in responses.inputs.roots]
     transform = InverseTransform(responses.name, responses.inputs, [center[name] for name in names])
     sign = -1.0 if quantity.below else 1.0

@@ -13,12 +13,12 @@ from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import Floats, positive_integer, share
 from prbayes.decision.populations import Populations, ResponseSample
 from prbayes.decision.quantities import interval_grid
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable
 
 
-@in_turn
+@locked
 def p_box(
     result: Optimum | xr.DataTree,
     response: Callable[..., Any],

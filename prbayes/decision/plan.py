@@ -20,7 +20,7 @@ from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
 from prbayes.model.elements import split_elements, told_elements
 from prbayes.model.labels import labelled
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable
@@ -67,7 +67,7 @@ class Condition:
         return f"Condition of {getattr(self.response, '__name__', type(self.response).__name__)}"
 
 
-@in_turn
+@locked
 def plan(
     result: Optimum | xr.DataTree,
     candidates: Mapping[str, Condition],
@@ -161,9 +161,9 @@ def plan(
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
         quantity_sample.refuse_failed(quantity)
-    draws = Draws.of(populations.thetas, evaluator.prior_sd)
+    draws = Draws.of(populations.thetas, evaluator.hyperparameters.prior_sd)
     forecast = _Forecast(populations, draws, quantity, quantity_sample)
-    now = forecast.sd(np.zeros((evaluator.size, evaluator.size)))
+    now = forecast.sd(np.zeros((evaluator.hyperparameters.size, evaluator.hyperparameters.size)))
     _refuse_target(target, list(now))
     samples = {
         name: populations.sample_of_all_outputs(condition.response, condition.inputs)
@@ -244,7 +244,7 @@ class _Forecast:
         """Return standard deviations by name after information, (d, d)."""
         thetas = self.draws.with_information(information)
         evaluator = self.populations.evaluator
-        variables = evaluator.constrained(thetas)
+        variables = evaluator.hyperparameters.constrained(thetas)
         values = labelled(evaluator, variables, {"draw": len(thetas)}).data_vars
         elements = split_elements(values)
         sd = {name: float(elements[name].std()) for name in told_elements(values)}
@@ -316,9 +316,8 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
     # Directions with a standard error of up to ten spreads of the prior: fainter ones have less
     # than a hundredth of the prior's information.
-    local = SamplingDistribution.of(
-        evaluator.of_one(alone, sample.k), center, np.ones(1), 10.0
-    ).local
+    simulator_alone = replace(evaluator, nodes=(alone,), has_graph=False)
+    local = SamplingDistribution.of(simulator_alone, center, np.ones(1), 10.0).local
     if not local.identified.size:
         return np.zeros((center.size, center.size))
     information = local.identified @ np.linalg.inv(local.covariance) @ local.identified.T
@@ -333,7 +332,7 @@ def fisher_information(sample: ResponseSample) -> Floats:
     outputs the covariance of the inputs' score, an upper bound.
     """
     evaluator = sample.populations.evaluator
-    unit = evaluator.prior_sd
+    unit = evaluator.hyperparameters.prior_sd
     step = 1e-3 * unit
     parents = evaluator.roots(cross(sample.populations.center, step), sample.k)
     _, weights = sample.design.populations(parents)

@@ -61,11 +61,13 @@ class Populations:
         model = model_of(result, model, caller)
         if isinstance(result, Optimum):
             thetas = _sobol_thetas(result, n_draws, caller)
-            evaluator = result.evaluator if model is result.model else Evaluator(model)
+            evaluator = result.evaluator if model is result.model else Evaluator.of(model)
             return cls(result, evaluator, thetas, result.theta, caller, are_draws=False)
         points, _ = populations_of(result, model, n_draws, caller)
-        evaluator = Evaluator(model)
-        thetas = evaluator.thetas_of([points[str(rv.name)] for rv in model.free_RVs])
+        evaluator = Evaluator.of(model)
+        thetas = evaluator.hyperparameters.thetas_of(
+            [points[str(rv.name)] for rv in model.free_RVs]
+        )
         center = np.median(thetas, axis=0)
         return cls(result, evaluator, thetas, center, caller, are_draws=True)
 

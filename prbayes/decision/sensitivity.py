@@ -17,7 +17,7 @@ from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.decision.copula import Copula
 from prbayes.decision.populations import InverseTransform, Populations, ResponseSample
 from prbayes.decision.quantities import Quantity, refuse_quantity
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.numerics.points import sobol
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
@@ -29,7 +29,7 @@ REPLICATES = 16
 _STEP = 0.02
 
 
-@in_turn
+@locked
 def sensitivity(
     result: Optimum | xr.DataTree,
     quantity: Quantity,
@@ -149,10 +149,13 @@ def sensitivity(
     evaluator = populations.evaluator
     simulator = evaluator.simulators[sample.k]
     names = aleatory_names(simulator.inputs, simulator.responses.function)
-    kinds = ["hyperparameter"] * evaluator.size + ["input"] * len(names)
+    kinds = ["hyperparameter"] * evaluator.hyperparameters.size + ["input"] * len(names)
     return xr.Dataset(
         columns,
-        coords={"factor": [*evaluator.readable_names, *names], "kind": ("factor", kinds)},
+        coords={
+            "factor": [*evaluator.hyperparameters.readable_names, *names],
+            "kind": ("factor", kinds),
+        },
         attrs={
             "quantity": repr(quantity),
             "value": float(sample.evaluate(quantity, populations.center[None])[0]),
@@ -193,7 +196,7 @@ def _hyperparameter_indices(
 ) -> Indices:
     """Return the indices of the elements of theta in the variance of the quantity."""
     copula = Copula.of(sample.populations.thetas)
-    d = sample.populations.evaluator.size
+    d = sample.populations.evaluator.hyperparameters.size
     first, second = _paired_points(n_samples // REPLICATES, d, seed)
     z = first @ copula.root.T
     independent = second @ copula.root.T

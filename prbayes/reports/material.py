@@ -270,7 +270,7 @@ def _require_known_labels(
         known |= {simulator, *own.names}
     if description is not None:
         known |= {str(variable["name"]) for variable in description["variables"]}
-    evaluator = None if model is None else Evaluator(model)
+    evaluator = None if model is None else Evaluator.of(model)
     refuse_labels(labels, sorted(known), evaluator=evaluator)
 
 

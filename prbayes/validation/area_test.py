@@ -14,7 +14,7 @@ from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, share
 from prbayes.model.fingerprint import Identity, as_attributes
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.results.predict import data_digest
 from prbayes.validation.conditions import DIRECTION, Case, Predicted, read_case
 from prbayes.validation.nulls import ExactModel, Null, PosteriorNull
@@ -113,7 +113,7 @@ class ValidityTest:
         )
 
 
-@in_turn
+@locked
 def area_test(
     observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
     predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],

@@ -13,15 +13,15 @@ from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.inference.resampling import DataSets, specimens
 from prbayes.model.emulated import PopulationSimulator
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.validation.scores import log_scores, scoring_target
 
 
-@in_turn
+@locked
 def cross_validate(
     optimum: Optimum,
     *,
@@ -190,7 +190,7 @@ def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> 
 
 def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
     """Return minus the mean log-likelihood of weighted specimens, (folds, simulators)."""
-    by_name = evaluator.specimen_log_likelihoods(thetas)
+    by_name = specimen_log_likelihoods(evaluator, thetas)
     columns = []
     for simulator, weights in zip(evaluator.emulated, data, strict=True):
         likelihood, measurement = simulator.likelihood, simulator.measurement

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
@@ -252,7 +252,7 @@ class _Tested:
 
 
 def _specimen_numbers(
-    nodes: list[Node], tested: list[_Tested]
+    nodes: Sequence[Node], tested: list[_Tested]
 ) -> tuple[list[NDArray[np.intp]], int]:
     """Return the numbers of each condition's specimens, (n,), and how many are new.
 

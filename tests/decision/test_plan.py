@@ -74,7 +74,7 @@ LEAST = [0.95, 0.85, 0.8]
 def test_a_specimen_of_a_normal_population(metric: prb.Metric, least: float) -> None:
     populations = Populations.of(optimum(), None, 10, "prb.plan")
     sample = populations.sample_of_all_outputs(same, (normal()[1],))
-    unit = populations.evaluator.prior_sd
+    unit = populations.evaluator.hyperparameters.prior_sd
     found = specimen_information(sample, metric) / np.outer(unit, unit)
     # Fisher's information of the mean and of log sigma.
     sigma = np.exp(populations.center[1])
@@ -97,7 +97,10 @@ def test_the_unit_of_a_response_does_not_matter() -> None:
 
 def test_fishers_information_of_a_response() -> None:
     populations = Populations.of(optimum(), None, 10, "prb.plan")
-    unit = np.outer(populations.evaluator.prior_sd, populations.evaluator.prior_sd)
+    unit = np.outer(
+        populations.evaluator.hyperparameters.prior_sd,
+        populations.evaluator.hyperparameters.prior_sd,
+    )
     sigma = np.exp(populations.center[1])
     x = normal()[1]
     found = fisher_information(populations.sample_of_all_outputs(np.exp, (x,))) / unit
@@ -121,7 +124,7 @@ def test_what_tells_of_one_direction_only() -> None:
     found = specimen_information(sample, prb.LogLikelihood(density=prb.GaussianKDE()))
     # How far specimens are from about the middle says little of where that is.
     sigma = np.exp(populations.center[1])
-    unit = populations.evaluator.prior_sd
+    unit = populations.evaluator.hyperparameters.prior_sd
     assert found[0, 0] / unit[0] ** 2 < 0.05 / sigma**2
     assert 1.8 < found[1, 1] / unit[1] ** 2 < 2.1
 
@@ -143,6 +146,6 @@ def test_precisions_add_up() -> None:
 
 def test_draws_of_a_posterior_are_read() -> None:
     populations = Populations.of(posterior(), normal()[0], 1000, "prb.plan")
-    draws = Draws.of(populations.thetas, populations.evaluator.prior_sd)
+    draws = Draws.of(populations.thetas, populations.evaluator.hyperparameters.prior_sd)
     sd = np.sqrt(np.diag(draws.covariance)) * draws.unit
     np.testing.assert_allclose(sd, populations.thetas.std(axis=0), rtol=0.03)
