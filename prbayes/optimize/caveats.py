@@ -16,7 +16,9 @@ from prbayes.inference.identifiability import unidentified_directions, without
 from prbayes.inference.projections import number_parts, one_dimensional
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import dependent
-from prbayes.metrics.base import Minimum
+from prbayes.metrics.base import Minimum, is_likelihood
+from prbayes.metrics.likelihood import kernel_width
+from prbayes.metrics.multivariate import components_missed
 from prbayes.model.elements import read_variables, split_elements, told_elements
 from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.labels import labelled
@@ -244,7 +246,7 @@ def between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
             continue
         values, _ = evaluator.populations(theta[None], k)
         for part in number_parts(node.target):
-            width = part.target.resolution
+            width = kernel_width(part.target)
             if not width > 0:
                 continue
             observed = part.target.observed
@@ -283,10 +285,9 @@ def caveats(
 
     And whether the design is too small.
     """
+    missed = {node.name: components_missed(node.target) for node in evaluator.nodes}
     findings = [
-        Finding("components-left-out", f"{node.name}: {node.target.missed}.")
-        for node in evaluator.nodes
-        if node.target.missed
+        Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
     ]
     if design_error > _TOLERATED:
         findings.append(_of_design(evaluator, design_error))
@@ -310,7 +311,7 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[Finding]:
     """
     nodes = evaluator.nodes
     is_biased = [
-        node.metric.minimum is Minimum.ABSOLUTE or node.target.likelihood for node in nodes
+        node.metric.minimum is Minimum.ABSOLUTE or is_likelihood(node.target) for node in nodes
     ]
     fewest = min((len(node.observed) for node in nodes), default=enough)
     if len(nodes) < 2 or fewest >= enough or not any(is_biased) or dependent(nodes):
