@@ -133,7 +133,7 @@ def memory(metric: str, outputs: int, points: int) -> dict[str, Any]:
             "y", normal, x, metric=prb.Joint(lifted), observed=data,
             propagation=prb.Reweighted(16, max_points=points, emulator=None),
         )  # fmt: skip
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     (design,) = evaluator.designs.values()
     design.add([np.zeros((1, outputs))], points - 16)
     with_points = peak()

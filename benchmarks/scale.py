@@ -82,10 +82,10 @@ def one(kind: str, metric: str, size: int) -> dict[str, float]:
     else:
         how = prb.Resimulated(100) if propagation == "resimulated" else prb.Reweighted(256)
     model = model_of(metric, how)
-    evaluator = Evaluator(model)
-    thetas = evaluator.unconstrained({"mu": 10.0, "sigma": 1.0}) + 0.05 * np.random.default_rng(
-        2
-    ).normal(size=(THETAS if what == "n" else size, 2))
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.unconstrained(
+        {"mu": 10.0, "sigma": 1.0}
+    ) + 0.05 * np.random.default_rng(2).normal(size=(THETAS if what == "n" else size, 2))
     evaluator(thetas[:1])
     built = time.process_time() - clock
     spent = np.inf

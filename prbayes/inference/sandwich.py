@@ -127,7 +127,7 @@ class Information:
     @property
     def prior_sd(self) -> Floats:
         """The prior's standard deviations, shape (d,)."""
-        return self.evaluator.prior_sd
+        return self.evaluator.hyperparameters.prior_sd
 
     @property
     def _target(self) -> Discrepancy:

@@ -191,11 +191,11 @@ def start(
     """Return where to begin, and how many points were screened for it."""
     evaluator = search.evaluator
     if given is not None:
-        return evaluator.unconstrained(given), 0
+        return evaluator.hyperparameters.unconstrained(given), 0
     if evaluator.responses_per_theta:
-        return evaluator.initial, 0
-    points = evaluator.prior_points(THETAS, seed)
-    candidates = np.concatenate([evaluator.initial[None], points])
+        return evaluator.hyperparameters.initial, 0
+    points = evaluator.hyperparameters.prior_points(THETAS, seed)
+    candidates = np.concatenate([evaluator.hyperparameters.initial[None], points])
     return search.best_of(candidates, scales), len(candidates)
 
 
@@ -423,7 +423,7 @@ def approach(
         return Approach(theta, trace)
     guide = _Guide(evaluator, scales)
     if not evaluator.responses_per_theta:
-        points = evaluator.prior_points(THETAS, seed)
+        points = evaluator.hyperparameters.prior_points(THETAS, seed)
         candidates = np.vstack([theta, points])
         theta = candidates[np.argmin(guide(candidates))]
     function = differences(guide, _STEP * search.prior_sd)
@@ -481,7 +481,7 @@ class _Guide:
         areas = []
         for area, v, w in zip(self.areas, values, weights, strict=True):
             areas.append(area.of(v, w) / area.scale)
-        inside = self.evaluator.in_support(thetas)
+        inside = self.evaluator.hyperparameters.in_support(thetas)
         total = np.where(inside, np.sum(areas, axis=0), np.inf)
         # What is known of them besides: the overlap, and the model's own objective.
         overlaps = overlap(self.evaluator, values, weights)

@@ -44,7 +44,7 @@ def supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
     out = np.zeros(len(thetas), dtype=bool)
     where = np.flatnonzero(np.isfinite(thetas).all(axis=1))
     if where.size:
-        where = where[evaluator.in_support(thetas[where])]
+        where = where[evaluator.hyperparameters.in_support(thetas[where])]
     if not where.size:
         return out
     good = np.ones(where.size, dtype=bool)
@@ -91,7 +91,7 @@ def read_result(
     count = draws or _affordable(cost)
     points, _ = populations_of(result, evaluator.model, count, caller)
     values = [points[str(rv.name)] for rv in evaluator.model.free_RVs]
-    thetas = evaluator.thetas_of(values)
+    thetas = evaluator.hyperparameters.thetas_of(values)
     if isinstance(result, Optimum):
         around = _around(result, evaluator, thetas[0], count, free=free)
         return Ensemble(evaluator, thetas, around, "optimum", "standard error")
@@ -106,7 +106,7 @@ def _evaluator_of(result: Optimum | xr.DataTree, model: pm.Model | None, caller:
         return result.evaluator
     found = model_on_context(model, caller)
     require_of_model(result, found, caller, Level.POPULATIONS)
-    return Evaluator(found)
+    return Evaluator.of(found)
 
 
 def _affordable(cost: int) -> int:
@@ -143,7 +143,7 @@ def _around(
         return nothing
     rng = np.random.default_rng(0)
     drawn = rng.multivariate_normal(center, optimum.covariance, size=count, method="eigh")
-    ok = evaluator.in_support(drawn) if free else supported(evaluator, drawn)
+    ok = evaluator.hyperparameters.in_support(drawn) if free else supported(evaluator, drawn)
     return drawn[ok] if ok.mean() > 0.5 else nothing
 
 
@@ -158,10 +158,10 @@ def read_before(
     else the prior's initial point, where PyMC's samplers start.
     """
     if before is False:
-        return np.empty((0, evaluator.size)), ""
+        return np.empty((0, evaluator.hyperparameters.size)), ""
     if isinstance(before, Mapping):
         try:
-            return evaluator.unconstrained(dict(before))[None], "as given"
+            return evaluator.hyperparameters.unconstrained(dict(before))[None], "as given"
         except (KeyError, TypeError, ValueError) as error:
             raise type(error)(f"before: {error.args[0]}") from None
     if before not in (None, True):
@@ -173,4 +173,4 @@ def read_before(
         path = result.trace.get("theta")
         if path is not None and len(path):
             return path[:1], "optimiser's first point"
-    return evaluator.initial[None], "prior's initial point"
+    return evaluator.hyperparameters.initial[None], "prior's initial point"

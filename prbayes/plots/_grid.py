@@ -57,7 +57,7 @@ class _Plane:
             rows = np.column_stack(at[variable])
             draws.append(rows.reshape(size, *shape))
         with np.errstate(all="ignore"):
-            return self.evaluator.thetas_of(draws)
+            return self.evaluator.hyperparameters.thetas_of(draws)
 
     def within_support(self, name: str, end: float) -> float:
         """Return how far an axis can go from the optimum towards an end within the support."""
@@ -68,7 +68,7 @@ class _Plane:
         places[:, self.names.index(name)] = steps
         thetas = self.thetas(places)
         ok = np.isfinite(thetas).all(axis=1)
-        ok[ok] = self.evaluator.in_support(thetas[ok])
+        ok[ok] = self.evaluator.hyperparameters.in_support(thetas[ok])
         outside = np.flatnonzero(~ok)
         if not outside.size:
             return float(steps[-1])
@@ -85,7 +85,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     others = np.array([rival["theta"] for rival in optimum.rivals])
     others = others.reshape(-1, optimum.theta.size)
     rivals = free_elements(evaluator, others)
-    prior = free_elements(evaluator, evaluator.prior_thetas(1000, 0))
+    prior = free_elements(evaluator, evaluator.hyperparameters.prior_thetas(1000, 0))
 
     # Axes
     axes = []
@@ -120,7 +120,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
 
 def _plane(optimum: Optimum, evaluator: Evaluator, names: list[str]) -> _Plane:
     center = optimum.theta[None]
-    values = evaluator.constrained(center)
+    values = evaluator.hyperparameters.constrained(center)
     shapes = {}
     for rv in evaluator.model.free_RVs:
         name = str(rv.name)

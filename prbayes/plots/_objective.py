@@ -67,7 +67,7 @@ def objective(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> Floats:
 
 def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
     """Return the free variables' elements in the user's own units, shape (P,), by element name."""
-    values = evaluator.constrained(thetas)
+    values = evaluator.hyperparameters.constrained(thetas)
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
     some = {name: values[name] for name in names}
     return split_elements(labelled(evaluator, some, {"draw": len(thetas)}).data_vars)

@@ -15,7 +15,7 @@ from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, positive_integer
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, INK, VERMILION, Canvas, Limits, Panel, refuse_look
 from prbayes.plots._curves import central_range
@@ -36,7 +36,7 @@ _MOST = 7
 _SHARES = (0.5, INTERVAL)
 
 
-@in_turn
+@locked
 def plot_outputs(
     result: Optimum | xr.DataTree,
     *,

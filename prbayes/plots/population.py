@@ -10,7 +10,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._validate import positive_integer, share
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, SOLID, Canvas, Panel, refuse_look
 from prbayes.plots._ensemble import Ensemble, read_result
@@ -26,7 +26,7 @@ _IN_PAIRS = 3
 _OUTLINED = 200_000
 
 
-@in_turn
+@locked
 def plot_population(
     result: Optimum | xr.DataTree,
     *,

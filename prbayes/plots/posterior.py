@@ -110,7 +110,7 @@ def plot_posterior(
     _check_results(posterior, optimum, model)
     share(prob, "prob")
     found = _wanted(_read_hyperparameters(posterior, optimum, model), var_names)
-    evaluator = None if model is None else Evaluator(model)
+    evaluator = None if model is None else Evaluator.of(model)
     refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
     canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
     for name, hyperparameter in found.items():
@@ -191,10 +191,12 @@ def _read_hyperparameters(
         shared &= set(best)
     prior: dict[str, Floats] = {}
     if model is not None:
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         # So many tell a normal density's peak within 2%.
-        thetas = evaluator.prior_thetas(4000, 0)
-        drawn = labelled(evaluator, evaluator.constrained(thetas), {"draw": len(thetas)})
+        thetas = evaluator.hyperparameters.prior_thetas(4000, 0)
+        drawn = labelled(
+            evaluator, evaluator.hyperparameters.constrained(thetas), {"draw": len(thetas)}
+        )
         prior = split_elements(drawn.data_vars)
         shared &= set(prior)
 

@@ -18,7 +18,7 @@ from prbayes.inference.resampling import SETS, DataSets, groups
 from prbayes.inference.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 from prbayes.model.epsilon import Epsilon, refuse_without_epsilon
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
 
 # Thetas that carry each simulated data set's posterior: half or twice changes epsilon by 3%, as
@@ -30,7 +30,7 @@ _CLOUD = 500
 _WIDER = 3.0
 
 
-@in_turn
+@locked
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     """Return an epsilon for each simulator, so that the posterior is as wide as the data warrant.
 

@@ -98,7 +98,7 @@ def _gain(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
 def _told(evaluator: Evaluator, k: int, bias: Floats) -> str:
     node = evaluator.nodes[k]
     worst = int(bias.argmax())
-    name = evaluator.readable_names[worst]
+    name = evaluator.hyperparameters.readable_names[worst]
     kernel = ""
     parts = number_parts(node.target)
     if len(parts) == 1:
