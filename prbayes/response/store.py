@@ -541,7 +541,7 @@ _EXPLANATIONS = {
 def explanation(error: sqlite3.Error | _FileError) -> tuple[str, str, str]:
     """Return got, expected and what to do; an unknown error of SQLite is damage."""
     if isinstance(error, _FileError):
-        return error.args  # type: ignore[return-value]
+        return error.args
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
     # The kind of an extended result code (https://www.sqlite.org/rescode.html).
     known = _EXPLANATIONS.get(code) or _EXPLANATIONS.get(code & 0xFF)
