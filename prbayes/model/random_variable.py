@@ -41,7 +41,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._pages import more_in
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.model.first_look import tell_far_data
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
@@ -178,7 +178,7 @@ class Node:
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
         bound = self.bound.copied()
-        bound.aim(target.beside(bound.first_responses, bound.dimensions))
+        bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
         other = replace(self, target=bound.target, bound=bound)
         if self.epsilon_is_default:
             other.epsilon.set_value(np.asarray(1 / other.n_specimens))
@@ -237,7 +237,8 @@ class Specification:
         responses.on_start = partial(_log_first_runs, self.propagation, responses)
         with shown(self.progressbar):
             bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
-            bound.aim(self.target.beside(bound.first_responses, bound.dimensions))
+            target = self.target
+            bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
         responses.on_start = None
         tell_far_data(self.name, self.target.observed, bound.first_responses, self.outputs.names)
         return Node(
@@ -296,7 +297,7 @@ def has_default_epsilon(simulator: AnySimulator) -> bool:
     epsilon = float(simulator.epsilon.get_value())
     # Weights that were normalised again differ by rounding.
     is_default = abs(epsilon * effective_specimens(target, simulator.specimens) - 1) < 1e-12
-    return target.likelihood and is_default
+    return is_likelihood(target) and is_default
 
 
 def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> float:

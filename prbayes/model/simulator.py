@@ -27,7 +27,7 @@ from prbayes._validate import (
     sample_labels,
     sample_weights,
 )
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.first_look import tell_copies
 from prbayes.model.measurement import Measurement
@@ -494,7 +494,7 @@ def _observed_term(
     if term.labels is None:
         tell_copies(name, target.observed)
     if epsilon is None:
-        epsilon = 1 / effective_specimens(target, term.labels) if target.likelihood else np.nan
+        epsilon = 1 / effective_specimens(target, term.labels) if is_likelihood(target) else np.nan
     specification = Specification(
         name,
         target,

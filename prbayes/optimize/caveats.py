@@ -16,7 +16,9 @@ from prbayes.inference.identifiability import unidentified_directions, without
 from prbayes.inference.projections import number_parts, one_dimensional
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import dependent
-from prbayes.metrics.base import Minimum
+from prbayes.metrics.base import Minimum, is_likelihood
+from prbayes.metrics.likelihood import kernel_width
+from prbayes.metrics.multivariate import components_missed
 from prbayes.model.elements import read_variables, split_elements, told_elements
 from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.labels import labelled
@@ -236,7 +238,7 @@ def between_runs(evaluator: Evaluator, theta: Floats) -> list[str]:
             continue
         values, _ = evaluator.populations(theta[None], k)
         for part in number_parts(node.target):
-            width = part.target.resolution
+            width = kernel_width(part.target)
             if not width > 0:
                 continue
             observed = part.target.observed
@@ -271,7 +273,8 @@ def caveats(
 
     And whether the design is too small.
     """
-    lines = [f"{node.name}: {node.target.missed}" for node in evaluator.nodes if node.target.missed]
+    missed = {node.name: components_missed(node.target) for node in evaluator.nodes}
+    lines = [f"{name}: {text}" for name, text in missed.items() if text]
     if design_error > _TOLERATED:
         lines.append(_of_design(evaluator, design_error))
     for rival in others:
@@ -293,7 +296,7 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[str]:
     """
     nodes = evaluator.nodes
     is_biased = [
-        node.metric.minimum is Minimum.ABSOLUTE or node.target.likelihood for node in nodes
+        node.metric.minimum is Minimum.ABSOLUTE or is_likelihood(node.target) for node in nodes
     ]
     fewest = min((len(node.observed) for node in nodes), default=enough)
     if len(nodes) < 2 or fewest >= enough or not any(is_biased) or dependent(nodes):

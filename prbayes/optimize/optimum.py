@@ -13,6 +13,7 @@ from prbayes._display import view
 from prbayes._validate import Floats
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import read_variables, single_elements, told_of
 from prbayes.model.evaluator import Evaluator, likelihood_of, specimen_log_likelihoods
@@ -402,7 +403,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     variables["covariance"] = (["element", "other_element"], optimum.covariance)
     metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
     variables["metric"] = ("simulator", [without_addresses(metric) for metric in metrics])
-    compared = [node.target.told for node in nodes] + [""] * len(measurements)
+    compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
     variables["compared"] = ("simulator", compared)
     is_likelihood = [0] * len(nodes) + [1] * len(measurements)
     variables["is_likelihood"] = ("simulator", is_likelihood)

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._validate import Floats
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator, likelihood_of, specimen_log_likelihoods
@@ -252,7 +253,7 @@ def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
         "required_ess": ("simulator", required),
         "max_lost": ("simulator", [node.bound.max_lost for node in nodes]),
         "metric": ("simulator", [without_addresses(node.metric) for node in nodes]),
-        "compared": ("simulator", [node.target.told for node in nodes]),
+        "compared": ("simulator", [components_summary(node.target) for node in nodes]),
         "propagation": ("simulator", [without_addresses(node.propagation) for node in nodes]),
         "n_points": ("simulator", [node.bound.n_points for node in nodes]),
         "n_runs": ("simulator", [node.bound.n_runs for node in nodes]),

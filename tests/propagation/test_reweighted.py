@@ -15,6 +15,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._validate import Floats
+from prbayes.metrics.multivariate import CompositeDiscrepancy
 from prbayes.model.coverage import shortcomings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
@@ -812,7 +813,7 @@ def test_where_a_basis_would_be_too_large_nothing_else_changes(
     at, many, sizes = found()
     assert max(sizes) > 128 * 100
     monkeypatch.setattr("prbayes.propagation.reweighted._MOST_NUMBERS", 100)
-    monkeypatch.setattr("prbayes.metrics.base.AT_ONCE", 100)
+    monkeypatch.setattr(CompositeDiscrepancy.basis, "__defaults__", (100,))
     compact_at, compact_many, compact_sizes = found()
     assert max(compact_sizes) == 128 * 4
     np.testing.assert_allclose(compact_at[0], at[0], rtol=1e-10)
