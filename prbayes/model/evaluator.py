@@ -279,7 +279,8 @@ class Evaluator:
                 counted = node.target.weights if same_size else None
             target = (metric or node.metric).against(observed, counted)
             bound = node.bound
-            targets.append(target.beside(bound.first_responses, bound.inputs.dimensions))
+            dimensions = bound.inputs.dimensions
+            targets.append(target.metric.beside(target, bound.first_responses, dimensions))
         return self.with_targets(targets)
 
     def roots(self, thetas: Floats, k: int) -> list[Floats]:

@@ -38,10 +38,10 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.shape import Shape
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.model.first_look import tell_far_data
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
@@ -178,7 +178,8 @@ class Node:
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
         bound = self.bound.copied()
-        bound.target = target.beside(bound.first_responses, bound.inputs.dimensions)
+        dimensions = bound.inputs.dimensions
+        bound.target = target.metric.beside(target, bound.first_responses, dimensions)
         other = replace(self, target=bound.target, bound=bound)
         if self.epsilon_is_default:
             other.epsilon.set_value(np.asarray(1 / other.n_specimens))
@@ -237,7 +238,9 @@ class Specification:
         responses.on_start = partial(_log_first_runs, self.propagation, responses)
         with shown(self.progressbar):
             bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
-            bound.target = self.target.beside(bound.first_responses, bound.inputs.dimensions)
+            dimensions = bound.inputs.dimensions
+            metric = self.target.metric
+            bound.target = metric.beside(self.target, bound.first_responses, dimensions)
         responses.on_start = None
         tell_far_data(self.name, self.target.observed, bound.first_responses, self.outputs.names)
         return Node(
@@ -296,7 +299,7 @@ def has_default_epsilon(simulator: AnySimulator) -> bool:
     epsilon = float(simulator.epsilon.get_value())
     # Weights that were normalised again differ by rounding.
     is_default = abs(epsilon * effective_specimens(target, simulator.specimens) - 1) < 1e-12
-    return target.likelihood and is_default
+    return is_likelihood(target) and is_default
 
 
 def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> float:
@@ -467,12 +470,14 @@ class SimulatorRV(RandomVariable):
         if not others or self._warned:
             return
         self._warned = True
-        _log.warning(
-            "%s has inputs that %s has too, the same specimens; PyMC's predictive sampling draws "
-            "each variable by itself, and so as independent of the others: use prb.predict for "
-            "responses of the same specimens",
-            self.simulator.name,
-            ", ".join(others),
+        report(
+            Finding(
+                "independent-draws",
+                f"{self.simulator.name} has inputs that {', '.join(others)} has too, the same "
+                "specimens; PyMC's predictive sampling draws each variable by itself, and so "
+                "as independent of the others: use prb.predict for responses of the same "
+                "specimens.",
+            )
         )
 
 
@@ -537,18 +542,19 @@ def _log_density(
     (value,) = values
     known = known_value(value)
     node = op.node if known is None else _observing(op.node, known)
-    unset = (
+    unset = Finding(
+        "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
         "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use "
-        "prb.sample_smc, which calibrates it"
-        f"{more_in('choose.md#epsilon-and-the-width-of-the-posterior')}"
+        "prb.sample_smc, which calibrates it.",
+        "choose.md#epsilon-and-the-width-of-the-posterior",
     )
     if np.isnan(node.epsilon_value):
         # nutpie tells no more of an error than its number; nobody else has to be told who may yet
         # calibrate it
         blunt = "nutpie" in sys.modules and not _QUIET.get()
-        _log.log(logging.WARNING if blunt else logging.DEBUG, "%s", unset)
-    check = CheckParameterValue(unset)
+        report(unset, level=logging.WARNING if blunt else logging.DEBUG)
+    check = CheckParameterValue(str(unset))
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs
     density = log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)

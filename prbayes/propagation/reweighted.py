@@ -17,10 +17,11 @@ from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
+from prbayes._finding import Finding, report
 from prbayes._validate import Floats, positive_integer
 from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
-from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import (
     MAX_LOST,
@@ -42,7 +43,7 @@ from prbayes.propagation.importance import (
     Sample,
     fit_emulator,
 )
-from prbayes.propagation.ops import CompactOp, OpaqueOp
+from prbayes.propagation.ops import stored_discrepancy
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import prior_draws, refuse_without_density
 from prbayes.response.inputs import Inputs
@@ -54,8 +55,6 @@ from prbayes.response.response import (
     refuse_coarse,
     refuse_other_number,
 )
-
-_log = logging.getLogger("prbayes")
 
 # Largest basis in a compiled graph, 1 GiB, for the largest design. Graphs without a basis are as
 # fast (benchmarks/joint_speed.py), but JAX does not know their operations.
@@ -523,18 +522,15 @@ class ReweightedBound(Bound):
 
     def _graph_arrays(self) -> list[Any]:
         """Return what compiled graphs read: arrays of weights, and the basis of the metric."""
-        values = self._design.sample.values
-        is_large = self._has_large_basis
-        basis = self.target.compact(values) if is_large else self.target.basis(values)
-        return [*self._design.weight_arrays, *basis]
+        basis = self._graph_basis(self._design.sample.values)
+        return [*self._design.weight_arrays, *basis.arrays]
 
-    @property
-    def _has_large_basis(self) -> bool:
-        """Whether graphs do without a basis, as that of the largest design fills the memory."""
+    def _graph_basis(self, values: Floats) -> Basis:
+        """Return the basis for compiled graphs; its form stays the same while the design grows."""
         most = self.config.most
         if self.config.emulates(self.inputs):
             most = max(most, SIZES.largest)
-        return self.target.columns * most > _MAX_BASIS
+        return self.target.basis(values, _MAX_BASIS * len(values) / most)
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the reweighted responses, +inf where no point has weight."""
@@ -552,14 +548,8 @@ class ReweightedBound(Bound):
         centred = logs - disconnected_grad(largest)
         raw = pt.exp(pt.switch(supported, centred, 0.0))
         weights = raw / raw.sum()
-        if self._has_large_basis:
-            features = CompactOp(self.target)(*basis, weights)
-            value = self.target.outer(features, xp=pt)
-        elif self.target.symbolic:
-            features = self.target.from_basis(weights, basis, pt)
-            value = self.target.outer(*features, xp=pt)
-        else:
-            value = OpaqueOp(self.target)(*basis, weights)
+        form = replace(self._graph_basis(self._design.sample.values[:1]), arrays=basis)
+        value = stored_discrepancy(self.target, form, weights)
         return pt.switch(supported, value, np.inf)
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
@@ -576,7 +566,7 @@ class ReweightedBound(Bound):
         """
         sample = self._design.sample
         if self._basis[0] is not target or self._basis[1] is not sample:
-            self._basis = (target, sample, target.stored(sample.values))
+            self._basis = (target, sample, target.basis(sample.values))
         basis = self._basis[2]
         size = len(params[0])
         step = max(_MIN_POPULATIONS, _BLOCK // self.n_points)
@@ -588,7 +578,7 @@ class ReweightedBound(Bound):
                 weights = self._log_weights(roots, self._design)
                 is_supported = np.isfinite(normalise(weights))
                 weights[~is_supported] = 1 / self.n_points
-                features = target.from_basis(weights, basis, np)
+                features = basis.features(weights)
                 values = target.outer(*features, xp=np)
                 parts.append(np.where(is_supported, values, np.inf))
         return np.concatenate(parts)
@@ -639,16 +629,13 @@ def _warn_of_low_ess(bound: ReweightedBound, ess: float) -> None:
             f"{dimensions} inputs are many for stored responses alone: {leave}use "
             "propagation=prb.Resimulated(n), which has no design"
         )
-    _log.log(
-        level,
-        "%s: the design of %d runs supports a typical population of the prior with a weight "
-        "effective sample size of %.0f, where %.0f make its error small; %s",
-        bound.name,
-        bound.config.n,
-        ess,
-        bound.required_ess,
-        advice,
+    finding = Finding(
+        "thin-design",
+        f"{bound.name}: the design of {bound.config.n} runs supports a typical population of the "
+        f"prior with a weight effective sample size of {ess:.0f}, where {bound.required_ess:.0f} "
+        f"make its error small; {advice}.",
     )
+    report(finding, level=level)
 
 
 @contextmanager
