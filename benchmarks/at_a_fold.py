@@ -90,7 +90,7 @@ def errors(metric: Any, rooted: bool, size: int, replicates: int) -> Any:
             observed=data(0),
             propagation=prb.Reweighted(POINTS),
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     found = []
     for replicate in range(replicates):
         here = evaluator.observing({"y": data(replicate)}, metric)

@@ -58,7 +58,7 @@ def design_of(response: Response, n: int, seed: int, emulator: Any) -> Any:
             observed=observed,
             propagation=prb.Reweighted(n, emulator=emulator, random_seed=seed),
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def populations(response: Response) -> list[tuple[Any, Any]]:
@@ -90,7 +90,7 @@ def off(evaluator: Any, response: Response, known: list[Any]) -> float:
         values: dict[str, Any] = {}
         for i in range(response.d):
             values |= {f"mu{i}": mean[i], f"sigma{i}": sd[i]}
-        thetas.append(evaluator.unconstrained(values))
+        thetas.append(evaluator.hyperparameters.unconstrained(values))
     simulated, weights = evaluator.populations(np.array(thetas), 0)
     squares = []
     for y, w, quantiles in zip(simulated, weights, known, strict=True):

@@ -30,7 +30,7 @@ def evaluator_of(metric, n):
         prb.Simulator(
             "y", np.positive, x, metric=metric, observed=observed, propagation=prb.Reweighted(n)
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def main():
@@ -45,7 +45,7 @@ def main():
     for name, metric in METRICS.items():
         for points in POINTS:
             evaluator = evaluator_of(metric, points)
-            thetas = evaluator.prior_thetas(POPULATIONS, 1)
+            thetas = evaluator.hyperparameters.prior_thetas(POPULATIONS, 1)
             seconds: dict[str, list[float]] = {block: [] for block in blocks}
             for _ in range(arguments.repeats):
                 for block, setting in blocks.items():

@@ -405,7 +405,7 @@ def after_first(problem: Problem, half: Any, before: dict[str, Any]) -> dict[str
 def result_of_first(found: Any) -> list[Any]:
     """Return all of an optimum that what follows rests on, digit by digit."""
     optimum = found[0] if isinstance(found, tuple) else found
-    units = optimum.evaluator.prior_sd
+    units = optimum.evaluator.hyperparameters.prior_sd
     parts = [
         optimum.theta,
         optimum.covariance,

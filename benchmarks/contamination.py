@@ -42,7 +42,7 @@ def evaluator_of(metric: str) -> Evaluator:
             metric=BY_NAME[metric],
             observed=np.random.default_rng(0).normal(10, 1, SIZE),
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def posterior(evaluator: Evaluator, data: Any) -> Any:

@@ -530,7 +530,7 @@ def trial(case: Case, propagation: Any, *, search: bool = True) -> dict[str, Any
                 propagation=propagation,
                 progressbar=False,
             )
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         found = {"discrepancy": _off(case, evaluator, observed)}
         if search and not evaluator.nodes[0].bound.random:
             found["gradient"] = _off_derivative(case, evaluator)
@@ -545,7 +545,7 @@ def trial(case: Case, propagation: Any, *, search: bool = True) -> dict[str, Any
 
 
 def _theta(evaluator: Evaluator, h: float) -> Any:
-    return evaluator.thetas_of([np.array([h])])
+    return evaluator.hyperparameters.thetas_of([np.array([h])])
 
 
 def _off(case: Case, evaluator: Evaluator, observed: Any) -> float:
@@ -569,7 +569,7 @@ def _off_derivative(case: Case, evaluator: Evaluator) -> float:
         objective = evaluator.objective(prior=False, gradient=True)
     except (NotImplementedError, TypeError):
         return 0.0  # it says to have none
-    step = 1e-4 * evaluator.prior_sd[0]
+    step = 1e-4 * evaluator.hyperparameters.prior_sd[0]
     pairs = []
     below_truth, _, above_truth = case.nearby()  # at which atoms meet those of the data
     for h in (below_truth, above_truth):

@@ -141,7 +141,7 @@ def along_axes(reference: Any) -> Any:
 
     Of the sampling covariance in units of the prior's spread, as `Optimum.design_error` has them.
     """
-    prior_sd = reference.evaluator.prior_sd
+    prior_sd = reference.evaluator.hyperparameters.prior_sd
     covariance = np.where(np.isfinite(reference.covariance), reference.covariance, 0.0)
     variances, axes = np.linalg.eigh(covariance / np.outer(prior_sd, prior_sd))
     known = variances > 0

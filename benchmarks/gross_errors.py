@@ -54,8 +54,8 @@ def posterior(observed: Floats, *, gross_errors: bool) -> tuple[Floats, Floats]:
         metric = prb.LogLikelihood(gross_errors=gross_errors)
         x = pm.Normal.dist(mu, sigma)
         prb.Simulator("y", np.positive, x, metric=metric, observed=observed, progressbar=False)
-    evaluator = Evaluator(model)
-    d = evaluator.size
+    evaluator = Evaluator.of(model)
+    d = evaluator.hyperparameters.size
 
     def log_density(theta: Floats) -> Floats:
         values = evaluator(np.ascontiguousarray(theta))

@@ -227,7 +227,7 @@ class Cell:
                 prb.Simulator(
                     "y", p.response, *inputs, metric=metric, observed=some, propagation=stored
                 )
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         for design in evaluator.designs.values():
             design.add([self.near[root.name] for root in design.inputs.roots], n)
         return evaluator
@@ -238,7 +238,7 @@ class Cell:
 
     def told(self, evaluator: Any, thetas: Any) -> Any:
         """Return the numbers whose errors are told, (P, h)."""
-        return self.problem.told(evaluator.constrained(thetas))
+        return self.problem.told(evaluator.hyperparameters.constrained(thetas))
 
     def data(self, replicate: int) -> Any:
         """Return inputs of a data set, (N, p)."""
@@ -291,7 +291,7 @@ class Cell:
         optimum = find_optimum(evaluator, Minimisation(starts=0, refine=False, start=truth))
         asked = Sampling(draws=1000, chains=4, optimum=optimum)
         tree = draw_posterior(evaluator, asked)
-        draws = np.asarray(tree["calibration"]["theta"]).reshape(-1, evaluator.size)
+        draws = np.asarray(tree["calibration"]["theta"]).reshape(-1, evaluator.hyperparameters.size)
         return self._row(evaluator, optimum.theta, draws, len(draws))
 
     def _observing(self, method: str, outputs: Any) -> Any:

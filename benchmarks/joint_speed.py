@@ -133,7 +133,7 @@ def memory(metric: str, outputs: int, points: int) -> dict[str, Any]:
             "y", normal, x, metric=prb.Joint(lifted), observed=data,
             propagation=prb.Reweighted(16, max_points=points, emulator=None),
         )  # fmt: skip
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     (design,) = evaluator.designs.values()
     design.add([np.zeros((1, outputs))], points - 16)
     with_points = peak()
@@ -151,7 +151,9 @@ def memory(metric: str, outputs: int, points: int) -> dict[str, Any]:
         "before": round(before_points),
         "with points": round(with_points),
         "peak": round(peak()),
-        "basis": round(target.columns * points * 8 / 2**20),
+        "basis": round(
+            target.basis(np.zeros((1, outputs)), np.inf).arrays[0].size * points / 2**17
+        ),
         "objective": round(between - begun, 3),
         "batch": round(done - between, 3),
     }

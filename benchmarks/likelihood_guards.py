@@ -87,7 +87,7 @@ def of_draws(evaluator: Evaluator, populations: Populations) -> dict[str, Any]:
     points = likelihood.points
     draws = populations.posterior(points.z, points.log_a).thetas
     result = xr.DataTree.from_dict({"posterior": xr.Dataset()})
-    checked = check_draws(evaluator, result, draws.reshape(2, -1, evaluator.size))
+    checked = check_draws(evaluator, result, draws.reshape(2, -1, evaluator.hyperparameters.size))
     return {
         "codes": [finding.code for finding in checked.findings],
         "untested": [name for name in TESTS if any(name in text for text in checked.untested)],
@@ -124,7 +124,7 @@ def main() -> None:
         problem = CASES[name]
         _base_model, base = likelihood_of(problem)
         model, _ = likelihood_of(problem)
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         (likelihood,) = evaluator.likelihoods
         populations = likelihood.populations
         rows = found["rows"].setdefault(name, [])

@@ -59,9 +59,9 @@ def measured(seed: int, sets: int = SETS, points: int = POINTS) -> dict[str, Any
     begun = time.process_time()
     idata = prb.sample(500, model=model, random_seed=seed, progressbar=False)
     seconds = time.process_time() - begun
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     (likelihood,) = evaluator.likelihoods
-    thetas = evaluator.thetas_of(
+    thetas = evaluator.hyperparameters.thetas_of(
         [idata.posterior[rv.name].values.reshape(-1) for rv in model.free_RVs]
     )
     populations = likelihood.populations

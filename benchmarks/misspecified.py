@@ -68,7 +68,7 @@ def evaluator() -> Evaluator:
             observed=data,
             propagation=prb.Resimulated(4096),
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def fit(base: Evaluator, data: Any, metric: str) -> tuple[float, float, bool]:
@@ -78,7 +78,7 @@ def fit(base: Evaluator, data: Any, metric: str) -> tuple[float, float, bool]:
     except ValueError:
         return np.nan, np.nan, False
     search = Search(ev, np.array([1.0, 1.0]), Method(), prior=False, tolerance=1e-6, most=3000)
-    start = ev.unconstrained({"mu": float(np.median(data)) + 0.3, "sigma": 1.5})
+    start = ev.hyperparameters.unconstrained({"mu": float(np.median(data)) + 0.3, "sigma": 1.5})
     led = approach(search, start, np.ones(1), 0)
     run = settle(search, minimise(search, led.theta, np.ones(1), led.trace))
     return float(run.best[0]), float(np.exp(run.best[1])), run.success

@@ -79,8 +79,8 @@ def evaluation(repeats: int) -> dict[str, Any]:
         y = system.response(x, None)
         target = METRICS["PR"].against(data)
         weights = np.broadcast_to(1 / MILLION, MILLION)
-        ev = Evaluator(smooth_model(system, METRICS["PR"], data, prb.Resimulated(MILLION)))
-        theta = ev.unconstrained({"mu": mu, "sigma": sigma})
+        ev = Evaluator.of(smooth_model(system, METRICS["PR"], data, prb.Resimulated(MILLION)))
+        theta = ev.hyperparameters.unconstrained({"mu": mu, "sigma": sigma})
         value, gradient = (ev.objective(prior=False, gradient=g) for g in (False, True))
         row = {
             "draw": best_time(lambda mu=mu, sigma=sigma: rng.normal(mu, sigma, MILLION), repeats),

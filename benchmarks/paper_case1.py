@@ -92,7 +92,7 @@ def work(arguments: argparse.Namespace) -> dict[str, Any]:
         for seed in seeds:  # outermost, in case the run is not finished
             for n, (index, (name, system)) in product(SIZES, enumerate(SYSTEMS.items())):
                 observed = system.data(np.random.default_rng([seed, n, index]), n)
-                scale = evaluators[name].prior_sd
+                scale = evaluators[name].hyperparameters.prior_sd
                 for metric in METRICS:
                     key = f"{points}/{name}/{n}/{seed}/{metric}"
                     if key in done:

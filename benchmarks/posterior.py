@@ -199,7 +199,7 @@ def build(problem: Problem, prior: str, metric: str, size: int) -> Any:
                 metric=METRICS[metric], observed=np.linspace(0.1, 0.9, part),
                 propagation=prb.Reweighted(max_points=2048),
             )  # fmt: skip
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def analyse(evaluator: Any, problem: Problem, seed: list[int]) -> dict[str, Any]:
@@ -209,8 +209,8 @@ def analyse(evaluator: Any, problem: Problem, seed: list[int]) -> dict[str, Any]
     from prbayes.posterior.smc import Sampling
 
     rng = np.random.default_rng(seed)
-    truth = evaluator.prior_thetas(1, int(rng.integers(2**31)))
-    values = [v[0] for v in evaluator.constrained(truth).values()]
+    truth = evaluator.hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
+    values = [v[0] for v in evaluator.hyperparameters.constrained(truth).values()]
     data = {}
     for node, response in zip(evaluator.nodes, problem.responses, strict=True):
         n = len(node.observed)

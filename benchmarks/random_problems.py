@@ -107,9 +107,9 @@ class Problem:
 
 def reference(problem: Problem, optimum: prb.Optimum) -> Any:
     """Return where a simplex ends that begins around an optimum, without a design."""
-    evaluator = Evaluator(problem.model(prb.Resimulated(16_384)))
+    evaluator = Evaluator.of(problem.model(prb.Resimulated(16_384)))
     stderr = np.sqrt(np.diag(optimum.covariance))
-    steps = 0.3 * np.where(np.isfinite(stderr), stderr, 0.3 * evaluator.prior_sd)
+    steps = 0.3 * np.where(np.isfinite(stderr), stderr, 0.3 * evaluator.hyperparameters.prior_sd)
     found = minimize(
         lambda theta: float(evaluator.total(theta[None], np.ones(1))[0]),
         optimum.theta,

@@ -273,7 +273,7 @@ def given_estimate(
         "points": points,
         "converged": optimum.converged,
     }
-    return likelihood, likelihood.evaluator.constrained(draws), figures
+    return likelihood, likelihood.evaluator.hyperparameters.constrained(draws), figures
 
 
 def compared(draws: Any, reference: Any) -> dict[str, Any]:
@@ -337,7 +337,7 @@ def modes_row(name: str, size: int, number: int) -> dict[str, Any]:
     likelihood = refit_likelihood(optimum.evaluator, optimum)
     target = posterior(likelihood, likelihood.starts)
     sample = importance_sample(target.log_posterior, _modes(target) or [], DRAWS, seed=0)
-    mu = likelihood.evaluator.constrained(sample.draws)["mu"]
+    mu = likelihood.evaluator.hyperparameters.constrained(sample.draws)["mu"]
     means, log_sds = np.linspace(-3, 5, 401)[:, None, None], np.linspace(-2, 1, 150)[None, :, None]
     root, sds = np.sqrt(y), np.exp(log_sds)
     pair = np.logaddexp(
@@ -428,7 +428,7 @@ def starts(name: str, number: int, count: int = 32) -> dict[str, Any]:
     evaluator = likelihood.evaluator
     density = posterior(likelihood).log_posterior
     (best,) = laplace(density, likelihood.point[None], likelihood.scale)
-    points = evaluator.prior_points(count, number)
+    points = evaluator.hyperparameters.prior_points(count, number)
     possible = np.isfinite(density(points))
     arrived = 0
     for start in points[possible]:

@@ -82,10 +82,10 @@ def one(kind: str, metric: str, size: int) -> dict[str, float]:
     else:
         how = prb.Resimulated(100) if propagation == "resimulated" else prb.Reweighted(256)
     model = model_of(metric, how)
-    evaluator = Evaluator(model)
-    thetas = evaluator.unconstrained({"mu": 10.0, "sigma": 1.0}) + 0.05 * np.random.default_rng(
-        2
-    ).normal(size=(THETAS if what == "n" else size, 2))
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.unconstrained(
+        {"mu": 10.0, "sigma": 1.0}
+    ) + 0.05 * np.random.default_rng(2).normal(size=(THETAS if what == "n" else size, 2))
     evaluator(thetas[:1])
     built = time.process_time() - clock
     spent = np.inf
@@ -126,10 +126,10 @@ def tasks(size: int) -> dict[str, float]:
     import cloudpickle
     import distributed
 
-    from prbayes.response import call as calling
+    from prbayes.response import call, chunks
 
     numbers = np.random.default_rng(1).normal(size=(size, 5))
-    function = calling.scalar(lambda *x: sum(x))
+    function = call.scalar(lambda *x: sum(x))
     cluster = distributed.LocalCluster(
         n_workers=2,
         threads_per_worker=1,
@@ -139,15 +139,15 @@ def tasks(size: int) -> dict[str, float]:
     )
     with cluster, distributed.Client(cluster) as client:
         executor = _Untold(client.get_executor(pure=False))
-        how = calling.Calling("y", function, executor)  # type: ignore[arg-type]
-        points = calling.Points(list(numbers.T), [True] * 5)
-        calling.respond(how, points.at(np.arange(10)), calling.Tally())  # the workers are up
-        calling.chunk_size = lambda *_: 1
+        how = chunks.Calling("y", function, executor)  # type: ignore[arg-type]
+        points = call.Points(list(numbers.T), [True] * 5)
+        chunks.respond(how, points.at(np.arange(10)), chunks.Tally())  # the workers are up
+        chunks.chunk_size = lambda *_: 1
         before, clock = peak(), time.perf_counter()
-        calling.respond(how, points, calling.Tally())
+        chunks.respond(how, points, chunks.Tally())
         spent = time.perf_counter() - clock
-    one, packed = points.at(np.arange(1)), calling.packed(function)
-    task = cloudpickle.dumps((calling.compute_packed, packed, one, False))
+    one, packed = points.at(np.arange(1)), call.packed(function)
+    task = cloudpickle.dumps((call.compute_packed, packed, one, False))
     return {
         "seconds a task": spent / size,
         "bytes a task": len(task),

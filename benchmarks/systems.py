@@ -53,7 +53,7 @@ class System:
 
     def evaluator(self, propagation: Any) -> Evaluator:
         """Return an evaluator of the model, to be given data and metrics."""
-        return Evaluator(
+        return Evaluator.of(
             self.model(METRICS["PR"], self.data(np.random.default_rng(0), 100), propagation)
         )
 

@@ -137,7 +137,7 @@ def build(propagation: Any) -> pm.Model:
 def away(coarse: Callable[..., Any] | None, n: int, seed: int, reference: Any) -> list[float]:
     """Calibrate with n runs, and return how far from the reference, in its standard errors."""
     stored = prb.Reweighted(n, emulator="auto", coarse=coarse, random_seed=seed)
-    evaluator = Evaluator(build(stored))
+    evaluator = Evaluator.of(build(stored))
     rng = np.random.default_rng(0)
     near = rng.multivariate_normal(reference.theta, reference.covariance, 64)
     evaluator.designs["y"].widen(evaluator.roots(near, 0))

@@ -574,7 +574,6 @@ TABLE: dict[str, Row] = {
         prb.cost,
         {
             "model": (3, "model", Name("bare"), print, Name("optimum")),
-            "dry_run": FLAG,
         },
         {"model": Name("model")},
     ),

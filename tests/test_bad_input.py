@@ -679,8 +679,8 @@ def test_set_epsilon_is_all_or_nothing(epsilon: dict[str, Any], error: type[Exce
 
 def test_a_few_nan_responses_are_fine_and_reported() -> None:
     model = build(lambda x: np.where(x < 0.8, np.nan, 0.75 * x), propagation=prb.Reweighted(512))
-    evaluator = Evaluator(model)
-    theta = evaluator.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
+    evaluator = Evaluator.of(model)
+    theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
     node = next(iter(nodes(model).values()))
     lost = node.bound.support(evaluator.roots(theta, 0))["lost_mass"]
     np.testing.assert_allclose(lost, norm.cdf(0.8, 2.0, 0.8), atol=0.01)
@@ -703,8 +703,8 @@ def test_much_lost_mass_at_the_optimum_is_an_error() -> None:
 @pytest.mark.parametrize("propagation", SMALL[:2], ids=lambda p: type(p).__name__)
 def test_specimens_that_fail_are_infinite(propagation: prb.propagation.Propagation) -> None:
     model = build(lambda x: np.where(np.asarray(x) > 3, np.inf, 0.75 * x), propagation=propagation)
-    evaluator = Evaluator(model)
-    theta = evaluator.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
+    evaluator = Evaluator.of(model)
+    theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
     values, weights = evaluator.populations(theta, 0)
     failed = weights[0][np.isinf(values[0])].sum()
     np.testing.assert_allclose(failed, norm.sf(3, 2.0, 0.8), atol=0.02)

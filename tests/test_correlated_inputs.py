@@ -68,7 +68,9 @@ def model_of(
 
 def theta_of_truth(evaluator: Evaluator) -> Floats:
     factor = np.linalg.cholesky(COVARIANCE)
-    return evaluator.unconstrained({"mean": MEAN, "chol": factor[np.tril_indices(2)]})
+    return evaluator.hyperparameters.unconstrained(
+        {"mean": MEAN, "chol": factor[np.tril_indices(2)]}
+    )
 
 
 def exact_errors() -> tuple[Floats, float]:
@@ -153,7 +155,7 @@ def test_a_cholesky_factor_is_no_covariance_and_refused_before_any_response(
 
 def test_marginal_responses_tell_the_standard_deviations_and_no_correlation() -> None:
     alone = {name: MIXED[name] for name in ("first", "second")}
-    evaluator = Evaluator(model_of(alone, prb.KullbackLeibler(), n=2048))
+    evaluator = Evaluator.of(model_of(alone, prb.KullbackLeibler(), n=2048))
     theta = theta_of_truth(evaluator)
     sampling = SamplingDistribution.of(evaluator, theta, np.ones(2))
     covariance = sampling.local.in_theta
@@ -252,7 +254,7 @@ def test_standard_errors_are_the_spread_over_data_sets(metric: prb.Metric) -> No
     sampling = optimum.sampling()
     x, arrived = sampling.refit(DataSets(values, weights))
     assert arrived.mean() > 0.95
-    fits = optimum.evaluator.constrained(sampling.thetas(x[arrived]))
+    fits = optimum.evaluator.hyperparameters.constrained(sampling.thetas(x[arrived]))
     correlation = fits["chol_corr"][:, 0, 1]
     error = optimum.stderr["chol_corr"][0, 1]
     # A standard deviation of 200 has an error of 5%; four of them, and the curvature of theta.

@@ -16,7 +16,7 @@ from suppliers import labelled
 
 import prbayes as prb
 from prbayes.model.description import describe
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.random_variable import nodes
 from prbayes.optimize.design_refinement import _add
 from prbayes.plots._margins import margins, select_margins
@@ -66,23 +66,23 @@ def specimen(model: pm.Model) -> Any:
 
 def test_all_groups_are_of_one_design() -> None:
     before = calls
-    evaluator = Evaluator(build())
+    evaluator = Evaluator.of(build())
     assert calls == before + 256
     assert [node.name for node in evaluator.nodes] == PARTS
     first, second = (node.bound for node in evaluator.nodes)
     assert first.same_points(second)
     # It grows for the populations of both at the same points.
-    _add(evaluator, evaluator.prior_thetas(64, 1), {"y[Busch]"})
+    _add(evaluator, evaluator.hyperparameters.prior_thetas(64, 1), {"y[Busch]"})
     assert calls == before + 512
-    assert evaluator.n_runs == evaluator.n_responses == 512
+    assert n_design_runs(evaluator) == evaluator.n_responses == 512
     assert first.same_points(second)
     assert evaluator.nodes[0].design.n_runs == 512
     assert sum(node.bound.responses.computed for node in evaluator.nodes) == 512
 
 
 def test_each_group_is_compared_with_its_own_population() -> None:
-    evaluator = Evaluator(build())
-    theta = evaluator.unconstrained({"mu": [0.1, 0.9], "sigma": 0.3})
+    evaluator = Evaluator.of(build())
+    theta = evaluator.hyperparameters.unconstrained({"mu": [0.1, 0.9], "sigma": 0.3})
     for k, (name, mean) in enumerate(zip(NAMES, [0.1, 0.9], strict=True)):
         node = evaluator.nodes[k]
         own = DATA.values[name == WHO]
@@ -93,7 +93,7 @@ def test_each_group_is_compared_with_its_own_population() -> None:
         assert abs(center - mean) < 0.02
         direct = prb.ProbabilityResidual().against(own)(values[0], weights[0])
         np.testing.assert_allclose(evaluator.discrepancies(theta[None], k), direct, rtol=1e-9)
-    moved = evaluator.unconstrained({"mu": [0.1, 1.4], "sigma": 0.3})
+    moved = evaluator.hyperparameters.unconstrained({"mu": [0.1, 1.4], "sigma": 0.3})
     before, after = evaluator(np.stack([theta, moved])).discrepancies
     assert before[0] == after[0]
     assert before[1] != after[1]
@@ -121,8 +121,8 @@ def test_groups_are_those_of_simulators_written_one_by_one() -> None:
 def test_the_density_is_that_of_all_groups_also_in_a_clone() -> None:
     model = build()
     prb.set_epsilon(model, {"y[Adler]": 0.5, "y[Busch]": 0.25})
-    evaluator = Evaluator(model)
-    theta = evaluator.prior_thetas(1, 3)
+    evaluator = Evaluator.of(model)
+    theta = evaluator.hyperparameters.prior_thetas(1, 3)
     point = {"mu": theta[0, :2], "sigma_log__": theta[0, 2]}
     found = evaluator(theta)
     expected = found.log_prior[0] - found.discrepancies[0] @ [2, 4]
@@ -178,7 +178,7 @@ def test_predictions_have_a_dimension_of_groups() -> None:
 
 def test_populations_of_inputs_are_called_by_their_groups() -> None:
     model, _ = case()
-    every = margins(Evaluator(model))
+    every = margins(Evaluator.of(model))
     assert [margin.name for margin in every] == ["x[Adler]", "x[Busch]"]
     assert [margin.node for margin in every] == [0, 1]
     assert select_margins(every, ["x[Busch]"]) == every[1:]
@@ -187,9 +187,9 @@ def test_populations_of_inputs_are_called_by_their_groups() -> None:
 
 @pytest.mark.parametrize("propagation", [prb.Resimulated(256), prb.Fresh(256)])
 def test_other_propagations_have_groups_as_well(propagation: Any) -> None:
-    evaluator = Evaluator(build(propagation=propagation))
-    theta = evaluator.unconstrained({"mu": [0.0, 0.5], "sigma": 0.15})
-    far = evaluator.unconstrained({"mu": [0.0, 1.5], "sigma": 0.15})
+    evaluator = Evaluator.of(build(propagation=propagation))
+    theta = evaluator.hyperparameters.unconstrained({"mu": [0.0, 0.5], "sigma": 0.15})
+    far = evaluator.hyperparameters.unconstrained({"mu": [0.0, 1.5], "sigma": 0.15})
     near_both, far_of_one = evaluator(np.stack([theta, far])).discrepancies
     assert far_of_one[1] > 5 * near_both[1]
     assert far_of_one[0] < 5 * near_both[0] + 1

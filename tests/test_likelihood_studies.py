@@ -34,7 +34,7 @@ def test_guards() -> None:
     problem = likelihood_guards.LINEAR
     _model, base = likelihood_coverage.likelihood_of(problem)
     model, _ = likelihood_coverage.likelihood_of(problem)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     (likelihood,) = evaluator.likelihoods
     y = likelihood_guards.readings(problem, 0)
     assert likelihood_guards.before_the_fit(likelihood, base, y) == {"before the fit": []}

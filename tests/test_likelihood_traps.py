@@ -23,7 +23,7 @@ from prbayes._finding import Finding
 from prbayes.inference.checks.population_test import population_statistics, population_test
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.data_checks import data_findings
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.specimen_points import PointOptions
@@ -363,11 +363,11 @@ def shift(
     exact : callable
         Hyperparameters by name, (S,) each -> exact log-likelihood up to a constant, (S,).
     """
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     prior = evaluator.hyperparameters.log_prior(thetas)
-    values = evaluator.constrained(thetas)
+    values = evaluator.hyperparameters.constrained(thetas)
     by_name = {str(rv.name): np.asarray(values[str(rv.name)]) for rv in model.free_RVs}
-    ours = sum(each.sum(axis=1) for each in evaluator.specimen_log_likelihoods(thetas).values())
+    ours = sum(each.sum(axis=1) for each in specimen_log_likelihoods(evaluator, thetas).values())
     columns = np.stack(list(by_name.values()), axis=1)
     truth = exact(by_name)
     logs = np.nan_to_num(truth + prior - log_proposal, nan=-np.inf)
@@ -656,8 +656,8 @@ def sum_shift(seed: int) -> float:
     rng = np.random.default_rng([seed, 8])
     y = sample(rng, 50, 1.0, 0.3) + sample(rng, 50, 1.3, 0.3)
     model = model_of(lambda a, b: a + b, two_inputs, y)
-    thetas = Evaluator(model).hyperparameters.prior_points(4096, 3)
-    log_proposal = Evaluator(model).hyperparameters.log_prior(thetas)
+    thetas = Evaluator.of(model).hyperparameters.prior_points(4096, 3)
+    log_proposal = Evaluator.of(model).hyperparameters.log_prior(thetas)
     return shift(
         model,
         thetas,
@@ -803,7 +803,7 @@ def test_draws_report_a_conflict() -> None:
 
     x = sample(np.random.default_rng(5), 20, 0.5, 0.3)
     model = model_of(line, prior, line(x))
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     thetas, log_proposal = over_box(np.array([[-0.2, -2.2], [0.8, 0.2]]))
     logs = -evaluator.total(thetas, np.empty(0)) + evaluator.hyperparameters.log_prior(thetas)
     weights = np.exp(logs - log_proposal - logs.max())

@@ -122,8 +122,8 @@ def test_ten_calls_of_minimize_grow_little() -> None:
 def test_the_support_of_many_populations_is_looked_at_in_parts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    evaluator = Evaluator(build())
-    thetas = evaluator.prior_thetas(50, 1)
+    evaluator = Evaluator.of(build())
+    thetas = evaluator.hyperparameters.prior_thetas(50, 1)
     whole = evaluator.support(thetas)["y"]
     monkeypatch.setattr("prbayes.model.evaluator.IN_CACHE", 1024)
     parts = evaluator.support(thetas)["y"]

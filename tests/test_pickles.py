@@ -85,7 +85,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "response.Abort": prb.response.Abort,
     "response.Additive": lambda: prb.response.Additive([20.0, 1000.0]),
     "response.BudgetError": lambda: prb.response.BudgetError("max_seconds = 1 was reached"),
-    "response.Cost": lambda: prb.cost(optimum().model, dry_run=True),
+    "response.Cost": lambda: prb.cost(optimum().model),
     "response.Multiplicative": lambda: prb.response.Multiplicative([20.0, 1000.0]),
     "response.Replace": lambda: prb.response.Replace(1.0),
     "response.ResponseError": lambda: prb.response.ResponseError("y: it raised"),

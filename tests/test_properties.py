@@ -154,7 +154,7 @@ def test_the_area_is_that_of_plain_sums(simulated: Any, observed: Any, scale: fl
     found = metric(scale * x, scale * y, weights=w, observed_weights=v)
     assert found / scale == pytest.approx(plain_area(x, w, y, v), rel=1e-12, abs=1e-13)
     prepared = metric.against(scale * y, v)
-    stored = prepared.outer(*prepared.from_basis(w, prepared.basis(scale * x), np), xp=np)
+    stored = prepared.outer(*prepared.basis(scale * x).features(w), xp=np)
     assert float(stored) / scale == pytest.approx(found / scale, rel=1e-12, abs=1e-13)
 
 
@@ -312,7 +312,7 @@ def evaluator_of(problem: dict[str, Any], propagation: Any) -> Evaluator:
             observed=response(*truth),
             propagation=propagation,
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 @pytest.mark.long
@@ -325,7 +325,9 @@ def test_three_propagations_agree_and_gradients_are_differences(problem: dict[st
     for propagation in (prb.Reweighted(n), prb.Resimulated(2 * n), prb.Fresh(1 << 14)):
         evaluator = evaluator_of(problem, propagation)
         bound = evaluator.nodes[0].bound
-        theta = evaluator.unconstrained({"a": problem["at"][0], "b": problem["at"][1]})
+        theta = evaluator.hyperparameters.unconstrained(
+            {"a": problem["at"][0], "b": problem["at"][1]}
+        )
         roots = evaluator.roots(theta[None], 0)
         (value,) = bound.discrepancies(roots, bound.target)
         found.append(value)

@@ -52,7 +52,7 @@ def model_of(response=two, data=None, *, metric=JOINT, propagation=None):
 
 def node_of(model):
     """Return the only simulator."""
-    return Evaluator(model).nodes[0]
+    return Evaluator.of(model).nodes[0]
 
 
 # -- one run ---------------------------------------------------------------------------------------
@@ -156,7 +156,7 @@ def test_simulators_that_observe_a_mapping_in_another_order_do_not_share_its_col
             prb.Simulator(
                 name, as_mapping, a, b, metric=JOINT, observed=data, propagation=propagation
             )
-    first, second = (node.design.values for node in Evaluator(model).nodes)
+    first, second = (node.design.values for node in Evaluator.of(model).nodes)
     np.testing.assert_array_equal(second, first[:, ::-1])
 
 
@@ -299,8 +299,8 @@ def test_data_sets_lack_the_outputs_that_the_observed_ones_lack():
     data = observed()
     data[:10, 1] = np.nan
     data[10:15, 0] = np.nan
-    evaluator = Evaluator(model_of(data=data))
-    theta = evaluator.initial
+    evaluator = Evaluator.of(model_of(data=data))
+    theta = evaluator.hyperparameters.initial
     sets = simulated_sets(evaluator, theta, 30)
     (values,), (weights,) = sets.values, sets.weights
     first, second = ~np.isnan(values).T

@@ -1,10 +1,10 @@
-"""From scatter to decision: what moves a decision, what more data would change, what is risked."""
+"""Decision analysis: exceedance probabilities, sensitivities, and the value of more specimens."""
 
-from prbayes.decision.information import Condition
-from prbayes.decision.interval import Interval
 from prbayes.decision.p_box import p_box
+from prbayes.decision.plan import Condition
 from prbayes.decision.quantities import (
     Exceedance,
+    Interval,
     Mean,
     Quantile,
     Quantity,

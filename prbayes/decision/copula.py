@@ -1,78 +1,67 @@
-"""The distribution of draws as a normal copula: draws of one element given the others."""
+"""Normal copula of draws: an element given the rest, and the rest given an element."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
 from prbayes._validate import Floats
 
-# Standard normal levels of the quantiles between which a margin is straight. Of a normal margin,
-# variances are then right to half a percent; closer ones follow the noise of four thousand draws.
+# Normal scores of the quantiles between which a margin is linear. Variances of a normal margin are
+# then right to half a percent; closer quantiles follow the noise of 4000 draws.
 _SCORES = np.linspace(-2.75, 2.75, 23)
 
 
 @dataclass(frozen=True, eq=False)
 class Copula:
-    """Draws of theta as a monotone function of each element of a normal vector z.
+    """Theta as a monotone function of each element of a normal vector z."""
 
-    Attributes
-    ----------
-    quantiles : ndarray, shape (q, d)
-        Of each element, at levels evenly spaced in z; straight on beyond the outermost.
-    correlation : ndarray, shape (d, d)
-        Of z.
-    """
-
-    quantiles: Floats
-    correlation: Floats
+    quantiles: Floats  # (q, d): of each element, at `_SCORES`; extrapolated linearly
+    correlation: Floats  # (d, d): of z
 
     @classmethod
     def of(cls, thetas: Floats) -> Copula:
-        """Read draws, (k, d): margins by quantiles, correlation by normal scores."""
-        from scipy.special import ndtr
-
+        """Fit draws, (k, d): margins by quantiles, correlation by normal scores."""
         quantiles = np.quantile(thetas, ndtr(_SCORES), axis=0)
-        ranks = rankdata(thetas, axis=0)
-        scores = ndtri((ranks - 0.5) / len(thetas))
+        scores = ndtri((rankdata(thetas, axis=0) - 0.5) / len(thetas))
         d = thetas.shape[1]
         return cls(quantiles, np.corrcoef(scores, rowvar=False).reshape(d, d))
 
     def thetas(self, z: Floats) -> Floats:
-        """Return thetas, (..., d), of normal vectors (..., d)."""
-        gap = _SCORES[1] - _SCORES[0]
-        place = (z - _SCORES[0]) / gap
-        below = np.clip(np.floor(place), 0, len(_SCORES) - 2).astype(int)
+        """Return the thetas of normal vectors, (..., d)."""
+        position = (z - _SCORES[0]) / (_SCORES[1] - _SCORES[0])
+        below = np.clip(np.floor(position), 0, len(_SCORES) - 2).astype(int)
         columns = np.arange(z.shape[-1])
-        low = self.quantiles[below, columns]
-        high = self.quantiles[below + 1, columns]
-        found = low + (place - below) * (high - low)
-        return np.asarray(found)
+        low, high = self.quantiles[below, columns], self.quantiles[below + 1, columns]
+        return np.asarray(low + (position - below) * (high - low))
 
-    @property
+    @cached_property
     def root(self) -> Floats:
-        """The lower root of the correlation: of independent normal numbers it makes z, (d, d)."""
+        """The lower Cholesky factor of the correlation, (d, d)."""
         return np.linalg.cholesky(self.correlation)
 
-    @property
+    @cached_property
+    def _precision(self) -> Floats:
+        return np.linalg.inv(self.correlation)
+
+    @cached_property
     def conditional_sd(self) -> Floats:
         """The standard deviation of each element of z given all others, (d,)."""
-        precision = np.linalg.inv(self.correlation)
-        return 1 / np.sqrt(np.diag(precision))
+        return 1 / np.sqrt(np.diag(self._precision))
 
-    def redrawn(self, z: Floats, fresh: Floats, i: int) -> Floats:
-        """Return z with a new i-th element given the others, of normal numbers (..., d)."""
-        precision = np.linalg.inv(self.correlation)
+    def element_given_rest(self, z: Floats, normal: Floats, i: int) -> Floats:
+        """Return z with a new i-th element given the rest, from independent normals (..., d)."""
         sd = self.conditional_sd[i]
-        mean = z[..., i] - (z @ precision[:, i]) * sd**2
-        found = z.copy()
-        found[..., i] = mean + sd * fresh[..., i]
-        return found
+        mean = z[..., i] - (z @ self._precision[:, i]) * sd**2
+        result = z.copy()
+        result[..., i] = mean + sd * normal[..., i]
+        return result
 
-    def others_redrawn(self, z: Floats, fresh: Floats, i: int) -> Floats:
-        """Return the i-th element of z with new others given it, of another draw of z."""
-        away = z[..., i] - fresh[..., i]
-        return fresh + away[..., None] * self.correlation[:, i]
+    def rest_given_element(self, z: Floats, independent: Floats, i: int) -> Floats:
+        """Return the i-th element of z with a new rest, from an independent draw of z (..., d)."""
+        shift = z[..., i] - independent[..., i]
+        return independent + shift[..., None] * self.correlation[:, i]

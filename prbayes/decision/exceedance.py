@@ -1,9 +1,9 @@
-"""`exceedance`: the probability that a response is beyond a limit, with its interval."""
+"""Probability that a response exceeds a limit, with its interval."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
@@ -22,31 +22,24 @@ from prbayes._validate import (
     seed_number,
     share,
 )
-from prbayes.decision.importance_sampling import rare
-from prbayes.decision.interval import intervals, told_places, variants
-from prbayes.decision.inverse_transform import Specimens
-from prbayes.decision.populations import Populations, Told, output_place
-from prbayes.decision.quantities import Exceedance
-from prbayes.model.fingerprint import as_attributes, identity_of_model
-from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.decision.importance_sampling import rare_event
+from prbayes.decision.populations import (
+    InverseTransform,
+    Populations,
+    ResponseSample,
+    output_column,
+)
+from prbayes.decision.quantities import Exceedance, interval_grid, interval_values
+from prbayes.model.locking import locked
 from prbayes.model.random_variable import response_name
-from prbayes.optimize.optimum import Optimum, identity_in
+from prbayes.optimize.optimum import Optimum
 from prbayes.propagation.base import MAX_LOST, N_BLOCKS, DesignError
-from prbayes.response.response import refuse_uncallable
+from prbayes.response.response import Responses, refuse_uncallable
 
 _log = logging.getLogger("prbayes")
 
-# Error of a probability, as a share of it, from which on it is said that points are needed. By
-# judgement: a probability is then known to a factor of two, with two errors to either side.
-_ROUGH = 0.3
-# Populations whose weights tell the error of an emulator: they are held at all points.
-_EMULATED_AT = 400
-# Importance points at least: a tenth of them is a step towards the limit, of which a fifth counts.
-_FEWEST_POINTS = 100
 
-
-@in_turn
+@locked
 def exceedance(
     result: Optimum | xr.DataTree,
     response: Callable[..., Any],
@@ -65,11 +58,11 @@ def exceedance(
 ) -> xr.Dataset:
     """Return the probability that a response is above a limit, with its interval.
 
-    Each draw of the posterior is a population, with a probability of its own; their mean is that of
-    a new specimen. By default it comes from stored responses alone, whose number bounds
-    how small a probability they tell. With ``points``, that many responses are computed where the
-    limit is exceeded, for all populations together: probabilities of one in a thousand to one in a
-    million then have an error of some percent.
+    Each draw of the posterior is a population with its probability; the mean over draws is the
+    probability of a new specimen. By default it comes from stored responses, whose number limits
+    how small a probability they resolve. With ``points``, importance sampling computes that many
+    responses near the limit, for all populations together: probabilities of one in a thousand to
+    one in a million then have an error of some percent.
 
     Parameters
     ----------
@@ -81,8 +74,8 @@ def exceedance(
     limit : float
         In units of the response.
     *inputs
-        As for `predict`. An ``prb.decision.Interval`` among them is a constant known only to lie
-        between two ends: the answer then has bounds, and no distribution over it.
+        As for `predict`. A ``prb.decision.Interval`` among them is a constant known only to lie
+        between two ends: the probability then has bounds.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     output : label, optional
@@ -92,15 +85,15 @@ def exceedance(
     prob : float
         Probability of the interval.
     requirement : float, optional
-        The largest probability that is accepted. It is met if the whole interval is below it, not
-        met if all of it is above, and not decided in between.
+        Largest acceptable probability. It is met if the whole interval is below it, not met if the
+        whole interval is above it, and else not decided.
     n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     points : int
-        How many responses are computed where they matter, for each place in the intervals; 0, or
-        at least 100. The inputs need inverse distribution functions, and no stored responses.
+        Number of responses to compute near the limit, for each point of the intervals; 0, or at
+        least 100. The inputs need inverse distribution functions, and no stored responses.
     steps : int
-        Places in each interval, its ends among them; at least 2.
+        Number of values in each interval, its ends included; at least 2.
     executor : concurrent.futures.Executor, optional
         Where the response is computed.
     random_seed : int, sequence of int, numpy.random.Generator or None
@@ -108,14 +101,14 @@ def exceedance(
     Returns
     -------
     xarray.Dataset
-        ``probability``, of a new specimen; ``lower`` and ``upper``, the equal-tailed interval of
-        the populations' probabilities; ``error``, the standard error of ``probability`` by the
-        points, the emulator and the draws that it was made from; ``by_draw``, with dimension
-        ``draw``. With intervals ``probability`` and ``error`` have the dimension ``bound``,
-        "lower" and "upper"; ``lower`` and ``upper`` are the ends over all places, ``by_draw`` has
-        ``bound`` too, and the attribute ``at`` says where in the intervals the bounds are.
-        Attributes: ``prob``, ``responses`` (how many were computed), ``source``, ``identity``, and
-        with a requirement ``requirement`` and ``verdict``: "met", "not met" or "not decided".
+        ``probability`` of a new specimen; ``lower`` and ``upper``, the equal-tailed interval of
+        the populations' probabilities; ``error``, the standard error of ``probability`` from the
+        points, the emulator and the draws; ``by_draw``, with dimension ``draw``. With intervals
+        ``probability``, ``error`` and ``by_draw`` have the dimension ``bound``, "lower" and
+        "upper"; ``lower`` and ``upper`` are the extremes over all points of the intervals, and the
+        attribute ``at`` has the points of the bounds.
+        Attributes: ``prob``, ``responses`` (number computed), ``source``, ``identity``, and with a
+        requirement ``requirement`` and ``verdict``: "met", "not met" or "not decided".
 
     Raises
     ------
@@ -129,10 +122,10 @@ def exceedance(
 
     Notes
     -----
-    The error of stored responses is that of the jackknife over eight blocks of them; of one input,
-    whose points cut the population into parts of equal mass, it is rather too large. Extremes
-    inside an interval are looked for at ``steps`` places only. The result of the calibration is the
-    same at all of them: a constant that the calibration used as well is to be varied there.
+    The error from stored responses is the jackknife over eight blocks of them. It is rather too
+    large for one input, whose points divide the population into parts of equal mass. Extremes
+    inside an interval are found among ``steps`` values only. The result of the calibration is the
+    same at all of them: vary a constant that the calibration also used there.
 
     References
     ----------
@@ -163,187 +156,164 @@ def exceedance(
         requirement = share(requirement, "requirement")
     positive_integer(n_draws, "n_draws", minimum=2)
     positive_integer(points, "points", minimum=0)
-    if 0 < points < _FEWEST_POINTS:
-        raise ValueError(f"points: got {points}, expected 0, or at least {_FEWEST_POINTS}")
+    if 0 < points < 100:  # a tenth of them is a step towards the limit
+        raise ValueError(f"points: got {points}, expected 0, or at least 100")
     positive_integer(steps, "steps", minimum=2)
     executes(executor, "executor")
     seed = seed_number(random_seed)
     populations = Populations.of(result, model, n_draws, caller)
-    asked = _Asked(populations, response, limit, output, below, points, executor, seed)
-    places = variants(inputs, steps)
-    found = [asked.at(place) for place in places]
-    by_draw = np.array([one.by_draw for one in found])
-    tails = [(1 - prob) / 2, (1 + prob) / 2]
-    low, high = np.quantile(by_draw, tails, axis=1)
+    grid = interval_grid(inputs, steps)
+    estimates = []
+    for place in grid:
+        quantity = Exceedance(response, *place, limit=limit, below=below, output=output)
+        if points:
+            responses = populations.responses(response, place, executor=executor)
+            estimates.append(_rare_probability(populations, responses, quantity, points, seed))
+        else:
+            sample = populations.sample(response, place, output, executor=executor)
+            estimates.append(_stored_probability(sample, quantity))
+    by_draw = np.array([estimate.by_draw for estimate in estimates])
+    low, high = np.quantile(by_draw, [(1 - prob) / 2, (1 + prob) / 2], axis=1)
     means = by_draw.mean(axis=1)
-    ends = [int(means.argmin()), int(means.argmax())]
-    errors = np.array([one.error for one in found])
-    _tell(response, means[ends], errors[ends], points)
-    identity = identity_in(result) or identity_of_model(populations.evaluator.model)
+    errors = np.array([estimate.error for estimate in estimates])
+    bounds = [int(means.argmin()), int(means.argmax())]
+    _warn_of_large_error(response, means[bounds], errors[bounds], points)
     attrs = {
         "prob": prob,
         "limit": limit,
         "below": int(below),
-        "responses": sum(one.responses for one in found),
-        "source": found[0].source,
+        "responses": sum(estimate.responses for estimate in estimates),
+        "source": estimates[0].source,
         "random_seed": str(seed),
-        **as_attributes(identity),
-        **versions(),
+        **populations.provenance(),
     }
-    if not intervals(inputs):
-        data: dict[str, Any] = {
+    data: dict[str, Any]
+    if len(grid) == 1:
+        coords = {}
+        data = {
             "probability": means[0],
             "error": errors[0],
             "by_draw": ("draw", by_draw[0]),
         }
-        coords = {}
     else:
-        data = {
-            "probability": ("bound", means[ends]),
-            "error": ("bound", errors[ends]),
-            "by_draw": (["bound", "draw"], by_draw[ends]),
-        }
         coords = {"bound": ["lower", "upper"]}
-        attrs["at"] = [told_places(inputs, places[end]) for end in ends]
+        data = {
+            "probability": ("bound", means[bounds]),
+            "error": ("bound", errors[bounds]),
+            "by_draw": (["bound", "draw"], by_draw[bounds]),
+        }
+        attrs["at"] = [interval_values(inputs, grid[bound]) for bound in bounds]
     data |= {"lower": low.min(), "upper": high.max()}
     if requirement is not None:
-        attrs |= {"requirement": requirement, "verdict": _verdict(data, requirement)}
+        verdict = "not decided"
+        if data["upper"] <= requirement:
+            verdict = "met"
+        elif data["lower"] > requirement:
+            verdict = "not met"
+        attrs |= {"requirement": requirement, "verdict": verdict}
     return xr.Dataset(data, coords=coords, attrs=attrs)
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """Probabilities of one variant of the inputs."""
+class _Estimate:
+    """Probabilities at one point of the intervals."""
 
     by_draw: Floats  # (k,)
     error: float
-    responses: int
+    responses: int  # computed
     source: str
 
 
-@dataclass(frozen=True, eq=False)
-class _Asked:
-    """What is asked of a response, but for its inputs."""
+def _stored_probability(sample: ResponseSample, quantity: Exceedance) -> _Estimate:
+    """Return the probabilities of each population from stored or emulated responses."""
+    by_draw = sample.evaluate(quantity, sample.populations.thetas)
+    by_draw = by_draw[np.isfinite(by_draw)]
+    errors = [
+        _jackknife_error(sample, quantity),
+        _emulator_error(sample, quantity),
+        _error_of_draws(sample.populations, by_draw),
+    ]
+    kind = "stored" if sample.emulator is None else "emulated"
+    source = f"{kind} responses of {sample.populations.evaluator.simulators[sample.k].name}"
+    return _Estimate(by_draw, float(np.linalg.norm(errors)), sample.responses.count, source)
 
-    populations: Populations
-    response: Callable[..., Any]
-    limit: float
-    output: Any
-    below: bool
-    points: int
-    executor: Executor | None
-    seed: int
 
-    def at(self, inputs: Sequence[Any]) -> _Found:
-        """Return probabilities for some inputs."""
-        return self._by_points(inputs) if self.points else self._stored(inputs)
-
-    def _stored(self, inputs: Sequence[Any]) -> _Found:
-        """Return them from stored responses."""
-        told = self.populations.told(self.response, inputs, self.output, executor=self.executor)
-        quantity = Exceedance(self.response, *inputs, limit=self.limit, below=self.below)
-        by_draw = told.at(quantity, self.populations.thetas)
-        known = by_draw[np.isfinite(by_draw)]
-        error = np.linalg.norm(
-            [
-                _error_of_points(told, quantity),
-                _error_of_emulator(told, quantity),
-                self._error_of_draws(known),
-            ]
+def _rare_probability(
+    populations: Populations, responses: Responses, quantity: Exceedance, points: int, seed: int
+) -> _Estimate:
+    """Return the probabilities of each population by importance sampling near the limit."""
+    if responses.inputs.epistemic:
+        raise TypeError(
+            f"prb.exceedance: {responses.name}: got a model variable as an input, expected "
+            ".dist() objects and constants; take the .dist() objects of the model, or "
+            "prb.decision.Interval"
         )
-        kind = "stored" if told.emulator is None else "emulated"
-        source = f"{kind} responses of {self.populations.evaluator.simulators[told.k].name}"
-        return _Found(known, float(error), told.responses.count, source)
+    evaluator = populations.evaluator
+    values = evaluator.hyperparameters.constrained(populations.thetas)
+    center = evaluator.hyperparameters.constrained(populations.center[None])
+    names = [str(rv.name) for rv in responses.inputs.roots]
+    transform = InverseTransform(responses.name, responses.inputs, [center[name] for name in names])
+    sign = -1.0 if quantity.below else 1.0
 
-    def _by_points(self, inputs: Sequence[Any]) -> _Found:
-        """Return them from points that are drawn where they matter."""
-        responses = self.populations.responses(self.response, inputs, executor=self.executor)
-        if responses.inputs.epistemic:
-            raise TypeError(
-                f"prb.exceedance: {responses.name}: got a model variable as an input, expected "
-                ".dist() objects and constants; take the .dist() objects of the model, or "
-                "prb.decision.Interval"
-            )
-        evaluator = self.populations.evaluator
-        values = evaluator.constrained(self.populations.thetas)
-        center = evaluator.constrained(self.populations.center[None])
-        names = [str(rv.name) for rv in responses.inputs.roots]
-        specimens = Specimens(responses.name, responses.inputs, [center[name] for name in names])
-        sign = -1.0 if self.below else 1.0
+    def respond(z: Floats) -> Floats:
+        outputs = transform.responses(responses, z)
+        column = output_column(responses, outputs, quantity.output)
+        return sign * (outputs if column is None else outputs[:, column])
 
-        def respond(z: Floats) -> Floats:
-            found = specimens.computed(responses, z)
-            place = output_place(responses, found, self.output)
-            return sign * (found if place is None else found[:, place])
-
-        rng = np.random.default_rng(self.seed)
-        roots = [values[name] for name in names]
-        found = rare(specimens, roots, respond, sign * self.limit, self.points, rng)
-        if found.lost > MAX_LOST:
-            raise DesignError(
-                f"{responses.name}: lost mass: got {found.lost:.1%} of a population's weight on "
-                f"points whose response is NaN, expected at most {MAX_LOST:.0%}; repair it, or "
-                "return +inf for specimens that fail"
-            )
-        error = np.hypot(found.error, self._error_of_draws(found.by_draw))
-        return _Found(found.by_draw, float(error), responses.count, "importance points")
-
-    def _error_of_draws(self, by_draw: Floats) -> float:
-        """Return the error of a mean over draws of the posterior, as if they were independent."""
-        if not self.populations.drawn:
-            return 0.0
-        return float(by_draw.std(ddof=1) / np.sqrt(by_draw.size))
+    rng = np.random.default_rng(seed)
+    parents = [values[name] for name in names]
+    event = rare_event(transform, parents, respond, sign * quantity.limit, points, rng)
+    if event.lost > MAX_LOST:
+        raise DesignError(
+            f"{responses.name}: lost mass: got {event.lost:.1%} of a population's weight on "
+            f"points whose response is NaN, expected at most {MAX_LOST:.0%}; repair it, or "
+            "return +inf for specimens that fail"
+        )
+    error = np.hypot(event.error, _error_of_draws(populations, event.by_draw))
+    return _Estimate(event.by_draw, float(error), responses.count, "importance points")
 
 
-def _error_of_points(told: Told, quantity: Exceedance) -> float:
+def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
+    """Return the Monte Carlo error of the mean over draws of the posterior, as if independent."""
+    return float(by_draw.std(ddof=1) / np.sqrt(by_draw.size)) if populations.are_draws else 0.0
+
+
+def _jackknife_error(sample: ResponseSample, quantity: Exceedance) -> float:
     """Return the error of the mean probability, by the jackknife over blocks of the points."""
-    thetas = told.populations.thetas
-    beyond = quantity.of_specimen(told.values, np.nan)
-    weights = told.mean_weights(thetas)
-    if not (weights * beyond).any():
-        # No point is there: what a single one stands for where there are some.
-        return float(weights.max())
+    is_beyond = quantity.of_specimen(sample.values, np.nan)
+    weights = sample.mean_weights()
+    if not (weights * is_beyond).any():
+        return float(weights.max())  # the contribution of a single point
     without = []
     for block in range(N_BLOCKS):
-        left = weights * (told.blocks != block)
-        without.append(left @ beyond / left.sum())
+        rest = weights * (sample.blocks != block)
+        without.append(rest @ is_beyond / rest.sum())
     return float(np.sqrt((N_BLOCKS - 1) * np.var(without)))
 
 
-def _error_of_emulator(told: Told, quantity: Exceedance) -> float:
+def _emulator_error(sample: ResponseSample, quantity: Exceedance) -> float:
     """Return the error of the mean probability, by emulators without a block of the runs each."""
-    design = told.design
-    said = told.emulated(told.points)
-    if not said:
+    outputs = sample.emulated(sample.points)
+    if not outputs:
         return 0.0
-    # Of some populations: those emulators differ by far less than populations do.
-    thetas = told.populations.thetas[:: max(1, len(told.populations.thetas) // _EMULATED_AT)]
-    roots = told.populations.evaluator.roots(thetas, told.k)
-    _, weights = design.populations(roots)
+    thetas = sample.populations.thinned()
+    _, weights = sample.design.populations(sample.populations.evaluator.roots(thetas, sample.k))
     mass = np.nanmean(weights, axis=0)
-    shares = [mass @ quantity.of_specimen(values, np.nan) for values in said]
-    return float(np.sqrt(np.sum((np.array(shares[1:]) - shares[0]) ** 2)))
+    means = [mass @ quantity.of_specimen(values, np.nan) for values in outputs]
+    return float(np.sqrt(np.sum((np.array(means[1:]) - means[0]) ** 2)))
 
 
-def _verdict(data: dict[str, Any], requirement: float) -> str:
-    """Return whether a probability is as required, by its interval."""
-    if data["upper"] <= requirement:
-        return "met"
-    return "not met" if data["lower"] > requirement else "not decided"
-
-
-def _tell(response: Any, means: Floats, errors: Floats, points: int) -> None:
-    """Say so where a probability is hardly known."""
-    rough = errors > _ROUGH * means
-    if not rough.any():
+def _warn_of_large_error(response: Any, means: Floats, errors: Floats, points: int) -> None:
+    """Warn where two standard errors are a factor of two of the probability, about."""
+    excess = errors - 0.3 * means
+    if not (excess > 0).any():
         return
-    worst = int(np.argmax(errors - _ROUGH * means))
-    name = response_name(response)
+    worst = int(np.argmax(excess))
     more = f"more than points={points}" if points else "points=1000, which computes as many"
     _log.warning(
         "%s: a probability of %.2g has a standard error of %.2g; pass %s responses where the "
         "limit is exceeded",
-        name,
+        response_name(response),
         means[worst],
         errors[worst],
         more,

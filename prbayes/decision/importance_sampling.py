@@ -1,119 +1,92 @@
-"""Probabilities of rare responses, from points that are drawn where they occur."""
+"""Probabilities of rare responses by importance sampling with the cross-entropy method."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
 
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.decision.inverse_transform import Specimens
-
-# Parts of all points of which one is spent on each step towards the limit: half of them are taken.
-_SEARCH_PARTS = 16
-# Points that count for one from the wide proposal, which bounds weights. By judgement, as a tenth
-# of them costs a twentieth of the accuracy.
-_TO_ONE = 9
-# How much wider than the population the first points are, in standard deviations, over the root of
-# the number of dimensions; they keep weights bounded. By judgement: of one input eight points in a
-# thousand are then four standard deviations out, and of ten weights are as even as of one.
-_ROOM_AT_FIRST = 0.5
-# Share of a step's points that the next one is drawn towards, as in Rubinstein's method, where .1
-# to .2 are usual.
-_ELITE = 0.2
-# Variances beyond one by fewer of their standard errors are taken for one. By judgement: where a
-# proposal is too narrow the error is not seen, and where it is too wide it is only larger.
-_SURE = 3.0
-# Factor of the variance across: weights far out are then bounded. By judgement, as that of ten
-# dimensions costs a third of the points.
-_ROOMY = 1.2
-# Variance towards the limit at least: of the tail of a normal population beyond four standard
-# deviations it is .05, and a proposal may be wider.
-_LEAST_ALONG = 0.1
+from prbayes.decision.populations import InverseTransform
 
 
 @dataclass(frozen=True, eq=False)
-class _Proposal:
-    """A normal distribution of z."""
-
-    mean: Floats  # (D,)
-    root: Floats  # (D, D): lower
-
-    def draw(self, n: int, rng: np.random.Generator) -> Floats:
-        """Return n points, (n, D)."""
-        z = rng.standard_normal((n, self.mean.size))
-        return np.asarray(self.mean + z @ self.root.T)
-
-    def log_density(self, z: Floats) -> Floats:
-        """Return the log density at points, (n, D) -> (n,)."""
-        standard = np.linalg.solve(self.root, (z - self.mean).T).T
-        return log_normal(standard) - float(np.log(np.diag(self.root)).sum())
-
-
-@dataclass(eq=False)
-class Points:
-    """Points drawn one proposal after the other, with their responses."""
-
-    z: list[Floats] = field(default_factory=list)
-    values: list[Floats] = field(default_factory=list)
-    log_ratio: list[Floats] = field(default_factory=list)
-    # Each with the number of points that are drawn from it.
-    proposals: list[tuple[int, _Proposal]] = field(default_factory=list)
-
-    def all(self) -> tuple[Floats, Floats, Floats]:
-        """Return points (n, D), responses (n,) and the log ratios of populations, (k, n)."""
-        return (
-            np.concatenate(self.z),
-            np.concatenate(self.values),
-            np.concatenate(self.log_ratio, axis=1),
-        )
-
-    def log_mixture(self, z: Floats) -> Floats:
-        """Return the log density of the mixture that all points are drawn from, (n,)."""
-        sizes = np.array([size for size, _ in self.proposals])
-        logs = [one.log_density(z) for _, one in self.proposals]
-        return np.asarray(logsumexp(logs, axis=0, b=sizes[:, None] / sizes.sum()))
-
-
-@dataclass(frozen=True, eq=False)
-class Rare:
-    """Probabilities of each population, and the error of their mean."""
+class RareEvent:
+    """Probabilities of an event in each population, and the error of their mean."""
 
     by_draw: Floats  # (k,)
     error: float  # standard error of their mean
     lost: float  # share of the populations' weight that has no response
 
 
-def rare(
-    specimens: Specimens,
-    roots: Sequence[Floats],
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """A normal proposal of z."""
+
+    mean: Floats  # (D,)
+    root: Floats  # (D, D): lower Cholesky factor of the covariance
+
+    def draw(self, n: int, rng: np.random.Generator) -> Floats:
+        z = rng.standard_normal((n, self.mean.size))
+        return np.asarray(self.mean + z @ self.root.T)
+
+    def log_density(self, z: Floats) -> Floats:
+        standard = np.linalg.solve(self.root, (z - self.mean).T).T
+        return log_normal(standard) - float(np.log(np.diag(self.root)).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Points from several proposals, with their responses."""
+
+    sizes: list[int]  # number of points from each proposal
+    proposals: list[_Normal]
+    z: Floats  # (n, D)
+    values: Floats  # (n,)
+    log_ratio: Floats  # (k, n): of the density of each population to that of the central one
+
+    def log_mixture(self) -> Floats:
+        """Return the log-density of the mixture of all proposals at the points, (n,)."""
+        sizes = np.array(self.sizes)
+        logs = [proposal.log_density(self.z) for proposal in self.proposals]
+        return np.asarray(logsumexp(logs, axis=0, b=sizes[:, None] / sizes.sum()))
+
+    def log_weights(self) -> Floats:
+        """Return the log importance weights for all populations together, (n,)."""
+        pooled = logsumexp(self.log_ratio, axis=0)
+        return np.asarray(pooled + log_normal(self.z) - self.log_mixture())
+
+
+def rare_event(
+    transform: InverseTransform,
+    parents: Sequence[Floats],
     respond: Callable[[Floats], Floats],
     limit: float,
     size: int,
     rng: np.random.Generator,
-) -> Rare:
+) -> RareEvent:
     r"""Return the probability that a response is above a limit, in each of k populations.
 
-    Points are standard normal numbers z behind the inputs of one population
-    :math:`\theta_*`. Half of them are drawn towards the limit step by step, by the cross-entropy
-    method. The other half is drawn from the mixture q that these tell, and counts:
+    Points are standard normal numbers z behind the inputs of a central population
+    :math:`\theta_*`. One half is drawn towards the limit step by step, by the cross-entropy method.
+    The other half is drawn from the mixture q of the last proposals, and counts:
 
     .. math:: P_j = \frac{1}{n} \sum_i 1[y_i > c] \frac{p(x_i | \theta_j)}{p(x_i | \theta_*)}
         \frac{\phi(z_i)}{q(z_i)}
 
     Parameters
     ----------
-    specimens : Specimens
-        Of the population in the middle.
-    roots : sequence of ndarray, shapes (k, *shape)
-        The populations.
+    transform : InverseTransform
+        Of the central population.
+    parents : sequence of ndarray, shapes (k, *shape)
+        Of the populations.
     respond : callable
         Normal numbers (n, D) -> responses (n,).
     limit : float
     size : int
-        How many responses are computed.
+        Number of responses to compute.
     rng : Generator
 
     References
@@ -123,146 +96,127 @@ def rare(
     .. [2] Owen, A. B. and Y. Zhou (2000), Safe and effective importance sampling, J. Am. Stat.
        Assoc. 95, 135-143, doi:10.1080/01621459.2000.10473909.
     """
-    d = specimens.size
-    points = Points()
-    widest = _Proposal(np.zeros(d), (1 + _ROOM_AT_FIRST / np.sqrt(d)) * np.eye(d))
+    d = transform.size
+    # Wider than the population, which bounds the weights; less so in each of many dimensions.
+    widest = _Normal(np.zeros(d), (1 + 0.5 / np.sqrt(d)) * np.eye(d))
     proposals = [widest]
-    # More dimensions need more points for a step.
-    part = max(size // _SEARCH_PARTS, min(10 * d, size // 8), 1)
-    # Towards the limit; once there, where it is exceeded becomes known better.
-    search = size // 2
-    while search:
-        n = min(part, search)
-        _add(points, proposals, n, specimens, roots, respond, rng)
-        search -= n
-        proposals = _towards(points, _level(points, limit), limit) or proposals
-    # The proposals know nothing of these points, so that their mean is not off.
-    final = Points()
-    _add(final, [*_repeated(proposals), widest], size - size // 2, specimens, roots, respond, rng)
-    z, values, log_ratio = final.all()
-    log_weight = log_normal(z) - final.log_mixture(z)
-    known = ~np.isnan(values)
-    weights = np.exp(log_ratio + log_weight)
-    pooled = weights.mean(axis=0)
-    beyond = known & (values > limit)
-    each = np.where(beyond, pooled, 0.0)
-    error = each.std(ddof=1) / np.sqrt(len(each))
-    if not beyond.any():
-        error = pooled.max() / len(each)  # what one point would tell
-    return Rare(
-        by_draw=np.where(beyond, weights, 0.0).mean(axis=1),
+    # A sixteenth of the points a step; more dimensions need more.
+    step = max(size // 16, min(10 * d, size // 8), 1)
+    batches: list[_Points] = []
+    remaining = size // 2
+    while remaining:
+        n = min(step, remaining)
+        batches.append(_draw_points(proposals, n, transform, parents, respond, rng))
+        remaining -= n
+        level = min(_elite_quantile(batches[-1].values, limit), limit)
+        proposals = _cross_entropy_proposals(_concatenated(batches), level, limit) or proposals
+    search = _concatenated(batches)
+    # The proposals do not depend on the final points, whose mean is unbiased. One point in ten
+    # comes from the widest proposal, which bounds weights.
+    copies = max(1, 9 // len(proposals))
+    mixture = [proposal for proposal in proposals for _ in range(copies)] + [widest]
+    final = _draw_points(mixture, size - size // 2, transform, parents, respond, rng)
+    weights = np.exp(final.log_ratio + (log_normal(final.z) - final.log_mixture()))
+    mean_weights = weights.mean(axis=0)
+    is_beyond = ~np.isnan(final.values) & (final.values > limit)
+    terms = np.where(is_beyond, mean_weights, 0.0)
+    error = terms.std(ddof=1) / np.sqrt(len(terms))
+    if not is_beyond.any():
+        error = mean_weights.max() / len(terms)  # the contribution of a single point
+    log_weights = search.log_weights()
+    shares = np.exp(log_weights - log_weights.max())
+    return RareEvent(
+        by_draw=np.where(is_beyond, weights, 0.0).mean(axis=1),
         error=float(error),
-        lost=_lost(points),
+        lost=float(shares[np.isnan(search.values)].sum() / shares.sum()),
     )
 
 
-def _lost(points: Points) -> float:
-    """Return the share of the populations' weight on points without response."""
-    _, values, log_weight = _weighed(points)
-    weights = np.exp(log_weight - log_weight.max())
-    lost = weights[np.isnan(values)]
-    return float(lost.sum() / weights.sum())
-
-
-def _weighed(points: Points) -> tuple[Floats, Floats, Floats]:
-    """Return points (n, D), responses and log weights in all populations together, (n,) each."""
-    z, values, log_ratio = points.all()
-    all_together = logsumexp(log_ratio, axis=0)
-    log_weight = all_together + log_normal(z) - points.log_mixture(z)
-    return z, values, log_weight
-
-
-def _repeated(proposals: list[_Proposal]) -> list[_Proposal]:
-    """Return proposals as often as they are drawn from for each point of a wide one."""
-    return [one for one in proposals for _ in range(max(1, _TO_ONE // len(proposals)))]
-
-
-def _add(
-    points: Points,
-    proposals: list[_Proposal],
+def _draw_points(
+    proposals: list[_Normal],
     n: int,
-    specimens: Specimens,
-    roots: Sequence[Floats],
+    transform: InverseTransform,
+    parents: Sequence[Floats],
     respond: Callable[[Floats], Floats],
     rng: np.random.Generator,
-) -> None:
-    """Draw points, and compute their responses."""
+) -> _Points:
+    """Draw n points, in equal parts from each proposal, and compute their responses."""
     sizes = [len(part) for part in np.array_split(np.arange(n), len(proposals))]
-    drawn = [one.draw(size, rng) for one, size in zip(proposals, sizes, strict=True)]
-    z = np.concatenate(drawn)
-    x = specimens.at(z)
-    own = specimens.log_density(specimens.roots, x)
+    draws = [proposal.draw(size, rng) for proposal, size in zip(proposals, sizes, strict=True)]
+    z = np.concatenate(draws)
+    x = transform(z)
+    central = transform.log_density(transform.parents, x)
     step = max(1, AT_ONCE // n)
-    ratios = []
-    for first in range(0, len(roots[0]), step):
-        some = [root[first : first + step] for root in roots]
-        ratios.append(specimens.log_density(some, x) - own)
-    points.z.append(z)
-    points.values.append(respond(z))
-    points.log_ratio.append(np.concatenate(ratios))
-    points.proposals += zip(sizes, proposals, strict=True)
+    log_ratio = [
+        transform.log_density([values[first : first + step] for values in parents], x) - central
+        for first in range(0, len(parents[0]), step)
+    ]
+    return _Points(sizes, proposals, z, respond(z), np.concatenate(log_ratio))
 
 
-def _level(points: Points, limit: float) -> float:
-    """Return what the next points are drawn towards: the limit, or what some of the last reach."""
-    last = points.values[-1]
-    known = last[~np.isnan(last)]
-    if not known.size:
-        return limit
-    reached = float(np.quantile(known, 1 - _ELITE, method="lower"))
-    return min(reached, limit)
+def _concatenated(batches: Sequence[_Points]) -> _Points:
+    return _Points(
+        sizes=[size for batch in batches for size in batch.sizes],
+        proposals=[proposal for batch in batches for proposal in batch.proposals],
+        z=np.concatenate([batch.z for batch in batches]),
+        values=np.concatenate([batch.values for batch in batches]),
+        log_ratio=np.concatenate([batch.log_ratio for batch in batches], axis=1),
+    )
 
 
-def _towards(points: Points, level: float, limit: float) -> list[_Proposal]:
-    """Return about the normal distribution nearest to the populations above a level, if any is.
+def _elite_quantile(values: Floats, limit: float) -> float:
+    """Return the level that the highest fifth of responses exceeds, as is usual for the method."""
+    values = values[~np.isnan(values)]
+    return float(np.quantile(values, 1 - 0.2, method="lower")) if values.size else limit
 
-    Two, where what is above spreads wider than the population, as on two sides of it.
+
+def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> list[_Normal]:
+    """Return the normal distribution nearest to the populations above a level, if any point is.
+
+    Two of them if the points above spread wider than the population, as on both sides of it.
     """
-    z, values, log_weight = _weighed(points)
-    above = values >= level
-    if not above.any():
+    is_above = points.values >= level
+    if not is_above.any():
         return []
-    z = z[above]
-    log_weight = log_weight[above]
-    weights = np.exp(log_weight - log_weight.max())
+    z = points.z[is_above]
+    log_weights = points.log_weights()[is_above]
+    weights = np.exp(log_weights - log_weights.max())
     total = weights.sum()
-    # Narrower only where the limit is reached: a step is longer for it before.
-    least = _LEAST_ALONG if level >= limit else 1.0
+    # Variance towards the limit. Before the limit is reached, narrow proposals slow the search;
+    # beyond four standard deviations a normal tail has a variance of .05.
+    least = 0.1 if level >= limit else 1.0
     mean = weights @ z / total
-    away = z - mean
-    covariance = (away.T * weights) @ away / total
+    deviation = z - mean
+    covariance = (deviation.T * weights) @ deviation / total
     variances, axes = np.linalg.eigh(covariance)
     error = np.sqrt(2 * (weights**2).sum()) / total  # of a variance of one
-    # The largest of several is larger by chance (Marchenko and Pastur 1967).
+    # The largest of several variances is larger by chance (Marchenko and Pastur 1967).
     by_chance = (1 + np.sqrt(mean.size / 2) * error) ** 2
-    if variances[-1] <= max(by_chance, 1 + _SURE * error):
-        return [_nearest(z, weights, least)]
-    side = away @ axes[:, -1] > 0
-    return [_nearest(z[own], weights[own], least) for own in (side, ~side)]
+    if variances[-1] <= max(by_chance, 1 + 3 * error):
+        return [_tail_normal(z, weights, least)]
+    side = deviation @ axes[:, -1] > 0
+    return [_tail_normal(z[part], weights[part], least) for part in (side, ~side)]
 
 
-def _nearest(z: Floats, weights: Floats, least: float) -> _Proposal:
+def _tail_normal(z: Floats, weights: Floats, least: float) -> _Normal:
     """Return a normal distribution with the mean of points, and their variance along it.
 
-    Few points tell no covariance of several dimensions: across it is the same everywhere.
+    Few points do not determine a covariance of several dimensions: across the mean it is isotropic.
     """
     total = weights.sum()
     mean = weights @ z / total
-    distance = float(np.linalg.norm(mean))
-    towards = mean / max(distance, 1e-300)
-    share = weights / total
-    away = z - mean
-    whole = float(share @ (away**2).sum(axis=1))
-    own = float(share @ (away @ towards) ** 2)
-    along = max(own, least)
-    others = max(mean.size - 1, 1)
-    across = _ROOMY * max((whole - own) / others, 1.0)
-    outer = np.outer(towards, towards)
-    identity = np.eye(mean.size)
-    covariance = across * (identity - outer) + along * outer
-    return _Proposal(mean, np.linalg.cholesky(covariance))
+    direction = mean / max(float(np.linalg.norm(mean)), 1e-300)
+    shares = weights / total
+    deviation = z - mean
+    whole = float(shares @ (deviation**2).sum(axis=1))
+    along = float(shares @ (deviation @ direction) ** 2)
+    # A fifth wider across, which bounds weights far out.
+    across = 1.2 * max((whole - along) / max(mean.size - 1, 1), 1.0)
+    outer = np.outer(direction, direction)
+    covariance = across * (np.eye(mean.size) - outer) + max(along, least) * outer
+    return _Normal(mean, np.linalg.cholesky(covariance))
 
 
 def log_normal(z: Floats) -> Floats:
-    """Return the log density of independent standard normal numbers, (n, D) -> (n,)."""
+    """Return the log-density of independent standard normal numbers, (n, D) -> (n,)."""
     return np.asarray(-0.5 * (z**2).sum(axis=1) - 0.5 * z.shape[1] * np.log(2 * np.pi))

@@ -1,4 +1,4 @@
-"""`p_box`: bounds of the distribution function of a response."""
+"""Probability box: bounds of the distribution function of a response."""
 
 from __future__ import annotations
 
@@ -10,23 +10,15 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import ENVELOPED, envelope
-from prbayes._validate import AT_ONCE, Floats, positive_integer, share
-from prbayes.decision.interval import intervals, variants
-from prbayes.decision.populations import Populations, Told
-from prbayes.model.fingerprint import as_attributes, identity_of_model
-from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
-from prbayes.optimize.optimum import Optimum, identity_in
+from prbayes._validate import Floats, positive_integer, share
+from prbayes.decision.populations import Populations, ResponseSample
+from prbayes.decision.quantities import interval_grid
+from prbayes.model.locking import locked
+from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable
 
-# Places at which distribution functions are compared: those of a band, between which both are
-# monotone, differ from those at twice as many by less than the eye sees.
-_PLACES = 200
-# Probability beyond the outermost places, on either side, of the mean distribution.
-_BEYOND_PLACES = 1e-4
 
-
-@in_turn
+@locked
 def p_box(
     result: Optimum | xr.DataTree,
     response: Callable[..., Any],
@@ -39,9 +31,10 @@ def p_box(
 ) -> xr.Dataset:
     r"""Return bounds of the distribution function of a response over the population.
 
-    Two bands from the same draws of the posterior. The *pointwise* one holds the share ``prob``
-    of the populations' distribution functions at each place by itself. The *simultaneous* one holds
-    that share of them entirely: with this posterior probability the true one is nowhere outside.
+    Two bands from the same draws of the posterior. The *pointwise* band contains the share ``prob``
+    of the populations' distribution functions at each value by itself. The *simultaneous* band
+    contains that share of them entirely: with this posterior probability the true distribution
+    function is nowhere outside.
 
     Parameters
     ----------
@@ -53,7 +46,7 @@ def p_box(
         computed once for each run of the design, unless `predict` did that before.
     *inputs
         As for `predict`. An `Interval` among them is a constant known only to lie between two ends:
-        the bands then hold those of all places in it.
+        the bands then contain those at all points of the interval.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     output : label, optional
@@ -63,7 +56,7 @@ def p_box(
     n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     steps : int
-        Places in each interval, its ends among them; at least 2.
+        Number of values in each interval, its ends included; at least 2.
 
     Returns
     -------
@@ -71,7 +64,7 @@ def p_box(
         Dimensions ``y``, in units of the response, and ``band``, "pointwise" and "simultaneous".
         Variables ``lower`` and ``upper``, distribution functions; ``mean``, that of a new specimen,
         with intervals between ``mean`` and ``mean_upper``. Attributes: ``prob``, ``responses``
-        (how many were computed) and ``identity``.
+        (number computed) and ``identity``.
 
     Raises
     ------
@@ -106,73 +99,55 @@ def p_box(
     positive_integer(n_draws, "n_draws", minimum=2)
     positive_integer(steps, "steps", minimum=2)
     populations = Populations.of(result, model, n_draws, caller)
-    told = [populations.told(response, place, output) for place in variants(inputs, steps)]
-    y = _places(told)
-    lows, highs, means = [], [], []
-    for one in told:
-        functions = _functions(one, y)
+    grid = interval_grid(inputs, steps)
+    samples = [populations.sample(response, place, output) for place in grid]
+    y = _evaluation_points(samples)
+    lower, upper, means = [], [], []
+    for sample in samples:
+        functions = _distribution_functions(sample, y)
         low, high = np.quantile(functions, [(1 - prob) / 2, (1 + prob) / 2], axis=0)
         lowest, highest = envelope(functions, 1 - prob)
-        lows.append([low, lowest])
-        highs.append([high, highest])
+        lower.append([low, lowest])
+        upper.append([high, highest])
         means.append(functions.mean(axis=0))
-    lower = np.min(lows, axis=0)
-    upper = np.max(highs, axis=0)
     data: dict[str, Any] = {
-        "lower": (["band", "y"], lower),
-        "upper": (["band", "y"], upper),
+        "lower": (["band", "y"], np.min(lower, axis=0)),
+        "upper": (["band", "y"], np.max(upper, axis=0)),
         "mean": ("y", np.min(means, axis=0)),
     }
-    if intervals(inputs):
+    if len(grid) > 1:
         data["mean_upper"] = ("y", np.max(means, axis=0))
-    identity = identity_in(result) or identity_of_model(populations.evaluator.model)
     return xr.Dataset(
         data,
         coords={"y": y, "band": ["pointwise", "simultaneous"]},
         attrs={
             "prob": prob,
-            "responses": sum(one.responses.count for one in told),
-            **as_attributes(identity),
-            **versions(),
+            "responses": sum(sample.responses.count for sample in samples),
+            **populations.provenance(),
         },
     )
 
 
-def _places(told: list[Told]) -> Floats:
-    """Return places at even steps of the mean distributions, with tails, all different."""
-    scores = np.linspace(0, 1, _PLACES // len(told) or 2)
-    # More of them in the tails: even steps of the logit.
-    reach = np.log(_BEYOND_PLACES)
-    levels = 1 / (1 + np.exp(reach * (1 - 2 * scores)))
-    found = []
-    for one in told:
-        finite = np.isfinite(one.values)
-        weights = _mean_weights(one)[finite]
+def _evaluation_points(samples: list[ResponseSample]) -> Floats:
+    """Return quantiles of the mean distributions, evenly spaced in the logit of the probability."""
+    # 200 values, from 1e-4 to 1 - 1e-4: twice as many are indistinguishable in a plot.
+    steps = np.linspace(0, 1, 200 // len(samples) or 2)
+    levels = 1 / (1 + np.exp(np.log(1e-4) * (1 - 2 * steps)))
+    points = []
+    for sample in samples:
+        is_finite = np.isfinite(sample.values)
+        weights = sample.mean_weights()[is_finite]
         middles = (np.cumsum(weights) - weights / 2) / weights.sum()
-        found.append(np.interp(levels, middles, one.values[finite]))
-    return np.unique(np.concatenate(found))
+        points.append(np.interp(levels, middles, sample.values[is_finite]))
+    return np.unique(np.concatenate(points))
 
 
-def _mean_weights(told: Told) -> Floats:
-    """Return the weights of responses in the mean of all populations, (n,)."""
-    weights = [np.nansum(part, axis=0) for part in _weights(told)]
-    total = np.sum(weights, axis=0)
-    return np.asarray(total / total.sum())
-
-
-def _functions(told: Told, y: Floats) -> Floats:
-    """Return the populations' distribution functions at places, (k, m)."""
-    below = np.searchsorted(told.values, y, side="right")
+def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:
+    """Return the distribution functions of all valid populations at y, (k, m)."""
+    count = np.searchsorted(sample.values, y, side="right")
     parts = []
-    for weights in _weights(told):
+    for weights in sample.weight_batches(sample.populations.thetas):
         sums = np.cumsum(weights, axis=1)
-        parts.append(np.where(below > 0, sums[:, np.maximum(below - 1, 0)], 0.0))
-    found = np.concatenate(parts)
-    return found[np.isfinite(found).all(axis=1)]
-
-
-def _weights(told: Told) -> list[Floats]:
-    """Return the weights of responses in all populations, some populations at a time."""
-    thetas = told.populations.thetas
-    step = max(1, AT_ONCE // told.design.n_points)
-    return [told.weights(thetas[i : i + step]) for i in range(0, len(thetas), step)]
+        parts.append(np.where(count > 0, sums[:, np.maximum(count - 1, 0)], 0.0))
+    functions = np.concatenate(parts)
+    return functions[np.isfinite(functions).all(axis=1)]

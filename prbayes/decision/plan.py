@@ -1,8 +1,8 @@
-"""`plan`: what more specimens under each of some conditions would tell."""
+"""Expected information of further specimens: posterior standard deviations that they would give."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,25 +10,64 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
-from prbayes.decision.information import Belief, Condition, of_a_specimen
-from prbayes.decision.populations import Populations, Told
+from prbayes.decision.populations import Populations, ResponseSample
 from prbayes.decision.quantities import Quantity, refuse_quantity
+from prbayes.inference.measured import drawn_in
+from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.resampling import observable
+from prbayes.metrics.base import Metric
 from prbayes.model.elements import split_elements, told_elements
-from prbayes.model.fingerprint import as_attributes, identity_of_model
-from prbayes.model.labels import labelled, versions
-from prbayes.model.locking import in_turn
-from prbayes.optimize.optimum import Optimum, identity_in
-
-# Draws that are made narrower: standard deviations are then known to two percent.
-_READ = 2000
-# Specimens up to which one that reaches a target is looked for.
-_MOST_SPECIMENS = 1_000_000
-# What the row of the decision quantity is called.
-_QUANTITY = "quantity"
+from prbayes.model.labels import labelled
+from prbayes.model.locking import locked
+from prbayes.numerics.derivatives import cross, slopes
+from prbayes.optimize.optimum import Optimum
+from prbayes.response.response import refuse_uncallable
 
 
-@in_turn
+class Condition:
+    """A condition under which specimens could be tested: a response, its inputs, and a metric.
+
+    Parameters
+    ----------
+    response : callable
+        As for `Simulator`: that of a simulator of the model, or another one of the same specimens.
+    *inputs
+        As for `predict`.
+    metric : Metric, optional
+        Of its data; that of the model's simulator by default.
+
+    Raises
+    ------
+    TypeError
+        If an argument is not as described.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> prb.decision.Condition(np.square, pm.Normal.dist(), metric=prb.AreaMetric())
+    Condition of square
+    """
+
+    def __init__(
+        self, response: Callable[..., Any], *inputs: Any, metric: Metric | None = None
+    ) -> None:
+        refuse_uncallable("prb.decision.Condition", response)
+        if metric is not None and not isinstance(metric, Metric):
+            raise TypeError(
+                f"prb.decision.Condition: metric: got {called(metric)}, expected a metric, such as "
+                "prb.ProbabilityResidual()"
+            )
+        self.response = response
+        self.inputs = inputs
+        self.metric = metric
+
+    def __repr__(self) -> str:
+        return f"Condition of {getattr(self.response, '__name__', type(self.response).__name__)}"
+
+
+@locked
 def plan(
     result: Optimum | xr.DataTree,
     candidates: Mapping[str, Condition],
@@ -38,13 +77,13 @@ def plan(
     quantity: Quantity | None = None,
     target: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
-    r"""Say what k more specimens under each candidate condition are expected to tell.
+    r"""Predict standard deviations after k more specimens under each candidate condition.
 
-    The posterior has the precision :math:`\Lambda` that its draws say. One specimen under a
-    condition adds the metric's (Godambe) information :math:`a = H J^{-1} H`, H the Hessian of its
-    discrepancy at the centre and J the covariance of its gradient, both by the weights of stored
-    responses; it is at most the Fisher information of the response. After k specimens the draws
-    are expected to be as wide as :math:`(\Lambda + k a)^{-1}` says.
+    The posterior has the precision :math:`\Lambda` of its draws. One specimen under a condition
+    adds the metric's (Godambe) information :math:`a = H J^{-1} H`, with the Hessian H of its
+    discrepancy at the centre and the covariance J of its gradient, both by the weights of stored
+    responses; it is at most the Fisher information of the response. After k specimens the expected
+    covariance of the draws is :math:`(\Lambda + k a)^{-1}`.
 
     Parameters
     ----------
@@ -52,27 +91,26 @@ def plan(
         From `minimize`, with its sampling distribution, and then without the prior; or with a
         ``posterior`` group, from any sampler.
     candidates : mapping of str to Condition
-        By what a reader calls them. A response that is no simulator's is computed once for each run
-        of the design, unless `predict` did that before.
+        Conditions by name. A response other than a simulator's is computed once for each run of
+        the design, unless `predict` has computed it.
     k : int or sequence of int
         Numbers of further specimens.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     quantity : Quantity, optional
-        A decision quantity, whose standard deviation is told as well.
+        A decision quantity whose standard deviation is predicted as well.
     target : mapping of str to float, optional
-        Standard deviations to be reached, by the names of the table, in units of each; the
-        quantity's is called ``"quantity"``.
+        Standard deviations to reach, by names of the table, in the unit of each; that of the
+        quantity by ``"quantity"``.
 
     Returns
     -------
     xarray.Dataset
-        Dimensions ``candidate``, ``k`` and ``name``, the hyperparameters, deterministics among
-        them, and ``"quantity"``. Variables ``sd``, the expected standard deviation, in the user's
-        own units, inf where the quantity is infinite in some populations; ``now``, the present one;
-        and with ``target``, ``specimens``: the least number of them that reaches it, inf if a
-        million do not, NaN where there is no target. Attributes: ``responses`` (how many were
-        computed) and ``identity``.
+        Dimensions ``candidate``, ``k`` and ``name``: hyperparameters and deterministics, and
+        ``"quantity"``. Variables ``sd``, the expected standard deviation in the user's units, inf
+        where the quantity is infinite in some populations; ``now``, the present one; and with
+        ``target``, ``specimens``: the smallest number that reaches it, inf if a million do not, NaN
+        without a target. Attributes: ``responses`` (number computed) and ``identity``.
 
     Raises
     ------
@@ -86,9 +124,9 @@ def plan(
 
     Notes
     -----
-    This is an expectation at the centre of the result: a posterior after k specimens is there or
-    elsewhere, and wider or narrower. Specimens are new ones, each measured under one condition.
-    Numbers below ten are less reliable: information adds up as it does in large samples.
+    This is an expectation at the centre of the result: an actual posterior after k specimens has
+    another centre and width. Specimens are new, each measured under one condition. Numbers below
+    ten are less reliable, as information adds up in large samples.
 
     References
     ----------
@@ -112,135 +150,273 @@ def plan(
     True
     """
     caller = "prb.plan"
-    numbers = _numbers(k)
+    numbers = _specimen_numbers(k)
     _refuse_candidates(candidates)
     if quantity is not None:
         refuse_quantity(quantity, caller)
-    populations = Populations.of(result, model, _READ, caller)
+    # 2000 draws: standard deviations are then known to two percent.
+    populations = Populations.of(result, model, 2000, caller)
     evaluator = populations.evaluator
-    decided = None
+    quantity_sample = None
     if quantity is not None:
-        decided = populations.told(quantity.response, quantity.inputs, quantity.output)
-        decided.refuse_failed(quantity)
-    belief = Belief.of(populations.thetas, evaluator.prior_sd)
-    outlook = _Outlook(populations, belief, quantity, decided)
-    now = outlook.sd(np.zeros((evaluator.size, evaluator.size)))
+        quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
+        quantity_sample.refuse_failed(quantity)
+    draws = Draws.of(populations.thetas, evaluator.hyperparameters.prior_sd)
+    forecast = _Forecast(populations, draws, quantity, quantity_sample)
+    now = forecast.sd(np.zeros((evaluator.hyperparameters.size, evaluator.hyperparameters.size)))
     _refuse_target(target, list(now))
-    told = {
-        label: populations.all_outputs(one.response, one.inputs)
-        for label, one in candidates.items()
+    samples = {
+        name: populations.sample_of_all_outputs(condition.response, condition.inputs)
+        for name, condition in candidates.items()
     }
-    sd, needed = [], []
-    for label, one in candidates.items():
-        each = of_a_specimen(told[label], one.metric)
-        rows = [outlook.sd(number * each) for number in numbers]
-        sd.append([[row[name] for name in now] for row in rows])
-        needed.append([outlook.needed(each, name, (target or {}).get(name)) for name in now])
+    sd, specimens = [], []
+    for name, condition in candidates.items():
+        information = specimen_information(samples[name], condition.metric)
+        rows = [forecast.sd(number * information) for number in numbers]
+        sd.append([[row[element] for element in now] for row in rows])
+        specimens.append(
+            [forecast.needed(information, element, (target or {}).get(element)) for element in now]
+        )
     variables: dict[str, Any] = {
         "sd": (["candidate", "k", "name"], sd),
         "now": ("name", list(now.values())),
     }
     if target is not None:
-        variables["specimens"] = (["candidate", "name"], needed)
-    responses = [one.responses for one in (*told.values(), *([decided] if decided else []))]
-    identity = identity_in(result) or identity_of_model(evaluator.model)
+        variables["specimens"] = (["candidate", "name"], specimens)
+    count = sum(sample.responses.count for sample in samples.values())
+    count += 0 if quantity_sample is None else quantity_sample.responses.count
     return xr.Dataset(
         variables,
         coords={"candidate": list(candidates), "k": numbers, "name": list(now)},
         attrs={
-            "responses": sum(one.count for one in responses),
+            "responses": count,
             **({} if quantity is None else {"quantity": repr(quantity)}),
-            **as_attributes(identity),
-            **versions(),
+            **populations.provenance(),
         },
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Outlook:
+class Draws:
+    """Draws of theta, and their covariance."""
+
+    thetas: Floats  # (k, d)
+    unit: Floats  # (d,): the prior's spread
+    covariance: Floats  # (d, d): in that unit
+
+    @classmethod
+    def of(cls, thetas: Floats, unit: Floats) -> Draws:
+        """Return draws, (k, d), with a covariance in which outliers beyond 3 sd are drawn in."""
+        d = unit.size
+        covariance = np.cov(drawn_in(thetas / unit, 3.0), rowvar=False).reshape(d, d)
+        return cls(thetas, unit, covariance)
+
+    def with_information(self, information: Floats) -> Floats:
+        """Return the draws after information, (d, d), narrowed around the same median.
+
+        Precisions add up; the map is the symmetric one between the two normal distributions.
+        """
+        covariance = np.linalg.inv(np.linalg.inv(self.covariance) + information)
+        root = _square_root(self.covariance)
+        inverse = np.linalg.inv(root)
+        matrix = inverse @ _square_root(root @ covariance @ root) @ inverse
+        median = np.median(self.thetas, axis=0)
+        deviation = (self.thetas - median) / self.unit
+        return np.asarray(median + (deviation @ matrix.T) * self.unit)
+
+
+def _square_root(matrix: Floats) -> Floats:
+    """Return the symmetric square root."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Forecast:
     """Standard deviations after more information."""
 
     populations: Populations
-    belief: Belief
+    draws: Draws
     quantity: Quantity | None
-    decided: Told | None
+    sample: ResponseSample | None  # of the quantity's response
 
     def sd(self, information: Floats) -> dict[str, float]:
-        """Return standard deviations by name, after so much information, (d, d)."""
-        thetas = self.belief.after(information)
+        """Return standard deviations by name after information, (d, d)."""
+        thetas = self.draws.with_information(information)
         evaluator = self.populations.evaluator
-        own = evaluator.constrained(thetas)
-        values = labelled(evaluator, own, {"draw": len(thetas)}).data_vars
+        variables = evaluator.hyperparameters.constrained(thetas)
+        values = labelled(evaluator, variables, {"draw": len(thetas)}).data_vars
         elements = split_elements(values)
-        found = {name: float(elements[name].std()) for name in told_elements(values)}
+        sd = {name: float(elements[name].std()) for name in told_elements(values)}
         if self.quantity is not None:
-            found[_QUANTITY] = self._of_quantity(thetas)
-        return found
+            sd["quantity"] = self._quantity_sd(thetas)
+        return sd
 
-    def _of_quantity(self, thetas: Floats) -> float:
+    def _quantity_sd(self, thetas: Floats) -> float:
         assert self.quantity is not None
-        assert self.decided is not None
-        values = self.decided.at(self.quantity, thetas)
-        # Where specimens fail, a quantile may be infinite.
+        assert self.sample is not None
+        values = self.sample.evaluate(self.quantity, thetas)
+        # A quantile may be infinite where specimens fail.
         return float(values.std()) if np.isfinite(values).all() else np.inf
 
-    def _of_one(self, information: Floats, name: str) -> float:
-        """Return one of the standard deviations."""
-        if name == _QUANTITY:
-            return self._of_quantity(self.belief.after(information))
-        return replace(self, quantity=None).sd(information)[name]
-
-    def needed(self, each: Floats, name: str, target: float | None) -> float:
-        """Return the least number of specimens after which one is small enough; inf, NaN."""
+    def needed(self, information: Floats, name: str, target: float | None) -> float:
+        """Return the smallest number of specimens that reaches a target; inf, NaN without one."""
         if target is None:
             return np.nan
-        if self._of_one(0 * each, name) <= target:
+
+        def exceeds(n: int) -> bool:
+            if name == "quantity":
+                return self._quantity_sd(self.draws.with_information(n * information)) > target
+            return replace(self, quantity=None).sd(n * information)[name] > target
+
+        if not exceeds(0):
             return 0.0
-        # Twice as many until it is reached, and then halves of the gap.
         short, enough = 0, 1
-        while self._of_one(enough * each, name) > target:
-            short = enough
-            enough = 2 * enough
-            if short > _MOST_SPECIMENS:
+        while exceeds(enough):
+            short, enough = enough, 2 * enough
+            if short > 1_000_000:
                 return np.inf
         while enough - short > 1:
             middle = (enough + short) // 2
-            if self._of_one(middle * each, name) > target:
+            if exceeds(middle):
                 short = middle
             else:
                 enough = middle
         return float(enough)
 
 
-def _numbers(k: object) -> list[int]:
-    """Return numbers of specimens, or raise if they are none."""
+# -- information of one specimen -------------------------------------------------------------------
+
+
+def specimen_information(sample: ResponseSample, metric: Metric | None) -> Floats:
+    r"""Return the information of one specimen, (d, d), in units of the prior's spread.
+
+    The Godambe information :math:`H J^{-1} H` of an ideal sample of the central population, divided
+    by its size, and at most the Fisher information of the response. For a simulator with the
+    log-likelihood by specimen, the Fisher information itself.
+    """
+    evaluator = sample.populations.evaluator
+    center = sample.populations.center
+    design = sample.design
+    if not design.has_runs:
+        if metric is not None:
+            raise ValueError(
+                f"prb.plan: {sample.responses.name}: metric: got {metric!r} of a simulator with "
+                "the log-likelihood by specimen, whose posterior takes all the information of the "
+                "response; leave metric= out"
+            )
+        return fisher_information(sample)
+    node = evaluator.nodes[sample.k]
+    # At least 50 specimens: smaller samples have other bandwidths.
+    n = max(round(node.n_specimens), 50)
+    target = (metric or node.metric).against(_ideal_sample(sample, n))
+    bound = design.telling(
+        sample.outputs, target.metric.beside(target, sample.outputs, design.dimensions)
+    )
+    alone = replace(node, target=bound.target, bound=bound, specimens=None)
+    # Directions with a standard error of up to ten spreads of the prior: fainter ones have less
+    # than a hundredth of the prior's information.
+    simulator_alone = replace(evaluator, nodes=(alone,), has_graph=False)
+    local = SamplingDistribution.of(simulator_alone, center, np.ones(1), 10.0).local
+    if not local.identified.size:
+        return np.zeros((center.size, center.size))
+    information = local.identified @ np.linalg.inv(local.covariance) @ local.identified.T
+    return _at_most(information / n, fisher_information(sample))
+
+
+def fisher_information(sample: ResponseSample) -> Floats:
+    r"""Return the Fisher information of one specimen, (d, d), in units of the prior's spread.
+
+    The covariance of the score of a response, :math:`E[s(x) | y]`: the mean over bins of the
+    response of the score of the inputs, which is the derivative of their log weights. For several
+    outputs the covariance of the inputs' score, an upper bound.
+    """
+    evaluator = sample.populations.evaluator
+    unit = evaluator.hyperparameters.prior_sd
+    step = 1e-3 * unit
+    parents = evaluator.roots(cross(sample.populations.center, step), sample.k)
+    _, weights = sample.design.populations(parents)
+    outputs = sample.outputs
+    if sample.emulator is None:
+        is_observable = observable(outputs, evaluator.nodes[sample.k].target)
+    else:
+        is_observable = np.isfinite(outputs.reshape(len(outputs), -1)).all(axis=1)
+    is_used = (weights[0] > 0) & is_observable
+    weights = weights[:, is_used]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scores = slopes(np.log(weights), step) * unit
+    mass = weights[0] / weights[0].sum()
+    scores = scores - mass @ scores
+    if outputs.ndim > 1:
+        return np.asarray((scores.T * mass) @ scores)
+    values = outputs[is_used]
+    # Bins of half the root of the number of points; equal values are in one bin.
+    rank = np.searchsorted(np.sort(values), values)
+    bins = rank // max(1, int(np.sqrt(len(mass)) / 2))
+    share = np.bincount(bins, mass)
+    sums = np.array([np.bincount(bins, mass * column) for column in scores.T])
+    means = sums / np.where(share > 0, share, 1.0)
+    return np.asarray((means * share) @ means.T)
+
+
+def _at_most(information: Floats, bound: Floats) -> Floats:
+    """Return information that exceeds a bound in no direction, (d, d).
+
+    Along directions of which the response contains next to no information, both factors of a
+    sandwich are rounding errors, and their quotient is arbitrary.
+    """
+    if not np.isfinite(bound).all():  # the support moves, and the likelihood is no bound
+        return information
+    d = len(bound)
+    root = np.linalg.cholesky(bound + 1e-9 * np.trace(bound) * np.eye(d))
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ information @ inverse.T)
+    capped = (vectors * np.minimum(values, 1.0)) @ vectors.T
+    return np.asarray(root @ capped @ root.T)
+
+
+def _ideal_sample(sample: ResponseSample, n: int) -> Floats:
+    """Return n specimens at equal steps of probability of the central population."""
+    evaluator = sample.populations.evaluator
+    parents = evaluator.roots(sample.populations.center[None], sample.k)
+    _, weights = sample.design.populations(parents)
+    is_observable = observable(sample.outputs, evaluator.nodes[sample.k].target)
+    values = sample.outputs[is_observable]
+    mass = weights[0][is_observable]
+    order = np.argsort(values.reshape(len(values), -1)[:, 0])
+    steps = (np.arange(n) + 0.5) / n
+    return np.asarray(values[order][reached(mass[order], steps, normalized=True)])
+
+
+def _specimen_numbers(k: object) -> list[int]:
+    """Return numbers of specimens, or raise."""
     if isinstance(k, str | Mapping) or not isinstance(k, Sequence | np.ndarray):
         return [positive_integer(k, "k")]
     if len(k) == 0:
         raise ValueError(
             "k: got no numbers, expected numbers of further specimens, such as [5, 10]"
         )
-    return [positive_integer(one, "k") for one in k]
+    return [positive_integer(number, "k") for number in k]
 
 
 def _refuse_candidates(candidates: object) -> None:
-    """Raise if they are no conditions by name."""
+    """Raise if candidates are no conditions by name."""
     advice = 'such as {"later": prb.decision.Condition(response, x)}'
     if not isinstance(candidates, Mapping) or not candidates:
         raise TypeError(
             f"prb.plan: candidates: got {called(candidates)}, expected a mapping of names to "
             f"conditions, {advice}"
         )
-    for name, one in candidates.items():
-        if not isinstance(name, str) or not isinstance(one, Condition):
+    for name, condition in candidates.items():
+        if not isinstance(name, str) or not isinstance(condition, Condition):
             raise TypeError(
-                f"prb.plan: candidates: got {called(one)} by {called(name)}, expected a condition "
-                f"by a text, {advice}"
+                f"prb.plan: candidates: got {called(condition)} by {called(name)}, expected a "
+                f"condition by a text, {advice}"
             )
 
 
 def _refuse_target(target: object, names: list[str]) -> None:
-    """Raise if it is no standard deviation by name."""
+    """Raise if a target is no standard deviation by name."""
     if target is None:
         return
     if not isinstance(target, Mapping) or not target:

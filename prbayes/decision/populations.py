@@ -1,33 +1,35 @@
-"""A result's populations, and a response of their specimens, from stored responses."""
+"""Populations of a result, and weighted samples of a response under each of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.decision.quantities import Quantity
 from prbayes.inference.identifiability import oriented
-from prbayes.model.emulated import (
-    EmulatedResponse,
-    EmulatedSample,
-    EmulatedSimulator,
-    values_of,
-)
+from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
 from prbayes.model.evaluator import Evaluator
-from prbayes.numerics.points import sobol
-from prbayes.optimize.optimum import Optimum, require_sampling
+from prbayes.model.fingerprint import as_attributes, identity_of_model
+from prbayes.model.labels import versions
+from prbayes.numerics.points import inside, sobol
+from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.new_specimens import through_inverses
 from prbayes.propagation.reweighted import Design
+from prbayes.response.compile import compile_batched
+from prbayes.response.distributions import compiled_log_density
 from prbayes.response.groups import refuse_groups
-from prbayes.response.inputs import read_inputs
+from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import Responses
 from prbayes.results.predict import (
@@ -38,146 +40,120 @@ from prbayes.results.predict import (
     serving,
 )
 
-# Draws at which it is looked whether the design supports a result: quantiles of so many are known
-# to a few percent, and they cost a weight at each point.
-_SUPPORTED_AT = 400
+# Populations at which checks and error estimates look: their quantiles are known to a few percent.
+N_CHECKED = 400
 
 
 @dataclass(frozen=True, eq=False)
 class Populations:
-    """The populations that a result stands for, as thetas."""
+    """The populations that a result represents, as thetas."""
 
+    result: Any
     evaluator: Evaluator
-    thetas: Floats  # (k, d): the posterior's draws, or what an optimum's sampling distribution says
+    thetas: Floats  # (k, d): draws of the posterior, or quantiles of an optimum's distribution
     center: Floats  # (d,): the median, or the optimum
     caller: str  # for messages
-    drawn: bool  # whether thetas are draws, which scatter, and not spread evenly
+    are_draws: bool  # whether thetas are random draws, and not Sobol points
 
     @classmethod
-    def of(cls, result: Any, model: pm.Model | None, draws: int, caller: str) -> Populations:
-        """Read a result.
-
-        Raises
-        ------
-        TypeError, KeyError, ValueError
-            If it is none, or another model's, or an optimum without standard errors.
-        """
+    def of(cls, result: Any, model: pm.Model | None, n_draws: int, caller: str) -> Populations:
+        """Read a result; raise if it is another model's, or an optimum without standard errors."""
         model = model_of(result, model, caller)
         if isinstance(result, Optimum):
-            thetas = _normal_thetas(result, draws, caller)
-            own = model is result.model
-            evaluator = result.evaluator if own else Evaluator(model)
-            return cls(evaluator, thetas, result.theta, caller, drawn=False)
-        points, _ = populations_of(result, model, draws, caller)
-        evaluator = Evaluator(model)
-        thetas = evaluator.thetas_of([points[str(rv.name)] for rv in model.free_RVs])
-        return cls(evaluator, thetas, np.median(thetas, axis=0), caller, drawn=True)
+            thetas = _sobol_thetas(result, n_draws, caller)
+            evaluator = result.evaluator if model is result.model else Evaluator.of(model)
+            return cls(result, evaluator, thetas, result.theta, caller, are_draws=False)
+        points, _ = populations_of(result, model, n_draws, caller)
+        evaluator = Evaluator.of(model)
+        thetas = evaluator.hyperparameters.thetas_of(
+            [points[str(rv.name)] for rv in model.free_RVs]
+        )
+        center = np.median(thetas, axis=0)
+        return cls(result, evaluator, thetas, center, caller, are_draws=True)
+
+    def provenance(self) -> dict[str, Any]:
+        """Return the attributes of a table: the problem's fingerprint, and versions."""
+        identity = identity_in(self.result) or identity_of_model(self.evaluator.model)
+        return {**as_attributes(identity), **versions()}
+
+    def thinned(self) -> Floats:
+        """Return about `N_CHECKED` thetas, evenly spaced in their order."""
+        return self.thetas[:: max(1, len(self.thetas) // N_CHECKED)]
 
     def responses(
         self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
     ) -> Responses:
         """Return a response with its inputs."""
-        label = str(getattr(response, "__name__", type(response).__name__))
-        sorted_inputs = read_inputs(label, inputs, self.evaluator.model)
-        refuse_groups(f"{self.caller}: {label}", sorted_inputs.roots)
-        return Responses(
-            label,
-            response,
-            sorted_inputs,
-            outputs=known_outputs(self.evaluator.simulators, response),
-            **calling,
-        )
+        name = str(getattr(response, "__name__", type(response).__name__))
+        sorted_inputs = read_inputs(name, inputs, self.evaluator.model)
+        refuse_groups(f"{self.caller}: {name}", sorted_inputs.roots)
+        outputs = known_outputs(self.evaluator.simulators, response)
+        return Responses(name, response, sorted_inputs, outputs=outputs, **calling)
 
-    def design_for(self, responses: Responses) -> int:
-        """Return which simulator has stored or emulated specimens of a response.
+    @cached_property
+    def _emulated_samples(self) -> dict[int, EmulatedSample]:
+        return {}
+
+    def sample(
+        self, response: Callable[..., Any], inputs: Sequence[Any], output: Any, **calling: Any
+    ) -> ResponseSample:
+        """Return one output of a response at the design's specimens; compute it where unknown.
 
         Raises
         ------
         TypeError
-            If none has.
+            If no simulator has stored or emulated specimens of these inputs.
+        DesignError
+            If the design does not support the populations, or too many responses are NaN.
         """
-        simulator = serving(self.evaluator.simulators, responses)
+        sample = self.sample_of_all_outputs(response, inputs, **calling)
+        return replace(sample, column=output_column(sample.responses, sample.outputs, output))
+
+    def sample_of_all_outputs(
+        self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
+    ) -> ResponseSample:
+        """Return all outputs of a response at the design's specimens, as `sample` does."""
+        responses = self.responses(response, inputs, **calling)
+        simulators = self.evaluator.simulators
+        simulator = serving(simulators, responses)
         if simulator is None:
             raise TypeError(
                 f"{self.caller}: {responses.name}: got inputs of which no simulator of the model "
                 "has stored responses, expected the .dist() objects of one with prb.Reweighted(), "
                 "and constants"
             )
-        return self.evaluator.simulators.index(simulator)
-
-    @cached_property
-    def _samples(self) -> dict[int, EmulatedSample]:
-        return {}
-
-    def _sample(self, k: int, simulator: EmulatedSimulator) -> EmulatedSample:
-        """Return the weighted specimens of a simulator whose responses are emulated."""
-        if k not in self._samples:
-            roots = self.evaluator.roots(self.thetas, k)
-            self._samples[k] = EmulatedSample.of(simulator, roots)
-        return self._samples[k]
-
-    def told(
-        self, response: Callable[..., Any], inputs: Sequence[Any], output: Any, **calling: Any
-    ) -> Told:
-        """Return a response of the design's specimens; what is not known of it is computed.
-
-        Raises
-        ------
-        DesignError
-            If the design does not support the populations, or too many responses are NaN.
-        """
-        found = self.all_outputs(response, inputs, **calling)
-        return replace(found, place=output_place(found.responses, found.every, output))
-
-    def all_outputs(
-        self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
-    ) -> Told:
-        """Return the same of all outputs together."""
-        responses = self.responses(response, inputs, **calling)
-        k = self.design_for(responses)
-        simulator = self.evaluator.simulators[k]
+        k = simulators.index(simulator)
         if simulator.is_emulated:
-            sample = self._sample(k, simulator)
+            if k not in self._emulated_samples:
+                roots = self.evaluator.roots(self.thetas, k)
+                self._emulated_samples[k] = EmulatedSample.of(simulator, roots)
+            design = self._emulated_samples[k]
             emulator = simulator.emulator(responses)
-            values = emulator(sample.points_of(responses.inputs))
-            found = Told(self, k, sample, responses, values, None, emulator)
+            values = emulator(design.points_of(responses.inputs))
+            sample = ResponseSample(self, k, design, responses, values, None, emulator)
         else:
-            design = simulator.design
-            assert design is not None
-            found = Told(self, k, design, responses, design.values_of(responses), None)
-        found.refuse_unsupported()
-        return found
+            assert simulator.design is not None
+            values = simulator.design.values_of(responses)
+            sample = ResponseSample(self, k, simulator.design, responses, values, None)
+        sample.refuse_unsupported()
+        return sample
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """One output of a response at the points of a design."""
+class ResponseSample:
+    """A response at the points of a design, whose weights represent each population."""
 
     populations: Populations
-    k: int  # which simulator has the design
+    k: int  # the simulator with the design
     design: Design | EmulatedSample
     responses: Responses
-    every: Floats  # (n,) or (n, m): all outputs at the design's points
-    place: int | None  # of the output; None where there is one
+    outputs: Floats  # (n,) or (n, m): at the design's points
+    column: int | None  # of the output; None for a response with one number
     emulator: EmulatedResponse | None = None  # of the response, where it is not stored
 
-    def emulated(self, points: Sequence[Floats]) -> list[Floats]:
-        """Return the output at specimens as emulators give it, (n,) each: the best one first.
-
-        The others differ from it by its error: they lack a block of the runs each, or are off by
-        the error at runs that are left out. Empty where responses are stored and not emulated.
-
-        Parameters
-        ----------
-        points : sequence of ndarray, shapes (n, *event)
-            Of the inputs of the design.
-        """
-        if self.emulator is None:
-            assert self.design.has_runs
-            return [self.column(v) for v in self.design.emulated(self.responses, list(points))]
-        values = self.emulator(values_of(points, self.design.inputs, self.responses.inputs))
-        error = self.emulator.error.reshape(self.emulator.event)
-        return [self.column(values), self.column(values + error)]
+    def select(self, outputs: Floats) -> Floats:
+        """Return the output, (..., n) or (..., n, m) -> (..., n)."""
+        return outputs if self.column is None else outputs[..., self.column]
 
     @property
     def points(self) -> list[Floats]:
@@ -185,62 +161,69 @@ class Told:
         design = self.design
         return list(design.contents.table.points if design.has_runs else design.points)
 
-    def column(self, values: Floats) -> Floats:
-        """Return the output, (..., n) or (..., n, m) -> (..., n)."""
-        return values if self.place is None else values[..., self.place]
+    def emulated(self, points: Sequence[Floats]) -> list[Floats]:
+        """Return the output of emulators at specimens, (n,) each: the best estimate first.
+
+        The rest differ from it by its error: they lack a block of the runs each, or add the error
+        of left-out runs. Empty where responses are stored and not emulated.
+        """
+        if self.emulator is None:
+            assert self.design.has_runs
+            return [self.select(v) for v in self.design.emulated(self.responses, list(points))]
+        values = self.emulator(values_of(points, self.design.inputs, self.responses.inputs))
+        error = self.emulator.error.reshape(self.emulator.event)
+        return [self.select(values), self.select(values + error)]
 
     @cached_property
-    def _known(self) -> NDArray[np.intp]:
+    def _order(self) -> NDArray[np.intp]:
         """The points that have a response, in ascending order of it."""
-        values = self.column(self.every)
+        values = self.select(self.outputs)
         order = np.argsort(values, kind="stable")
         return order[~np.isnan(values[order])]
 
     @cached_property
     def values(self) -> Floats:
         """The responses in ascending order, (n,)."""
-        return self.column(self.every)[self._known]
+        return self.select(self.outputs)[self._order]
 
     @cached_property
     def blocks(self) -> NDArray[np.intp]:
-        """Which of the design's blocks each of them is in, (n,)."""
-        return self.design.blocks[self._known]
+        """The block of the design that each of the values is in, (n,)."""
+        return self.design.blocks[self._order]
 
     def weights(self, thetas: Floats) -> Floats:
-        """Return weights of the responses in populations, (k, d) -> (k, n): they sum to one."""
-        roots = self.populations.evaluator.roots(thetas, self.k)
-        _, weights = self.design.populations(roots)
-        known = weights[:, self._known]
+        """Return weights of the values in populations, (k, d) -> (k, n), with sum one."""
+        _, weights = self.design.populations(self.populations.evaluator.roots(thetas, self.k))
+        weights = weights[:, self._order]
         with np.errstate(invalid="ignore"):
-            return known / known.sum(axis=1, keepdims=True)
+            return weights / weights.sum(axis=1, keepdims=True)
 
-    def mean_weights(self, thetas: Floats) -> Floats:
-        """Return the mean of the weights of populations, (k, d) -> (n,), of those there are."""
-        total = np.zeros(self.values.size)
-        for weights in self._some_weights(thetas):
-            total += np.nansum(weights, axis=0)
-        return total / total.sum()
-
-    def at(self, quantity: Quantity, thetas: Floats) -> Floats:
-        """Return a quantity of populations, (k, d) -> (k,); NaN where there is no population."""
-        return np.concatenate([quantity.of(self.values, w) for w in self._some_weights(thetas)])
-
-    def _some_weights(self, thetas: Floats) -> Iterator[Floats]:
-        """Yield the weights of some populations at a time, as many as fit into memory."""
+    def weight_batches(self, thetas: Floats) -> Iterator[Floats]:
+        """Yield the weights of as many populations at a time as fit into memory."""
         step = max(1, AT_ONCE // self.design.n_points)
         for first in range(0, len(thetas), step):
             yield self.weights(thetas[first : first + step])
 
+    def mean_weights(self) -> Floats:
+        """Return the mean weights over all valid populations, (n,)."""
+        total = np.zeros(self.values.size)
+        for weights in self.weight_batches(self.populations.thetas):
+            total += np.nansum(weights, axis=0)
+        return total / total.sum()
+
+    def evaluate(self, quantity: Quantity, thetas: Floats) -> Floats:
+        """Return a quantity of populations, (k, d) -> (k,); NaN where there is no population."""
+        return np.concatenate([quantity.of(self.values, w) for w in self.weight_batches(thetas)])
+
     def refuse_unsupported(self) -> None:
-        """Raise if the design does not support the populations, or they lose too much of it."""
-        thetas = self.populations.thetas[:: max(1, len(self.populations.thetas) // _SUPPORTED_AT)]
-        roots = self.populations.evaluator.roots(thetas, self.k)
+        """Raise if the design does not support the populations, or too many responses are NaN."""
+        roots = self.populations.evaluator.roots(self.populations.thinned(), self.k)
         if self.design.has_runs:
             refuse_unsupported(self.responses.name, self.design, roots)
         else:
             self.design.refuse_unsupported(self.responses.name, roots)
         _, weights = self.design.populations(roots)
-        lost = float(np.nanmedian(weights[:, lacking(self.every)].sum(axis=1)))
+        lost = float(np.nanmedian(weights[:, lacking(self.outputs)].sum(axis=1)))
         if lost > self.design.max_lost:
             raise DesignError(
                 f"{self.responses.name}: lost mass: got {lost:.1%} of a population's weight on "
@@ -249,7 +232,7 @@ class Told:
             )
 
     def refuse_failed(self, quantity: Quantity) -> None:
-        """Raise if specimens failed, of which the quantity is no number."""
+        """Raise if specimens failed and the quantity needs finite responses."""
         if quantity.needs_finite and np.isposinf(self.values[-1]):
             raise ValueError(
                 f"{self.populations.caller}: {quantity!r}: got specimens that failed (+inf), of "
@@ -258,34 +241,72 @@ class Told:
             )
 
 
-def _normal_thetas(optimum: Optimum, draws: int, caller: str) -> Floats:
-    """Return thetas spread evenly over the sampling distribution of an optimum, (draws, d)."""
+class InverseTransform:
+    """The aleatory inputs of one population as functions of standard normal numbers z.
+
+    Inverse distribution functions at Phi(z). A distribution that has none, or depends on another
+    input, raises TypeError.
+    """
+
+    def __init__(self, name: str, inputs: Inputs, parents: Sequence[Floats]) -> None:
+        self.inputs = inputs
+        self.parents = parents  # shapes (1, *shape)
+        sizes = [int(np.prod(shape, dtype=int)) for shape in inputs.event_shapes]
+        ends = np.cumsum([0, *sizes]).tolist()
+        self.columns = [slice(a, b) for a, b in pairwise(ends)]  # of z, by input
+        self.size = ends[-1]
+        symbols = inputs.placeholders()
+        uniforms = [pt.tensor(dtype="float64", shape=(None, *s)) for s in inputs.event_shapes]
+        quantiles, epistemic = through_inverses(name, inputs, symbols, uniforms)
+        self._function = compile_batched([*symbols, *uniforms], [*quantiles, *epistemic])
+
+    @cached_property
+    def _log_density(self) -> Any:
+        return compiled_log_density(self.inputs)
+
+    def __call__(self, z: Floats) -> list[Floats]:
+        """Return the aleatory inputs, shapes (n, *event), of z (n, size)."""
+        shapes = self.inputs.event_shapes
+        uniforms = [
+            inside(ndtr(z[:, columns])).reshape(1, len(z), *shape)
+            for columns, shape in zip(self.columns, shapes, strict=True)
+        ]
+        values = self._function(*self.parents, *uniforms)[: len(shapes)]
+        return [
+            np.broadcast_to(v, (1, len(z), *shape))[0]
+            for v, shape in zip(values, shapes, strict=True)
+        ]
+
+    def log_density(self, parents: Sequence[Floats], x: Sequence[Floats]) -> Floats:
+        """Return log-densities of inputs in the populations of parents, (k, n)."""
+        return np.asarray(self._log_density(*parents, *x)[0])
+
+    def responses(self, responses: Responses, z: Floats) -> Floats:
+        """Call a response at z (n, size); return (n,) or (n, m)."""
+        x = self(z)
+        positions = [id(variable) for variable in self.inputs.aleatory]
+        return responses([x[positions.index(id(v))] for v in responses.inputs.aleatory], [])
+
+
+def _sobol_thetas(optimum: Optimum, n: int, caller: str) -> Floats:
+    """Return Sobol points of the sampling distribution of an optimum, (n, d)."""
     require_sampling(optimum, caller)
     covariance = optimum.covariance
     if not np.isfinite(covariance).all():
-        hidden = [
-            name
-            for name, variance in zip(optimum.names, np.diag(covariance), strict=True)
-            if not np.isfinite(variance)
-        ]
+        is_known = np.isfinite(np.diag(covariance))
+        unknown = [name for name, is_ok in zip(optimum.names, is_known, strict=True) if not is_ok]
         raise ValueError(
-            f"{caller}: got an optimum that says nothing of the uncertainty of {hidden}, expected "
+            f"{caller}: got an optimum that says nothing of the uncertainty of {unknown}, expected "
             "a standard error of each; pass the posterior of prb.sample_smc"
         )
-    z = ndtri(sobol(draws, optimum.theta.size, seed=0))
+    z = ndtri(sobol(n, optimum.theta.size, seed=0))
     values, vectors = np.linalg.eigh(covariance)
     root = oriented(vectors) * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(optimum.theta + z @ root.T)
 
 
-def output_place(responses: Responses, values: Floats, output: Any) -> int | None:
-    """Return which column of responses an output is; None where there is only one number.
-
-    Raises
-    ------
-    ValueError, KeyError
-        If it is none of them, or there are several and none is named.
-    """
+def output_column(responses: Responses, values: Floats, output: Any) -> int | None:
+    """Return the column of an output, or None for a response with one number; or raise."""
     if values.ndim == 1:
         if output is not None:
             raise ValueError(
@@ -294,13 +315,13 @@ def output_place(responses: Responses, values: Floats, output: Any) -> int | Non
             )
         return None
     outputs = responses.outputs or Outputs(tuple(range(values.shape[1])))
-    labels = list(outputs.labels)
+    labels, names = list(outputs.labels), list(outputs.names)
     if output is None:
         raise ValueError(
             f"{responses.name}: got a response of {len(labels)} outputs, expected output= to say "
-            f"which, of {list(outputs.names)[:9]}"
+            f"which, of {names[:9]}"
         )
-    for known in (labels, list(outputs.names)):
-        if output in known:
-            return known.index(output)
+    for identifiers in (labels, names):
+        if output in identifiers:
+            return identifiers.index(output)
     raise KeyError(f"{responses.name}: output: got {output!r}, expected one of {labels[:9]}")

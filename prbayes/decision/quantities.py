@@ -1,9 +1,11 @@
-"""What a decision looks at: a number of a population of responses, such as a quantile of them."""
+"""Decision quantities: functionals of the distribution of a response, such as its quantiles."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from prbayes.response.response import refuse_uncallable
 
 
 class Quantity(ABC):
-    """A number of the population of a response; derive from it for one of your own.
+    """A functional of the distribution of a response; derive from it to define another one.
 
     Parameters
     ----------
@@ -30,10 +32,9 @@ class Quantity(ABC):
     needs_finite : bool
         Whether no specimen may have failed (+inf).
     differentiable : bool
-        Whether the number of a specimen whose variance is shared out has derivatives where the
-        response has.
+        Whether `of_specimen` has derivatives where the response has.
     of_inputs : str
-        What that number is, in words.
+        Description of the number that `of_specimen` returns.
     """
 
     needs_finite = False
@@ -48,23 +49,23 @@ class Quantity(ABC):
 
     def __repr__(self) -> str:
         name = response_name(self.response)
-        return f"{self.told} of {name}" + ("" if self.output is None else f"[{self.output}]")
+        return f"{self.label} of {name}" + ("" if self.output is None else f"[{self.output}]")
 
     @property
-    def told(self) -> str:
-        """What it is, in words."""
+    def label(self) -> str:
+        """The name of the functional, such as "mean"."""
         return type(self).__name__
 
     @abstractmethod
     def of(self, values: Floats, weights: Floats) -> Floats:
-        """Return the number of each population.
+        """Return the quantity of each population.
 
         Parameters
         ----------
         values : ndarray, shape (n,)
             Responses in ascending order; +inf is a specimen that failed.
         weights : ndarray, shape (k, n)
-            Of each population; they sum to one.
+            Weights of the responses in each population, with sum one.
 
         Returns
         -------
@@ -72,7 +73,7 @@ class Quantity(ABC):
         """
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
-        """Return the number of each specimen whose variance is shared out among the inputs.
+        """Return the number of each specimen whose variance is attributed to the inputs.
 
         By default the response itself; ``at`` is the quantity of the population.
         """
@@ -92,7 +93,7 @@ class Mean(Quantity):
     """
 
     needs_finite = True
-    told = "mean"
+    label = "mean"
 
     def of(self, values: Floats, weights: Floats) -> Floats:
         """Return the means."""
@@ -112,13 +113,13 @@ class StandardDeviation(Quantity):
     """
 
     needs_finite = True
-    told = "standard deviation"
+    label = "standard deviation"
 
     def of(self, values: Floats, weights: Floats) -> Floats:
         """Return the standard deviations."""
-        # From a value in the middle, so that large means leave digits for the spread.
-        away = values - values[values.size // 2]
-        variance = weights @ away**2 - (weights @ away) ** 2
+        # Relative to a central value, against cancellation.
+        deviation = values - values[values.size // 2]
+        variance = weights @ deviation**2 - (weights @ deviation) ** 2
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
@@ -153,15 +154,14 @@ class Quantile(Quantity):
         self.probability = share(probability, "probability")
 
     @property
-    def told(self) -> str:
-        """What it is, in words."""
+    def label(self) -> str:
+        """The name of the functional."""
         return f"{100 * self.probability:g}% quantile"
 
     def of(self, values: Floats, weights: Floats) -> Floats:
-        """Return the quantiles, by lines between the middles of the steps."""
+        """Return the quantiles, by interpolation between the middles of the steps."""
         middles = np.cumsum(weights, axis=1) - 0.5 * weights
-        rows = [np.interp(self.probability, row, values) for row in middles]
-        return np.array(rows)
+        return np.array([np.interp(self.probability, row, values) for row in middles])
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return whether each specimen is beyond the population's quantile."""
@@ -203,8 +203,8 @@ class Exceedance(Quantity):
         self.below = flag(below, "below")
 
     @property
-    def told(self) -> str:
-        """What it is, in words."""
+    def label(self) -> str:
+        """The name of the functional."""
         return f"probability {'below' if self.below else 'above'} {self.limit:g}"
 
     def of(self, values: Floats, weights: Floats) -> Floats:
@@ -218,9 +218,56 @@ class Exceedance(Quantity):
 
 
 def refuse_quantity(quantity: object, caller: str) -> None:
-    """Raise if it is no quantity."""
+    """Raise if an argument is no quantity."""
     if not isinstance(quantity, Quantity):
         raise TypeError(
             f"{caller}: quantity: got {type(quantity).__name__}, expected a quantity with its "
             "response, such as prb.decision.Quantile(response, x, probability=0.99)"
         )
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A constant input, the same for all specimens, known only to lie between two ends.
+
+    Parameters
+    ----------
+    low, high : float
+        In units of the input.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If one is no finite number, or the first is not below the second.
+
+    Examples
+    --------
+    >>> import prbayes as prb
+    >>> prb.decision.Interval(2.4, 2.8)
+    Interval(low=2.4, high=2.8)
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        low = finite_number(self.low, "Interval: low")
+        if finite_number(self.high, "Interval: high") <= low:
+            raise ValueError(
+                f"Interval: high: got {self.high} with low = {self.low}, expected more than that"
+            )
+
+
+def interval_grid(inputs: Sequence[Any], steps: int) -> list[tuple[Any, ...]]:
+    """Return the inputs at each combination of ``steps`` evenly spaced values of each interval."""
+    values = [
+        np.linspace(x.low, x.high, steps).tolist() if isinstance(x, Interval) else [x]
+        for x in inputs
+    ]
+    return list(product(*values))
+
+
+def interval_values(inputs: Sequence[Any], point: Sequence[Any]) -> str:
+    """Return the values of the intervals at a point of the grid, as text."""
+    pairs = zip(inputs, point, strict=True)
+    return ", ".join(f"{value:g}" for x, value in pairs if isinstance(x, Interval))

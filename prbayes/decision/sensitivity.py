@@ -1,6 +1,12 @@
-"""`sensitivity`: which hyperparameter, and which input's scatter, moves a decision quantity."""
+"""Variance-based sensitivity of a decision quantity to hyperparameters and inputs.
+
+Sobol' indices of first and total order, and derivative-based bounds, from replicates of scrambled
+Sobol points.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import pymc as pm
@@ -9,34 +15,21 @@ from scipy.special import ndtri
 
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.decision.copula import Copula
-from prbayes.decision.indices import (
-    REPLICATES,
-    Indices,
-    derivative_bound,
-    first_order,
-    total_order,
-)
-from prbayes.decision.populations import Populations, Told
+from prbayes.decision.populations import InverseTransform, Populations, ResponseSample
 from prbayes.decision.quantities import Quantity, refuse_quantity
-from prbayes.decision.scatter import scatter
-from prbayes.model.fingerprint import as_attributes, identity_of_model
-from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.numerics.points import sobol
-from prbayes.optimize.optimum import Optimum, identity_in
+from prbayes.optimize.optimum import Optimum
 from prbayes.response.inputs import aleatory_names
 
-# Draws of a posterior that are read: margins and correlations are then known to two percent.
-_DRAWS = 4000
-# Step of differences of weights, in standard deviations of an element of theta. Half or twice
-# changes an index by less than a hundredth (tests/decision/test_sensitivity.py).
-_WEIGHT_STEP = 0.02
-# Share of populations that may have no finite number of the quantity, and are left out: shares are
-# not known to a hundredth anyway.
-_LEFT_OUT = 0.01
+# Independently scrambled point sets: the standard error between them is itself known to 18%.
+REPLICATES = 16
+# Step of differences in standard normal numbers. Half or twice changes an index by less than a
+# hundredth (tests/decision/test_sensitivity.py).
+_STEP = 0.02
 
 
-@in_turn
+@locked
 def sensitivity(
     result: Optimum | xr.DataTree,
     quantity: Quantity,
@@ -46,19 +39,19 @@ def sensitivity(
     computed: bool = False,
     random_seed: Seed = 0,
 ) -> xr.Dataset:
-    r"""Share out the uncertainty of a decision quantity, and the scatter of its response.
+    r"""Return Sobol' indices of a decision quantity, by hyperparameter and by input.
 
-    The quantity Q is uncertain because the hyperparameters are. For each of them the table has
-    the share of Q's variance that knowing it would remove on average (first order),
-    :math:`S_i = Var(E[Q | \theta_i]) / Var(Q)`, the share that is left when all others are known
-    (total order), :math:`T_i = E[Var(Q | \theta_{-i})] / Var(Q)`, and a bound of that from
-    derivatives. Each Q costs weights and no response. The response scatters because inputs do:
-    for each aleatory input the table has the same shares of the response's variance in the
-    population at the centre of the result; of an `Exceedance` or a `Quantile` those of whether a
-    specimen is beyond.
+    The quantity Q is uncertain because the hyperparameters are. For each hyperparameter the table
+    has the share of Q's variance that knowing it would remove on average (first order),
+    :math:`S_i = Var(E[Q | \theta_i]) / Var(Q)`, the share that remains when all others are known
+    (total order), :math:`T_i = E[Var(Q | \theta_{-i})] / Var(Q)`, and an upper bound of the total
+    from derivatives. Evaluating Q costs weights and no response. For each aleatory input the table
+    has the same shares of the response's variance in the population at the centre of the result;
+    for an `Exceedance` or a `Quantile`, shares of the variance of the indicator that a specimen is
+    beyond.
 
-    Hyperparameters depend on each other in the posterior: shares then sum to more than one, or
-    less, and the total may be smaller than the first order.
+    Hyperparameters depend on each other in the posterior. Their shares then need not sum to one,
+    and the total may be smaller than the first order.
 
     Parameters
     ----------
@@ -67,17 +60,17 @@ def sensitivity(
         sampler.
     quantity : Quantity
         From ``prb.decision``, such as ``prb.decision.Quantile(response, x, probability=0.99)``.
-        Another response than a simulator's is computed once for each run of the design, unless
-        `predict` did that before.
+        A response other than a simulator's is computed once for each run of the design, unless
+        `predict` has computed it.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     n_samples : int
-        Populations from which those of each share are made, and a quarter of the specimens; the
-        error falls with their number.
+        Number of populations for the indices of hyperparameters, and a quarter of the number of
+        specimens for those of inputs.
     computed : bool
-        Whether the response is called at new specimens to share out its scatter, 4 ``n_samples``
-        times (1 + 2 inputs + 2 numbers of a specimen) of them; by default emulators say it, or with
-        one input the runs.
+        Whether the indices of inputs come from calls of the response at new specimens,
+        4 ``n_samples`` times (1 + 2 inputs + 2 numbers of a specimen) of them; by default from
+        emulators, or with one input from the runs.
     random_seed : int, sequence of int, numpy.random.Generator or None
 
     Returns
@@ -86,12 +79,12 @@ def sensitivity(
         Dimension ``factor``, the elements of theta and the aleatory inputs, with ``kind``,
         "hyperparameter" or "input". Variables ``first``, ``total`` and ``derivative``, with their
         standard errors ``first_error``, ``total_error`` and ``derivative_error``: shares without a
-        unit; NaN where they are not known, as derivatives of whether a specimen is beyond a limit.
-        Attributes: ``quantity``, ``of_inputs`` (what of a specimen is shared out among the inputs),
-        ``value`` (at the centre, in units of the quantity) and ``sd``
-        (by the hyperparameters), ``scatter``, the share of a new specimen's variance that is
-        scatter and no lack of knowledge, ``responses`` (how many were computed), ``inputs``, why
-        shares of inputs are not known, and ``identity``.
+        unit; NaN where they are not known, as derivatives of an indicator.
+        Attributes: ``quantity``; ``of_inputs``, the number of a specimen whose variance is
+        attributed to the inputs; ``value``, the quantity at the centre, and ``sd``, its standard
+        deviation over the hyperparameters, both in its units; ``scatter``, the aleatory share of
+        the variance of a new specimen; ``responses``, the number computed; ``inputs``, the reason
+        if indices of inputs are not known; and ``identity``.
 
     Raises
     ------
@@ -105,11 +98,11 @@ def sensitivity(
 
     Notes
     -----
-    The posterior is taken as a normal copula with its own margins: draws of an element given the
-    others are exact where it is normal in unconstrained parameters. The derivative-based index of
-    an element is :math:`s_i^2 E[(dQ/dz_i)^2] / Var(Q)`, where z are the normal numbers of
-    the copula and s their standard deviations given all others; Poincaré's inequality for that
-    conditional distribution makes it at least the total. An input that is a vector is one factor.
+    The posterior is approximated by a normal copula with its margins: draws of an element given
+    the others are exact if it is normal in unconstrained parameters. The derivative-based index of
+    an element is :math:`s_i^2 E[(dQ/dz_i)^2] / Var(Q)`, where z is the normal vector of the copula
+    and s_i the standard deviation of z_i given all others; by Poincaré's inequality for that
+    conditional distribution it is at least the total. An input that is a vector is one factor.
 
     References
     ----------
@@ -141,92 +134,239 @@ def sensitivity(
     n_samples = positive_integer(n_samples, "n_samples", minimum=2 * REPLICATES)
     flag(computed, "computed")
     seed = seed_number(random_seed)
-    populations = Populations.of(result, model, _DRAWS, caller)
-    told = populations.told(quantity.response, quantity.inputs, quantity.output)
-    told.refuse_failed(quantity)
-    own = _of_hyperparameters(told, quantity, n_samples, seed)
-    inputs = scatter(told, quantity, n_samples, seed, computed=computed)
-    evaluator = populations.evaluator
-    simulator = evaluator.simulators[told.k]
-    names = aleatory_names(simulator.inputs, simulator.responses.function)
+    # 4000 draws: margins and correlations are then known to two percent.
+    populations = Populations.of(result, model, 4000, caller)
+    sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
+    sample.refuse_failed(quantity)
+    hyperparameters = _hyperparameter_indices(sample, quantity, n_samples, seed)
+    inputs, obstacle = input_indices(sample, quantity, n_samples, seed, computed=computed)
     columns = {}
-    for name in ("first", "total", "derivative"):
-        for key in (name, f"{name}_error"):
-            both = [getattr(own, key), getattr(inputs.indices, key)]
-            columns[key] = ("factor", np.concatenate(both))
-    kinds = ["hyperparameter"] * evaluator.size + ["input"] * len(names)
-    identity = identity_in(result) or identity_of_model(evaluator.model)
+    for row, name in enumerate(("first", "total", "derivative")):
+        values = [hyperparameters.values[row], inputs.values[row]]
+        errors = [hyperparameters.errors[row], inputs.errors[row]]
+        columns[name] = ("factor", np.concatenate(values))
+        columns[f"{name}_error"] = ("factor", np.concatenate(errors))
+    evaluator = populations.evaluator
+    simulator = evaluator.simulators[sample.k]
+    names = aleatory_names(simulator.inputs, simulator.responses.function)
+    kinds = ["hyperparameter"] * evaluator.hyperparameters.size + ["input"] * len(names)
     return xr.Dataset(
         columns,
-        coords={"factor": [*evaluator.readable_names, *names], "kind": ("factor", kinds)},
+        coords={
+            "factor": [*evaluator.hyperparameters.readable_names, *names],
+            "kind": ("factor", kinds),
+        },
         attrs={
             "quantity": repr(quantity),
-            "value": float(told.at(quantity, populations.center[None])[0]),
-            "sd": float(np.nanstd(told.at(quantity, populations.thetas))),
+            "value": float(sample.evaluate(quantity, populations.center[None])[0]),
+            "sd": float(np.nanstd(sample.evaluate(quantity, populations.thetas))),
             "of_inputs": quantity.of_inputs,
-            "scatter": _share_of_scatter(told, quantity),
-            "responses": told.responses.count,
-            "inputs": inputs.reason,
+            "scatter": _aleatory_share(sample, quantity),
+            "responses": sample.responses.count,
+            "inputs": obstacle,
             "random_seed": str(seed),
-            **as_attributes(identity),
-            **versions(),
+            **populations.provenance(),
         },
     )
 
 
-def _of_hyperparameters(told: Told, quantity: Quantity, n_samples: int, seed: int) -> Indices:
-    """Return the indices of the elements of theta."""
-    copula = Copula.of(told.populations.thetas)
-    d = told.populations.evaluator.size
-    n = n_samples // REPLICATES
-    nets = [ndtri(sobol(n, 2 * d, seed + 7919 * r)) for r in range(REPLICATES)]
-    here, fresh = np.split(np.array(nets), 2, axis=-1)
-    z = here @ copula.root.T
-    elsewhere = fresh @ copula.root.T
+@dataclass(frozen=True, eq=False)
+class Indices:
+    """First-order, total-order and derivative-based indices of d factors."""
 
-    def at(z: Floats) -> Floats:
-        thetas = copula.thetas(z).reshape(-1, d)
-        found = told.at(quantity, thetas)
-        return found.reshape(z.shape[:-1])
+    values: Floats  # (3, d)
+    errors: Floats  # (3, d): standard errors
 
-    values = at(z)
-    unknown = 1 - np.isfinite(values).mean()
-    if unknown > _LEFT_OUT:
+    @classmethod
+    def of_replicates(cls, indices: Floats) -> Indices:
+        """Return means and standard errors over r replicates, (d, 3, r)."""
+        errors = np.std(indices, axis=-1, ddof=1) / np.sqrt(indices.shape[-1])
+        return cls(np.mean(indices, axis=-1).T, errors.T)
+
+
+def _paired_points(n: int, d: int, seed: int) -> tuple[Floats, Floats]:
+    """Return two independent sets of n normal vectors by replicate, (r, n, d) each."""
+    sets = [ndtri(sobol(n, 2 * d, seed + 7919 * r)) for r in range(REPLICATES)]
+    first, second = np.split(np.array(sets), 2, axis=-1)
+    return first, second
+
+
+def _hyperparameter_indices(
+    sample: ResponseSample, quantity: Quantity, n_samples: int, seed: int
+) -> Indices:
+    """Return the indices of the elements of theta in the variance of the quantity."""
+    copula = Copula.of(sample.populations.thetas)
+    d = sample.populations.evaluator.hyperparameters.size
+    first, second = _paired_points(n_samples // REPLICATES, d, seed)
+    z = first @ copula.root.T
+    independent = second @ copula.root.T
+
+    def evaluate(z: Floats) -> Floats:
+        return sample.evaluate(quantity, copula.thetas(z).reshape(-1, d)).reshape(z.shape[:-1])
+
+    values = evaluate(z)
+    infinite = 1 - np.isfinite(values).mean()
+    if infinite > 0.01:  # shares are not known to a hundredth anyway
         raise ValueError(
-            f"prb.sensitivity: {quantity!r}: got no finite number in {unknown:.1%} of the "
-            f"populations, expected one in all but {_LEFT_OUT:.0%}; where specimens fail, ask for "
-            "a smaller probability, or an Exceedance"
+            f"prb.sensitivity: {quantity!r}: got no finite number in {infinite:.1%} of the "
+            "populations, expected one in all but 1%; where specimens fail, ask for a smaller "
+            "probability, or an Exceedance"
         )
     values = np.where(np.isfinite(values), values, np.nan)
-    first = []
-    total = []
-    derivative = []
-    steps = np.eye(d) * _WEIGHT_STEP / 2
-    for i, (sd, step) in enumerate(zip(copula.conditional_sd, steps, strict=True)):
-        without_others = at(copula.others_redrawn(z, elsewhere, i))
-        first.append(first_order(values, without_others))
-        without_it = at(copula.redrawn(z, fresh, i))
-        total.append(total_order(values, without_it))
-        change = at(z + step) - at(z - step)
-        slopes = change / _WEIGHT_STEP
-        derivative.append(derivative_bound((sd * slopes) ** 2, values))
-    rows = [np.transpose(each) for each in (first, total, derivative)]
-    return Indices.of(*rows)
+    indices = []
+    for i, (sd, step) in enumerate(zip(copula.conditional_sd, np.eye(d) * _STEP / 2, strict=True)):
+        same_element = evaluate(copula.rest_given_element(z, independent, i))
+        same_rest = evaluate(copula.element_given_rest(z, second, i))
+        slopes = (evaluate(z + step) - evaluate(z - step)) / _STEP
+        indices.append(
+            [
+                first_order(values, same_element),
+                total_order(values, same_rest),
+                derivative_bound((sd * slopes) ** 2, values),
+            ]
+        )
+    return Indices.of_replicates(np.array(indices))
 
 
-def _share_of_scatter(told: Told, quantity: Quantity) -> float:
-    """Return the share of a new specimen's variance that is there in each population."""
-    populations = told.populations
-    step = max(1, len(populations.thetas) // 400)
-    thetas = populations.thetas[::step]
-    (at,) = told.at(quantity, populations.center[None])
-    numbers = quantity.of_specimen(told.values, at)
+def input_indices(
+    sample: ResponseSample, quantity: Quantity, n_samples: int, seed: int, *, computed: bool
+) -> tuple[Indices, str]:
+    """Return the indices of the inputs at the central population, and why they are not known.
+
+    Inputs are independent. The errors include the emulator's, from emulators without a block of
+    runs each.
+    """
+    center = sample.populations.center[None]
+    unknown = Indices(*np.full((2, 3, len(sample.design.inputs.aleatory)), np.nan))
+    parents = sample.populations.evaluator.roots(center, sample.k)
+    try:
+        transform = InverseTransform(sample.responses.name, sample.design.inputs, parents)
+    except TypeError as error:
+        return unknown, str(error)
+    d = transform.size
+    # Four times as many as hyperparameters: an emulator is cheaper than weights of a design.
+    first, second = _paired_points(4 * n_samples // REPLICATES, d, seed)
+    same_input, same_rest, neighbours = [], [], []
+    for columns in transform.columns:
+        is_input = np.isin(np.arange(d), np.arange(d)[columns])
+        same_input.append(np.where(is_input, first, second))
+        same_rest.append(np.where(is_input, second, first))
+    for step in np.eye(d) * _STEP / 2:
+        neighbours += [first + step, first - step]
+    z = np.array([first, *same_input, *same_rest, *neighbours])
+    outputs = _responses_at(sample, transform, z.reshape(-1, d), computed=computed)
+    if not outputs:
+        reason = "the response is not known between the runs; computed=True calls it at new ones"
+        return unknown, reason
+    (at,) = sample.evaluate(quantity, center)
+    replicates = []
+    for values in outputs:
+        numbers = quantity.of_specimen(values, at).reshape(z.shape[:-1])
+        replicates.append(_indices_of_matched(numbers, transform.columns))
+    best, *others = (Indices.of_replicates(indices) for indices in replicates)
+    emulator_error = np.sum([(other.values - best.values) ** 2 for other in others], axis=0)
+    is_known = np.array([[True], [True], [quantity.differentiable]])
+    values = np.where(is_known, best.values, np.nan)
+    errors = np.where(is_known, np.sqrt(best.errors**2 + emulator_error), np.nan)
+    return Indices(values, errors), ""
+
+
+def _indices_of_matched(numbers: Floats, columns: list[slice]) -> Floats:
+    """Return the indices of inputs by replicate, (inputs, 3, r), at the points of `input_indices`.
+
+    The rows of ``numbers`` are the points, those with the same input, those with the same rest,
+    and pairs of neighbours.
+    """
+    n = len(columns)
+    (base,), same_input, same_rest, neighbours = np.split(numbers, 1 + n * np.arange(3), axis=0)
+    slopes = (neighbours[::2] - neighbours[1::2]) / _STEP
+    return np.array(
+        [
+            [
+                first_order(base, same_input[i]),
+                total_order(base, same_rest[i]),
+                derivative_bound((slopes[own_columns] ** 2).sum(axis=0), base),
+            ]
+            for i, own_columns in enumerate(columns)
+        ]
+    )
+
+
+def _responses_at(
+    sample: ResponseSample, transform: InverseTransform, z: Floats, *, computed: bool
+) -> list[Floats]:
+    """Return the response at normal vectors, (N,), and of emulators without a block of runs."""
+    if computed:
+        return [sample.select(transform.responses(sample.responses, z))]
+    x = transform(z)
+    if not (sample.design.has_runs and sample.design.is_line):
+        return sample.emulated(x)
+    # One input: linear between the runs, and not finite where the nearest run is not.
+    (runs,) = sample.points
+    values = sample.select(sample.outputs)
+    order = np.argsort(runs)
+    runs, values = runs[order], values[order]
+    is_finite = np.isfinite(values)
+    interpolated = np.interp(x[0], runs[is_finite], values[is_finite])
+    nearest = values[np.searchsorted((runs[1:] + runs[:-1]) / 2, x[0])]
+    return [np.where(np.isfinite(nearest), interpolated, nearest)]
+
+
+def _aleatory_share(sample: ResponseSample, quantity: Quantity) -> float:
+    """Return the share of a new specimen's variance that is within populations."""
+    (at,) = sample.evaluate(quantity, sample.populations.center[None])
+    numbers = quantity.of_specimen(sample.values, at)
     if not np.isfinite(numbers).all():
         return np.nan
-    weights = told.weights(thetas)
-    away = numbers - numbers.mean()
-    means = weights @ away
-    within = np.nanmean(weights @ away**2 - means**2)
-    between = np.nanvar(means)
-    whole = within + between
-    return float(within / whole) if whole > 0 else np.nan
+    weights = sample.weights(sample.populations.thinned())
+    deviation = numbers - numbers.mean()
+    means = weights @ deviation
+    within = np.nanmean(weights @ deviation**2 - means**2)
+    total = within + np.nanvar(means)
+    return float(within / total) if total > 0 else np.nan
+
+
+def first_order(values: Floats, same: Floats) -> Floats:
+    r"""Return the first-order index of a factor by replicate, (r,).
+
+    :math:`S_i = Var(E[Y | X_i]) / Var(Y) = Corr(Y, Y')`, equation 6 of Janon et al. (2014),
+    Asymptotic normality and efficiency of two Sobol index estimators, doi:10.1051/ps/2013040.
+    ``same`` are values at other points with the same X_i, (r, n); pairs with NaN are left out.
+    """
+    values, same = _complete_pairs(values, same)
+    mean = np.nanmean(values + same, axis=1, keepdims=True) / 2
+    a, b = values - mean, same - mean
+    covariance = np.nanmean(a * b, axis=1)
+    return _ratio(covariance, np.nanmean(a**2 + b**2, axis=1) / 2)
+
+
+def total_order(values: Floats, other: Floats) -> Floats:
+    r"""Return the total-order index of a factor by replicate, (r,).
+
+    :math:`T_i = E[Var(Y | X_{-i})] / Var(Y) = E[(Y - Y')^2] / (2 Var(Y))`, after Jansen (1999),
+    doi:10.1016/S0010-4655(98)00154-4. ``other`` are values where X_i alone differs, drawn given
+    all others, (r, n).
+    """
+    values, other = _complete_pairs(values, other)
+    part = np.nanmean((values - other) ** 2, axis=1) / 2
+    return _ratio(part, (np.nanvar(values, axis=1) + np.nanvar(other, axis=1)) / 2)
+
+
+def derivative_bound(squares: Floats, values: Floats) -> Floats:
+    r"""Return Poincaré's bound of the total index of a standard normal factor, (r,).
+
+    :math:`T_i \le E[(dY / dz_i)^2] / Var(Y)`, with equality where Y is linear in z_i (Sobol' and
+    Kucherenko 2009, doi:10.1016/j.matcom.2009.01.023). ``squares`` are squared derivatives, (r, n).
+    """
+    return _ratio(np.nanmean(squares, axis=1), np.nanvar(values, axis=1))
+
+
+def _complete_pairs(a: Floats, b: Floats) -> tuple[Floats, Floats]:
+    """Return two arrays, NaN where either is not finite."""
+    is_complete = np.isfinite(a) & np.isfinite(b)
+    return np.where(is_complete, a, np.nan), np.where(is_complete, b, np.nan)
+
+
+def _ratio(part: Floats, variance: Floats) -> Floats:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(variance > 0, part / variance, np.nan)

@@ -30,7 +30,8 @@ from prbayes.emulators.multifidelity import Followed, Following, followed
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.numerics.points import sobol
-from prbayes.response.call import Calling, Points, Tally, compute, respond
+from prbayes.response.call import Points, compute
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
@@ -606,10 +607,10 @@ def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
     keys, values = store.known()
     if values.ndim == 1:
         return
-    usable = np.flatnonzero(_usable(values) & points.with_same_constants(keys))[:1]
+    usable = np.flatnonzero(_usable(values) & points.have_same_constants(keys))[:1]
     if not usable.size:
         return
-    (again,) = respond(replace(calling, store=None), points.read(keys[usable]), tally)
+    (again,) = respond(replace(calling, store=None), points.from_keys(keys[usable]), tally)
     (stored,) = values[usable]
     moved = np.allclose(np.sort(again), np.sort(stored)) and not np.allclose(again, stored)
     if tally.named is not None and moved:

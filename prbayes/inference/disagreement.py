@@ -10,7 +10,7 @@ from prbayes._stats import distribution_function
 from prbayes._validate import Floats
 from prbayes.inference.goodness_of_fit import UNLIKELY, Refitted, log_distances, probability_of
 from prbayes.inference.resampling import DataSets, observed_set
-from prbayes.metrics.lifted import failure_caps
+from prbayes.metrics.multivariate import failure_caps
 from prbayes.model.random_variable import Node
 
 # Outputs that are looked at; of more, as of a curve, some from the first to the last: neighbours

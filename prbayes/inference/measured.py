@@ -111,7 +111,7 @@ class Refits:
         """Draw and minimise."""
         sets = simulated_sets(evaluator, theta, SETS, seed=0)
         objective = BatchObjective.of(evaluator, scales, sets, simulators=simulators)
-        prior_sd = evaluator.prior_sd
+        prior_sd = evaluator.hyperparameters.prior_sd
         d = theta.size
         start = np.zeros((SETS, d))
         # The first simplices know no more than the prior.

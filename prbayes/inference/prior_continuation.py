@@ -7,7 +7,9 @@ sought beyond the end. Only the posterior knows the prior.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from scipy.special import expit, logit
 
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.parameters import THETAS
+from prbayes.model.parameters import THETAS, Hyperparameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,39 +107,46 @@ class Continuation:
         return roots
 
 
-class ContinuedEvaluator(Evaluator):
-    """An evaluator of populations at coordinates of a `Continuation` in place of theta."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContinuedHyperparameters(Hyperparameters):
+    """Hyperparameters with coordinates of a `Continuation` in place of theta."""
 
-    inner: Evaluator
     continuation: Continuation
-    _unit: Floats
+    inner: Hyperparameters
 
-    @classmethod
-    def of(cls, evaluator: Evaluator, continuation: Continuation) -> ContinuedEvaluator:
-        """Return an evaluator that shares all else."""
-        new = object.__new__(cls)
-        vars(new).update(vars(evaluator))
-        new.inner = evaluator
-        del new.prior_points  # the method below takes its place
-        new.continuation = continuation
-        points = continuation.coordinates(evaluator.prior_thetas(THETAS, 0))
-        upper, lower = np.quantile(points, [0.84, 0.16], axis=0)
-        spread = (upper - lower) / 2
-        new._unit = np.where(continuation.is_continued, spread, evaluator.prior_sd)
-        return new
-
-    @property
+    @cached_property
     def prior_sd(self) -> Floats:
         """The prior's standard deviation of each coordinate, (d,)."""
-        return self._unit
-
-    def roots(self, thetas: Floats, k: int) -> list[Floats]:
-        """Return the values of the roots of the k-th simulator, shapes (P, *shape)."""
-        return self.continuation.roots(self.inner, thetas, k)
+        points = self.continuation.coordinates(self.inner.prior_thetas(THETAS, 0))
+        upper, lower = np.quantile(points, [0.84, 0.16], axis=0)
+        spread = (upper - lower) / 2
+        return np.where(self.continuation.is_continued, spread, self.inner.prior_sd)
 
     def prior_points(self, size: int, seed: int) -> Floats:
         """Return coordinates spread evenly over the prior, (size, d)."""
         return self.continuation.coordinates(self.inner.prior_points(size, seed))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContinuedEvaluator(Evaluator):
+    """An evaluator of populations at coordinates of a `Continuation` in place of theta."""
+
+    continuation: Continuation
+    inner: Evaluator
+
+    @classmethod
+    def continuing(cls, evaluator: Evaluator, continuation: Continuation) -> ContinuedEvaluator:
+        """Return an evaluator with the simulators and compiled functions of another."""
+        fields = {f.name: getattr(evaluator, f.name) for f in dataclasses.fields(Evaluator)}
+        inner = evaluator.hyperparameters
+        fields["hyperparameters"] = ContinuedHyperparameters(
+            inner.model, inner.point, continuation=continuation, inner=inner
+        )
+        return cls(**fields, continuation=continuation, inner=evaluator)
+
+    def roots(self, thetas: Floats, k: int) -> list[Floats]:
+        """Return the values of the roots of the k-th simulator, shapes (P, *shape)."""
+        return self.continuation.roots(self.inner, thetas, k)
 
 
 def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
@@ -145,7 +154,7 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
 
     An element is bounded if its value is the logistic function of theta between fixed ends.
     """
-    d = evaluator.size
+    d = evaluator.hyperparameters.size
     lower, upper = _ends(evaluator)
     bounded = np.isfinite(upper - lower)
     below, above = bounded.copy(), bounded.copy()
@@ -157,7 +166,7 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
             points = trial.coordinates(np.nan_to_num(thetas, posinf=30, neginf=-30))
             middle, half = (upper[i] + lower[i]) / 2, (upper[i] - lower[i]) / 2
             points[:, i] = middle + sign * 1.05 * half
-            side[i] = _is_possible(ContinuedEvaluator.of(evaluator, trial), points)
+            side[i] = _is_possible(ContinuedEvaluator.continuing(evaluator, trial), points)
     return Continuation(lower, upper, below, above)
 
 
@@ -172,9 +181,9 @@ def _is_possible(evaluator: Evaluator, points: Floats) -> bool:
 
 def _ends(evaluator: Evaluator) -> tuple[Floats, Floats]:
     """Return the ends of the values of elements, (d,) each; NaN where there are none."""
-    d = evaluator.size
+    d = evaluator.hyperparameters.size
     nothing = np.full(d, np.nan)
-    base = evaluator.prior_thetas(2, 0)
+    base = evaluator.hyperparameters.prior_thetas(2, 0)
     far = np.full((2, d), 1e6)
     rows = np.vstack([base, -far, far])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -191,6 +200,6 @@ def _ends(evaluator: Evaluator) -> tuple[Floats, Floats]:
 
 def _free_values(evaluator: Evaluator, thetas: Floats) -> Floats:
     """Return the values of the free variables, side by side."""
-    values = evaluator.constrained(thetas)
+    values = evaluator.hyperparameters.constrained(thetas)
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
     return np.column_stack([values[name].reshape(len(thetas), -1) for name in names])

@@ -6,7 +6,7 @@ An obstacle is a reason in words, as the end of a sentence.
 from __future__ import annotations
 
 from prbayes.metrics.base import Minimum
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, has_other_terms
 
 
 def simulator_obstacle(evaluator: Evaluator, k: int) -> str | None:
@@ -44,7 +44,7 @@ def refit_obstacle(evaluator: Evaluator) -> str | None:
     obstacle = sampling_obstacle(evaluator)
     if obstacle is not None:
         return obstacle
-    if evaluator.has_other_terms:
+    if has_other_terms(evaluator):
         return "the model has likelihood terms or potentials besides its simulators"
     return None
 

@@ -64,13 +64,13 @@ def _labels(node: PopulationSimulator, k: int) -> list[object]:
     return [(k, i) for i in range(size)]
 
 
-def dependent(nodes: list[Node]) -> bool:
+def dependent(nodes: Sequence[Node]) -> bool:
     """Return whether a specimen has several observations."""
     numbers, total = specimens(nodes)
     return total < sum(n.size for n in numbers)
 
 
-def groups(nodes: list[Node]) -> list[list[int]]:
+def groups(nodes: Sequence[Node]) -> list[list[int]]:
     """Return simulators by position, those together that share specimens, even through others."""
     numbers, _ = specimens(nodes)
     found: list[tuple[list[int], set[int]]] = []
@@ -91,7 +91,7 @@ def groups(nodes: list[Node]) -> list[list[int]]:
     return sorted(members for members, _ in found)
 
 
-def siblings(nodes: list[Node], names: set[str]) -> set[str]:
+def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
     """Return names with those of simulators that share specimens, or are of groups of the same.
 
     They share a design.
@@ -104,7 +104,7 @@ def siblings(nodes: list[Node], names: set[str]) -> set[str]:
     return found
 
 
-def families(nodes: list[Node]) -> list[list[int]]:
+def families(nodes: Sequence[Node]) -> list[list[int]]:
     """Return simulators by position, those together whose specimens are of groups of the same."""
     found: dict[int, list[int]] = {}
     for k, node in enumerate(nodes):
@@ -113,7 +113,7 @@ def families(nodes: list[Node]) -> list[list[int]]:
     return list(found.values())
 
 
-def aligned(nodes: list[Node]) -> bool:
+def aligned(nodes: Sequence[Node]) -> bool:
     """Return whether the i-th points of all simulators' populations are the same specimen."""
     return all(_same_specimens(node, nodes[0]) for node in nodes)
 
@@ -298,7 +298,7 @@ def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
 
 
 def _observable_together(
-    nodes: list[Node], populations: list[tuple[Floats, Floats]], group: list[int]
+    nodes: Sequence[Node], populations: list[tuple[Floats, Floats]], group: list[int]
 ) -> NDArray[np.bool_]:
     """Return which points can be observed by all of some simulators, (n,)."""
     seen = [observable(populations[k][0][0], nodes[k].target) for k in group]
@@ -335,7 +335,7 @@ def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats
     return values[:, :_MOST_POINTS], equal
 
 
-def _refuse_unlike(nodes: list[Node]) -> None:
+def _refuse_unlike(nodes: Sequence[Node]) -> None:
     if not aligned(nodes):
         names = ", ".join(n.name for n in nodes)
         raise ValueError(

@@ -11,7 +11,7 @@ import pymc as pm
 from prbayes._validate import called, positive_number
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, identity_of, require_same
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.model.random_variable import AnySimulator, required_simulators, simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 
@@ -52,7 +52,7 @@ def checked_epsilon(
     if unknown:
         raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {sorted(names)}")
     if isinstance(epsilon, Epsilon):
-        require_same(epsilon.identity, identity_of(Evaluator(model)), caller)
+        require_same(epsilon.identity, identity_of(Evaluator.of(model)), caller)
     found = {}
     for name, value in epsilon.items():
         found[name] = positive_number(value, f"{name}: epsilon")
@@ -74,7 +74,7 @@ def refuse_without_epsilon(model: pm.Model, caller: str, advice: str) -> None:
         )
 
 
-@in_turn
+@locked
 def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     """Set the epsilon of simulators by name.
 

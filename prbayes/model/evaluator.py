@@ -1,14 +1,9 @@
-"""Reads a PyMC model: theta[P, d] -> log prior[P], discrepancies[P, k], gradients.
-
-One evaluator serves all routes.
-"""
+"""Evaluator of a PyMC model: theta (P, d) -> log prior (P,), discrepancies (P, k), gradients."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Collection
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,11 +13,12 @@ from numpy.typing import NDArray
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
-from prbayes.model.emulated import PopulationSimulator, emulated_simulators
+from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement
-from prbayes.model.parameters import Hyperparameters
+from prbayes.model.parameters import Hyperparameters, roots_of
 from prbayes.model.random_variable import (
     Node,
+    SimulatorRV,
     log_kernel,
     nodes,
     priors_alone,
@@ -40,121 +36,96 @@ from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
 from prbayes.response.groups import is_group
-from prbayes.response.inputs import Inputs
 
-# Points of a design from which on an eighth of them serve on the way to an answer: those of the
-# smallest cloud.
+# Points of a design from which on samplers start with an eighth of them.
 _LARGE = CLOUD
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is known of a batch of thetas."""
+    """Terms of the log posterior of a batch of thetas."""
 
     log_prior: Floats  # (P,): with the Jacobian of the transforms
     log_other: Floats  # (P,): log-likelihood of ordinary observed variables, and potentials
     # (P, k): one column per simulator; +inf where a population is invalid or has no support.
     discrepancies: Floats
-    # (P, k): share of a population's weight on points without response; NaN where it is invalid,
-    # and of stored responses, whose support tells.
+    # (P, k): weight of a population on points without response; NaN where the population is
+    # invalid, and for stored responses, whose support reports it.
     lost: Floats
 
     def log_likelihood(self, epsilon: Floats) -> Floats:
         """Return the pseudo log-likelihood, shape (P,), for epsilons of shape (k,)."""
         kernels = np.asarray(log_kernel(self.discrepancies, epsilon))
-        total = kernels.sum(axis=-1)
-        return np.asarray(self.log_other + total)
+        return np.asarray(self.log_other + kernels.sum(axis=-1))
 
 
+@dataclass(frozen=True, eq=False)
 class Evaluator:
-    """Everything that the optimiser, the epsilon rules and the sampler ask of a model.
-
-    Names, transforms and prior draws are those of `hyperparameters`, and stand here too, since all
-    ask for them.
-
-    Parameters
-    ----------
-    model : pymc.Model
-        With at least one `Simulator`.
+    """The simulators, likelihoods and hyperparameters of a model, compiled for batches of thetas.
 
     Attributes
     ----------
-    nodes : list of Node
-        The simulators with a metric of distributions.
-    likelihoods : list of SpecimenLikelihood
-        The log-likelihoods by specimen, one for simulators with common specimens.
-    measurements : list of Measurement
-        The simulators with a log-likelihood by specimen.
-    emulated : list of EmulatedSimulator
-        The populations of these, by group.
+    model : pymc.Model
     hyperparameters : Hyperparameters
+        Names, transforms and prior of theta.
+    nodes : tuple of Node
+        The simulators with a metric of distributions.
+    likelihoods : tuple of SpecimenLikelihood
+        The log-likelihoods by specimen, one for simulators with common specimens.
+    measurements : tuple of Measurement
+        The simulators with a log-likelihood by specimen.
+    emulated : tuple of EmulatedSimulator
+        The populations of these, by group.
+    has_graph : bool
+        Whether the nodes have the data and designs of the model, so that its graph is the
+        objective.
+    functions : dict
+        Compiled functions, which evaluators of other data share.
     """
 
-    def __init__(self, model: pm.Model) -> None:
-        self.model = model
+    model: pm.Model
+    hyperparameters: Hyperparameters
+    nodes: tuple[Node, ...]
+    likelihoods: tuple[SpecimenLikelihood, ...]
+    measurements: tuple[Measurement, ...]
+    emulated: tuple[EmulatedSimulator, ...]
+    has_graph: bool = True
+    functions: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, model: pm.Model) -> Evaluator:
+        """Return the evaluator of a model with at least one `Simulator`."""
         require_simulator(model)
-        self.hyperparameters = Hyperparameters(model)  # refuses what would waste the first runs
-        by_variable = nodes(model)
-        self.nodes: list[Node] = list(by_variable.values())
-        self._variables = list(by_variable)
-        # Simulators with a likelihood by specimen: ordinary observed variables.
-        self.likelihoods = list(dict.fromkeys(specimen_likelihoods(model).values()))
-        self.measurements = list(measurements_of(model).values())
-        self.emulated = emulated_simulators(model)
-        for likelihood in self.likelihoods:
-            likelihood.evaluated_by(self.hyperparameters)
-        # Compiled, by what they were asked for; they live as long as this evaluator.
-        self._objectives: dict[tuple[bool, bool], Any] = {}
-        names = self.hyperparameters
-        self.size = names.size
-        self.initial = names.initial
-        self.shapes = names.shapes
-        self.in_support = names.in_support
-        self.constrained = names.constrained
-        self.unconstrained = names.unconstrained
-        self.thetas_of = names.thetas_of
-        self.prior_thetas = names.prior_thetas
-        self.prior_points = names.prior_points
+        hyperparameters = Hyperparameters.of(model)  # refuses a model before its first runs
+        computed = tuple(nodes(model).values())
+        likelihoods = tuple(dict.fromkeys(specimen_likelihoods(model).values()))
+        for likelihood in likelihoods:
+            likelihood.evaluated_by(hyperparameters)
+        return cls(
+            model,
+            hyperparameters,
+            computed,
+            likelihoods,
+            tuple(measurements_of(model).values()),
+            tuple(emulated_simulators(model)),
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel as the model packed by cloudpickle: those of PyMC have no plain pickle."""
+        """Pickle the model by cloudpickle: models of PyMC have no plain pickle."""
         import cloudpickle
 
-        # What other data are observed by an evaluator is not in the model.
-        targets = [node.target for node in self.nodes] if "objective" in vars(self) else None
-        return _unpacked, (cloudpickle.dumps((self.model, targets)),)
-
-    def __copy__(self) -> Evaluator:
-        """Share the model, and what is compiled for it."""
-        other = object.__new__(Evaluator)
-        vars(other).update(vars(self))
-        return other
+        targets = None if self.has_graph else [node.target for node in self.nodes]
+        return _unpickled, (cloudpickle.dumps((self.model, targets)),)
 
     @property
-    def is_current(self) -> bool:
-        """Whether the model has the data that this was made with: `pymc.set_data` changes them."""
-        now = [*nodes(self.model).values(), *specimen_likelihoods(self.model).values()]
-        before = [*self.nodes, *(self.likelihood_of(m) for m in self.measurements)]
-        same = zip(now, before, strict=False)
-        return len(now) == len(before) and all(a is b for a, b in same)
+    def simulators(self) -> list[PopulationSimulator]:
+        """All simulators: `nodes`, then those whose responses are emulated, by group."""
+        return [*self.nodes, *self.emulated]
 
     @property
-    def names(self) -> list[str]:
-        """Names of the elements of theta, such as 'sigma_log__' or 'mu[1]'."""
-        return self.hyperparameters.names
-
-    @property
-    def readable_names(self) -> list[str]:
-        """The same with the variables' own names, such as 'sigma'."""
-        return self.hyperparameters.readable_names
-
-    @property
-    def prior_sd(self) -> Floats:
-        """The prior's standard deviation of each element of theta, shape (d,).
-
-        The unit of parameters.
-        """
-        return self.hyperparameters.prior_sd
+    def designs(self) -> dict[str, Design]:
+        """The designs of the simulators that reweight stored responses, by name."""
+        return {n.name: n.design for n in self.nodes if n.design is not None}
 
     @property
     def epsilon(self) -> Floats:
@@ -163,136 +134,39 @@ class Evaluator:
 
     @property
     def n_responses(self) -> int:
-        """Scalar responses computed so far; those that several simulators share count once."""
-        by_metric = self._once([node.bound.responses.count for node in self.nodes])
-        return by_metric + sum(m.responses.count for m in self.measurements)
-
-    @property
-    def n_runs(self) -> int:
-        """Runs of all designs; those that several simulators share count once."""
-        return self._once([0 if n.design is None else n.design.n_runs for n in self.nodes])
-
-    def likelihood_of(self, measurement: Measurement) -> SpecimenLikelihood:
-        """Return the log-likelihood of a simulator's specimens."""
-        return next(joint for joint in self.likelihoods if measurement in joint.measurements)
-
-    @property
-    def simulators(self) -> list[PopulationSimulator]:
-        """All simulators: `nodes`, then those whose responses are emulated, by group."""
-        return [*self.nodes, *self.emulated]
-
-    def _once(self, counts: list[int]) -> int:
-        """Return the sum of counts by simulator, with one of those that share their runs."""
-        shared: dict[int, int] = {}
-        for node, count in zip(self.nodes, counts, strict=True):
-            runs = id(node.bound.responses.runs)
-            shared[runs] = max(count, shared.get(runs, 0))
-        return sum(shared.values())
+        """Number of scalar responses that were computed; shared responses count once."""
+        counts = [node.bound.responses.count for node in self.nodes]
+        return _sum_over_runs(self, counts) + sum(m.responses.count for m in self.measurements)
 
     @property
     def responses_per_theta(self) -> int:
-        """Scalar responses that one theta costs."""
+        """Number of scalar responses that one theta costs."""
         return sum(node.bound.n_per_theta for node in self.nodes)
 
-    @property
-    def designs(self) -> dict[str, Design]:
-        """The designs of the simulators that reweight stored responses, by name."""
-        return {n.name: n.design for n in self.nodes if n.design is not None}
-
-    def _params(self) -> list[list[Any]]:
-        """Return the simulators' roots as they stand in this model, which may be a clone."""
-        found = []
-        for node, rv in zip(self.nodes, self._variables, strict=True):
-            params = rv.owner.op.dist_params(rv.owner)
-            found.append(node.bound.inputs.core(params))
-        return found
-
-    @cached_property
-    def told_by_prior(self) -> NDArray[np.bool_]:
-        """Which elements of theta the data tell by others and the prior alone, shape (d,).
-
-        Such as the spread between groups, or the mean of a group that was not measured.
-        """
-        params = [p for own in self._params() for p in own]
-        return self.hyperparameters.beyond_others(params)
-
-    def _graphs(self) -> list[Any]:
-        graphs = []
-        for node, params in zip(self.nodes, self._params(), strict=True):
-            graphs.append(pt.as_tensor(node.bound.discrepancy(params)))
-        return list(self.model.replace_rvs_by_values(graphs))
-
-    def _log_other(self, without: Collection[Any] = ()) -> Any:
-        evaluated = {*self._variables, *without}
-        ordinary = [rv for rv in self.model.observed_RVs if rv not in evaluated]
-        with without_epsilon_warning():
-            likelihood = self.model.logp(vars=ordinary) if ordinary else pt.constant(0.0)
-        return likelihood + self.model.potentiallogp
-
-    @property
-    def has_other_terms(self) -> bool:
-        """Whether there are ordinary observed variables or potentials."""
-        ordinary = len(self.model.observed_RVs) > len(self.nodes)
-        return ordinary or bool(self.model.potentials)
-
-    @cached_property
-    def _without_graph(self) -> list[Any]:
-        """The observed variables of the likelihoods by specimen that need no graph."""
-        return [
-            rv
-            for rv, measurement in measurements_of(self.model).items()
-            if not self.likelihood_of(measurement).needs_graph
-        ]
-
-    @cached_property
-    def _evaluate_other(self) -> Any:
-        return self.hyperparameters.compile([self._log_other(self._without_graph)])
+    def function(self, key: Any, compile_function: Callable[[], Any]) -> Any:
+        """Return a compiled function by its key; the first call compiles it."""
+        if key not in self.functions:
+            self.functions[key] = compile_function()
+        return self.functions[key]
 
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
         total = np.zeros(len(thetas))
+        evaluated = set()
         for k, likelihood in enumerate(self.likelihoods):
             if not likelihood.needs_graph:
-                values = likelihood.log_likelihoods(self.specimen_params(thetas, k))
+                values = likelihood.log_likelihoods(specimen_params(self, thetas, k))
                 total += values.sum(axis=1)
-        evaluated = len(self.nodes) + len(self._without_graph)
-        if self.model.potentials or len(self.model.observed_RVs) > evaluated:
-            (ordinary,) = self._evaluate_other(np.ascontiguousarray(thetas))
-            total = total + ordinary
+                evaluated |= {m.name for m in likelihood.measurements}
+        ordinary = [rv for rv in _other_variables(self.model) if rv.name not in evaluated]
+        if ordinary or self.model.potentials:
+            function = self.function(
+                "log_other",
+                lambda: self.hyperparameters.compile([_log_other(self.model, ordinary)]),
+            )
+            (values,) = function(np.ascontiguousarray(thetas))
+            total = total + values
         return total
-
-    def specimen_log_likelihoods(self, thetas: Floats) -> dict[str, Floats]:
-        """Return log p(y_i | theta) by simulator, shapes (P, S), of those with a likelihood.
-
-        Of simulators with common specimens the last has those of all, and the others have none.
-        """
-        result = {m.name: np.empty((len(thetas), 0)) for m in self.measurements}
-        for k, likelihood in enumerate(self.likelihoods):
-            if likelihood.needs_graph:
-                rows = max(1, IN_CACHE // likelihood.points.log_a.size)
-                blocks = np.split(np.ascontiguousarray(thetas), range(rows, len(thetas), rows))
-                values = np.concatenate([self._evaluate_specimens[k](block)[0] for block in blocks])
-            else:
-                values = likelihood.log_likelihoods(self.specimen_params(thetas, k))
-            result[likelihood.measurements[-1].name] = values
-        return result
-
-    def specimen_params(self, thetas: Floats, k: int) -> dict[Any, Floats]:
-        """Return the variables of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
-        values = self.constrained(thetas)
-        variables = self.likelihoods[k].variables()
-        return {v: values[str(v.name)] for v in variables if not is_group(v)}
-
-    @cached_property
-    def _evaluate_specimens(self) -> list[Any]:
-        return [self.hyperparameters.compile([graph]) for graph in self.specimen_graphs()]
-
-    def specimen_graphs(self) -> list[Any]:
-        """Return the graphs of the log-likelihoods of the specimens, by likelihood, (S,)."""
-        last = {joint.measurements[-1]: k for k, joint in enumerate(self.likelihoods)}
-        variables = {v: last[m] for v, m in measurements_of(self.model).items() if m in last}
-        graphs = self.model.logp(vars=sorted(variables, key=variables.__getitem__), sum=False)
-        return list(graphs)
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
@@ -301,11 +175,14 @@ class Evaluator:
         return node.bound.discrepancies(self.roots(thetas, k), target or node.target)
 
     def __call__(self, thetas: Floats) -> Evaluation:
-        """Evaluate a batch, shape (P, d); invalid thetas leave the others alone."""
+        """Evaluate a batch, shape (P, d); an invalid theta does not affect the rest."""
         size = len(thetas)
         rows_at_once = [AT_ONCE // max(1, node.bound.n_points) for node in self.nodes]
-        by_graph = [each for each in self.likelihoods if each.needs_graph]
-        rows_at_once += [IN_CACHE // each.points.log_a.size for each in by_graph]
+        rows_at_once += [
+            IN_CACHE // likelihood.points.log_a.size
+            for likelihood in self.likelihoods
+            if likelihood.needs_graph
+        ]
         step = max(1, min(rows_at_once, default=size))
         log_prior = np.empty(size)
         log_other = np.empty(size)
@@ -324,12 +201,17 @@ class Evaluator:
         discrepancies[np.isnan(discrepancies)] = np.inf
         return Evaluation(log_prior, log_other, discrepancies, lost)
 
-    def _count(self, thetas: int) -> None:
-        """Count the responses that are part of a graph, evaluated at so many thetas."""
-        for node in self.nodes:
-            bound = node.bound
-            if bound.symbolic:
-                bound.responses.count_symbolic(bound.n_per_theta * thetas)
+    def total(self, thetas: Floats, scales: Floats) -> Floats:
+        """Return the sum of d_k / scale_k - log of ordinary terms, shape (P,).
+
+        +inf outside the priors' support.
+        """
+        terms = self(thetas)
+        with np.errstate(invalid="ignore"):
+            scaled = terms.discrepancies / scales
+            value = scaled.sum(axis=-1) - terms.log_other
+        is_finite = np.isfinite(terms.log_prior) & np.isfinite(value)
+        return np.where(is_finite, value, np.inf)
 
     def objective(self, *, prior: bool, gradient: bool) -> Any:
         """Compile the objective as a function of theta and scales.
@@ -342,34 +224,31 @@ class Evaluator:
         Raises
         ------
         NotImplementedError, TypeError
-            If a gradient is asked for and there is none.
+            If the objective has no gradient.
         """
-        asked = (prior, gradient)
-        if asked not in self._objectives:
-            with untraced():
-                self._objectives[asked] = self._objective(prior=prior, gradient=gradient)
-        return self._objectives[asked]
-
-    def _objective(self, *, prior: bool, gradient: bool) -> Any:
-        scales = pt.dvector("scales")
-        scaled = sum(graph / scales[k] for k, graph in enumerate(self._graphs()))
-        total = scaled - self._log_other()
-        with priors_alone():
-            log_prior = self.model.logp(vars=self.model.free_RVs, jacobian=False)
-        objective = total - log_prior if prior else total
-        within = pt.switch(log_prior > -np.inf, objective, np.inf)
-        (value,), theta = self.hyperparameters.joined([within])
-        graphs = [value]
-        if gradient:
-            graphs.append(pt.grad(value, theta))
-        function = compiled([theta, scales], ninf_for_invalid(graphs))
+        if not self.has_graph:
+            if prior or gradient:
+                raise NotImplementedError("on other data the objective is evaluated, not compiled")
+            return lambda theta, scales: (self.total(theta[None], scales)[0],)
+        function = self.function(
+            ("objective", prior, gradient),
+            lambda: _compile_objective(self, prior=prior, gradient=gradient),
+        )
+        symbolic = [node.bound for node in self.nodes if node.bound.symbolic]
 
         def counted(theta: Floats, scales: Floats) -> Any:
             budget().go_on()
-            self._count(1)
+            for bound in symbolic:
+                bound.responses.count_symbolic(bound.n_per_theta)
             return function(theta, scales)
 
         return counted
+
+    def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
+        """Return an evaluator of the same model with other prepared metrics, by simulator."""
+        pairs = zip(self.nodes, targets, strict=True)
+        changed = tuple(replace(node, target=target) for node, target in pairs)
+        return replace(self, nodes=changed, has_graph=False)
 
     def observing(
         self,
@@ -379,156 +258,240 @@ class Evaluator:
     ) -> Evaluator:
         """Return an evaluator of the same model with other observed responses.
 
-        They come by the names of simulators, and so do their weights; those of as many responses
-        are by default what they were.
-        Metrics choose bandwidths and cells anew; designs and epsilons are the same objects. With
-        ``metric`` all simulators have that one.
+        Metrics choose bandwidths and cells again; designs and epsilons are the same objects.
+
+        Parameters
+        ----------
+        data : dict
+            Observed responses by the names of simulators.
+        metric : Metric, optional
+            Of all simulators; by default each has its own.
+        weights : dict, optional
+            Weights of the responses; by default those of the model for as many responses.
         """
-        _ = self._roots  # compiled once, for all copies
         targets = []
         for node in self.nodes:
             observed = data[node.name]
-            before = node.target
-            same_size = np.shape(observed) == before.observed.shape
-            counted = before.weights if same_size else None
             if weights is not None:
-                counted = weights[node.name]
-            chosen = metric or node.metric
-            target = chosen.against(observed, counted)
+                counted: Floats | None = weights[node.name]
+            else:
+                same_size = np.shape(observed) == node.target.observed.shape
+                counted = node.target.weights if same_size else None
+            target = (metric or node.metric).against(observed, counted)
             bound = node.bound
-            targets.append(target.beside(bound.first_responses, bound.dimensions))
+            targets.append(target.metric.beside(target, bound.first_responses, bound.dimensions))
         return self.with_targets(targets)
-
-    def of_one(self, node: Node, k: int) -> Evaluator:
-        """Return an evaluator of one simulator alone, of the k-th's inputs; it is not compiled."""
-        other = copy.copy(self)
-        other.nodes = [node]
-        other._variables = [self._variables[k]]
-        vars(other).pop("_roots", None)
-        other.__dict__["objective"] = other._uncompiled
-        return other
-
-    def coarser(self) -> Evaluator | None:
-        """Return an evaluator with an eighth of the points of large designs; None if none is."""
-        bounds: list[Bound] = []
-        for node in self.nodes:
-            design = node.design
-            large = design is not None and design.n_points >= _LARGE
-            bounds.append(design.coarser() if design is not None and large else node.bound)
-        pairs = list(zip(self.nodes, bounds, strict=True))
-        if all(node.bound is bound for node, bound in pairs):
-            return None
-        other = copy.copy(self)
-        other.nodes = [replace(node, bound=bound) for node, bound in pairs]
-        other.__dict__["objective"] = other._uncompiled
-        return other
-
-    def coarse_where_sufficient(self, theta: Floats) -> Evaluator:
-        """Return that of an eighth of the points of large designs if they support theta, (d,)."""
-        coarse = self.coarser()
-        if coarse is None:
-            return self
-        support = coarse.support(theta[None])
-        is_sufficient = [
-            support[name]["weight_ess"][0] >= design.required_ess
-            for name, design in coarse.designs.items()
-        ]
-        return coarse if all(is_sufficient) else self
-
-    def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
-        """Return an evaluator of the same model with other prepared metrics, by simulator."""
-        other = copy.copy(self)
-        pairs = zip(self.nodes, targets, strict=True)
-        other.nodes = [replace(node, target=target) for node, target in pairs]
-        other.__dict__["objective"] = other._uncompiled
-        return other
-
-    def _uncompiled(self, *, prior: bool, gradient: bool) -> Any:
-        if prior or gradient:
-            raise NotImplementedError("on other data the objective is evaluated, not compiled")
-        return lambda theta, scales: (self.total(theta[None], scales)[0],)
-
-    def total(self, thetas: Floats, scales: Floats) -> Floats:
-        """Return the sum of d_k / scale_k - log of ordinary terms, shape (P,).
-
-        +inf outside the priors' support.
-        """
-        found = self(thetas)
-        with np.errstate(invalid="ignore"):
-            scaled = found.discrepancies / scales
-            value = scaled.sum(axis=-1) - found.log_other
-        known = np.isfinite(found.log_prior) & np.isfinite(value)
-        return np.where(known, value, np.inf)
-
-    @cached_property
-    def _roots(self) -> tuple[Any, Any]:
-        """The compiled roots of all simulators, and where those of each begin and end."""
-        params = self._params()
-        every = [p for own in params for p in own]
-        function = self.hyperparameters.compile(self.model.replace_rvs_by_values(every))
-        return function, np.cumsum([0, *map(len, params)])
 
     def roots(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the roots of the k-th of `simulators`, shapes (P, *shape)."""
         if k >= len(self.nodes):
-            return self._emulated_roots(thetas, k)
-        function, ends = self._roots
-        values = function(np.ascontiguousarray(thetas))
-        size = len(thetas)
-        found = []
-        for value in values[ends[k] : ends[k + 1]]:
-            shape = (size, *np.shape(value)[1:])
-            found.append(np.broadcast_to(value, shape))
-        return found
-
-    def _emulated_roots(self, thetas: Floats, k: int) -> list[Floats]:
-        """Return the roots of a simulator whose responses are emulated, its group among them."""
-        simulator = self.emulated[k - len(self.nodes)]
-        return self.roots_of(thetas, simulator.inputs, simulator.place)
-
-    def roots_of(self, thetas: Floats, inputs: Inputs, place: int | None) -> list[Floats]:
-        """Return the roots of inputs in the group with this index, shapes (P, *shape)."""
-        values = self.constrained(thetas)
-        return [
-            np.full(len(thetas), place) if is_group(root) else values[str(root.name)]
-            for root in inputs.roots
-        ]
+            simulator = self.emulated[k - len(self.nodes)]
+            return roots_of(self.hyperparameters, thetas, simulator.inputs, simulator.place)
+        key = ("roots", *(node.name for node in self.nodes))
+        function, ends = self.function(key, lambda: _compile_roots(self))
+        values = function(np.ascontiguousarray(thetas))[ends[k] : ends[k + 1]]
+        return [np.broadcast_to(value, (len(thetas), *np.shape(value)[1:])) for value in values]
 
     def populations(self, thetas: Floats, k: int) -> tuple[Floats, Floats]:
         """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`."""
         return self.simulators[k].populations(self.roots(thetas, k))
 
-    def missing(self, theta: Floats, k: int) -> dict[str, float]:
-        """Return the shares of a population without numbers, by what they are.
-
-        At the theta, shape (d,), that was evaluated last this costs no response.
-        """
-        found = self.nodes[k].bound.missing(self.roots(theta[None], k))
-        return {"lost_mass": float(found.lost[0]), "failed_mass": float(found.failed[0])}
-
     def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
-        found = {}
+        by_name = {}
         for k, node in enumerate(self.nodes):
             design = node.design
             if design is None:
                 continue
-            # Some populations at a time: their weights are held at all points.
+            # Some populations at a time: their weights at all points take memory.
             step = max(1, IN_CACHE // design.n_points)
             parts = []
             for first in range(0, max(1, len(thetas)), step):
                 roots = self.roots(thetas[first : first + step], k)
                 parts.append(design.support(roots))
-            found[node.name] = {
+            by_name[node.name] = {
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]
             }
-        return found
+        return by_name
 
 
-def _unpacked(payload: bytes) -> Evaluator:
+def _unpickled(payload: bytes) -> Evaluator:
     """Return an evaluator that was pickled."""
     import cloudpickle
 
     model, targets = cloudpickle.loads(payload)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     return evaluator if targets is None else evaluator.with_targets(targets)
+
+
+# Compiled functions.
+
+
+def _simulator_params(evaluator: Evaluator) -> list[list[Any]]:
+    """Return the roots of the nodes in the evaluator's model, which may be a clone."""
+    params = []
+    for node in evaluator.nodes:
+        application = evaluator.model.named_vars[node.name].owner
+        params.append(node.bound.inputs.core(application.op.dist_params(application)))
+    return params
+
+
+def _compile_roots(evaluator: Evaluator) -> tuple[Any, Any]:
+    """Compile the roots of all nodes; return the function, and where the roots of each node end."""
+    params = _simulator_params(evaluator)
+    graphs = evaluator.model.replace_rvs_by_values([p for group in params for p in group])
+    return evaluator.hyperparameters.compile(graphs), np.cumsum([0, *map(len, params)])
+
+
+@untraced()
+def _compile_objective(evaluator: Evaluator, *, prior: bool, gradient: bool) -> Any:
+    """Compile the objective of `Evaluator.objective`."""
+    model = evaluator.model
+    graphs = [
+        pt.as_tensor(node.bound.discrepancy(params))
+        for node, params in zip(evaluator.nodes, _simulator_params(evaluator), strict=True)
+    ]
+    scales = pt.dvector("scales")
+    scaled = sum(graph / scales[k] for k, graph in enumerate(model.replace_rvs_by_values(graphs)))
+    total = scaled - _log_other(model, _other_variables(model))
+    with priors_alone():
+        log_prior = model.logp(vars=model.free_RVs, jacobian=False)
+    objective = total - log_prior if prior else total
+    within = pt.switch(log_prior > -np.inf, objective, np.inf)
+    (value,), theta = evaluator.hyperparameters.joined([within])
+    outputs = [value, pt.grad(value, theta)] if gradient else [value]
+    return compiled([theta, scales], ninf_for_invalid(outputs))
+
+
+# Terms beside the discrepancies.
+
+
+def _other_variables(model: pm.Model) -> list[Any]:
+    """Return the observed variables without a metric of distributions."""
+    return [rv for rv in model.observed_RVs if not isinstance(rv.owner.op, SimulatorRV)]
+
+
+def _log_other(model: pm.Model, variables: list[Any]) -> Any:
+    """Return the graph of the log-likelihood of observed variables, plus potentials."""
+    with without_epsilon_warning():
+        likelihood = model.logp(vars=variables) if variables else pt.constant(0.0)
+    return likelihood + model.potentiallogp
+
+
+def has_other_terms(evaluator: Evaluator) -> bool:
+    """Return whether there are observed variables without a metric, or potentials."""
+    return bool(_other_variables(evaluator.model) or evaluator.model.potentials)
+
+
+def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
+    """Return which elements of theta only the prior links to the data, shape (d,).
+
+    Such as the spread between groups, or the mean of a group that was not measured.
+    """
+    params = [p for group in _simulator_params(evaluator) for p in group]
+    return evaluator.hyperparameters.only_through_others(params)
+
+
+def likelihood_of(evaluator: Evaluator, measurement: Measurement) -> SpecimenLikelihood:
+    """Return the log-likelihood of a simulator's specimens."""
+    return next(e.likelihood for e in evaluator.emulated if e.measurement is measurement)
+
+
+def specimen_params(evaluator: Evaluator, thetas: Floats, k: int) -> dict[Any, Floats]:
+    """Return the variables of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
+    values = evaluator.hyperparameters.constrained(thetas)
+    variables = evaluator.likelihoods[k].variables()
+    return {v: values[str(v.name)] for v in variables if not is_group(v)}
+
+
+def specimen_graphs(evaluator: Evaluator) -> list[Any]:
+    """Return the graphs of the log-likelihoods of the specimens, by likelihood, (S,)."""
+    names = [likelihood.measurements[-1].name for likelihood in evaluator.likelihoods]
+    variables = [evaluator.model.named_vars[name] for name in names]
+    return list(evaluator.model.logp(vars=variables, sum=False))
+
+
+def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
+    """Return log p(y_i | theta), (P, S), by simulator with a log-likelihood by specimen.
+
+    Of simulators with common specimens the last has those of all, and the first ones have none.
+    """
+    result = {m.name: np.empty((len(thetas), 0)) for m in evaluator.measurements}
+    for k, likelihood in enumerate(evaluator.likelihoods):
+        if likelihood.needs_graph:
+            functions = evaluator.function(
+                "specimens",
+                lambda: [
+                    evaluator.hyperparameters.compile([g]) for g in specimen_graphs(evaluator)
+                ],
+            )
+            rows = max(1, IN_CACHE // likelihood.points.log_a.size)
+            blocks = np.split(np.ascontiguousarray(thetas), range(rows, len(thetas), rows))
+            values = np.concatenate([functions[k](block)[0] for block in blocks])
+        else:
+            values = likelihood.log_likelihoods(specimen_params(evaluator, thetas, k))
+        result[likelihood.measurements[-1].name] = values
+    return result
+
+
+# Runs and designs.
+
+
+def is_current(evaluator: Evaluator) -> bool:
+    """Return whether the model still has the evaluator's data; `pymc.set_data` changes them."""
+    model = evaluator.model
+    likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
+    now: list[object] = [*nodes(model).values(), *likelihoods]
+    before: list[object] = [*evaluator.nodes, *evaluator.likelihoods]
+    return len(now) == len(before) and all(a is b for a, b in zip(now, before, strict=True))
+
+
+def _sum_over_runs(evaluator: Evaluator, counts: list[int]) -> int:
+    """Return the sum of counts by node; nodes that share their runs count once."""
+    by_runs: dict[int, int] = {}
+    for node, count in zip(evaluator.nodes, counts, strict=True):
+        runs = id(node.bound.responses.runs)
+        by_runs[runs] = max(count, by_runs.get(runs, 0))
+    return sum(by_runs.values())
+
+
+def n_design_runs(evaluator: Evaluator) -> int:
+    """Return the number of runs of all designs; shared runs count once."""
+    designs = [node.design for node in evaluator.nodes]
+    return _sum_over_runs(evaluator, [0 if d is None else d.n_runs for d in designs])
+
+
+def missing_mass(evaluator: Evaluator, theta: Floats, k: int) -> dict[str, float]:
+    """Return the weight of a population, at theta (d,), on responses that are NaN and that failed.
+
+    No response is computed at the theta that was evaluated last.
+    """
+    missing = evaluator.nodes[k].bound.missing(evaluator.roots(theta[None], k))
+    return {"lost_mass": float(missing.lost[0]), "failed_mass": float(missing.failed[0])}
+
+
+def coarser_evaluator(evaluator: Evaluator) -> Evaluator | None:
+    """Return an evaluator with an eighth of the points of large designs; None if none is large."""
+    bounds: list[Bound] = []
+    for node in evaluator.nodes:
+        design = node.design
+        is_large = design is not None and design.n_points >= _LARGE
+        bounds.append(design.coarser() if design is not None and is_large else node.bound)
+    pairs = list(zip(evaluator.nodes, bounds, strict=True))
+    if all(node.bound is bound for node, bound in pairs):
+        return None
+    coarse = tuple(replace(node, bound=bound) for node, bound in pairs)
+    return replace(evaluator, nodes=coarse, has_graph=False)
+
+
+def coarse_where_sufficient(evaluator: Evaluator, theta: Floats) -> Evaluator:
+    """Return the coarser evaluator if its designs support theta, (d,), else the evaluator."""
+    coarse = coarser_evaluator(evaluator)
+    if coarse is None:
+        return evaluator
+    support = coarse.support(theta[None])
+    is_sufficient = [
+        support[name]["weight_ess"][0] >= design.required_ess
+        for name, design in coarse.designs.items()
+    ]
+    return coarse if all(is_sufficient) else evaluator

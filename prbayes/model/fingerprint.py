@@ -165,7 +165,7 @@ def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) ->
     return _identity(
         evaluator.model,
         simulators,
-        shapes=evaluator.shapes,
+        shapes=evaluator.hyperparameters.shapes,
         prior_minimised=prior_minimised,
         thetas=tuple(map(_numbers, thetas[:, by_name])),
         log_prior=_numbers(evaluator.hyperparameters.log_prior(thetas)),

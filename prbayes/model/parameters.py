@@ -6,6 +6,7 @@ Theta is the vector of the model's value variables, unconstrained through PyMC's
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -23,38 +24,37 @@ from prbayes.model.random_variable import priors_alone
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid, untraced
 from prbayes.response.distributions import PriorPoints, PriorSampler
-from prbayes.response.inputs import event_shape
+from prbayes.response.groups import is_group
+from prbayes.response.inputs import Inputs, event_shape
 
-# Levels of a normal distribution one standard deviation above and below its mean.
-# Thetas that stand for a distribution of them: for the prior, for what surrounds an optimum, for a
-# posterior. They cost time, not responses.
+# Size of a sample of thetas from a prior or a posterior; thetas cost time, but no response.
 THETAS = 256
 
 
+@dataclass(frozen=True, eq=False)
 class Hyperparameters:
     """The free variables of a model as vectors theta of numbers, and their prior.
 
-    Parameters
-    ----------
-    model : pymc.Model
-
     Attributes
     ----------
-    shapes : dict
-        Shapes of the value variables, in the order of theta.
-    initial : ndarray, shape (d,)
-        PyMC's initial point.
-    size : int
-        Number of elements of theta, d.
-
-    Raises
-    ------
-    TypeError
-        If one is discrete.
+    model : pymc.Model
+    point : dict
+        PyMC's initial point: values of the value variables by name.
     """
 
-    def __init__(self, model: pm.Model) -> None:
-        self.model = model
+    model: pm.Model
+    point: dict[str, Any]
+    _prior_draws: dict[tuple[int, int], Floats] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, model: pm.Model) -> Hyperparameters:
+        """Return the hyperparameters of a model.
+
+        Raises
+        ------
+        TypeError
+            If one is discrete.
+        """
         discrete = [v.name for v in model.value_vars if not v.dtype.startswith("float")]
         if discrete:
             raise TypeError(
@@ -64,55 +64,57 @@ class Hyperparameters:
         for v in model.value_vars:
             refuse_single_precision(f"model: {v.name}", v.dtype)
         with interpreted():
-            self._point = model.initial_point(random_seed=0)
-        values = [self._point[v.name] for v in model.value_vars]
-        names = [str(v.name) for v in model.value_vars]
-        shapes = [np.shape(value) for value in values]
-        raveled = [np.ravel(value) for value in values]
-        self.shapes = dict(zip(names, shapes, strict=True))
-        self.initial = np.concatenate(raveled)
-        self.size = self.initial.size
-        self._drawn: dict[tuple[int, int], Floats] = {}
+            return cls(model, model.initial_point(random_seed=0))
+
+    @cached_property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the value variables, in the order of theta."""
+        return {str(v.name): np.shape(self.point[v.name]) for v in self.model.value_vars}
+
+    @cached_property
+    def initial(self) -> Floats:
+        """PyMC's initial point as theta, shape (d,)."""
+        return np.concatenate([np.ravel(self.point[v.name]) for v in self.model.value_vars])
+
+    @property
+    def size(self) -> int:
+        """Number of elements of theta, d."""
+        return self.initial.size
 
     # Names.
 
     @property
     def names(self) -> list[str]:
         """Names of the elements of theta, such as 'sigma_log__', 'mu[1]' or 'mu[Adler]'."""
-        return self._elements(list(self.shapes))
-
-    @property
-    def plain_names(self) -> list[str]:
-        """The same with places instead of coordinates: they order elements, whatever these are."""
-        found: list[str] = []
-        for name, shape in self.shapes.items():
-            found += element_names(name, shape)
-        return found
+        return self._element_names(list(self.shapes))
 
     @property
     def readable_names(self) -> list[str]:
-        """The same with the variables' own names, such as 'sigma'.
-
-        They are transformed nevertheless.
-        """
-        return self._elements(self._own_names)
+        """The same with the names of the untransformed variables, such as 'sigma'."""
+        return self._element_names(self._variable_names)
 
     @property
-    def _own_names(self) -> list[str]:
-        """Names of the variables themselves, in the order of theta."""
+    def plain_names(self) -> list[str]:
+        """Names with indices in place of coordinates."""
+        return [name for v, shape in self.shapes.items() for name in element_names(v, shape)]
+
+    @property
+    def _variable_names(self) -> list[str]:
+        """Names of the variables, in the order of theta."""
         return [str(self.model.values_to_rvs[v].name) for v in self.model.value_vars]
 
-    def _elements(self, names: list[str]) -> list[str]:
-        found: list[str] = []
+    def _element_names(self, names: list[str]) -> list[str]:
+        """Return the names of all elements, from those of the variables."""
+        elements: list[str] = []
         shapes = self.shapes.values()
-        for name, own, shape in zip(names, self._own_names, shapes, strict=True):
-            found += element_names(name, shape, coordinates(self.model, own))
-        return found
+        for name, variable, shape in zip(names, self._variable_names, shapes, strict=True):
+            elements += element_names(name, shape, coordinates(self.model, variable))
+        return elements
 
-    def beyond_others(self, graphs: Sequence[Any]) -> NDArray[np.bool_]:
-        """Return which elements of theta hang together with graphs by other variables only, (d,).
+    def only_through_others(self, graphs: Sequence[Any]) -> NDArray[np.bool_]:
+        """Return which elements of theta are linked to graphs, but by other variables only, (d,).
 
-        Those above others that the graphs are of, and those below any of these.
+        Parents of the variables that the graphs are of, and descendants of these.
         """
         free = set(self.model.free_RVs)
         direct = {v for v in ancestors(graphs, blockers=free) if v in free}
@@ -121,15 +123,15 @@ class Hyperparameters:
         for rv in self.model.free_RVs:
             if joined.intersection(ancestors([rv])):
                 joined.add(rv)
-        hidden = {str(rv.name) for rv in joined - direct}
+        indirect = {str(rv.name) for rv in joined - direct}
         sizes = [int(np.prod(shape, dtype=int)) for shape in self.shapes.values()]
-        return np.repeat([name in hidden for name in self._own_names], sizes)
+        return np.repeat([name in indirect for name in self._variable_names], sizes)
 
     # Functions of theta.
 
     def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
         """Return graphs of the value variables as graphs of one vector theta, and that vector."""
-        outputs, theta = join_nonshared_inputs(self._point, list(graphs), self.model.value_vars)
+        outputs, theta = join_nonshared_inputs(self.point, list(graphs), self.model.value_vars)
         return list(outputs), theta
 
     def compile(self, graphs: Sequence[Any]) -> Any:
@@ -144,20 +146,20 @@ class Hyperparameters:
             return compiled([batch], batched)
 
     @cached_property
+    @untraced()
     def _log_prior(self) -> Any:
         """The log-density of each free variable, in its own units, and the Jacobian of all."""
         model = self.model
-        with untraced():
-            with priors_alone():
-                terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
-            jacobian: Any = np.float64(0.0)
-            for rv in model.free_RVs:
-                transform = model.rvs_to_transforms[rv]
-                if transform is not None:
-                    value = model.rvs_to_values[rv]
-                    jacobian += transform.log_jac_det(value, *rv.owner.inputs).sum()
-            graphs = model.replace_rvs_by_values([pt.as_tensor(jacobian)])
-            return self.compile([*(term.sum() for term in terms), *graphs])
+        with priors_alone():
+            terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
+        jacobian: Any = np.float64(0.0)
+        for rv in model.free_RVs:
+            transform = model.rvs_to_transforms[rv]
+            if transform is not None:
+                value = model.rvs_to_values[rv]
+                jacobian += transform.log_jac_det(value, *rv.owner.inputs).sum()
+        graphs = model.replace_rvs_by_values([pt.as_tensor(jacobian)])
+        return self.compile([*(term.sum() for term in terms), *graphs])
 
     def log_prior_terms(self, thetas: Floats) -> dict[str, Floats]:
         """Return the log-density of each free variable in the user's own units, shapes (P,)."""
@@ -176,8 +178,8 @@ class Hyperparameters:
     def log_posterior(self, thetas: Floats, log_likelihood: Callable[[Floats], Floats]) -> Floats:
         """Return the log prior density plus a log-likelihood, (P, d) -> (P,).
 
-        The log-likelihood is evaluated where the prior is positive. Where it is not known the
-        result is -inf.
+        The log-likelihood is evaluated where the prior is positive. The result is -inf where it is
+        NaN.
         """
         thetas = np.ascontiguousarray(thetas)
         result = self.log_prior(thetas)
@@ -192,24 +194,21 @@ class Hyperparameters:
         return np.isfinite(self.log_prior(thetas))
 
     @cached_property
+    @untraced()
     def _constrain(self) -> Any:
-        with untraced():
-            return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
+        return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
 
     def constrained(self, thetas: Floats) -> dict[str, Floats]:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
-        if not size:  # PyTensor has no transform of nothing for matrices
-            one = self.constrained(self.initial[None])
-            return {name: value[:0] for name, value in one.items()}
+        if not size:  # PyTensor transforms no empty matrices
+            return {name: v[:0] for name, v in self.constrained(self.initial[None]).items()}
         values = self._constrain(np.ascontiguousarray(thetas))
-        found = {}
-        for variable, value in zip(self.model.unobserved_RVs, values, strict=True):
-            # What does not depend on theta comes without the leading axis, or with one of length
-            # one.
-            shape = (size, *np.shape(value)[1:])
-            found[variable.name] = np.array(np.broadcast_to(value, shape))
-        return found
+        # Values that do not depend on theta have no leading axis, or one of length one.
+        return {
+            variable.name: np.array(np.broadcast_to(value, (size, *np.shape(value)[1:])))
+            for variable, value in zip(self.model.unobserved_RVs, values, strict=True)
+        }
 
     def unconstrained(self, point: Mapping[str, Any]) -> Floats:
         """Return theta, shape (d,), of a point given in the user's own units.
@@ -236,8 +235,7 @@ class Hyperparameters:
                 raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
             draws.append(np.broadcast_to(value, shape)[None])
         thetas = self.thetas_of(draws)
-        finite = np.isfinite(thetas).all()
-        if not (finite and self.in_support(thetas).all()):
+        if not (np.isfinite(thetas).all() and self.in_support(thetas).all()):
             raise ValueError(
                 f"start: got {dict(point)}, expected values inside the support of the priors"
             )
@@ -247,30 +245,25 @@ class Hyperparameters:
     @cached_property
     @untraced()
     def _transform(self) -> Any:
+        """The compiled function of values of the free variables that returns thetas."""
         free = self.model.free_RVs
-        symbols = [rv.type() for rv in free]
         columns = []
         for value_variable in self.model.value_vars:
             rv = self.model.values_to_rvs[value_variable]
             transform = self.model.rvs_to_transforms[rv]
-            value = rv
-            if transform is not None:
-                value = transform.forward(rv, *rv.owner.inputs)
+            value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
             columns.append(pt.atleast_1d(value).ravel())
+        symbols = [rv.type() for rv in free]
         swap = dict(zip(free, symbols, strict=True))
         theta = graph_replace(pt.concatenate(columns), swap, strict=False)
-        batched = []
-        for symbol in symbols:
-            shape = (None, *symbol.type.shape)
-            batched.append(pt.tensor(dtype=symbol.dtype, shape=shape))
-        in_batches = dict(zip(symbols, batched, strict=True))
-        thetas = vectorize_graph(theta, in_batches)
+        batched = [pt.tensor(dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
+        thetas = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
         return compiled(batched, [thetas], allow_input_downcast=True)
 
     def thetas_of(self, draws: Sequence[Floats]) -> Floats:
         """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
-        (found,) = self._transform(*draws)
-        return np.asarray(found)
+        (thetas,) = self._transform(*draws)
+        return np.asarray(thetas)
 
     # The prior.
 
@@ -280,31 +273,28 @@ class Hyperparameters:
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        asked = (size, seed)
-        if asked not in self._drawn:
-            draws = self._sampler(size, seed)
-            self._drawn[asked] = self.thetas_of(draws)
-        return self._drawn[asked].copy()
+        if (size, seed) not in self._prior_draws:
+            self._prior_draws[size, seed] = self.thetas_of(self._sampler(size, seed))
+        return self._prior_draws[size, seed].copy()
 
     @cached_property
     def prior_sd(self) -> Floats:
         """The prior's standard deviation of each element, robust, shape (d,).
 
-        The unit of parameters.
+        The unit of parameters. One is returned where it is zero or not finite.
         """
         thetas = self.prior_thetas(THETAS, seed=0)
-        # Of a normal distribution, one standard deviation above and below the mean.
+        # Levels of a normal distribution one standard deviation above and below its mean.
         upper, lower = np.quantile(thetas, [0.84, 0.16], axis=0)
         spread = (upper - lower) / 2
-        known = (spread > 0) & np.isfinite(spread)
-        return np.where(known, spread, 1.0)
+        return np.where((spread > 0) & np.isfinite(spread), spread, 1.0)
 
     @cached_property
     def _points(self) -> PriorPoints | None:
-        free = self.model.free_RVs
+        """The inverse distribution functions of the prior; None if a variable has none."""
         try:
-            return PriorPoints(free)
-        except TypeError:  # a prior without inverse distribution function
+            return PriorPoints(self.model.free_RVs)
+        except TypeError:
             return None
 
     def prior_points(self, size: int, seed: int) -> Floats:
@@ -314,32 +304,39 @@ class Hyperparameters:
         """
         if self._points is None:
             return self.prior_thetas(size, seed)
-        cube = sobol(size, self._points.size, seed)
-        return self._placed(cube)
+        return self._thetas_at(self._points, sobol(size, self._points.size, seed))
 
-    def _placed(self, cube: Floats) -> Floats:
+    def _thetas_at(self, points: PriorPoints, cube: Floats) -> Floats:
         """Return thetas at points of the unit cube, shape (P, size)."""
-        assert self._points is not None
-        thetas = self.thetas_of(self._points(cube))
+        thetas = self.thetas_of(points(cube))
         return np.where(np.isfinite(thetas), thetas, self.initial)
 
     def fixed_points(self, size: int) -> Floats:
-        """Return thetas, shape (size, d), that are the same for clones.
+        """Return thetas, shape (size, d), that do not depend on the order of the variables.
 
-        Clones may order variables in other ways.
+        Clones of a model may order variables in other ways.
         """
         if self._points is None:
             offsets = sobol(size, self.size, seed=0) - 0.5
-            return self.initial + _by_name(offsets, self.plain_names)
-        names: list[str] = []
-        for rv in self.model.free_RVs:
-            names += element_names(rv.name, event_shape(rv))
+            return self.initial + _columns_by_name(offsets, self.plain_names)
+        names = [n for rv in self.model.free_RVs for n in element_names(rv.name, event_shape(rv))]
         cube = sobol(size, self._points.size, seed=0)
-        return self._placed(_by_name(cube, names))
+        return self._thetas_at(self._points, _columns_by_name(cube, names))
 
 
-def _by_name(columns: Floats, names: Sequence[str]) -> Floats:
-    """Return columns such that the first is that of the first name in the alphabet, and so on."""
-    own = np.empty_like(columns)
-    own[:, np.argsort(names)] = columns
-    return own
+def _columns_by_name(columns: Floats, names: Sequence[str]) -> Floats:
+    """Return columns of which the first is that of the first name in the alphabet, and so on."""
+    result = np.empty_like(columns)
+    result[:, np.argsort(names)] = columns
+    return result
+
+
+def roots_of(
+    hyperparameters: Hyperparameters, thetas: Floats, inputs: Inputs, group: int | None
+) -> list[Floats]:
+    """Return the roots of inputs at thetas, in the group with this index, shapes (P, *shape)."""
+    values = hyperparameters.constrained(thetas)
+    return [
+        np.full(len(thetas), group) if is_group(root) else values[str(root.name)]
+        for root in inputs.roots
+    ]

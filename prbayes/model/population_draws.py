@@ -63,7 +63,7 @@ class Populations:
         model = self.model()
         if model is None:
             raise RuntimeError("got a simulator whose model is gone; build the model again")
-        return Hyperparameters(model)
+        return Hyperparameters.of(model)
 
     def _roots(self, thetas: Floats, group: int) -> list[Floats]:
         """Return the roots of the inputs at thetas, shapes (S, *shape)."""

@@ -41,13 +41,13 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._pages import more_in
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.model.first_look import tell_far_data
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
+from prbayes.response.budget import duration
 from prbayes.response.compile import PLAIN
-from prbayes.response.costs import in_words
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import ONE, Outputs
 from prbayes.response.response import Responses
@@ -178,7 +178,7 @@ class Node:
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
         bound = self.bound.copied()
-        bound.aim(target.beside(bound.first_responses, bound.dimensions))
+        bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
         other = replace(self, target=bound.target, bound=bound)
         if self.epsilon_is_default:
             other.epsilon.set_value(np.asarray(1 / other.n_specimens))
@@ -237,7 +237,8 @@ class Specification:
         responses.on_start = partial(_log_first_runs, self.propagation, responses)
         with shown(self.progressbar):
             bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
-            bound.aim(self.target.beside(bound.first_responses, bound.dimensions))
+            target = self.target
+            bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
         responses.on_start = None
         tell_far_data(self.name, self.target.observed, bound.first_responses, self.outputs.names)
         return Node(
@@ -265,8 +266,8 @@ def _log_first_runs(
     propagation: Propagation, responses: Responses, runs: int, seconds: float
 ) -> None:
     """Log how many runs there are, and how long they take, from the time of one run, or NaN."""
-    demand = propagation.demand
-    if demand.each and np.isnan(seconds):
+    cost = propagation.cost
+    if cost.each and np.isnan(seconds):
         return  # known after the first call
     responses.on_start = None
 
@@ -274,7 +275,7 @@ def _log_first_runs(
         total = ceil(number / responses.workers) * seconds
         if not number or np.isnan(total):
             return str(number)
-        return f"{number}, {f'about {in_words(total)}' if total >= 1 else 'less than 1 s'}"
+        return f"{number}, {f'about {duration(total)}' if total >= 1 else 'less than 1 s'}"
 
     setting = type(propagation).__name__
     if hasattr(propagation, "n"):
@@ -284,9 +285,9 @@ def _log_first_runs(
         "another number in propagation=%s; more: %s",
         responses.name,
         with_duration(runs),
-        with_duration(demand.each),
+        with_duration(cost.each),
         setting,
-        demand.decides,
+        cost.growth,
     )
 
 
@@ -296,7 +297,7 @@ def has_default_epsilon(simulator: AnySimulator) -> bool:
     epsilon = float(simulator.epsilon.get_value())
     # Weights that were normalised again differ by rounding.
     is_default = abs(epsilon * effective_specimens(target, simulator.specimens) - 1) < 1e-12
-    return target.likelihood and is_default
+    return is_likelihood(target) and is_default
 
 
 def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> float:

@@ -27,9 +27,8 @@ from prbayes._validate import (
     sample_labels,
     sample_weights,
 )
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.model.cost import Asked, SpecimenRuns, listening, with_points
 from prbayes.model.first_look import tell_copies
 from prbayes.model.measurement import Measurement
 from prbayes.model.random_variable import (
@@ -263,10 +262,6 @@ def _by_specimen(
         _measurement_variables(name, model, metric, partners),
     )
     likelihood = _likelihood(measurement, partners, model)
-    asked = listening()
-    if asked is not None:
-        asked.append(SpecimenRuns(likelihood, measurement))
-        return pt.as_tensor(values, name=name)
     data: Any = values
     if isinstance(observed, Variable):
         data = observed
@@ -492,17 +487,14 @@ def _observed_term(
     inputs = responses.inputs
     earlier = list(simulators(model).values())
     propagation.check_simulator(name, inputs, target)
-    asked = listening()
-    if asked is not None:
-        others_asked = [(one.propagation, one.responses) for one in with_points(asked)]
-        shared = _share(responses, propagation, others_asked)
-        asked.append(Asked(responses, propagation, target, shared))
-        return pt.as_tensor(target.observed, name=name)
-    _share(responses, propagation, [(other.propagation, other.responses) for other in earlier])
+    for other in earlier:
+        if other.propagation == propagation and responses.same_as(other.responses):
+            responses.share(other.responses)
+            break
     if term.labels is None:
         tell_copies(name, target.observed)
     if epsilon is None:
-        epsilon = 1 / effective_specimens(target, term.labels) if target.likelihood else np.nan
+        epsilon = 1 / effective_specimens(target, term.labels) if is_likelihood(target) else np.nan
     specification = Specification(
         name,
         target,
@@ -625,17 +617,6 @@ def _responses(
         timeout=propagation.timeout,
         outputs=outputs,
     )
-
-
-def _share(
-    responses: Responses, propagation: Propagation, others: list[tuple[Propagation, Responses]]
-) -> str:
-    """Take the runs of another simulator with the same response and inputs; return its name."""
-    for settings, other in others:
-        if settings == propagation and responses.same_as(other):
-            responses.share(other)
-            return other.name
-    return ""
 
 
 def _target(name: str, metric: Metric, observed: Floats, weights: ArrayLike | None) -> Discrepancy:

@@ -70,7 +70,7 @@ from prbayes.propagation.specimen_points import (
     draw_points,
     emulate,
 )
-from prbayes.response.costs import in_words
+from prbayes.response.budget import duration
 from prbayes.response.distributions import log_density
 from prbayes.response.groups import is_group
 from prbayes.response.inputs import Inputs, aleatory_names
@@ -266,14 +266,14 @@ class SpecimenLikelihood:
         """Log how many runs there are, how long they take, and which number changes them."""
         responses.on_start = None
         total = np.ceil(runs / responses.workers) * seconds
-        duration = f", about {in_words(float(total))}" if total >= 1 else ""
+        time = f", about {duration(float(total))}" if total >= 1 else ""
         more = max(runs // 2, self.options.fresh)
         _log.info(
             "%s: runs at first: %d%s; then %d at a time at the roots of the specimens; to change "
             "this, pass another number in propagation=prb.Reweighted(n=%d)",
             responses.name,
             runs,
-            duration,
+            time,
             more,
             runs,
         )

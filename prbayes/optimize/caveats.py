@@ -16,9 +16,11 @@ from prbayes.inference.identifiability import unidentified_directions, without
 from prbayes.inference.projections import number_parts, one_dimensional
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import dependent
-from prbayes.metrics.base import Minimum
+from prbayes.metrics.base import Minimum, is_likelihood
+from prbayes.metrics.likelihood import kernel_width
+from prbayes.metrics.multivariate import components_missed
 from prbayes.model.elements import read_variables, split_elements, told_elements
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.labels import labelled
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross
@@ -81,7 +83,7 @@ def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
 def no_information(evaluator: Evaluator, theta: Floats) -> bool:
     """Return whether no discrepancy changes around theta, as where populations miss the data."""
     # In spreads of the prior: small enough to stay on a plateau, and large against rounding.
-    step = 0.01 * evaluator.prior_sd
+    step = 0.01 * evaluator.hyperparameters.prior_sd
     found = evaluator(cross(theta, step)).discrepancies
     here = found[0]
     with np.errstate(invalid="ignore"):
@@ -120,14 +122,14 @@ def elements_at_edge(
     seed : int
     """
     # Elements far from the middle of their prior.
-    middle = np.median(evaluator.prior_thetas(THETAS, seed), axis=0)
+    middle = np.median(evaluator.hyperparameters.prior_thetas(THETAS, seed), axis=0)
     away = theta - middle
     distance = np.abs(away)
-    far = np.flatnonzero(distance > _OUTSIDE * evaluator.prior_sd)
+    far = np.flatnonzero(distance > _OUTSIDE * evaluator.hyperparameters.prior_sd)
     if not far.size or no_information(evaluator, theta):
         return ()
     # What changes further out, and on the way back.
-    outwards = np.sign(away) * evaluator.prior_sd
+    outwards = np.sign(away) * evaluator.hyperparameters.prior_sd
     further = theta + np.diag(outwards)[far]
     back = theta - np.diag(away)[far]
     thetas = np.vstack([theta, further, back])
@@ -147,7 +149,7 @@ def elements_at_edge(
             outwards_from_there = last + further[i] - theta
             changes_here = _apart(evaluator, last, outwards_from_there) > _DIFFERENT
         if changes_here:
-            name = evaluator.readable_names[far[i]]
+            name = evaluator.hyperparameters.readable_names[far[i]]
             found.append(name)
     return tuple(found)
 
@@ -236,7 +238,7 @@ def between_runs(evaluator: Evaluator, theta: Floats) -> list[str]:
             continue
         values, _ = evaluator.populations(theta[None], k)
         for part in number_parts(node.target):
-            width = part.target.resolution
+            width = kernel_width(part.target)
             if not width > 0:
                 continue
             observed = part.target.observed
@@ -271,7 +273,8 @@ def caveats(
 
     And whether the design is too small.
     """
-    lines = [f"{node.name}: {node.target.missed}" for node in evaluator.nodes if node.target.missed]
+    missed = {node.name: components_missed(node.target) for node in evaluator.nodes}
+    lines = [f"{name}: {text}" for name, text in missed.items() if text]
     if design_error > _TOLERATED:
         lines.append(_of_design(evaluator, design_error))
     for rival in others:
@@ -293,7 +296,7 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[str]:
     """
     nodes = evaluator.nodes
     is_biased = [
-        node.metric.minimum is Minimum.ABSOLUTE or node.target.likelihood for node in nodes
+        node.metric.minimum is Minimum.ABSOLUTE or is_likelihood(node.target) for node in nodes
     ]
     fewest = min((len(node.observed) for node in nodes), default=enough)
     if len(nodes) < 2 or fewest >= enough or not any(is_biased) or dependent(nodes):
@@ -310,10 +313,12 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[str]:
 
 def _have_hyperparameters_in_common(evaluator: Evaluator) -> bool:
     """Return whether an element of theta enters the populations of two simulators."""
-    thetas = evaluator.initial + np.vstack([0 * evaluator.prior_sd, np.diag(evaluator.prior_sd)])
-    count = np.zeros(evaluator.size)
+    thetas = evaluator.hyperparameters.initial + np.vstack(
+        [0 * evaluator.hyperparameters.prior_sd, np.diag(evaluator.hyperparameters.prior_sd)]
+    )
+    count = np.zeros(evaluator.hyperparameters.size)
     for k in range(len(evaluator.nodes)):
-        moves = np.zeros(evaluator.size, dtype=bool)
+        moves = np.zeros(evaluator.hyperparameters.size, dtype=bool)
         for root in evaluator.roots(thetas, k):
             flat = root.reshape(len(thetas), -1)
             moves |= (flat[1:] != flat[0]).any(axis=1)
@@ -323,8 +328,8 @@ def _have_hyperparameters_in_common(evaluator: Evaluator) -> bool:
 
 def not_identified(evaluator: Evaluator, local: Local, told: Sequence[str] = ()) -> list[str]:
     """Say about which directions the data tell less than the prior, without those told of."""
-    hidden = without(local.unidentified, evaluator.told_by_prior)
-    directions = unidentified_directions(hidden, evaluator.readable_names)
+    hidden = without(local.unidentified, only_through_prior(evaluator))
+    directions = unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
     return [_of_direction(direction) for direction in directions if direction not in told]
 
 
@@ -345,7 +350,9 @@ def _of_design(evaluator: Evaluator, error: float) -> str:
 
 def _of_rival(evaluator: Evaluator, rival: Rival) -> str:
     # Beside another point, by which what is the same everywhere is seen.
-    points = evaluator.constrained(np.stack([rival.theta, evaluator.initial]))
+    points = evaluator.hyperparameters.constrained(
+        np.stack([rival.theta, evaluator.hyperparameters.initial])
+    )
     read = read_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
     values = labelled(evaluator, {name: points[name] for name in read}, {"point": 2}).data_vars
     elements = split_elements(values)

@@ -17,6 +17,7 @@ from prbayes._progress import progress
 from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
+from prbayes.metrics.density import overlap as density_overlap
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, differences
@@ -191,11 +192,11 @@ def start(
     """Return where to begin, and how many points were screened for it."""
     evaluator = search.evaluator
     if given is not None:
-        return evaluator.unconstrained(given), 0
+        return evaluator.hyperparameters.unconstrained(given), 0
     if evaluator.responses_per_theta:
-        return evaluator.initial, 0
-    points = evaluator.prior_points(THETAS, seed)
-    candidates = np.concatenate([evaluator.initial[None], points])
+        return evaluator.hyperparameters.initial, 0
+    points = evaluator.hyperparameters.prior_points(THETAS, seed)
+    candidates = np.concatenate([evaluator.hyperparameters.initial[None], points])
     return search.best_of(candidates, scales), len(candidates)
 
 
@@ -423,7 +424,7 @@ def approach(
         return Approach(theta, trace)
     guide = _Guide(evaluator, scales)
     if not evaluator.responses_per_theta:
-        points = evaluator.prior_points(THETAS, seed)
+        points = evaluator.hyperparameters.prior_points(THETAS, seed)
         candidates = np.vstack([theta, points])
         theta = candidates[np.argmin(guide(candidates))]
     function = differences(guide, _STEP * search.prior_sd)
@@ -481,7 +482,7 @@ class _Guide:
         areas = []
         for area, v, w in zip(self.areas, values, weights, strict=True):
             areas.append(area.of(v, w) / area.scale)
-        inside = self.evaluator.in_support(thetas)
+        inside = self.evaluator.hyperparameters.in_support(thetas)
         total = np.where(inside, np.sum(areas, axis=0), np.inf)
         # What is known of them besides: the overlap, and the model's own objective.
         overlaps = overlap(self.evaluator, values, weights)
@@ -520,7 +521,8 @@ def areas(evaluator: Evaluator, scales: Floats, thetas: Floats) -> Floats:
 def overlap(evaluator: Evaluator, values: list[Floats], weights: list[Floats]) -> Floats:
     """Return the smallest overlap over simulators with densities, (P,); one where there is none."""
     overlaps = [
-        n.target.overlap(v, w) for n, v, w in zip(evaluator.nodes, values, weights, strict=True)
+        density_overlap(n.target, v, w)
+        for n, v, w in zip(evaluator.nodes, values, weights, strict=True)
     ]
     return np.min([np.ones(len(values[0])), *overlaps], axis=0)
 
@@ -536,7 +538,7 @@ def apart_from_data(evaluator: Evaluator, theta: Floats, least: float = OVERLAP)
         return False
     values, weights = _populations(evaluator, theta[None])
     every = zip(evaluator.nodes, values, weights, strict=True)
-    return all(node.target.overlap(v, w)[0] < least for node, v, w in every)
+    return all(density_overlap(node.target, v, w)[0] < least for node, v, w in every)
 
 
 def _populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[Floats], list[Floats]]:

@@ -186,7 +186,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         Thetas whose discrepancies differ by no more than sampling noise.
     """
     rng = np.random.default_rng(seed)
-    thetas = evaluator.prior_thetas(4 * THETAS, seed)
+    thetas = evaluator.hyperparameters.prior_thetas(4 * THETAS, seed)
     for _ in range(2 * MAX_ROUNDS):
         # Keep the best.
         found = evaluator(thetas)

@@ -113,7 +113,7 @@ def _starts(best: Best, n: int, seed: int) -> tuple[Floats, float]:
 
     They are the better half of points of the prior, without crowding.
     """
-    points = best.evaluator.prior_points(_LOOKED_AT * n, seed)
+    points = best.evaluator.hyperparameters.prior_points(_LOOKED_AT * n, seed)
     values = best(points)
     ranked = np.argsort(values, kind="stable")
     thinned = ranked[: len(ranked) // 2 : max(_LOOKED_AT // 2, 1)]

@@ -17,7 +17,7 @@ from prbayes._finding import Finding, report
 from prbayes._validate import Floats
 from prbayes.inference.checks.failing_region import failing_region_findings
 from prbayes.inference.checks.prior_ends import PriorEnd, end_of_range, prior_end_findings
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, slopes
@@ -85,7 +85,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         }
         for mode, weight in zip(modes[1:], weights[1:], strict=True)
     )
-    values = evaluator.specimen_log_likelihoods(best.theta[None])
+    values = specimen_log_likelihoods(evaluator, best.theta[None])
     identified = np.isfinite(best.covariance).all()
     message = "Converged: " if best.converged else "Not converged: "
     message += f"{len(modes)} local optimum(s) from {len(starts)} starts."
@@ -102,7 +102,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         stderr=stderr,
         covariance=best.covariance,
         theta=best.theta,
-        names=evaluator.names,
+        names=evaluator.hyperparameters.names,
         evaluator=evaluator,
         trace=objective.trace(best.steps),
         seconds=time.perf_counter() - clock,
@@ -120,7 +120,7 @@ def _posterior_weights(
     if with_prior or len(modes) == 1:
         return mode_weights(modes)
     log_prior = evaluator.hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
-    return mode_weights(modes, log_prior, evaluator.prior_sd)
+    return mode_weights(modes, log_prior, evaluator.hyperparameters.prior_sd)
 
 
 def mode_weights(
@@ -162,7 +162,7 @@ class _Objective:
 
     def __init__(self, evaluator: Evaluator, prior: bool) -> None:
         self.function = evaluator.objective(prior=prior, gradient=True)
-        self.unit = evaluator.prior_sd
+        self.unit = evaluator.hyperparameters.prior_sd
         self.count = 0
         self.thetas: list[Floats] = []
         self.values: list[float] = []
@@ -190,22 +190,22 @@ def _starts(
 ) -> tuple[list[Floats], int]:
     """Return the given start, or the most likely points of the prior, and the number screened."""
     if options.start is not None:
-        return [evaluator.unconstrained(options.start)], 0
-    thetas = evaluator.prior_points(screened, options.random_seed)
+        return [evaluator.hyperparameters.unconstrained(options.start)], 0
+    thetas = evaluator.hyperparameters.prior_points(screened, options.random_seed)
     values = evaluator.total(thetas, np.empty(0))
     order = np.argsort(values, kind="stable")
     count = descents if options.starts is None else max(1, options.starts)
     order = order[np.isfinite(values[order])]
     if not order.size:
-        return [evaluator.initial], screened
+        return [evaluator.hyperparameters.initial], screened
     # The best one, and of the better quarter those farthest from all chosen before.
-    candidates = thetas[order[: max(count, order.size // 4)]] / evaluator.prior_sd
+    candidates = thetas[order[: max(count, order.size // 4)]] / evaluator.hyperparameters.prior_sd
     chosen = [0]
     distance = ((candidates - candidates[0]) ** 2).sum(axis=1)
     while len(chosen) < min(count, len(candidates)):
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1))
-    return list(candidates[chosen] * evaluator.prior_sd), screened
+    return list(candidates[chosen] * evaluator.hyperparameters.prior_sd), screened
 
 
 def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum:
@@ -366,8 +366,8 @@ def _in_units(
     evaluator: Evaluator, theta: Floats, covariance: Floats
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return variables in the user's units, and their standard errors by the delta method."""
-    step = 1e-4 * evaluator.prior_sd
-    values = evaluator.constrained(cross(theta, step))
+    step = 1e-4 * evaluator.hyperparameters.prior_sd
+    values = evaluator.hyperparameters.constrained(cross(theta, step))
     point = {name: plain(v[0]) for name, v in values.items()}
     stderr = {}
     for name, v in values.items():
@@ -390,10 +390,14 @@ def _prior_ends(
     """
     from scipy.optimize import minimize
 
-    theta, unit = optimum.theta, evaluator.prior_sd
+    theta, unit = optimum.theta, evaluator.hyperparameters.prior_sd
     flat = np.flatnonzero(np.isinf(np.diag(optimum.covariance)))
     ends = []
-    prior = evaluator.prior_thetas(THETAS, 0) if flat.size else np.empty((0, theta.size))
+    prior = (
+        evaluator.hyperparameters.prior_thetas(THETAS, 0)
+        if flat.size
+        else np.empty((0, theta.size))
+    )
     for i in flat.tolist():
         below = float((prior[:, i] <= theta[i]).mean())
         if 0.05 <= below <= 0.95:
@@ -413,7 +417,7 @@ def _prior_ends(
             options = {"maxfev": 100 * theta.size, "xatol": 1e-2, "fatol": 1e-2}
             back = minimize(along, nothing, method="Nelder-Mead", options=options).fun
         if back > optimum.value + 3.0:
-            ends.append(PriorEnd(evaluator.readable_names[i], value, bound))
+            ends.append(PriorEnd(evaluator.hyperparameters.readable_names[i], value, bound))
     return ends
 
 
@@ -436,7 +440,9 @@ def _findings(
         )
     flat = [
         name
-        for name, v in zip(evaluator.readable_names, np.diag(best.covariance), strict=True)
+        for name, v in zip(
+            evaluator.hyperparameters.readable_names, np.diag(best.covariance), strict=True
+        )
         if np.isinf(v) and name not in {end.name for end in ends}
     ]
     if flat:

@@ -33,8 +33,8 @@ from prbayes.inference.requirements import sampling_obstacle
 from prbayes.inference.resampling import SETS
 from prbayes.model.budgets import explained, kept
 from prbayes.model.coverage import shortcomings
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.locking import in_turn
+from prbayes.model.evaluator import Evaluator, has_other_terms, n_design_runs, only_through_prior
+from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
@@ -86,7 +86,7 @@ from prbayes.response.inputs import model_on_context
 _log = logging.getLogger("prbayes")
 
 
-@in_turn
+@locked
 def refine(
     model: pm.Model | None = None,
     *,
@@ -148,13 +148,13 @@ def refine(
             "the call out, or give the emulator more first runs with "
             "propagation=prb.Reweighted(n)"
         )
-    wanted = None if thetas is None else _thetas(Hyperparameters(model), thetas)
+    wanted = None if thetas is None else _thetas(Hyperparameters.of(model), thetas)
     with (
         shown(progressbar),
         explained(model, "prb.refine"),
         limited(max_seconds, max_runs),
     ):
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         if wanted is None:
             require_finished(find_optimum(evaluator, Minimisation()))
         else:
@@ -197,7 +197,7 @@ _LOOKS = 3
 _VISITED = 4
 
 
-@in_turn
+@locked
 def minimize(
     model: pm.Model | None = None,
     *,
@@ -317,7 +317,7 @@ def minimize(
         explained(model, "prb.minimize"),
         limited(max_seconds, max_runs),
     ):
-        return find_optimum(Evaluator(model), asked)
+        return find_optimum(Evaluator.of(model), asked)
 
 
 @dataclass(frozen=True)
@@ -449,12 +449,12 @@ def _planned(
     """Return what is to be done."""
     clock = time.perf_counter()
     _refuse_random(evaluator, asked.method)
-    stored = evaluator.n_runs
+    stored = n_design_runs(evaluator)
     free = not evaluator.responses_per_theta
     return _Plan(
         search=Search(
             evaluator,
-            evaluator.prior_sd,
+            evaluator.hyperparameters.prior_sd,
             asked.method,
             asked.prior,
             asked.tolerance,
@@ -507,9 +507,9 @@ def _require_weights(evaluator: Evaluator, *, prior: bool) -> bool:
 
 def _other_terms_weigh(evaluator: Evaluator) -> bool:
     """Return whether other terms do more than to exclude hyperparameters."""
-    if not evaluator.has_other_terms:
+    if not has_other_terms(evaluator):
         return False
-    thetas = evaluator.prior_points(_TERMS, 0)
+    thetas = evaluator.hyperparameters.prior_points(_TERMS, 0)
     values = evaluator.log_other(thetas)
     finite = values[np.isfinite(values)]
     return finite.size > 0 and bool(np.ptp(finite) > 0)
@@ -599,10 +599,12 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     emulated = all(design.contents.cloud for design in evaluator.designs.values())
     if near is None or (emulated and state.local is not None):
         # Points of clouds follow wherever it goes; runs are added where the pilot has led.
-        near = spread_around(state.theta, _covariance(state), evaluator.prior_sd, seed=plan.seed)
+        near = spread_around(
+            state.theta, _covariance(state), evaluator.hyperparameters.prior_sd, seed=plan.seed
+        )
     if state.hold is not None and state.local is not None:
         near = spread_along(state.theta, state.local, seed=plan.seed)
-    near = near[evaluator.in_support(near)]
+    near = near[evaluator.hyperparameters.in_support(near)]
     short = shortcomings(evaluator, near) or shortcomings(evaluator, state.theta[None])
     if not short:
         # Enough for the populations; for the optimum?
@@ -624,10 +626,10 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
         left = runs_left(evaluator, errors)
         note = f"error {errors.whole:.2f} standard errors, {AGREE} are wanted"
         note += f", about {left} runs to go" if left else ", no more runs are needed"
-        before = evaluator.n_runs
+        before = n_design_runs(evaluator)
         if not grow(evaluator, near, errors):
             return state
-        plan.advance(evaluator.n_runs - before, note)
+        plan.advance(n_design_runs(evaluator) - before, note)
     elif rounds == MAX_ROUNDS:
         # A search follows what is not identified until no design supports it.
         known = [] if state.local is None else not_identified(evaluator, state.local)
@@ -687,8 +689,8 @@ def _likeliest(plan: _Plan, thetas: Floats, scales: Floats) -> Floats:
     best = thetas[np.argmin(values)]
     as_good = values <= values.min() + _noise(evaluator, best, scales)
     candidates = thetas[as_good]
-    middle = np.median(evaluator.prior_thetas(THETAS, plan.seed), axis=0)
-    away = (candidates - middle) / evaluator.prior_sd
+    middle = np.median(evaluator.hyperparameters.prior_thetas(THETAS, plan.seed), axis=0)
+    away = (candidates - middle) / evaluator.hyperparameters.prior_sd
     return np.asarray(candidates[np.argmin((away**2).sum(axis=1))])
 
 
@@ -787,7 +789,7 @@ def _settled(plan: _Plan, state: _State) -> _State:
         return state
     away = np.abs(state.theta - before)
     # A simplex that settles a line search mostly moves less, and standard errors change by less.
-    if (away > 0.01 * plan.evaluator.prior_sd).any():
+    if (away > 0.01 * plan.evaluator.hyperparameters.prior_sd).any():
         sampling = _sampling(plan.evaluator, state.theta, state.scales)
         state = replace(state, sampling=sampling)
     known = not np.isnan(state.design_error) and not away.any()
@@ -849,8 +851,8 @@ _HELD = (
 
 def _told_by_prior(evaluator: Evaluator) -> str:
     """Say which hyperparameters the data tell through others only, by the prior."""
-    names = evaluator.readable_names
-    above = [name for name, own in zip(names, evaluator.told_by_prior, strict=True) if own]
+    names = evaluator.hyperparameters.readable_names
+    above = [name for name, own in zip(names, only_through_prior(evaluator), strict=True) if own]
     if not above:
         return ""
     return (

@@ -13,9 +13,10 @@ from prbayes._display import view
 from prbayes._validate import Floats
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import read_variables, single_elements, told_of
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, likelihood_of, specimen_log_likelihoods
 from prbayes.model.fingerprint import (
     Identity,
     Level,
@@ -26,7 +27,7 @@ from prbayes.model.fingerprint import (
     require_same,
 )
 from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.caveats import breakdown
 
 # What is less is written as 0.0%.
@@ -216,7 +217,7 @@ class Optimum:
         """
         return failures_dataset(self.evaluator)
 
-    @in_turn
+    @locked
     def sampling(self, *, weakest: float = 1.0) -> SamplingDistribution:
         """Return the sampling distribution of the minimiser around the optimum.
 
@@ -310,7 +311,7 @@ def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
 
     Their elements are in the evaluator's order, which may differ in a clone of the optimum's model.
     """
-    order = [optimum.names.index(name) for name in evaluator.names]
+    order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
     rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
     return np.array([optimum.theta, *rivals])[:, order]
 
@@ -402,12 +403,12 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     variables["covariance"] = (["element", "other_element"], optimum.covariance)
     metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
     variables["metric"] = ("simulator", [without_addresses(metric) for metric in metrics])
-    compared = [node.target.told for node in nodes] + [""] * len(measurements)
+    compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
     variables["compared"] = ("simulator", compared)
     is_likelihood = [0] * len(nodes) + [1] * len(measurements)
     variables["is_likelihood"] = ("simulator", is_likelihood)
     runs = [node.bound.n_runs for node in nodes]
-    runs += [len(evaluator.likelihood_of(m).emulation.z) for m in measurements]
+    runs += [len(likelihood_of(evaluator, m).emulation.z) for m in measurements]
     variables["n_runs"] = ("simulator", runs)
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.Dataset(variables, coords={"simulator": names, **elements})
@@ -415,7 +416,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
 
 def _log_likelihoods(optimum: Optimum) -> dict[str, Floats]:
     """Return the log-likelihoods of the specimens at the optimum, by simulator, (1, N)."""
-    return optimum.evaluator.specimen_log_likelihoods(optimum.theta[None])
+    return specimen_log_likelihoods(optimum.evaluator, optimum.theta[None])
 
 
 def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:

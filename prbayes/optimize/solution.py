@@ -8,7 +8,7 @@ import numpy as np
 
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, has_other_terms, missing_mass
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, slopes
@@ -83,7 +83,7 @@ def assemble(
         stderr=stderr,
         covariance=covariance,
         theta=theta,
-        names=evaluator.names,
+        names=evaluator.hyperparameters.names,
         evaluator=evaluator,
         support=_support(evaluator, theta, affordable=affordable),
         trace={
@@ -102,10 +102,12 @@ def point_and_stderr(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return variables and deterministics in the user's units, and their standard errors."""
     # Any small step serves: transforms are smooth.
-    step = 1e-4 * evaluator.prior_sd
-    values = evaluator.constrained(cross(theta, step))
+    step = 1e-4 * evaluator.hyperparameters.prior_sd
+    values = evaluator.hyperparameters.constrained(cross(theta, step))
     point = {name: plain(v[0]) for name, v in values.items()}
-    prior = evaluator.constrained(evaluator.prior_thetas(THETAS, seed=0))
+    prior = evaluator.hyperparameters.constrained(
+        evaluator.hyperparameters.prior_thetas(THETAS, seed=0)
+    )
     deterministic = {str(variable.name) for variable in evaluator.model.deterministics}
     stderr = {}
     for name, v in values.items():
@@ -152,7 +154,7 @@ def _stderr(gradients: Floats, covariance: Floats) -> Floats:
 
 def _nowhere(evaluator: Evaluator, theta: Floats, covariance: Floats) -> bool:
     """Return whether the search ended where no hyperparameter changes the discrepancy."""
-    variance = np.diag(covariance) / evaluator.prior_sd**2
+    variance = np.diag(covariance) / evaluator.hyperparameters.prior_sd**2
     # A smaller variance can be that of rounding errors; the discrepancy tells.
     suspect = np.isinf(variance) | (variance < 1e-16)
     return bool(suspect.all()) and no_information(evaluator, theta)
@@ -160,7 +162,7 @@ def _nowhere(evaluator: Evaluator, theta: Floats, covariance: Floats) -> bool:
 
 def _known_discrepancies(search: Search, run: Run) -> Floats:
     """Return what the search tells of the discrepancies where it ended, NaN if nothing."""
-    if len(run.scales) > 1 or search.prior or search.evaluator.has_other_terms:
+    if len(run.scales) > 1 or search.prior or has_other_terms(search.evaluator):
         return np.full(len(run.scales), np.nan)
     return run.lowest * run.scales
 
@@ -174,13 +176,13 @@ def _support(
         out[name] = {key: float(value[0]) for key, value in support.items()}
     for k, node in enumerate(evaluator.nodes):
         if node.design is None and affordable:
-            out[node.name] = evaluator.missing(theta, k)
+            out[node.name] = missing_mass(evaluator, theta, k)
     return out
 
 
 def rival_record(evaluator: Evaluator, rival: Rival) -> dict[str, Any]:
     """Return another optimum as `Optimum` keeps it."""
-    values = evaluator.constrained(rival.theta[None])
+    values = evaluator.hyperparameters.constrained(rival.theta[None])
     return {
         "point": {name: plain(v[0]) for name, v in values.items()},
         "discrepancy": rival.value,

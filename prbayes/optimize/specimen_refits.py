@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_params
 from prbayes.model.specimen_likelihood import SpecimenLikelihood
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
 from prbayes.propagation.specimen_points import draw_points, specimen_roots
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
-
-_COMPILED = "weighted log-likelihood"
 
 
 def specimen_refit_obstacle(evaluator: Evaluator) -> str | None:
@@ -198,15 +196,12 @@ class SpecimenRefits:
     @property
     def _function(self) -> Any:
         """The compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
-        compiled_by = vars(self.evaluator)  # lives as long as the evaluator
-        if _COMPILED not in compiled_by:
-            compiled_by[_COMPILED] = self._compile()
-        return compiled_by[_COMPILED]
+        return self.evaluator.function("weighted log-likelihood", self._compile)
 
     def _compile(self) -> Any:
         evaluator = self.evaluator
         with untraced():
-            graphs = evaluator.specimen_graphs()
+            graphs = specimen_graphs(evaluator)
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
             terms = [
                 pt.switch(pt.gt(w, 0), w * g, 0.0).sum()
@@ -223,7 +218,7 @@ class SpecimenRefits:
             values, vectors = np.linalg.eigh(self.covariance)
             if values.min() > 0:
                 return np.asarray(vectors * np.sqrt(values))
-        return np.diag(self.evaluator.prior_sd)
+        return np.diag(self.evaluator.hyperparameters.prior_sd)
 
     def fit(self, weights: Sequence[Floats] | None = None) -> tuple[Floats, bool]:
         """Return the estimate, (d,), and whether its search converged.
@@ -265,7 +260,7 @@ class SpecimenRefits:
             rng = np.random.default_rng([seed, 21])
             evaluator = self.evaluator
             self._pools[seed] = [
-                specimen_pool(likelihood, evaluator.specimen_params(self.theta[None], k), rng)
+                specimen_pool(likelihood, specimen_params(evaluator, self.theta[None], k), rng)
                 for k, likelihood in enumerate(evaluator.likelihoods)
             ]
         return self._pools[seed]

@@ -66,7 +66,7 @@ def read_result(
     else:
         model = model_on_context(model, caller)
         require_of_model(result, model, caller, Level.POPULATIONS)
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
     cost = 0 if free else evaluator.responses_per_theta
     if n_draws is None:
         # The sides of a band are quantiles: with 200 curves the standard error of the probability
@@ -74,7 +74,7 @@ def read_result(
         n_draws = max(8, min(40, AT_ONCE // cost)) if cost else 200
     points, _ = populations_of(result, evaluator.model, n_draws, caller)
     values = [points[str(rv.name)] for rv in evaluator.model.free_RVs]
-    thetas = evaluator.thetas_of(values)
+    thetas = evaluator.hyperparameters.thetas_of(values)
     if isinstance(result, Optimum):
         around = _around(result, evaluator, thetas[0], n_draws, free=free)
         return Ensemble(evaluator, thetas, around, "optimum", "standard error")
@@ -95,7 +95,7 @@ def supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
     out = np.zeros(len(thetas), dtype=bool)
     indices = np.flatnonzero(np.isfinite(thetas).all(axis=1))
     if indices.size:
-        indices = indices[evaluator.in_support(thetas[indices])]
+        indices = indices[evaluator.hyperparameters.in_support(thetas[indices])]
     if not indices.size:
         return out
     ok = np.ones(indices.size, dtype=bool)
@@ -115,7 +115,7 @@ def _around(
         return nothing
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(center, optimum.covariance, size=n_draws, method="eigh")
-    ok = evaluator.in_support(draws) if free else supported(evaluator, draws)
+    ok = evaluator.hyperparameters.in_support(draws) if free else supported(evaluator, draws)
     return draws[ok] if ok.mean() > 0.5 else nothing
 
 
@@ -130,10 +130,10 @@ def read_before(
     screen for one; otherwise the prior's initial point, where PyMC's samplers start.
     """
     if before is False:
-        return np.empty((0, evaluator.size)), ""
+        return np.empty((0, evaluator.hyperparameters.size)), ""
     if isinstance(before, Mapping):
         try:
-            return evaluator.unconstrained(dict(before))[None], "as given"
+            return evaluator.hyperparameters.unconstrained(dict(before))[None], "as given"
         except (KeyError, TypeError, ValueError) as error:
             raise type(error)(f"before: {error.args[0]}") from None
     if before not in (None, True):
@@ -145,7 +145,7 @@ def read_before(
         path = result.trace.get("theta")
         if path is not None and len(path):
             return path[:1], "optimiser's first point"
-    return evaluator.initial[None], "prior's initial point"
+    return evaluator.hyperparameters.initial[None], "prior's initial point"
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,7 +52,7 @@ def objective(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> Floats:
 
 def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
     """Return the free variables' elements in the user's own units, shape (P,), by element name."""
-    values = evaluator.constrained(thetas)
+    values = evaluator.hyperparameters.constrained(thetas)
     free = {str(rv.name): values[str(rv.name)] for rv in evaluator.model.free_RVs}
     return split_elements(labelled(evaluator, free, {"draw": len(thetas)}).data_vars)
 
@@ -88,7 +88,7 @@ class _Plane:
     @classmethod
     def of(cls, optimum: Optimum, evaluator: Evaluator, names: list[str]) -> _Plane:
         center = optimum.theta[None]
-        values = evaluator.constrained(center)
+        values = evaluator.hyperparameters.constrained(center)
         shapes = {str(rv.name): values[str(rv.name)].shape[1:] for rv in evaluator.model.free_RVs}
         return cls(evaluator, names, free_elements(evaluator, center), shapes)
 
@@ -105,7 +105,7 @@ class _Plane:
             for variable, shape in self.shapes.items()
         ]
         with np.errstate(all="ignore"):
-            return self.evaluator.thetas_of(values)
+            return self.evaluator.hyperparameters.thetas_of(values)
 
     def within_support(self, name: str, end: float) -> float:
         """Return how far an axis can go from the optimum towards an end within the support."""
@@ -115,7 +115,7 @@ class _Plane:
         places[:, self.names.index(name)] = steps
         thetas = self.thetas(places)
         ok = np.isfinite(thetas).all(axis=1)
-        ok[ok] = self.evaluator.in_support(thetas[ok])
+        ok[ok] = self.evaluator.hyperparameters.in_support(thetas[ok])
         outside = np.flatnonzero(~ok)
         last = max(outside[0] - 1, 0) if outside.size else -1
         return float(steps[last])
@@ -127,7 +127,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     path = free_elements(evaluator, optimum.trace["theta"])
     local_optima = np.array([rival["theta"] for rival in optimum.rivals])
     rivals = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
-    prior = free_elements(evaluator, evaluator.prior_thetas(1000, 0))
+    prior = free_elements(evaluator, evaluator.hyperparameters.prior_thetas(1000, 0))
     errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
 
     axes = []

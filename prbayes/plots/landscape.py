@@ -11,7 +11,7 @@ import pymc as pm
 from prbayes._validate import Floats, called, positive_integer
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._labels import named, refuse_labels
@@ -25,7 +25,7 @@ from prbayes.plots._landscape_data import (
 )
 
 
-@in_turn
+@locked
 def plot_landscape(
     optimum: Optimum,
     *,
@@ -128,13 +128,13 @@ def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
     if model is None or model is optimum.model:
         return optimum.evaluator
     require_of_model(optimum, model, "plot_landscape", Level.POPULATIONS)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     simulators = [node.name for node in evaluator.nodes or evaluator.measurements]
     expected = list(optimum.scales)
-    if evaluator.names != optimum.names or simulators != expected:
+    if evaluator.hyperparameters.names != optimum.names or simulators != expected:
         raise ValueError(
-            f"model: got hyperparameters and simulators {evaluator.names} and {simulators}, "
-            f"expected {optimum.names} and {expected}"
+            f"model: got hyperparameters and simulators {evaluator.hyperparameters.names} and "
+            f"{simulators}, expected {optimum.names} and {expected}"
         )
     return evaluator
 

@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, positive_integer
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import (
     BLUE,
@@ -40,7 +40,7 @@ _log = logging.getLogger("prbayes")
 _MOST = 7
 
 
-@in_turn
+@locked
 def plot_outputs(
     result: Optimum | xr.DataTree,
     *,

@@ -11,7 +11,7 @@ import xarray as xr
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import positive_integer, share
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, SOLID, Canvas, Panel, refuse_look
 from prbayes.plots._ensemble import Calibrated, Ensemble, read_result
@@ -21,7 +21,7 @@ from prbayes.plots._regions import outlines
 from prbayes.response.distributions import PopulationSampler
 
 
-@in_turn
+@locked
 def plot_population(
     result: Optimum | xr.DataTree,
     *,

@@ -107,7 +107,7 @@ def plot_posterior(
     refuse_look(labels, pc_kwargs)
     _check_results(posterior, optimum, model)
     share(prob, "prob")
-    evaluator = None if model is None else Evaluator(model)
+    evaluator = None if model is None else Evaluator.of(model)
     hyperparameters = _read_hyperparameters(posterior, optimum, evaluator)
     names = _select(list(hyperparameters), var_names)
     refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
@@ -174,8 +174,10 @@ def _read_hyperparameters(
     prior: dict[str, Floats] = {}
     if evaluator is not None:
         # 4000 draws give a normal density's peak within 2%.
-        thetas = evaluator.prior_thetas(4000, 0)
-        values = labelled(evaluator, evaluator.constrained(thetas), {"draw": len(thetas)})
+        thetas = evaluator.hyperparameters.prior_thetas(4000, 0)
+        values = labelled(
+            evaluator, evaluator.hyperparameters.constrained(thetas), {"draw": len(thetas)}
+        )
         prior = split_elements(values.data_vars)
         shared &= set(prior)
     if not shared:

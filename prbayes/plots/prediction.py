@@ -20,7 +20,7 @@ from prbayes.plots._curves import (
     staircase,
 )
 from prbayes.plots._labels import named, refuse_labels
-from prbayes.validation.measured_vs_predicted import Comparable, comparables
+from prbayes.validation.conditions import Comparable, comparables
 
 
 def plot_prediction(

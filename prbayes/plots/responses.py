@@ -13,7 +13,7 @@ import xarray as xr
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, flag, positive_integer, share
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Limits, Panel, refuse_look
 from prbayes.plots._curves import (
@@ -40,7 +40,7 @@ from prbayes.plots._panels import (
 _log = logging.getLogger("prbayes")
 
 
-@in_turn
+@locked
 def plot_responses(
     result: Optimum | xr.DataTree,
     *,

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods, specimen_params
 from prbayes.model.labels import (
     arviz_attributes,
     labelled,
@@ -49,7 +49,7 @@ def arviz_groups(
     draws = thetas.shape[1]
     rng = np.random.default_rng(seed)
     prior_seed = int(rng.integers(2**31))
-    prior = evaluator.prior_thetas(draws, prior_seed)
+    prior = evaluator.hyperparameters.prior_thetas(draws, prior_seed)
     groups = {
         "prior": _variables(evaluator, prior[None]),
         "log_prior": _log_prior(evaluator, thetas),
@@ -81,8 +81,8 @@ def specimen_groups(
     """
     chains, draws, d = thetas.shape
     rng = np.random.default_rng(seed)
-    prior = evaluator.prior_thetas(draws, int(rng.integers(2**31)))
-    values = evaluator.specimen_log_likelihoods(thetas.reshape(-1, d))
+    prior = evaluator.hyperparameters.prior_thetas(draws, int(rng.integers(2**31)))
+    values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     observed = observed_dataset(evaluator)
     coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(draws)}
     log_likelihood = {}
@@ -109,7 +109,7 @@ def _emulated(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) ->
     chains, draws, d = thetas.shape
     drawn = {}
     for k, likelihood in enumerate(evaluator.likelihoods):
-        params = evaluator.specimen_params(thetas.reshape(-1, d), k)
+        params = specimen_params(evaluator, thetas.reshape(-1, d), k)
         for measurement in likelihood.measurements:
             values = likelihood.draws(rng, params, len(measurement.observed), measurement)
             drawn[measurement.name] = values.reshape(chains, draws, *values.shape[1:])
@@ -120,7 +120,7 @@ def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     """Return variables and deterministics at thetas, shape (chains, draws, d)."""
     chains, draws, d = thetas.shape
     found = {}
-    for name, value in evaluator.constrained(thetas.reshape(-1, d)).items():
+    for name, value in evaluator.hyperparameters.constrained(thetas.reshape(-1, d)).items():
         found[name] = value.reshape(chains, draws, *value.shape[1:])
     return labelled(evaluator, found, {"chain": chains, "draw": draws})
 

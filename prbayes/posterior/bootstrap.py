@@ -11,13 +11,13 @@ from prbayes._progress import shown
 from prbayes._validate import Seed, flag, positive_integer, seed_number
 from prbayes.inference.identifiability import unidentified_directions
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.posterior.trees import bootstrap_tree
 
 
-@in_turn
+@locked
 def bootstrap(
     optimum: Optimum,
     draws: int = 1000,
@@ -89,7 +89,9 @@ def bootstrap(
     flag(parametric, "parametric")
     seed = seed_number(random_seed)
     sampling = optimum.sampling()
-    unidentified = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
+    unidentified = unidentified_directions(
+        sampling.local.unidentified, evaluator.hyperparameters.readable_names
+    )
     if unidentified:
         raise ValueError(
             f"bootstrap: the data tell less than the prior about {', '.join(unidentified)}, "

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._progress import CONSOLE, lines, live, shown
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, coarser_evaluator
 from prbayes.posterior.checkpoint import Checkpoint
 from prbayes.posterior.importance import LogDensity
 from prbayes.posterior.kernel import BatchedKernel
@@ -94,7 +94,7 @@ class Chains:
             TextColumn("acceptance {task.fields[rate]:.2f}"),
             TimeElapsedColumn(),
         )
-        coarser = self.evaluator.coarser() if log_likelihood is None else None
+        coarser = coarser_evaluator(self.evaluator) if log_likelihood is None else None
         done: list[Chain] = []
         stats: list[Stages] = []
         stopped = ""

@@ -16,9 +16,9 @@ from prbayes.inference.measured import Refits
 from prbayes.inference.requirements import simulator_obstacle
 from prbayes.inference.resampling import SETS, DataSets, groups
 from prbayes.inference.sandwich import Information, LinearArea
-from prbayes.metrics.base import Minimum
+from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.model.epsilon import Epsilon, refuse_without_epsilon
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
 
 # Thetas that carry each simulated data set's posterior: half or twice changes epsilon by 3%, as
@@ -30,7 +30,7 @@ _CLOUD = 500
 _WIDER = 3.0
 
 
-@in_turn
+@locked
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     """Return an epsilon for each simulator, so that the posterior is as wide as the data warrant.
 
@@ -144,7 +144,7 @@ def _dependence(optimum: Optimum, group: list[int], epsilon: Floats) -> float:
 
 def _epsilon(information: Information) -> float:
     node = information.node
-    if node.target.likelihood:
+    if is_likelihood(node.target):
         return 1 / node.n_specimens
     obstacle = simulator_obstacle(information.evaluator, information.k)
     if obstacle is not None:

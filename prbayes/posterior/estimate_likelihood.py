@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.inference.resampling import SETS, aligned, groups, observable, specimens
+from prbayes.metrics.base import is_additive
 from prbayes.metrics.score import (
     ScoreOptions,
     ShiftedResponses,
@@ -25,7 +26,7 @@ from prbayes.metrics.score import (
     specimen_scores,
     tabulated_scores,
 )
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, coarse_where_sufficient
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.design_refinement import noise_floors
 from prbayes.optimize.optimum import Optimum, optima_of
@@ -241,7 +242,7 @@ def estimate_likelihood(
     if _needs_population(evaluator, options):
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
-    evaluator = evaluator.coarse_where_sufficient(point)
+    evaluator = coarse_where_sufficient(evaluator, point)
     parts = [
         _group_scores(evaluator, members, point, scales, options)
         for members in groups(evaluator.nodes)
@@ -271,10 +272,10 @@ def _unit(
         size = sum(len(node.observed) for node in evaluator.nodes)
         precision = _likelihood_spread(evaluator, point, options) * np.sqrt(size)
         units = 100 / np.maximum(precision, 100)
-        return np.asarray(units * evaluator.prior_sd)
-    order = [optimum.names.index(name) for name in evaluator.names]
+        return np.asarray(units * evaluator.hyperparameters.prior_sd)
+    order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
     errors = np.sqrt(np.diag(optimum.covariance))[order]
-    return np.asarray(np.minimum(100 * errors, evaluator.prior_sd))
+    return np.asarray(np.minimum(100 * errors, evaluator.hyperparameters.prior_sd))
 
 
 def _needs_population(evaluator: Evaluator, options: EstimateLikelihoodOptions) -> bool:
@@ -307,7 +308,7 @@ def _minimised_on_population(
     unset = np.isnan(prepared.epsilon)
     if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
-    unit = evaluator.prior_sd
+    unit = evaluator.hyperparameters.prior_sd
 
     def objective(shift: Floats) -> tuple[float, Floats]:
         step = 1e-4 * unit
@@ -341,7 +342,7 @@ def _group_scores(
     populations = []
     for k, node in zip(members, nodes, strict=True):
         # The gradient of the objective is a sum over specimens of these, by units of the prior.
-        factor = evaluator.prior_sd / (n * scales[k])
+        factor = evaluator.hyperparameters.prior_sd / (n * scales[k])
         population: WeightSlopes | ShiftedResponses
         if node.bound.stored:
             population = _weight_slopes(evaluator, k, point, options)
@@ -387,7 +388,7 @@ def _shifted_responses(
     evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
 ) -> ShiftedResponses:
     """Return the k-th simulator's responses at theta and a step away along each element."""
-    steps = options.resimulated_step * evaluator.prior_sd
+    steps = options.resimulated_step * evaluator.hyperparameters.prior_sd
     axes = np.diag(steps)
     thetas = np.vstack([theta, theta + axes, theta - axes])
     responses, _ = evaluator.populations(thetas, k)
@@ -401,7 +402,7 @@ def _weight_slopes(
     """Return the k-th simulator's stored responses with weights, and their derivatives."""
     moves = evaluator.nodes[k].bound.support_moves
     share = options.wide_step if moves else options.step
-    steps = share * evaluator.prior_sd
+    steps = share * evaluator.hyperparameters.prior_sd
     axes = np.diag(steps)
     thetas = np.vstack([theta, theta + axes, theta - axes])
     responses, weights = evaluator.populations(thetas, k)
@@ -427,9 +428,9 @@ def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihood
     """
     if not all(node.bound.stored for node in evaluator.nodes):
         return theta
-    middle = np.median(evaluator.prior_points(256, 0), axis=0)
+    middle = np.median(evaluator.hyperparameters.prior_points(256, 0), axis=0)
     way = middle - theta
-    is_far = np.abs(way) > options.distance * evaluator.prior_sd
+    is_far = np.abs(way) > options.distance * evaluator.hyperparameters.prior_sd
     way[~is_far] = 0
     for share in np.linspace(0, 1, 33):
         point = theta + share * way
@@ -453,7 +454,7 @@ def _likelihood_spread(
     for k in range(len(evaluator.nodes)):
         population = _weight_slopes(evaluator, k, theta, options)
         variance += population.spread**2
-    return np.asarray(np.sqrt(variance) * evaluator.prior_sd)
+    return np.asarray(np.sqrt(variance) * evaluator.hyperparameters.prior_sd)
 
 
 def score_obstacle(evaluator: Evaluator) -> str | None:
@@ -463,7 +464,7 @@ def score_obstacle(evaluator: Evaluator) -> str | None:
     simulators that share specimens in part.
     """
     for node in evaluator.nodes:
-        if not node.target.additive:
+        if not is_additive(node.target):
             metric = type(node.metric).__name__
             return f"{node.name} has a {metric}, whose gradient is no mean over specimens"
         if np.ptp(node.target.weights) > 1e-12:

@@ -79,7 +79,7 @@ class BatchedKernel(SMC_KERNEL):
         self.start = start
         self.threshold = share(threshold, "threshold")
         model = model_on_context(model, "BatchedKernel")
-        self.evaluator = evaluator or Evaluator(model)
+        self.evaluator = evaluator or Evaluator.of(model)
         self.log_likelihood = log_likelihood
         unset = [n.name for n in self.evaluator.nodes if np.isnan(n.epsilon_value)]
         if unset and log_likelihood is None:
@@ -90,7 +90,7 @@ class BatchedKernel(SMC_KERNEL):
             )
         self.variables = model.value_vars
         self.var_info = {}
-        for name, shape in self.evaluator.shapes.items():
+        for name, shape in self.evaluator.hyperparameters.shapes.items():
             size = int(np.prod(shape, dtype=int))
             self.var_info[name] = (shape, size)
         self.rng = np.random.default_rng(random_seed)
@@ -114,7 +114,7 @@ class BatchedKernel(SMC_KERNEL):
     def _initialize_kernel(self) -> None:
         seed = int(self.rng.integers(2**31))
         if self.start is None:
-            self.tempered_posterior = self.evaluator.prior_thetas(self.draws, seed)
+            self.tempered_posterior = self.evaluator.hyperparameters.prior_thetas(self.draws, seed)
         else:
             self.tempered_posterior = self._started()
         found = self._evaluate(self.tempered_posterior)

@@ -38,7 +38,7 @@ from prbayes.inference.resampling import (
 )
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.coverage import TOLERABLE, supports_each
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, coarse_where_sufficient
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
@@ -293,7 +293,7 @@ def refit_likelihood(
         if center.stderr.size == sampling.stderr.size:
             centers.append(center)
     # Identified directions are known from all stored responses; an eighth is enough for the rest.
-    evaluator = evaluator.coarse_where_sufficient(continuation.within(thetas[:1])[0])
+    evaluator = coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0])
@@ -489,7 +489,7 @@ def _best_starts(
 def _continued(evaluator: Evaluator, continuation: Continuation) -> Evaluator:
     if not continuation.is_continued.any():
         return evaluator
-    return ContinuedEvaluator.of(evaluator, continuation)
+    return ContinuedEvaluator.continuing(evaluator, continuation)
 
 
 def _at_minimiser(
@@ -542,13 +542,13 @@ def _require_inside(sampling: SamplingDistribution, options: RefitLikelihoodOpti
     if not local.unidentified.size:
         return
     evaluator = sampling.evaluator
-    middle = np.median(evaluator.prior_points(THETAS, 0), axis=0)
+    middle = np.median(evaluator.hyperparameters.prior_points(THETAS, 0), axis=0)
     shift = (middle - sampling.theta) / local.prior_sd
     along = local.identified @ (local.identified.T @ shift)
     inside = sampling.theta + (shift - along) * local.prior_sd
     there = SamplingDistribution.of(evaluator, inside, sampling.scales, options.weakest)
     if there.stderr.size > sampling.stderr.size:
-        names = np.array(evaluator.readable_names)
+        names = np.array(evaluator.hyperparameters.readable_names)
         is_flat = (local.unidentified**2).sum(axis=1) > 0.5
         raise ValueError(_at_edge(", ".join(names[is_flat])))
 
@@ -568,4 +568,4 @@ def _scale(
     errors = np.sqrt((axes**2).sum(axis=1))
     is_known = ~continuation.is_continued & (errors > 0)
     units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
-    return np.asarray(units * evaluator.prior_sd)
+    return np.asarray(units * evaluator.hyperparameters.prior_sd)

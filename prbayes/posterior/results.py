@@ -105,7 +105,7 @@ def as_multitrace(tree: xr.DataTree, evaluator: Evaluator) -> Any:
     from pymc.backends.base import MultiTrace
     from pymc.backends.ndarray import NDArray
 
-    sizes = [int(np.prod(shape, dtype=int)) for shape in evaluator.shapes.values()]
+    sizes = [int(np.prod(shape, dtype=int)) for shape in evaluator.hyperparameters.shapes.values()]
     ends = np.cumsum(sizes)[:-1]
     chains = []
     of_all = np.asarray(tree["calibration"]["theta"])
@@ -113,7 +113,9 @@ def as_multitrace(tree: xr.DataTree, evaluator: Evaluator) -> Any:
         held = NDArray(model=evaluator.model)
         held.setup(len(thetas), chain)
         for theta in thetas:
-            pairs = zip(evaluator.shapes.items(), np.split(theta, ends), strict=True)
+            pairs = zip(
+                evaluator.hyperparameters.shapes.items(), np.split(theta, ends), strict=True
+            )
             point = {name: part.reshape(shape) for (name, shape), part in pairs}
             held.record(point, in_warmup=False)
         chains.append(held)

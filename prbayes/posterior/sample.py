@@ -14,8 +14,8 @@ import xarray as xr
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.model.budgets import designs_as_before, explained
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.locking import in_turn
+from prbayes.model.evaluator import Evaluator, n_design_runs
+from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
 from prbayes.optimize.optimum import Optimum
@@ -36,7 +36,7 @@ from prbayes.response.inputs import model_on_context
 _OPTIONS = ImportanceOptions()
 
 
-@in_turn
+@locked
 def sample(
     draws: int = 1000,
     *,
@@ -150,7 +150,7 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     Stored responses are added where they do not support the draws.
     """
     clock = time.perf_counter()
-    before = evaluator.n_responses - evaluator.n_runs
+    before = evaluator.n_responses - n_design_runs(evaluator)
     optimum = estimate_of(evaluator, asked, "sample")
     asked = replace(asked, optimum=optimum)
     sample, nuts = None, None
@@ -162,7 +162,9 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                 break
             size = asked.chains * asked.draws
             seed = seed_number(asked.random_seed)
-            prior = Prior(evaluator.prior_thetas, evaluator.hyperparameters.log_prior)
+            prior = Prior(
+                evaluator.hyperparameters.prior_thetas, evaluator.hyperparameters.log_prior
+            )
             sample = importance_sample(target.log_posterior, modes, size, seed, _OPTIONS, prior)
             if not sample.is_reliable(_OPTIONS):
                 sample = None
@@ -254,7 +256,7 @@ def _by_nuts(
     evaluator: Evaluator, mode: Laplace, asked: Sampling
 ) -> tuple[dict[str, Any], Floats, xr.Dataset]:
     """Return the same by NUTS from the mode of the posterior."""
-    values = evaluator.constrained(mode.mode[None])
+    values = evaluator.hyperparameters.constrained(mode.mode[None])
     free = [str(rv.name) for rv in evaluator.model.free_RVs]
     with evaluator.model:
         idata = pm.sample(
@@ -271,5 +273,5 @@ def _by_nuts(
     posterior = idata["posterior"].to_dataset()
     columns = [posterior[name].transpose("chain", "draw", ...).values for name in free]
     flat = [x.reshape(-1, *x.shape[2:]) for x in columns]
-    thetas = evaluator.thetas_of(flat).reshape(asked.chains, asked.draws, -1)
+    thetas = evaluator.hyperparameters.thetas_of(flat).reshape(asked.chains, asked.draws, -1)
     return {"sampler": "NUTS"}, thetas, idata["sample_stats"].to_dataset()

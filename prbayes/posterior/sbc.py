@@ -20,8 +20,8 @@ import xarray as xr
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.locking import in_turn
+from prbayes.model.evaluator import Evaluator, has_other_terms, specimen_params
+from prbayes.model.locking import locked
 from prbayes.optimize.specimen_refits import (
     other_specimens,
     simulation_obstacle,
@@ -38,7 +38,7 @@ _log = logging.getLogger("prbayes")
 _CHUNK = 10
 
 
-@in_turn
+@locked
 def simulation_based_calibration(
     n: int = 200,
     *,
@@ -119,14 +119,14 @@ def simulation_based_calibration(
     executes(executor, "executor")
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     obstacle = None if evaluator.nodes else simulation_obstacle(evaluator)
     if obstacle is not None:
         raise ValueError(
             f"simulation_based_calibration: {obstacle}, so that data sets cannot be drawn; "
             "calibrate data of your own simulations with prb.sample_smc"
         )
-    if evaluator.nodes and evaluator.has_other_terms:
+    if evaluator.nodes and has_other_terms(evaluator):
         raise ValueError(
             "simulation_based_calibration: got a model with likelihood terms or potentials "
             "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"
@@ -188,7 +188,7 @@ def _on_executor(
 def _remote(sent: bytes, job: _Job) -> list[_Row]:
     import cloudpickle
 
-    return _analyse(Evaluator(cloudpickle.loads(sent)), job)
+    return _analyse(Evaluator.of(cloudpickle.loads(sent)), job)
 
 
 def _analyse(
@@ -213,13 +213,13 @@ def _analyse(
 def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str, Floats]:
     """Draw hyperparameters, and data from their population, and rank them among the draws."""
     theta_seed = int(rng.integers(2**31))
-    theta = evaluator.prior_thetas(1, theta_seed)[0]
+    theta = evaluator.hyperparameters.prior_thetas(1, theta_seed)[0]
     # Of a likelihood by specimen the emulator is the response.
     pools, data = [], {}
     if evaluator.nodes:
         data = fresh_data(evaluator, theta, rng)
     for k, likelihood in enumerate(evaluator.likelihoods):
-        params = evaluator.specimen_params(theta[None], k)
+        params = specimen_params(evaluator, theta[None], k)
         pools.append(specimen_pool(likelihood, params, rng, size=len(likelihood.readings)))
     draws_seed = int(rng.integers(2**31))
     asked = Sampling(draws=job.draws, adjustment=job.adjustment, random_seed=draws_seed)
@@ -227,7 +227,7 @@ def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str,
     with other_specimens(evaluator.likelihoods, [pool.data_set(rng) for pool in pools]):
         posterior = draw(evaluator.observing(data), asked)["posterior"]
     row = {}
-    for name, (truth,) in evaluator.constrained(theta[None]).items():
+    for name, (truth,) in evaluator.hyperparameters.constrained(theta[None]).items():
         found = np.asarray(posterior[name])[0]
         below = (found < truth).sum(axis=0)
         # Somewhere between the two neighbours, so that ranks are uniform and not discrete.

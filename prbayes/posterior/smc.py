@@ -21,9 +21,9 @@ from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, s
 from prbayes.model.budgets import designs_as_before, explained
 from prbayes.model.coverage import shortcomings
 from prbayes.model.epsilon import checked_epsilon
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, is_current, missing_mass, n_design_runs
 from prbayes.model.fingerprint import identity_of, require_same
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import log_kernel
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
@@ -55,7 +55,7 @@ Adjustment = Literal["estimate"] | None
 _FAR_OUT = 0.05
 
 
-@in_turn
+@locked
 def sample_smc(
     draws: int = 1000,
     *,
@@ -272,14 +272,14 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
 def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """Return draws of the posterior: given the estimate, or of a log-likelihood by specimen."""
     clock = time.perf_counter()
-    before = evaluator.n_responses - evaluator.n_runs
+    before = evaluator.n_responses - n_design_runs(evaluator)
     with designs_as_before(evaluator) as restore_designs:
         optimum = estimate_of(evaluator, asked, "sample_smc")
         rounds = _rounds(evaluator, asked, optimum)
         particles = rounds.until_supported(asked.progressbar)
         log_likelihood = None
         if rounds.log_likelihood is not None:
-            rows = particles.thetas.reshape(-1, evaluator.size)
+            rows = particles.thetas.reshape(-1, evaluator.hyperparameters.size)
             log_likelihood = rounds.log_likelihood(rows).reshape(particles.thetas.shape[:2])
         tree = result_tree(
             evaluator,
@@ -322,7 +322,7 @@ def estimate_of(evaluator: Evaluator, asked: Sampling, caller: str) -> Optimum |
 def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """Return draws of prior times exp(-sum of d_k / epsilon_k)."""
     clock = time.perf_counter()
-    before = evaluator.n_responses - evaluator.n_runs
+    before = evaluator.n_responses - n_design_runs(evaluator)
     with epsilons_restored(evaluator), designs_as_before(evaluator) as restore_designs:
         optimum = _calibrated(evaluator, asked)
         particles = _rounds(evaluator, asked, optimum).until_supported(asked.progressbar)
@@ -338,7 +338,7 @@ def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             if asked.with_groups:
                 thetas = particles.thetas
                 kernels = np.asarray(log_kernel(particles.discrepancies, evaluator.epsilon))
-                other = evaluator.log_other(thetas.reshape(-1, evaluator.size))
+                other = evaluator.log_other(thetas.reshape(-1, evaluator.hyperparameters.size))
                 logs = kernels.sum(axis=-1) + other.reshape(thetas.shape[:2])
                 groups = arviz_groups(evaluator, thetas, logs, asked.random_seed)
             tree = posterior_tree(
@@ -521,7 +521,7 @@ class Rounds:
             particles = self.run(children, progressbar, self.log_likelihood)
             if not refines:
                 return particles
-            rows = particles.thetas.reshape(-1, evaluator.size)
+            rows = particles.thetas.reshape(-1, evaluator.hyperparameters.size)
             thetas = np.random.default_rng(self.seeds).permutation(rows)[:THETAS]
             if particles.stopped and shortcomings(evaluator, thetas):
                 raise BudgetError(particles.stopped)
@@ -670,9 +670,9 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
     An optimum's own if it is this model's, and no optimum of another problem.
     """
     if optimum is None:
-        return Evaluator(model)
-    own = optimum.model is model and optimum.evaluator.is_current
-    evaluator = optimum.evaluator if own else Evaluator(model)
+        return Evaluator.of(model)
+    own = optimum.model is model and is_current(optimum.evaluator)
+    evaluator = optimum.evaluator if own else Evaluator.of(model)
     require_same(optimum.identity, identity_of(evaluator), f"{caller}: optimum")
     return evaluator
 
@@ -692,7 +692,7 @@ def _at_the_best(
     for k, node in enumerate(evaluator.nodes):
         roots = evaluator.roots(best, k)
         errors.append(node.bound.discrepancy_error(roots))
-        missing[node.name] = evaluator.missing(best[0], k)
+        missing[node.name] = missing_mass(evaluator, best[0], k)
     return np.array(errors), missing
 
 

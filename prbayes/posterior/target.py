@@ -47,22 +47,24 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
         starts = _prior_starts(evaluator)
     else:
         starts = tuple(optima_of(optimum, evaluator))
-    return Target(evaluator, evaluator.log_other, starts, evaluator.prior_sd)
+    return Target(evaluator, evaluator.log_other, starts, evaluator.hyperparameters.prior_sd)
 
 
 def _prior_starts(evaluator: Evaluator, screened: int = 1024, count: int = 8) -> tuple[Floats, ...]:
     """Return the best point of the prior, and others of the best quarter far from each other."""
-    thetas = evaluator.prior_points(screened, 0)
-    heights = Target(evaluator, evaluator.log_other, (), evaluator.prior_sd).log_posterior(thetas)
+    thetas = evaluator.hyperparameters.prior_points(screened, 0)
+    heights = Target(
+        evaluator, evaluator.log_other, (), evaluator.hyperparameters.prior_sd
+    ).log_posterior(thetas)
     order = np.argsort(-heights, kind="stable")
-    candidates = thetas[order[: screened // 4]] / evaluator.prior_sd
+    candidates = thetas[order[: screened // 4]] / evaluator.hyperparameters.prior_sd
     chosen = [0]
     distance = np.full(len(candidates), np.inf)
     while len(chosen) < count:
         away = ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1)
         distance = np.minimum(distance, away)
         chosen.append(int(np.argmax(distance)))
-    return tuple(candidates[chosen] * evaluator.prior_sd)
+    return tuple(candidates[chosen] * evaluator.hyperparameters.prior_sd)
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
@@ -132,21 +134,21 @@ def prior_conflicts(
     """
     if optimum.prior or any(rival["comparable"] for rival in optimum.rivals):
         return ()
-    order = [optimum.names.index(name) for name in evaluator.names]
+    order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
     covariance = optimum.covariance[np.ix_(order, order)]
     is_identified = np.isfinite(np.diag(covariance))
     if not is_identified.any():
         return ()
     within = covariance[np.ix_(is_identified, is_identified)]
-    prior = evaluator.prior_thetas(size, 0)[:, is_identified]
+    prior = evaluator.hyperparameters.prior_thetas(size, 0)[:, is_identified]
     rng = np.random.default_rng(5)
     errors = rng.multivariate_normal(np.zeros(len(within)), within, size, method="eigh")
-    names = np.array(evaluator.readable_names)[is_identified]
+    names = np.array(evaluator.hyperparameters.readable_names)[is_identified]
     return conflict_findings(
         names.tolist(),
         prior,
         optimum.theta[order][is_identified],
         np.sqrt(np.diag(within)),
-        thetas.reshape(-1, evaluator.size)[:, is_identified].mean(axis=0),
+        thetas.reshape(-1, evaluator.hyperparameters.size)[:, is_identified].mean(axis=0),
         prior + errors,
     )

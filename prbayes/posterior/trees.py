@@ -9,9 +9,10 @@ import numpy as np
 import xarray as xr
 
 from prbayes._validate import Floats
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import split_elements
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, likelihood_of, specimen_log_likelihoods
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.labels import (
     arviz_attributes,
@@ -144,7 +145,7 @@ def _calibration(
         },
         coords={
             "simulator": [node.name for node in evaluator.nodes],
-            "element": evaluator.names,
+            "element": evaluator.hyperparameters.names,
             "chain": np.arange(chains),
             "draw": np.arange(draws),
         },
@@ -169,8 +170,8 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, beside: xr.Dataset) -> xr
     """
     chains, draws, d = thetas.shape
     measurements = evaluator.measurements
-    likelihoods = [evaluator.likelihood_of(m) for m in measurements]
-    values = evaluator.specimen_log_likelihoods(thetas.reshape(-1, d))
+    likelihoods = [likelihood_of(evaluator, m) for m in measurements]
+    values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     names = [m.name for m in measurements]
     discrepancies = np.stack([-values[name].sum(axis=1) for name in names], axis=-1)
     runs = [len(likelihood.emulation.z) for likelihood in likelihoods]
@@ -252,7 +253,7 @@ def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
         "required_ess": ("simulator", required),
         "max_lost": ("simulator", [node.bound.max_lost for node in nodes]),
         "metric": ("simulator", [without_addresses(node.metric) for node in nodes]),
-        "compared": ("simulator", [node.target.told for node in nodes]),
+        "compared": ("simulator", [components_summary(node.target) for node in nodes]),
         "propagation": ("simulator", [without_addresses(node.propagation) for node in nodes]),
         "n_points": ("simulator", [node.bound.n_points for node in nodes]),
         "n_runs": ("simulator", [node.bound.n_runs for node in nodes]),
@@ -365,7 +366,7 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
 def _draws(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     """Return draws, shape (chains, draws, d), as labelled variables."""
     chains, draws, d = thetas.shape
-    values = evaluator.constrained(thetas.reshape(-1, d)).items()
+    values = evaluator.hyperparameters.constrained(thetas.reshape(-1, d)).items()
     by_chain = {}
     for name, value in values:
         shape = value.shape[1:]

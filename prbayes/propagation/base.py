@@ -24,8 +24,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats, flag, positive_number
 from prbayes.metrics.base import Discrepancy
+from prbayes.response.budget import RunCost
 from prbayes.response.compile import compile_batched
-from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,
     prior_draws,
@@ -41,11 +41,6 @@ from prbayes.response.response import Responses, refuse_calling
 # Parts of a population's points whose differences tell its error: few enough that each is a design
 # of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
 N_BLOCKS = 8
-
-# What decides how many runs there are where each value of the hyperparameters takes some.
-BY_EVALUATIONS = (
-    "each value that the optimiser or sampler asks for; max_runs= and max_seconds= end it"
-)
 
 # Share of a population's weight, at an answer, that may fall on points without response. By
 # judgement: as much as one may choose to overlook; whoever knows better passes another.
@@ -340,9 +335,9 @@ class Propagation(ABC):
         refuse_timeout(self.timeout, self.executor)
 
     @property
-    def demand(self) -> Demand:
-        """What is asked for after the first runs, as far as it is known."""
-        return Demand(0, None, f"as {type(self).__name__} asks for them")
+    def cost(self) -> RunCost:
+        """Runs that this propagation needs."""
+        return RunCost(0, 0, None, f"as {type(self).__name__} asks for them")
 
     def check_simulator(  # noqa: B027 (one of a user's own may take all)
         self, name: str, inputs: Inputs, target: Discrepancy
@@ -376,6 +371,12 @@ def refuse_nested(name: str, inputs: Inputs) -> None:
             "is not that of independent inputs; use one multivariate distribution, "
             "or propagation=prb.Fresh()"
         )
+
+
+def cost_by_evaluation(n: int) -> RunCost:
+    """Return the runs of a propagation with n runs for each value of the hyperparameters."""
+    growth = "each value that the optimiser or sampler asks for; max_runs= and max_seconds= end it"
+    return RunCost(16, n, None, growth)  # the points of `probe`
 
 
 def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:

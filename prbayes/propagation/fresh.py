@@ -13,18 +13,17 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._validate import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
-    BY_EVALUATIONS,
     MAX_LOST,
     Bound,
     Propagation,
+    cost_by_evaluation,
     probe,
     refuse_max_lost,
 )
 from prbayes.propagation.ops import OwnOp
-from prbayes.response.broadcasting import batch_shape, broadcast_batch
-from prbayes.response.costs import Demand
+from prbayes.response.budget import RunCost
 from prbayes.response.distributions import PopulationSampler
-from prbayes.response.inputs import Inputs
+from prbayes.response.inputs import Inputs, batch_shape, broadcast_batch
 from prbayes.response.response import Responses
 
 
@@ -66,9 +65,9 @@ class Fresh(Propagation):
         refuse_max_lost(self.max_lost, "Fresh")
 
     @property
-    def demand(self) -> Demand:
-        """The same number for each value of the hyperparameters."""
-        return Demand(self.n, None, BY_EVALUATIONS)
+    def cost(self) -> RunCost:
+        """Runs that this propagation needs: n for each value of the hyperparameters."""
+        return cost_by_evaluation(self.n)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Prepare the generator of draws, and try the response."""

@@ -19,17 +19,17 @@ from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.numerics.points import base_points, points_from
 from prbayes.propagation.base import (
-    BY_EVALUATIONS,
     MAX_LOST,
     Bound,
     Propagation,
+    cost_by_evaluation,
     probe,
     refuse_max_lost,
     refuse_nested,
 )
 from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
+from prbayes.response.budget import RunCost
 from prbayes.response.compile import PLAIN, compile_batched, ninf_for_invalid
-from prbayes.response.costs import Demand
 from prbayes.response.distributions import PopulationSampler, quantiles, valid
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
@@ -77,9 +77,9 @@ class Resimulated(Propagation):
         positive_integer(self.random_seed, "Resimulated: random_seed", minimum=0)
 
     @property
-    def demand(self) -> Demand:
-        """The same number for each value of the hyperparameters."""
-        return Demand(self.n, None, BY_EVALUATIONS)
+    def cost(self) -> RunCost:
+        """Runs that this propagation needs: n for each value of the hyperparameters."""
+        return cost_by_evaluation(self.n)
 
     def check_simulator(self, name: str, inputs: Inputs, target: Discrepancy) -> None:
         """Refuse inputs without inverse distribution functions; warn of too few responses."""

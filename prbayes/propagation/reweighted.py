@@ -24,7 +24,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._validate import IN_CACHE, Floats, positive_integer
 from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
-from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.numerics.points import base_points
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import (
@@ -54,10 +54,9 @@ from prbayes.propagation.moving_support import (
     moving_inputs,
     refuse_moving_atoms,
 )
-from prbayes.propagation.ops import CompactOp, OpaqueOp
+from prbayes.propagation.ops import stored_discrepancy
+from prbayes.response.budget import RunCost
 from prbayes.response.compile import compile_batched
-from prbayes.response.costs import Demand
-from prbayes.response.deduplication import Known, once_each
 from prbayes.response.distributions import (
     PopulationSampler,
     log_density,
@@ -67,7 +66,13 @@ from prbayes.response.distributions import (
 )
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import lacking
-from prbayes.response.response import Responses, refuse_coarse, refuse_other_number
+from prbayes.response.response import (
+    Known,
+    Responses,
+    once_each,
+    refuse_coarse,
+    refuse_other_number,
+)
 
 _log = logging.getLogger("prbayes")
 
@@ -180,13 +185,13 @@ class Reweighted(Propagation):
             )
 
     @property
-    def demand(self) -> Demand:
-        """No run for a value of the hyperparameters; more where a design does not support it."""
-        decides = (
+    def cost(self) -> RunCost:
+        """Runs that this propagation needs: no run for a value of the hyperparameters."""
+        growth = (
             f"up to {self.most} in all, where the calibrated populations are not supported, or "
             "another design would answer differently"
         )
-        return Demand(0, self.most, decides)
+        return RunCost(self.n, 0, self.most, growth)
 
     @property
     def emulator_runs(self) -> int | None:
@@ -517,11 +522,11 @@ class Design(Bound):
         """Compare with the same data in another way from here on; before anything is compiled."""
         if target is self.target:
             return
-        before = len(self._shared) - len(self._basis_of(self.values[:1]))
+        before = len(self._shared) - len(self._basis_of(self.values[:1]).arrays)
         self.target = target
         kept = self._held()[:before]
         self._shared = []
-        self._share([*kept, *self._basis_of(self.values)])
+        self._share([*kept, *self._basis_of(self.values).arrays])
 
     @property
     def known_points(self) -> Sequence[Floats]:
@@ -853,7 +858,12 @@ class Design(Bound):
     def _arrays(self) -> list[Any]:
         """Return what compiled graphs read."""
         table = self.contents.table
-        return [*table.points, table.log_g, *self._cell_ends(), *self._basis_of(table.values)]
+        return [
+            *table.points,
+            table.log_g,
+            *self._cell_ends(),
+            *self._basis_of(table.values).arrays,
+        ]
 
     def _weights_at(self, components: Sequence[Floats], table: Table) -> Floats:
         """Return weights of a table's points in some populations, (T, n): they sum to one."""
@@ -867,19 +877,10 @@ class Design(Bound):
         weights = self._weights_at(components, self.contents.table)
         return float(np.median(1 / (weights**2).sum(axis=1)))
 
-    @property
-    def _too_many(self) -> bool:
-        """Whether graphs do without a basis, as it would take too much memory.
-
-        That does not change while the design grows.
-        """
+    def _basis_of(self, values: Floats) -> Basis:
+        """Return the basis for compiled graphs; its form stays the same while the design grows."""
         most = max(self.max_points, LARGEST_CLOUD) if self.emulates else self.max_points
-        return self.target.columns * most > _MOST_NUMBERS
-
-    def _basis_of(self, values: Floats) -> tuple[NDArray[Any], ...]:
-        """Return what graphs make features of."""
-        target = self.target
-        return target.compact(values) if self._too_many else target.basis(values)
+        return self.target.basis(values, _MOST_NUMBERS * len(values) / most)
 
     def _responses_at(self, points: Sequence[Floats]) -> Floats:
         """Return the responses at points: none is computed that this or another design had."""
@@ -888,12 +889,12 @@ class Design(Bound):
             for rows in before.rows():
                 known = [x[rows] for x in before.points]
                 if all(map(np.array_equal, known, points)):
-                    self.responses.find(len(points[0]))
+                    self.responses.count_reused(len(points[0]))
                     return before.values[rows]
         runs = self.responses.runs
         shared = runs.at(points)
         if shared is not None:
-            self.responses.find(len(shared))
+            self.responses.count_reused(len(shared))
             return shared
         stored = self._contents
         own = None if stored is None else Known(stored.batches.points, stored.batches.values)
@@ -1161,14 +1162,8 @@ class Design(Bound):
         weights = raw / raw.sum()
         before_the_basis = len(self.inputs.aleatory) + 1 + 2 * len(self._moving or ())
         basis = tuple(self._shared[before_the_basis:])
-        if self._too_many:
-            features = CompactOp(self.target)(*basis, weights)
-            value = self.target.outer(features, xp=pt)
-        elif self.target.symbolic:
-            features = self.target.from_basis(weights, basis, pt)
-            value = self.target.outer(*features, xp=pt)
-        else:
-            value = OpaqueOp(self.target)(*basis, weights)
+        form = self._basis_of(self.values[:1])
+        value = stored_discrepancy(self.target, replace(form, arrays=basis), weights)
         return pt.switch(supported, value, np.inf)
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
@@ -1199,8 +1194,7 @@ class Design(Bound):
         """
         wanted = (target, self.contents.table)
         if any(a is not b for a, b in zip(self._basis, wanted, strict=False)):
-            made = target.stored(self.values)
-            self._basis = (*wanted, made)
+            self._basis = (*wanted, target.basis(self.values))
         *_, basis = self._basis
 
         size = len(params[0])
@@ -1211,7 +1205,7 @@ class Design(Bound):
             for first in range(0, max(1, size), step):
                 weights, supported = self._weights([p[first : first + step] for p in params])
                 weights[~supported] = 1 / self.n_points
-                features = target.from_basis(weights, basis, np)
+                features = basis.features(weights)
                 each = target.outer(*features, xp=np)
                 found.append(np.where(supported, each, np.inf))
         return np.concatenate(found)

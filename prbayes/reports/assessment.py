@@ -29,7 +29,7 @@ from prbayes.reports.summary import verdict
 from prbayes.reports.tables import rows_table
 from prbayes.results.diagnose import Diagnosis
 from prbayes.validation.area_test import ValidityTest
-from prbayes.validation.measured_vs_predicted import Comparable, comparables
+from prbayes.validation.conditions import Comparable, comparables
 
 # -- comparison ------------------------------------------------------------------------------
 

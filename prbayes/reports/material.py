@@ -28,9 +28,8 @@ from prbayes.plots._labels import refuse_labels
 from prbayes.response.outputs import ONE, Outputs, read_observed
 from prbayes.results.compare import compare
 from prbayes.results.diagnose import Diagnosis, diagnose
-from prbayes.validation.area_test import ValidityTest
-from prbayes.validation.measured_vs_predicted import comparables
-from prbayes.validation.probability_transform import u_values
+from prbayes.validation.area_test import ValidityTest, u_values
+from prbayes.validation.conditions import comparables
 
 # Measured values are rounded, or predicted ones for a test: by far less than this in half of the
 # u-values, while those of other data are apart by .3 on average.
@@ -271,7 +270,7 @@ def _require_known_labels(
         known |= {simulator, *own.names}
     if description is not None:
         known |= {str(variable["name"]) for variable in description["variables"]}
-    evaluator = None if model is None else Evaluator(model)
+    evaluator = None if model is None else Evaluator.of(model)
     refuse_labels(labels, sorted(known), evaluator=evaluator)
 
 

@@ -12,9 +12,8 @@ from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike
 from prbayes.reports.section import Section
 from prbayes.reports.tables import rows_table
-from prbayes.validation.conditions import DIRECTION
-from prbayes.validation.measured_vs_predicted import Comparable, comparables
-from prbayes.validation.probability_transform import u_values
+from prbayes.validation.area_test import u_values
+from prbayes.validation.conditions import DIRECTION, Comparable, comparables
 
 # A page; of more the first ones are told.
 _ON_A_PAGE = 40

@@ -1,7 +1,6 @@
 """The user's response: its inputs, how it is called, when it fails, where it is kept."""
 
-from prbayes.response.budget import BudgetError
-from prbayes.response.costs import Cost
+from prbayes.response.budget import BudgetError, Cost
 from prbayes.response.discrepancy import Additive, Multiplicative
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.groups import group

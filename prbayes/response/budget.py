@@ -1,7 +1,7 @@
-"""Budgets of time and of responses: what is under way stops when one is spent.
+"""Runs of the response: what they cost, and budgets that end a calculation.
 
-A budget holds for all that happens inside `limited`, in this thread. It is asked before every chunk
-of responses and every evaluation; what was begun is finished, and stored.
+A budget applies to everything inside `limited` in this thread. It is checked before every chunk of
+responses and every evaluation. Runs that have begun are finished and stored.
 """
 
 from __future__ import annotations
@@ -21,31 +21,28 @@ class BudgetError(RuntimeError):
 
 @dataclass(eq=False)
 class Budget:
-    """What may be spent, and what was."""
+    """Limits on time and runs, and what was spent of them."""
 
     max_seconds: float | None = None
     max_runs: int | None = None
-    begun: float = field(default_factory=time.perf_counter)
+    start: float = field(default_factory=time.perf_counter)
     computed: int = 0  # responses; those found in a store cost nothing
-    spent: str = ""  # what was spent, in words; nothing goes on from then on
+    spent: str = ""  # why the budget is spent, as a clause; final once it is set
 
     def go_on(self) -> None:
-        """Raise if it is spent."""
-        seconds = time.perf_counter() - self.begun
+        """Raise if the budget is spent."""
+        seconds = time.perf_counter() - self.start
         if not self.spent and self.max_seconds is not None and seconds > self.max_seconds:
             self.spent = f"max_seconds = {self.max_seconds:g} was reached"
         if self.spent:
             raise BudgetError(self.spent)
 
-    def grant(self, wanted: int, least: int) -> int:
-        """Return how many of so many responses may be computed, or raise if fewer than the least.
-
-        They count as computed.
-        """
+    def grant(self, runs: int, least: int) -> int:
+        """Return how many of the runs may be computed, and count them; raise below ``least``."""
         self.go_on()
         if self.max_runs is None:
-            return wanted
-        granted = min(wanted, self.max_runs - self.computed)
+            return runs
+        granted = min(runs, self.max_runs - self.computed)
         if granted < least:
             self.spent = f"max_runs = {self.max_runs} was reached"
             raise BudgetError(self.spent)
@@ -53,37 +50,118 @@ class Budget:
         return granted
 
 
-_at_work: ContextVar[Budget] = ContextVar("budget")
-_NONE = Budget()
+_current: ContextVar[Budget] = ContextVar("budget")
+_UNLIMITED = Budget()
 
 
 def budget() -> Budget:
-    """Return the budget that holds here; one without limits by default."""
-    return _at_work.get(_NONE)
+    """Return the current budget, by default one without limits."""
+    return _current.get(_UNLIMITED)
 
 
 @contextmanager
 def limited(max_seconds: float | None, max_runs: int | None) -> Iterator[None]:
-    """Stop what happens inside, by `BudgetError`, when a budget is spent.
+    """Limit the time and runs of the block; a spent budget raises `BudgetError`.
 
     Raises
     ------
     TypeError, ValueError
-        If one is no positive number.
+        If a limit is not a positive number.
     """
     if max_seconds is not None:
         positive_number(max_seconds, "max_seconds")
     if max_runs is not None:
         positive_integer(max_runs, "max_runs")
-    token = _at_work.set(Budget(max_seconds, max_runs))
+    token = _current.set(Budget(max_seconds, max_runs))
     try:
         yield
     finally:
-        _at_work.reset(token)
+        _current.reset(token)
 
 
 @contextmanager
 def unlimited() -> Iterator[None]:
-    """Let what costs no response be finished after a budget was spent."""
+    """Suspend the budget in the block, for work that costs no response."""
     with limited(None, None):
         yield
+
+
+@dataclass(frozen=True)
+class RunCost:
+    """Runs of the response that a propagation needs.
+
+    Attributes
+    ----------
+    first : int
+        Runs at the first use of the model.
+    each : int
+        Runs for each value of the hyperparameters.
+    most : int or None
+        Largest number of runs; None without a limit.
+    growth : str
+        The condition for more runs, as a clause.
+    """
+
+    first: int
+    each: int
+    most: int | None
+    growth: str
+
+
+@dataclass(frozen=True)
+class SimulatorCost:
+    """Runs of one simulator: those that it needs, and those that are computed."""
+
+    name: str
+    propagation: str
+    needed: RunCost
+    computed: int
+    workers: int
+
+    def __str__(self) -> str:
+        """Return the cost as lines."""
+        needed = self.needed
+        workers = "one at a time" if self.workers == 1 else f"{self.workers} at a time"
+        each = f"{needed.each} runs" if needed.each else "no run"
+        return (
+            f"{self.name}: {self.propagation}\n"
+            f"  at first: {needed.first} runs, {self.computed} of them computed, {workers}\n"
+            f"  for each value of the hyperparameters: {each}\n"
+            f"  more: {needed.growth}"
+        )
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Runs that the simulators of a model need; see `cost`.
+
+    Attributes
+    ----------
+    simulators : tuple
+        For each simulator: ``name``, ``propagation``, the ``needed`` runs (``first``, ``each``,
+        ``most`` and ``growth``), the number of ``computed`` runs, and ``workers``.
+    """
+
+    simulators: tuple[SimulatorCost, ...]
+
+    @property
+    def runs(self) -> int:
+        """Runs that are computed at the first use, of all simulators."""
+        return sum(cost.needed.first - cost.computed for cost in self.simulators)
+
+    @property
+    def runs_each(self) -> int:
+        """Runs for each value of the hyperparameters, of all simulators."""
+        return sum(cost.needed.each for cost in self.simulators)
+
+    def __repr__(self) -> str:
+        """Return the costs of the simulators, one after the other."""
+        return "\n".join(map(str, self.simulators))
+
+
+def duration(seconds: float) -> str:
+    """Return a time in the unit in which it reads best."""
+    for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2 * size:  # below, two digits of the smaller unit are more precise
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"

@@ -1,14 +1,18 @@
-"""What is known of executors: how much they take, and whether their workers are lost or gone.
+"""Executors of concurrent calls: capacity, time limits, and lost workers.
 
-The interface of `concurrent.futures.Executor` tells none of that. What is read beyond it, by names
-that others may change, stands here, and `tests/test_contracts.py` tests it on real executors.
+The interface of `concurrent.futures.Executor` has none of these. Attributes beyond the interface,
+whose names may change, are read in this module only; `tests/test_contracts.py` tests them.
 """
 
 from __future__ import annotations
 
+import faulthandler
 import logging
 import os
-from collections.abc import Callable, Iterable
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -17,7 +21,9 @@ from concurrent.futures import (
     Future,
     wait,
 )
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from inspect import signature
 from pathlib import Path
 from traceback import walk_tb
@@ -32,95 +38,172 @@ _log = logging.getLogger("prbayes")
 
 @dataclass(frozen=True)
 class Capacity:
-    """How many workers an executor has, and how many chunks it is sent at a time."""
+    """Number of workers, and of chunks that are sent to them at a time."""
 
     workers: int
     chunks: int
 
 
 def capacity(executor: Executor | None) -> Capacity:
-    """Return how much an executor takes.
-
-    Processes, threads and loky keep ``_max_workers``, MPI ``num_workers``, and Dask's client knows.
-    Of others many chunks are sent out, lest workers wait.
-    """
+    """Return the capacity of an executor; an unknown one is sent many chunks."""
     if executor is None:
         return Capacity(1, 1)
+    # Of processes, threads and loky; of MPI; of Dask.
     workers = getattr(executor, "_max_workers", 0) or getattr(executor, "num_workers", 0)
-    workers = workers or sum((_threads(executor) or {}).values())
+    workers = workers or sum((_dask_threads(executor) or {}).values())
     if not workers:
-        # As many as workers that are known of in practice; what one costs in memory is measured by
-        # `python -m benchmarks.scale`.
-        return Capacity(os.cpu_count() or 1, 1024)
-    # While a worker computes a chunk, the next one is there already.
-    return Capacity(int(workers), 2 * int(workers))
+        return Capacity(os.cpu_count() or 1, 1024)  # as many as the largest clusters in practice
+    return Capacity(int(workers), 2 * int(workers))  # a worker has its next chunk ready
 
 
-def _threads(executor: Executor | None) -> dict[str, int] | None:
-    """Return how many threads each worker of Dask has, by its address; None for others."""
+def _dask_threads(executor: Executor | None) -> dict[str, int] | None:
+    """Return the number of threads of each Dask worker by address, None for other executors."""
     threads = getattr(getattr(executor, "_client", None), "nthreads", None)
     return dict(threads()) if callable(threads) else None
 
 
+def _process_pool_class(executor: Executor | None) -> type[Executor] | None:
+    """Return the class of a pool of processes; loky's has the name of the standard one."""
+    classes = type(executor).__mro__
+    return next((c for c in classes if c.__name__ == "ProcessPoolExecutor"), None)
+
+
+# -- time limits -----------------------------------------------------------------------------------
+
+
 def refuse_timeout(timeout: object, executor: Executor | None) -> None:
-    """Raise if it is no time, or one that the executor's workers cannot keep."""
+    """Raise for a time limit that is not a number, or that the executor cannot enforce."""
     if timeout is None:
         return
     positive_number(timeout, "timeout")
-    if not _has_processes(executor):
+    addresses = _dask_threads(executor)
+    in_dask_processes = addresses is not None and not any(
+        address.startswith("inproc:") for address in addresses
+    )
+    if _process_pool_class(executor) is None and not in_dask_processes:
         raise ValueError(
             f"timeout: got {timeout} with executor {called(executor)}, expected an executor of "
             "processes, such as concurrent.futures.ProcessPoolExecutor(4), or of Dask with workers "
             "in other processes: nothing else ends a response that hangs; prb.command, "
-            "prb.umbridge and prb.fmu have a timeout= of their own, which is kept anywhere"
+            "prb.umbridge and prb.fmu have a timeout= of their own, which applies anywhere"
         )
 
 
-def _has_processes(executor: Executor | None) -> bool:
-    """Return whether workers are processes of their own, which may be ended."""
-    if _kind(executor) is not None:
-        return True
-    addresses = _threads(executor)
-    # Dask calls those in this process so.
-    return addresses is not None and not any(a.startswith("inproc:") for a in addresses)
+class _AlarmError(TimeoutError):
+    """Raised inside a late response; a class of its own, as responses have time limits."""
 
 
-def _kind(executor: Executor | None) -> type[Executor] | None:
-    """Return the class of an executor of processes: loky's has the name of the standard one."""
-    kinds = type(executor).__mro__
-    return next((kind for kind in kinds if kind.__name__ == "ProcessPoolExecutor"), None)
+@contextmanager
+def time_limit(seconds: float | None) -> Iterator[None]:
+    """Raise `TimeoutError` in the block after some seconds, or end this process a while later.
+
+    A signal interrupts the main thread. Other threads, and code that never returns to Python, end
+    with their process.
+    """
+    if seconds is None:
+        yield
+        return
+    start = time.monotonic()
+    message = f"no result within timeout = {seconds:g} s"
+    with _watchdog(1.5 * seconds + 1):  # late enough for the signal to come first
+        try:
+            in_main = threading.current_thread() is threading.main_thread()
+            if in_main and hasattr(signal, "setitimer"):
+                with _alarm(seconds):
+                    yield
+            else:
+                yield
+        except _AlarmError:
+            raise TimeoutError(message) from None
+        except Exception as error:
+            # Compiled code replaces the alarm by an exception of its own.
+            if time.monotonic() - start < seconds:
+                raise
+            raise TimeoutError(message) from error
 
 
-# -- workers that are lost -------------------------------------------------------------------------
+@contextmanager
+def _alarm(seconds: float) -> Iterator[None]:
+    """Raise `_AlarmError` in the main thread after some seconds."""
+    is_over = False
+
+    def interrupt(*_: object) -> None:
+        if not is_over:
+            raise _AlarmError
+
+    previous = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, seconds)
+            yield
+        finally:
+            is_over = True  # an alarm from here on must not break the clean-up
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, previous)
+
+
+# Times at which the process ends, one for each block: Python has one watchdog for all threads.
+_deadlines: dict[object, float] = {}
+_deadlines_lock = threading.Lock()
+
+
+@contextmanager
+def _watchdog(seconds: float) -> Iterator[None]:
+    """End this process if the block takes longer."""
+    block = object()
+    with _deadlines_lock:
+        _deadlines[block] = time.monotonic() + seconds
+        _set_watchdog()
+    try:
+        yield
+    finally:
+        with _deadlines_lock:
+            del _deadlines[block]
+            _set_watchdog()
+
+
+def _set_watchdog() -> None:
+    faulthandler.cancel_dump_traceback_later()
+    if _deadlines:
+        left = max(min(_deadlines.values()) - time.monotonic(), 1e-3)  # it takes no less
+        faulthandler.dump_traceback_later(left, exit=True, file=_devnull())
+
+
+@lru_cache(maxsize=1)
+def _devnull() -> int:
+    return os.open(os.devnull, os.O_WRONLY)
+
+
+# -- lost workers ----------------------------------------------------------------------------------
 
 
 def failure_of(future: Future[Any]) -> BaseException | None:
-    """Return why a future that is done has no result; one that was cancelled raises elsewhere."""
+    """Return why a finished future has no result, None if it has one."""
     return CancelledError("it was cancelled") if future.cancelled() else future.exception()
 
 
 def is_loss(failure: BaseException | None) -> bool:
-    """Return whether a chunk failed since its worker was lost; Dask names that by a class."""
+    """Return whether a chunk failed because its worker was lost; Dask has a class for that."""
     names = {kind.__name__ for kind in type(failure).__mro__}
     return isinstance(failure, BrokenExecutor) or "KilledWorker" in names
 
 
 def has_slipped(failure: BaseException | None) -> bool:
-    """Return whether a result was there and is not, as its worker left at that very moment.
+    """Return whether Dask lost a result at the moment when its worker left.
 
-    Dask's executor reads the state of a task after its result: by then it may be at work again
-    elsewhere, and the executor takes the result for an exception.
+    Its executor reads the state of a task after the result. If the task is running again by then,
+    the executor takes the result for an exception.
     """
     if not isinstance(failure, TypeError):
         return False
-    file = ""
-    for frame, _ in walk_tb(failure.__traceback__):
-        file = frame.f_code.co_filename
+    frames = [frame for frame, _ in walk_tb(failure.__traceback__)]
+    file = frames[-1].f_code.co_filename if frames else ""
     return Path(file).parts[-2:] == ("distributed", "cfexecutor.py")
 
 
-def told(failure: BaseException) -> str:
-    """Return what became of an executor that has no result."""
+def failure_text(failure: BaseException) -> str:
+    """Return in words why an executor has no result."""
     text = f"{type(failure).__name__}: {failure!s:.200}"
     if is_loss(failure):
         return f"a worker was lost ({text})"
@@ -129,58 +212,58 @@ def told(failure: BaseException) -> str:
     return f"the executor failed ({text})"
 
 
-# Seconds without a result after which the log says so. By judgement: longer than most responses
-# take, and shorter than one waits for nothing.
-_SILENCE = 60.0
-# So many times in a row no worker is seen before it is believed that none will come: ten minutes,
-# as one that is started again after a loss is away for seconds, on a busy machine for minutes.
-_ABSENCES = 10
+_SILENCE = 60.0  # seconds without a result that are logged; longer than most responses take
 
-# Executors in the place of those whose workers were lost, as long as those are there.
-_renewed: WeakKeyDictionary[Executor, Executor] = WeakKeyDictionary()
+# Executors that replace those whose workers were lost.
+_replacements: WeakKeyDictionary[Executor, Executor] = WeakKeyDictionary()
 
 
 @dataclass
 class Pool:
-    """An executor, or a new one like it where its workers were lost."""
+    """An executor that is replaced by one like it when its workers are lost."""
 
     name: str  # of the simulator, for messages
-    given: Executor | None
+    original: Executor | None
 
     @property
     def executor(self) -> Executor | None:
         """The executor at work."""
-        return None if self.given is None else _renewed.get(self.given, self.given)
+        return None if self.original is None else _replacements.get(self.original, self.original)
 
     def renew(self, failure: BaseException | None) -> None:
-        """Take a new executor if this one is broken; those of others start workers themselves."""
-        if self.given is None or not isinstance(failure, BrokenExecutor):
+        """Replace a broken pool of processes; other executors start new workers themselves."""
+        kind = _process_pool_class(self.original)
+        if self.original is None or kind is None or not isinstance(failure, BrokenExecutor):
             return
-        kind = _kind(self.given)
-        if kind is not None:
-            _renewed[self.given] = _alike(self.given, kind)
+        # The standard library and loky store their arguments under the same names.
+        parameters = signature(kind).parameters
+        arguments: dict[str, Any] = {"max_workers": getattr(self.original, "_max_workers", None)}
+        for name, attribute in (
+            ("mp_context", "_mp_context"),
+            ("context", "_context"),
+            ("initializer", "_initializer"),
+            ("initargs", "_initargs"),
+        ):
+            value = getattr(self.original, attribute, None)
+            if name in parameters and value is not None:
+                arguments[name] = value
+        _replacements[self.original] = kind(**arguments)
 
     def refuse_dead(self) -> None:
-        """Raise if workers are lost whatever they do: then no response is to blame.
-
-        Raises
-        ------
-        ResponseError
-            If they are.
-        """
+        """Raise if workers are lost whatever they compute."""
         future = self.submitted(os.getpid)
         self.done([future])
         failure = failure_of(future)
         if failure is not None:
             raise ResponseError(
-                f"{self.name}: {told(failure)}, also without a response at work, expected an "
-                "executor whose workers stay; make a new one, and look at what its workers do "
+                f"{self.name}: {failure_text(failure)}, also without a response at work, expected "
+                "an executor whose workers stay; make a new one, and look at what its workers do "
                 "when they start: its initializer, or a script that runs without "
                 "`if __name__ == '__main__':`"
             )
 
     def submitted(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Return work as a future: done already without an executor, failed if that is broken."""
+        """Return a future of the work; without an executor it is finished."""
         future: Future[Any] = Future()
         try:
             if self.executor is not None:
@@ -190,35 +273,34 @@ class Pool:
             future.set_exception(error)
         return future
 
-    def done(self, begun: Iterable[Future[Any]]) -> set[Future[Any]]:
-        """Return futures that are done; waits for one, and says so after a minute.
+    def done(self, futures: Iterable[Future[Any]]) -> set[Future[Any]]:
+        """Wait until a future is finished, and return those that are; log a long silence.
 
         Raises
         ------
         ResponseError
-            If no worker is left, so that none will ever be done.
+            If there has been no worker for ten minutes.
         """
-        waiting = list(begun)
+        waiting = list(futures)
         silent, absences = 0.0, 0
         while True:
-            # Those that a pool cancels when it is closed, `wait` waits for in vain.
-            found = {future for future in waiting if future.cancelled()}
-            patience = 0.0 if found else _SILENCE
-            found |= wait(waiting, timeout=patience, return_when=FIRST_COMPLETED).done
-            if found or not waiting:
-                return found
+            # `wait` never returns futures that a pool cancels when it is closed.
+            finished = {future for future in waiting if future.cancelled()}
+            timeout = 0.0 if finished else _SILENCE
+            finished |= wait(waiting, timeout=timeout, return_when=FIRST_COMPLETED).done
+            if finished or not waiting:
+                return finished
             silent += _SILENCE
-            absent = _threads(self.executor) == {}
-            absences = absences + 1 if absent else 0
-            workers = ", and there is no worker" if absent else ""
+            has_workers = _dask_threads(self.executor) != {}
+            absences = 0 if has_workers else absences + 1
             _log.warning(
                 "%s: no response for %.0f s; %d chunks are at work%s",
                 self.name,
                 silent,
                 len(waiting),
-                workers,
+                "" if has_workers else ", and there is no worker",
             )
-            if absences == _ABSENCES:
+            if absences == 10:  # a worker that starts again on a busy machine is away for minutes
                 for future in waiting:
                     future.cancel()
                 raise ResponseError(
@@ -226,21 +308,3 @@ class Pool:
                     "expected workers; start some, wait for them, and run again: with store= "
                     "nothing that was computed is computed again"
                 )
-
-
-def _alike(executor: Executor, kind: type[Executor]) -> Executor:
-    """Return a new executor of processes like one whose workers were lost.
-
-    How one was made, the standard library and loky keep under the same names.
-    """
-    known = signature(kind).parameters
-    made: dict[str, Any] = {"max_workers": getattr(executor, "_max_workers", None)}
-    for name, kept in (
-        ("mp_context", "_mp_context"),
-        ("context", "_context"),
-        ("initializer", "_initializer"),
-        ("initargs", "_initargs"),
-    ):
-        if name in known and getattr(executor, kept, None) is not None:
-            made[name] = getattr(executor, kept)
-    return kind(**made)

@@ -329,3 +329,20 @@ def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
             "call it inside `with pm.Model():` or pass model="
         )
     return found.root
+
+
+# -- batches ---------------------------------------------------------------------------------------
+
+
+def batch_shape(values: Sequence[Any], event_ndims: Sequence[int]) -> tuple[int, ...]:
+    """Return the shape that the leading axes of arrays (..., *event) broadcast to."""
+    leading = [v.shape[: v.ndim - k] for v, k in zip(values, event_ndims, strict=True)]
+    return np.broadcast_shapes(*leading)
+
+
+def broadcast_batch(
+    values: Sequence[Any], event_ndims: Sequence[int], batch: tuple[int, ...]
+) -> list[Any]:
+    """Return arrays (..., *event) with their leading axes broadcast to ``batch``."""
+    pairs = zip(values, event_ndims, strict=True)
+    return [np.broadcast_to(v, batch + v.shape[v.ndim - k :]) for v, k in pairs]

@@ -1,4 +1,4 @@
-"""The user's response: a function, its inputs, and how it is called; shapes and counts."""
+"""The user's response: a function with its inputs, settings and counts of runs."""
 
 from __future__ import annotations
 
@@ -14,25 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 
 from prbayes._validate import Floats, called, executes, folder_path
-from prbayes.response.batch_consistency import refuse_mixing
-from prbayes.response.broadcasting import batch_shape, broadcast_batch
 from prbayes.response.budget import budget
-from prbayes.response.call import (
-    Calling,
-    Points,
-    Tally,
-    checked,
-    respond,
-    scalar,
-    shapes,
-)
+from prbayes.response.call import Points, checked, scalar, shapes
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.discrepancy import caveats_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
-from prbayes.response.inputs import Inputs
+from prbayes.response.inputs import Inputs, batch_shape, broadcast_batch
 from prbayes.response.outputs import ONE, Outputs, outputs_of_result
 from prbayes.response.store import Store
 
@@ -40,7 +32,7 @@ _log = logging.getLogger("prbayes")
 
 
 def refuse_uncallable(name: str, function: object) -> None:
-    """Raise if a response is no function: often the inputs were given first."""
+    """Raise if a response is no function: often the inputs were passed first."""
     if not callable(function) or isinstance(function, type):
         got = called(function) if isinstance(function, type) else type(function).__name__
         raise TypeError(
@@ -62,21 +54,18 @@ def refuse_coarse(label: str, function: object) -> None:
 def refuse_misfit(
     name: str, function: object, sizes: Callable[[], list[int]], outputs: Outputs | None
 ) -> None:
-    """Raise if a function of one specimen says that it takes other inputs, or gives other outputs.
-
-    Those that know it have a method of this name; nothing is computed yet.
-    """
+    """Raise if a function of one specimen declares other inputs or outputs, by a method of it."""
     refuse = getattr(getattr(function, "function", None), "refuse_misfit", None)
     if refuse is not None:
         refuse(name, sizes(), outputs)
 
 
 def refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
-    """Raise if a function says that it takes more or fewer arguments than there are inputs."""
-    own: Any = function.function if isinstance(function, scalar) else function
+    """Raise if the signature of a function has more or fewer arguments than there are inputs."""
+    inner: Any = function.function if isinstance(function, scalar) else function
     try:
-        # Of a decorated function: what it takes itself.
-        signature = inspect.signature(own, follow_wrapped=False)
+        # Of a decorated function its own signature, not that of the function inside.
+        signature = inspect.signature(inner, follow_wrapped=False)
     except (TypeError, ValueError):
         return
     try:
@@ -90,11 +79,15 @@ def refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
 
 
 def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
-    """Raise if one of the arguments that say how a response is called is not of its kind."""
+    """Raise if an argument that says how a response is called has the wrong type."""
     executes(executor, "executor")
     if store is not None:
         folder_path(store, "store")
-    refuse_version(version)
+    if version is not None and (not isinstance(version, str) or not version):
+        raise TypeError(
+            f"version: got {type(version).__name__} {version!r:.60}, expected a text that names "
+            "the response as it is, such as '2' or 'mesh 3, solver 1.4'"
+        )
     if not isinstance(on_failure, OnFailure):
         raise TypeError(
             f"on_failure: got {called(on_failure)}, expected prb.response.Abort(), "
@@ -102,58 +95,46 @@ def refuse_calling(executor: object, store: object, version: object, on_failure:
         )
 
 
-def refuse_version(version: object) -> None:
-    """Raise if a version is no text, or an empty one."""
-    if version is not None and (not isinstance(version, str) or not version):
-        raise TypeError(
-            f"version: got {type(version).__name__} {version!r:.60}, expected a text that names "
-            "the response as it is, such as '2' or 'mesh 3, solver 1.4'"
-        )
-
-
 @dataclass
 class Runs:
-    """Runs of a response that several simulators share, which have the same inputs and settings."""
+    """Runs of a response that simulators with the same inputs and settings share."""
 
-    # Batches of stored points, each (n, *event) for each aleatory input, and their responses,
-    # (n,) or (n, m).
+    # Batches of stored points, (n, *event) for each aleatory input, and their responses, (n,) or
+    # (n, m).
     stored: list[tuple[list[Floats], Floats]] = field(default_factory=list)
-    # What the response was called with last, and what it gave.
-    last: tuple[list[Floats], Floats] | None = None
-    several: bool = False  # whether there is more than one simulator
+    last: tuple[list[Floats], Floats] | None = None  # inputs and responses of the last call
+    is_shared: bool = False
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "last": None}
 
     def at(self, points: Sequence[Floats]) -> Floats | None:
-        """Return the responses of a batch that is stored, (n,) or (n, m), None if it is not."""
-        return next((values for known, values in self.stored if _alike(known, points)), None)
+        """Return the responses of a stored batch, (n,) or (n, m), None if it is not stored."""
+        return next((values for known, values in self.stored if _equal(known, points)), None)
 
-    def repeated(self, given: list[Floats]) -> Floats | None:
-        """Return what the last call gave if another simulator's was the same, else None."""
-        if not self.several or self.last is None or not _alike(self.last[0], given):
+    def repeated(self, inputs: list[Floats]) -> Floats | None:
+        """Return the responses of the last call if a shared one had the same inputs, else None."""
+        if not self.is_shared or self.last is None or not _equal(self.last[0], inputs):
             return None
         return self.last[1].copy()
 
-    def note(self, given: list[Floats], found: Floats) -> None:
-        """Keep a call for the simulator that comes next; of one simulator only a small one."""
-        if self.several or found.size <= _TRIAL:
-            self.last = [x.copy() for x in given], found.copy()
+    def record(self, inputs: list[Floats], responses: Floats) -> None:
+        """Keep a call for the next simulator; before there is one, only a small call.
+
+        That is the trial at some points of the prior, which all of them make.
+        """
+        if self.is_shared or responses.size <= 64:
+            self.last = [x.copy() for x in inputs], responses.copy()
         else:
             self.last = None
-
-
-# Responses of a call that is kept before another simulator is there: the trial at some points of
-# the prior, which both of them make.
-_TRIAL = 64
 
 
 class Responses:
     """The user's response: a function of inputs, and how it is called.
 
-    A function that takes whole batches, with nothing else asked for, is called once for each batch
-    (``plain``). Every other goes through `respond`: on an executor, in chunks, with a store and a
-    failure policy.
+    A function of whole batches without other settings is called once for each batch (``plain``).
+    Every other one goes through `respond`: on an executor, in chunks, with a store and a failure
+    policy.
 
     Parameters
     ----------
@@ -172,7 +153,7 @@ class Responses:
     timeout : float, optional
         Seconds.
     outputs : Outputs, optional
-        What a run gives; one number by default, and with None whatever it does.
+        Outputs of a run; one number by default, and with None those of the first run.
 
     Attributes
     ----------
@@ -181,8 +162,8 @@ class Responses:
     scatters : bool or None
         Whether the response has different values at the same point; None while it is not known.
     on_start : callable or None
-        ``on_start(runs, seconds)``, called with the number of runs that a call takes, and the time
-        of one of them as soon as it is known: NaN before a function is called for a whole batch.
+        ``on_start(runs, seconds)``, called with the number of runs of a call, and the time of one
+        run as soon as it is known: NaN before a function is called for a whole batch.
     """
 
     def __init__(
@@ -205,11 +186,15 @@ class Responses:
         for caveat in caveats_of(function):
             _log.warning("%s", caveat)
         policy = Abort() if on_failure is None else on_failure
-        kept = None
+        opened = None
         if store is not None:
-            size = None if outputs is None else max(1, len(outputs.labels))
-            named = _with_names(version, outputs)
-            kept = Store(store, name, columns=_columns(inputs), version=named, outputs=size)
+            columns, n_outputs = sum(_sizes(inputs)), None
+            if outputs is not None:
+                n_outputs = max(1, len(outputs.labels))
+                if version is not None and outputs.keys:
+                    # In another order they are other numbers.
+                    version = f"{version} ({', '.join(outputs.names)})"
+            opened = Store(store, name, columns=columns, version=version, outputs=n_outputs)
         self.name = name
         self.outputs = outputs
         self.function = function
@@ -223,32 +208,31 @@ class Responses:
         self.count = 0
         self.scatters: bool | None = None
         self.on_start: Callable[[int, float], None] | None = None
-        self._looked = False  # whether specimens are computed by themselves
-        self._found = 0
         self.runs = Runs()
+        self._checks_batches = self.plain
+        self._n_reused = 0
         self._calling = Calling(
-            name, function, executor, kept, policy, retry_failed, timeout, outputs
+            name, function, executor, opened, policy, retry_failed, timeout, outputs
         )
         self._tally = Tally()
         self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
 
     def copied(self) -> Responses:
-        """Return the same function with counts of its own; executor and store are the same."""
+        """Return the same function with its own counts, and the same executor and store."""
         other = copy.copy(self)
         other._tally = self._tally.copied()
-        # What is known stays known; what is computed from here on is each one's own.
         other.runs = Runs(list(self.runs.stored))
         return other
 
     def share(self, other: Responses) -> None:
-        """Compute nothing that another one of the same response, inputs and settings has."""
+        """Use the runs of another one with the same response, inputs and settings."""
         self.runs = other.runs
-        self.runs.several = True
+        self.runs.is_shared = True
 
     @property
     def computed(self) -> int:
         """Responses computed here: without those found in a store, with those tried again."""
-        return self.count - self._found if self.plain else self._tally.computed
+        return self.count - self._n_reused if self.plain else self._tally.computed
 
     @property
     def failures(self) -> int:
@@ -257,7 +241,7 @@ class Responses:
 
     @property
     def replacement(self) -> float:
-        """What takes the place of a response that failed; NaN if nothing does."""
+        """Value in place of a response that failed; NaN if nothing is."""
         value = self._calling.on_failure.final.replacement
         return np.nan if value is None else float(value)
 
@@ -268,26 +252,34 @@ class Responses:
 
     @property
     def workers(self) -> int:
-        """How many compute at a time."""
+        """Number of workers."""
         return capacity(self._calling.executor).workers
 
     @property
     def folder(self) -> Path | None:
-        """Where responses are stored."""
+        """Folder of the store."""
         return None if self._calling.store is None else self._calling.store.folder
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, inputs and constants, and output order."""
-        mine = self.inputs.arguments
-        others = other.inputs.arguments
-        if self.function is not other.function or len(mine) != len(others):
+        if self.function is not other.function:
             return False
-        # A mapping's arrays are put together in the order of what was observed.
-        known = [each.outputs.keys for each in (self, other) if each.outputs is not None]
-        if len(set(known)) > 1:
+        arguments, other_arguments = self.inputs.arguments, other.inputs.arguments
+        if len(arguments) != len(other_arguments):
             return False
-        pairs = zip(mine, others, strict=True)
-        return all(_same(self.inputs, x, other.inputs, y) for x, y in pairs)
+        # A mapping's arrays are concatenated in the order of what was observed.
+        keys = {r.outputs.keys for r in (self, other) if r.outputs is not None}
+        if len(keys) > 1:
+            return False
+        for x, y in zip(arguments, other_arguments, strict=True):
+            if isinstance(x, int) and isinstance(y, int):
+                x, y = self.inputs.aleatory[x], other.inputs.aleatory[y]
+            if isinstance(x, int | Variable) or isinstance(y, int | Variable):
+                if x is not y:
+                    return False
+            elif not np.array_equal(x, y):
+                return False
+        return True
 
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
         """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event).
@@ -297,87 +289,78 @@ class Responses:
         ResponseError
             If the response raises, or if its result is not real numbers in the batch shape.
         """
-        given = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
-        known = self.runs.repeated(given)
+        values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
+        known = self.runs.repeated(values)
         if known is not None:
-            self.find(known.size)
+            self.count_reused(known.size)
             return known
-        found = self._computed(given)
-        self.runs.note(given, found)
-        return found
+        responses = self._as_batch(values) if self.plain else self._as_points(values)
+        self.runs.record(values, responses)
+        return responses
 
     def alone(self, aleatory: Sequence[Floats]) -> Floats:
         """Compute one specimen by itself, (1, *event) by input; no run, and not in the store."""
-        given = [np.asarray(v, dtype=np.float64) for v in aleatory]
+        values = [np.asarray(v, dtype=np.float64) for v in aleatory]
         if self.plain:
-            return self._at_once(self._filled(given), (1,), counted=False)
-        _, points = self._rows(given)
+            return self._called(values, (1,), is_run=False)
+        _, points = self._points(values)
         return respond(replace(self._calling, store=None), points, self._tally.copied())
-
-    def _computed(self, given: list[Floats]) -> Floats:
-        """Call the function for values of the inputs."""
-        if self.plain:
-            batch = batch_shape(given, self._event_ndims)
-            values = broadcast_batch(given, self._event_ndims, batch)
-            size = int(np.prod(batch, dtype=int))
-            self._started(size, np.nan)
-            clock = time.perf_counter()
-            found = self._at_once(self._filled(values), batch)
-            self._started(size, (time.perf_counter() - clock) / max(1, size))
-            self._refuse_mixing(values, batch, found)
-            return found
-        batch, points = self._rows(given)
-        self.count += len(points)
-        found = respond(self._calling, points, self._tally, self._started)
-        if self.outputs is None:
-            self.outputs = self._tally.named
-        return found.reshape(batch + found.shape[1:])
-
-    def _started(self, runs: int, seconds: float) -> None:
-        if self.on_start is not None:
-            self.on_start(runs, seconds)
-
-    def _refuse_mixing(self, values: list[Floats], batch: tuple[int, ...], found: Floats) -> None:
-        """Raise if what is computed for a batch is another thing by itself; looked at once."""
-        if self._looked or int(np.prod(batch, dtype=int)) < 2 or not batch:
-            return
-        self._looked = True
-
-        def alone(place: tuple[int, ...]) -> Floats:
-            one = [np.array(v[place])[None] for v in values]
-            return self._at_once(self._filled(one), (1,), counted=False)
-
-        refuse_mixing(self.name, batch, found, alone)
-
-    def _rows(self, given: list[Floats]) -> tuple[tuple[int, ...], Points]:
-        """Return the batch shape of values of the inputs, and their points, each a row."""
-        batch = batch_shape(given, self._event_ndims)
-        values = broadcast_batch(given, self._event_ndims, batch)
-        n = int(np.prod(batch, dtype=int))
-        flat = [v.reshape(n, *v.shape[len(batch) :]) for v in values]
-        varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
-        return batch, Points(self._filled(flat), varying)
 
     def count_symbolic(self, size: int) -> None:
         """Count responses that are computed in a graph."""
         budget().grant(size, least=size)
         self.count += size
 
-    def find(self, size: int) -> None:
-        """Count responses that were known and are needed again."""
+    def count_reused(self, size: int) -> None:
+        """Count responses that are known and needed again."""
         self.count += size
-        self._found += size
+        self._n_reused += size
 
-    def _filled(self, values: Sequence[Floats]) -> list[Any]:
+    def _as_batch(self, values: list[Floats]) -> Floats:
+        """Return the responses of one call of the function."""
+        batch = batch_shape(values, self._event_ndims)
+        values = broadcast_batch(values, self._event_ndims, batch)
+        size = int(np.prod(batch, dtype=int))
+        if self.on_start is not None:
+            self.on_start(size, np.nan)
+        clock = time.perf_counter()
+        responses = self._called(values, batch)
+        if self.on_start is not None:
+            self.on_start(size, (time.perf_counter() - clock) / max(1, size))
+        if self._checks_batches and size > 1:
+            self._checks_batches = False
+            self._refuse_mixing(values, batch, responses)
+        return responses
+
+    def _as_points(self, values: list[Floats]) -> Floats:
+        """Return the responses by `respond`, each specimen a point."""
+        batch, points = self._points(values)
+        self.count += len(points)
+        responses = respond(self._calling, points, self._tally, self.on_start)
+        if self.outputs is None:
+            self.outputs = self._tally.named
+        return responses.reshape(batch + responses.shape[1:])
+
+    def _points(self, values: list[Floats]) -> tuple[tuple[int, ...], Points]:
+        """Return the batch shape of values of the inputs, and their points, each a row."""
+        batch = batch_shape(values, self._event_ndims)
+        n = int(np.prod(batch, dtype=int))
+        full = broadcast_batch(values, self._event_ndims, batch)
+        rows = [v.reshape(n, *v.shape[len(batch) :]) for v in full]
+        varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
+        return batch, Points(self._arguments(rows), varying)
+
+    def _arguments(self, values: Sequence[Floats]) -> list[Any]:
         """Return the function's arguments from values of aleatory, then epistemic inputs."""
         k = len(self.inputs.aleatory)
         return self.inputs.fill(values[:k], values[k:])
 
-    def _at_once(
-        self, arguments: Sequence[Any], batch: tuple[int, ...], *, counted: bool = True
+    def _called(
+        self, values: Sequence[Floats], batch: tuple[int, ...], *, is_run: bool = True
     ) -> Floats:
         """Call the function once for a batch of any shape."""
-        size = int(np.prod(batch, dtype=int)) if counted else 0
+        arguments = self._arguments(values)
+        size = int(np.prod(batch, dtype=int)) if is_run else 0
         budget().grant(size, least=size)
         try:
             with np.errstate(all="ignore"):
@@ -396,25 +379,45 @@ class Responses:
         except ResponseError as error:
             raise ResponseError(f"{self.name}: {error}") from None
 
+    def _refuse_mixing(
+        self, values: Sequence[Floats], batch: tuple[int, ...], responses: Floats
+    ) -> None:
+        """Raise if a specimen has another response alone than in its batch; one run, rarely two."""
+        event = responses.shape[len(batch) :]
+        rows = responses.reshape(-1, int(np.prod(event, dtype=int)))
+        finite = np.isfinite(rows).all(axis=1)
+        if finite.sum() < 2:
+            return
+        first = int(np.flatnonzero(finite)[0])
+        place = np.unravel_index(first, batch)
 
-def _with_names(version: str | None, outputs: Outputs | None) -> str | None:
-    """Return a version with the names of the outputs: in another order they are other numbers.
+        def alone() -> Floats:
+            # Copies, which the function may change in place.
+            specimen = [np.array(v[place])[None] for v in values]
+            return self._called(specimen, (1,), is_run=False).ravel()
 
-    Without a version a stored response is computed again, and tells.
-    """
-    if version is None or outputs is None or not outputs.keys:
-        return version
-    return f"{version} ({', '.join(outputs.names)})"
-
-
-def _columns(inputs: Inputs) -> int:
-    """Return of how many numbers the inputs of one point are made, constants included."""
-    # One that stands for several arguments counts once for each.
-    return sum(_sizes(inputs))
+        try:
+            single = alone()
+            # A solver that steps a batch as one system differs by up to .01 spreads; a mean, a sum
+            # or another order over specimens by about one.
+            if not (np.abs(rows[first] - single) > 0.01 * rows[finite].std(axis=0)).any():
+                return
+            # A response with scatter of its own is no mixing.
+            if (np.abs(alone() - single) > 1e-6 * np.abs(single)).any():
+                return
+        except ResponseError:  # it takes no batch of one
+            return
+        worst = int(np.nanargmax(np.abs(rows[first] - single)))
+        raise ResponseError(
+            f"{self.name}: the response of a specimen depends on those that it is computed with: "
+            f"got {single[worst]:.6g} by itself, and {rows[first, worst]:.6g} among {len(rows)}, "
+            "expected the same; look for a mean, a sum, a sort or another order over the axis of "
+            "specimens, or write it for one specimen, in prb.scalar"
+        )
 
 
 def _sizes(inputs: Inputs) -> list[int]:
-    """Return of how many numbers each argument of one point is made."""
+    """Return how many numbers each argument of one point has."""
     sizes = []
     for argument in inputs.arguments:
         if isinstance(argument, int):
@@ -427,17 +430,86 @@ def _sizes(inputs: Inputs) -> list[int]:
     return sizes
 
 
-def _same(inputs: Inputs, x: Any, others: Inputs, y: Any) -> bool:
-    """Return whether arguments of two responses are the same input, or equal constants."""
-    if isinstance(x, int) or isinstance(y, int):
-        both = isinstance(x, int) and isinstance(y, int)
-        return both and inputs.aleatory[x] is others.aleatory[y]
-    if isinstance(x, Variable) or isinstance(y, Variable):
-        return x is y
-    return np.array_equal(x, y)
-
-
-def _alike(some: Sequence[Floats], others: Sequence[Floats]) -> bool:
-    """Return whether arrays are the same, one by one."""
-    pairs = zip(some, others, strict=True)
+def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:
+    pairs = zip(arrays, others, strict=True)
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
+# -- points that repeat ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Known:
+    """Points whose responses are known."""
+
+    points: Sequence[Floats]  # (m, *event) for each aleatory input
+    values: Floats  # (m,), or (m, outputs)
+
+
+def once_each(responses: Responses, points: Sequence[Floats], known: Known | None) -> Floats:
+    """Return the responses at points, (n,) or (n, m); each different point is computed once.
+
+    Discrete inputs have few values, and a censored input repeats its bounds. If four points that
+    are computed again differ, the response has scatter of its own and is computed at all points.
+
+    Parameters
+    ----------
+    responses : Responses
+        Without epistemic inputs.
+    points : sequence of ndarray, shapes (n, *event)
+        One for each aleatory input.
+    known : Known, optional
+    """
+    n = len(points[0])
+    known_values = np.empty(0) if known is None else known.values
+    m = len(known_values)
+    keys = _keys(points)
+    if known is not None:
+        keys = np.concatenate([_keys([x[:m] for x in known.points]), keys])
+    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
+    earliest = first[which]
+    is_new = earliest[m:] == np.arange(m, m + n)
+    if is_new.all() or responses.scatters:
+        return responses(points, [])
+
+    new, repeated = np.flatnonzero(is_new), np.flatnonzero(~is_new)
+    again = repeated[:0]
+    if responses.scatters is not False:
+        # Different points; a response that is zero or one by chance passes four once in 16 times.
+        _, place = np.unique(earliest[m:][repeated], return_index=True)
+        again = repeated[np.sort(place)[:4]]
+    rows = np.concatenate([new, again])
+    rest = np.setdiff1d(repeated, again)
+    computed = responses([x[rows] for x in points], []) if rows.size else known_values[:0]
+    event = computed.shape[1:]
+    values = np.full((m + n, *event), np.nan)
+    values[:m] = known_values.reshape(m, *event)
+    values[m + new] = computed[: new.size]
+    second = computed[new.size :]
+    if again.size:
+        responses.scatters = not _equal_up_to_rounding(values[earliest[m + again]], second)
+    if responses.scatters:
+        values[m + again] = second
+        if rest.size:
+            values[m + rest] = responses([x[rest] for x in points], [])
+        return values[m:]
+    responses.count_reused(rest.size)
+    return values[earliest[m:]]
+
+
+def _keys(points: Sequence[Floats]) -> NDArray[np.void]:
+    """Return the bits of all numbers of each point as one item, shape (n,)."""
+    columns = []
+    for x in points:
+        size = int(np.prod(x.shape[1:], dtype=int))
+        columns.append(np.asarray(x, dtype=np.float64).reshape(len(x), size))
+    rows = np.concatenate(columns, axis=1)
+    bits = np.ascontiguousarray(rows + 0.0)  # -0.0 becomes 0.0
+    return bits.view(np.dtype((np.void, bits.dtype.itemsize * bits.shape[1]))).ravel()
+
+
+def _equal_up_to_rounding(values: Floats, again: Floats) -> bool:
+    # By output, as units may differ.
+    finite = np.where(np.isfinite(values), np.abs(values), 0.0)
+    scale = finite.max(axis=0, initial=0.0)
+    return np.allclose(values, again, rtol=1e-6, atol=1e-6 * scale, equal_nan=True)

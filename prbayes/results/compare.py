@@ -36,10 +36,10 @@ from prbayes.model.elements import (
     with_coordinates,
 )
 from prbayes.model.emulated import PopulationSimulator
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.fingerprint import as_attributes, require_together
 from prbayes.model.labels import labelled
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.design_refinement import reached
@@ -54,7 +54,7 @@ _METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), _KERNEL)
 _BY_SPECIMEN = "LogLikelihood by specimen"
 
 
-@in_turn
+@locked
 def compare(
     results: Mapping[str, Optimum | xr.DataTree],
     *,
@@ -312,7 +312,7 @@ def _scores(
 
     Where asked, designs that were never led anywhere reach them first.
     """
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     if metrics is None and evaluator.responses_per_theta:
         return {}  # a comparison that was not asked for scores computes no response
     thetas = _thetas(evaluator, names, estimates)
@@ -337,7 +337,7 @@ def _scored(
             scores = _discrepancies(evaluator, thetas, k, target)
             key = f"{before}{_class_of(metric)}"
             found[key] = np.where(supported, scores, np.nan)
-    for name, values in evaluator.specimen_log_likelihoods(thetas).items():
+    for name, values in specimen_log_likelihoods(evaluator, thetas).items():
         before = f"{name} " if several else ""
         if values.size:
             found[f"{before}{_BY_SPECIMEN}"] = -values.mean(axis=1)
@@ -380,4 +380,4 @@ def _thetas(evaluator: Evaluator, names: list[str], estimates: Floats) -> Floats
             return None
         places = [names.index(element) for element in elements]
         values.append(estimates[:, places].reshape(-1, *shape))
-    return evaluator.thetas_of(values)
+    return evaluator.hyperparameters.thetas_of(values)

@@ -29,7 +29,7 @@ from prbayes.model.elements import (
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.caveats import small_simulators
 from prbayes.optimize.optimum import NO_RESPONSE, TOLD_SHARE, Optimum, compared_in, require_of_model
 from prbayes.response.inputs import model_on_context
@@ -107,7 +107,7 @@ class Diagnosis:
         return view(heading, sentences=[*self.messages, *remarks])
 
 
-@in_turn
+@locked
 def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) -> Diagnosis:
     """Say in sentences what is wrong with a result, and what to do, whichever sampler gave it.
 
@@ -382,12 +382,12 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         designs = _stored(result["calibration"].to_dataset())
         by_specimen = _is_by_specimen(result)
         if model is not None and by_specimen:
-            evaluator = Evaluator(model)
+            evaluator = Evaluator.of(model)
             thetas = _thetas(posterior, model)
     else:
         model = model_on_context(model, "prb.diagnose")
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         thetas = _thetas(posterior, model)
         designs = _computed(evaluator, thetas)
         by_specimen = not evaluator.nodes
@@ -576,7 +576,7 @@ def _thetas(posterior: Any, model: pm.Model) -> Floats:
     if missing:
         raise KeyError(f"posterior: got no {missing}, expected the model's free variables {names}")
     draws = finite_draws(posterior, names)
-    return Evaluator(model).thetas_of(list(draws.values()))
+    return Evaluator.of(model).hyperparameters.thetas_of(list(draws.values()))
 
 
 # -- designs ---------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ from prbayes.inference.checks.population_test import (
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.inference.identifiability import oriented
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import roots_of
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.minimize import Minimisation, find_optimum
 from prbayes.optimize.optimum import Optimum
@@ -275,7 +276,7 @@ def _points(
         z = np.empty((*log_a.shape, likelihood.coordinates.size))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
-            roots = evaluator.roots_of(theta[None], likelihood.inputs, place)
+            roots = roots_of(evaluator.hyperparameters, theta[None], likelihood.inputs, place)
             of_group = [x[rows] for x in points]
             z[rows], weights[rows] = score.at(likelihood.inputs, roots, of_group, log_a[rows])
         result.append((z, weights))
@@ -304,7 +305,7 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
                 "that needs the model; pass model=.",
             )
         )
-    center = thetas.reshape(-1, evaluator.size).mean(axis=0)
+    center = thetas.reshape(-1, evaluator.hyperparameters.size).mean(axis=0)
     checked += Checked(failing_region_findings(evaluator, center), emulator_notes(evaluator))
     obstacle = simulation_obstacle(evaluator)
     if obstacle is not None:
@@ -383,10 +384,10 @@ def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
         return _conflict_not_tested("nothing is known of the sampling distribution of the optimum")
     if any(rival["comparable"] for rival in optimum.rivals):
         return _conflict_not_tested("the likelihood has several modes")
-    draws = thetas.reshape(-1, evaluator.size)
+    draws = thetas.reshape(-1, evaluator.hyperparameters.size)
     errors = np.sqrt(np.diag(optimum.covariance))
     pulls = np.abs(draws.mean(axis=0) - optimum.theta) / errors
-    names = evaluator.names
+    names = evaluator.hyperparameters.names
     j = int(pulls.argmax())
     shift = (
         f"The posterior mean of {names[j]} is {pulls[j]:.2f} standard errors from the estimate "
@@ -394,7 +395,7 @@ def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
     )
     if pulls[j] <= _OPTIONS.pull:
         return Checked(notes=(f"{shift}, less than a conflict with the prior that matters.",))
-    prior = evaluator.prior_thetas(_OPTIONS.prior_draws, 0)
+    prior = evaluator.hyperparameters.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)
     if np.isfinite(predictive).all(axis=1).mean() < 0.5:
         return _conflict_not_tested(
@@ -454,12 +455,12 @@ def _covariance(
     rng: np.random.Generator,
 ) -> Floats:
     """Return the inverse information of the inputs of all specimens, (d, d); NaN if singular."""
-    step = 1e-3 * evaluator.prior_sd
+    step = 1e-3 * evaluator.hyperparameters.prior_sd
     around = cross(theta, step)
     information = np.zeros((theta.size, theta.size))
     for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
         for place, rows in likelihood.by_group:
-            roots = evaluator.roots_of(around, likelihood.inputs, place)
+            roots = roots_of(evaluator.hyperparameters, around, likelihood.inputs, place)
             specimens, _ = sampler([root[:1] for root in roots], _OPTIONS.specimens, rng)
             (log_p,) = log_density(*roots, *[x[0] for x in specimens])
             log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))

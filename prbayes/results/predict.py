@@ -34,7 +34,7 @@ from prbayes.model.fingerprint import (
     require_same_responses,
 )
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
@@ -50,7 +50,7 @@ from prbayes.response.response import Responses, refuse_calling, refuse_uncallab
 _log = logging.getLogger("prbayes")
 
 
-@in_turn
+@locked
 def predict(
     result: Optimum | xr.DataTree,
     response: Callable[..., Any],

@@ -1,4 +1,4 @@
-"""Validity: do measured responses agree with the calibrated population? The area test."""
+"""The area test: whether measured responses agree with the calibrated population."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, share
 from prbayes.model.fingerprint import Identity, as_attributes
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.results.predict import data_digest
-from prbayes.validation.conditions import DIRECTION, Case, Condition, Predicted, read_case
-from prbayes.validation.exact_null import ExactModel
-from prbayes.validation.nulls import Null, PosteriorNull
+from prbayes.validation.conditions import DIRECTION, Case, Predicted, read_case
+from prbayes.validation.nulls import ExactModel, Null, PosteriorNull
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,18 +33,18 @@ class ValidityTest:
     p_value : float
     alpha : float
     null : str
-        What was held to be true.
+        The null hypothesis.
     folded : bool
         Whether the area is that of ``|2u - 1|``.
     u_values : ndarray, shape (n,)
         Of all conditions, one after the other.
     envelope : ndarray, shape (2, n)
-        Bounds of the sorted values that are tested; under the null they hold all of them with
-        probability 1 - ``alpha``.
+        Bounds of the sorted values that are tested; under the null all of them are between the
+        bounds with probability 1 - ``alpha``.
     conditions, specimens : ndarray of str, shape (n,)
-        Where each u-value comes from.
+        The condition and the specimen of each u-value.
     identity : Identity or None
-        Of the problem whose calibration is tested, where the predictions tell.
+        Of the problem whose calibration is tested, if the predictions have it.
     """
 
     statistic: float
@@ -67,24 +66,23 @@ class ValidityTest:
 
     @property
     def of_conditions(self) -> list[str]:
-        """The conditions that were tested, each once, in their order."""
+        """The tested conditions, in their order."""
         names = [name.split(DIRECTION)[0] for name in self.conditions.tolist()]
         return list(dict.fromkeys(names))
 
     def __repr__(self) -> str:
         verdict = "rejected" if self.rejected else "not rejected"
-        what = "area of |2u - 1|" if self.folded else "area"
-        values = self.u_values.size
-        specimens = np.unique(self.specimens).size
-        conditions = len(self.of_conditions)
-        under = "1 condition" if conditions == 1 else f"{conditions} conditions"
-        directions = np.unique(self.conditions).size
-        seen = f", seen in {directions} directions" if directions > conditions else ""
+        area = "area of |2u - 1|" if self.folded else "area"
+        n_specimens = np.unique(self.specimens).size
+        n_conditions = len(self.of_conditions)
+        conditions = "1 condition" if n_conditions == 1 else f"{n_conditions} conditions"
+        n_directions = np.unique(self.conditions).size
+        directions = f", seen in {n_directions} directions" if n_directions > n_conditions else ""
         return (
             f"ValidityTest: {verdict} at level {self.alpha:g}\n"
-            f"  {what} {self.statistic:.4f}, critical value {self.critical_value:.4f}, "
+            f"  {area} {self.statistic:.4f}, critical value {self.critical_value:.4f}, "
             f"p-value {self.p_value:.3g}\n"
-            f"  {values} values of {specimens} specimens, {under}{seen}\n"
+            f"  {self.u_values.size} values of {n_specimens} specimens, {conditions}{directions}\n"
             f"  null: {self.null}"
         )
 
@@ -94,10 +92,7 @@ class ValidityTest:
         return view(heading, sentences=sentences)
 
     def to_dataset(self) -> xr.Dataset:
-        """Return the result as a Dataset, which ``to_netcdf`` saves.
-
-        The dimension ``rank`` is that of the envelope.
-        """
+        """Return the result as a Dataset; its dimension ``rank`` is that of the envelope."""
         return xr.Dataset(
             {
                 "u": ("observation", self.u_values),
@@ -118,7 +113,7 @@ class ValidityTest:
         )
 
 
-@in_turn
+@locked
 def area_test(
     observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
     predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
@@ -141,16 +136,16 @@ def area_test(
 
     .. math:: A = \int_0^1 |F_n(v) - v| \, dv
 
-    It sees a wrong mean well and a wrong spread hardly; the area of ``|2u - 1|`` sees a wrong
-    spread.
+    It has much power against a wrong mean and little against a wrong spread, against which the area
+    of ``|2u - 1|`` has power.
 
     Parameters
     ----------
     observed : array_like, shape (n,) or (n, m); or a mapping or list of such, by condition
-        Measured on specimens that were not used in the calibration, but with `JointNull`. +inf is a
-        specimen that had failed. Several outputs of a specimen, (n, m), are seen in directions of
-        the whitened predicted ones; the statistic is the mean over these of the areas of u and
-        ``|2u - 1|``, since a wrong correlation is a wrong spread in some of them.
+        Measured on specimens that were not used in the calibration, except with `JointNull`. +inf
+        is a specimen that had failed. Several outputs of a specimen, (n, m), are projected on
+        directions of the whitened predicted ones; the statistic is the mean over these of the areas
+        of u and ``|2u - 1|``, since a wrong correlation is a wrong spread in some of them.
     predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
         Leading axes are draws of the posterior, the last one specimens, (..., S, m) with m outputs.
         NaN are left out.
@@ -161,9 +156,9 @@ def area_test(
         `ExactModel`. `JointNull` for the calibration's own specimens.
     specimens : as ``observed``, optional
         Labels. Values with the same label, also of several conditions, are of one specimen, and
-        replicates of the null then are as dependent as they: sample i of a draw must be the same
-        specimen in all conditions, as `predict` has it with the same seed. Without labels all
-        values are of different specimens.
+        replicates of the null are equally dependent: sample i of a draw must be the same specimen
+        in all conditions, as in results of `predict` with the same seed. Without labels all values
+        are of different specimens.
     folded : bool
         Whether to test ``|2u - 1|``, which a right model makes uniform as well: responses too far
         out, or too close to the middle. Two tests at ``alpha`` / 2 look at both mean and spread.
@@ -180,9 +175,8 @@ def area_test(
     ------
     TypeError, ValueError
         If an argument is not as described; if the data, or labels, are those of the calibration and
-        the null does not allow for it; if specimens are shared by conditions that were not
-        predicted for the same specimens; if conditions were predicted by calibrations of different
-        problems.
+        the null does not allow for it; if conditions share specimens but their predictions do not;
+        if conditions were predicted by calibrations of different problems.
 
     References
     ----------
@@ -200,7 +194,12 @@ def area_test(
     >>> prb.area_test(rng.normal(2, 1, 20), predicted).rejected
     True
     """
-    _refuse_null(null)
+    if null is not None and not isinstance(null, Null):
+        raise TypeError(
+            f"null: got {type(null).__name__} {null!r:.60}, expected "
+            "prb.validation.PosteriorNull(), prb.validation.ExactModel() or "
+            "prb.validation.JointNull(optimum)"
+        )
     alpha = share(alpha, "alpha")
     case = read_case(
         observed,
@@ -211,81 +210,116 @@ def area_test(
         random_seed=random_seed,
     )
     if null is None:
-        one_each = case.draws == 1 and not case.dependent
-        null = ExactModel() if one_each else PosteriorNull()
+        is_exact = case.n_draws == 1 and not case.is_dependent
+        null = ExactModel() if is_exact else PosteriorNull()
     if not null.own_specimens:
-        for condition in case.conditions:
-            _refuse_own(condition)
-    if case.shared:
-        _refuse_unlike(case)
-
+        _refuse_calibration_specimens(case)
+    if case.shares_specimens:
+        _require_same_samples(case)
     u = case.u_values()
     statistic = float(case.statistic(u))
     with shown(progressbar):
-        judged = null.judge(case, statistic, alpha)
-
-    # Where each value comes from.
-    conditions = np.repeat(
-        [c.name for c in case.conditions],
-        [c.observed.size for c in case.conditions],
-    )
-    labels = [label for c in case.conditions for label in c.specimens]
+        judgement = null.judge(case, statistic, alpha)
+    names = [c.name for c in case.conditions]
     return ValidityTest(
         statistic=statistic,
-        critical_value=judged.critical_value,
-        p_value=judged.p_value,
+        critical_value=judgement.critical_value,
+        p_value=judgement.p_value,
         alpha=alpha,
         null=null.describe(case),
         u_values=u,
         folded=folded,
-        envelope=np.array([judged.lower, judged.upper]),
-        conditions=conditions,
-        specimens=np.array(labels),
+        envelope=np.array([judgement.lower, judgement.upper]),
+        conditions=np.repeat(names, [c.observed.size for c in case.conditions]),
+        specimens=np.array([label for c in case.conditions for label in c.specimens]),
         identity=case.identity,
     )
 
 
-def _refuse_null(null: object) -> None:
-    """Raise if it is no null distribution, such as a class of one."""
-    if null is not None and not isinstance(null, Null):
-        raise TypeError(
-            f"null: got {type(null).__name__} {null!r:.60}, expected "
-            "prb.validation.PosteriorNull(), prb.validation.ExactModel() or "
-            "prb.validation.JointNull(optimum)"
+def _refuse_calibration_specimens(case: Case) -> None:
+    """Raise if the model was calibrated on specimens of the test."""
+    for condition in case.conditions:
+        attributes = condition.attributes
+        calibrated = np.atleast_1d(attributes.get("calibration_specimens", [])).tolist()
+        shared = set(condition.labels or ()) & set(calibrated)
+        digests = np.atleast_1d(attributes.get("calibration_data", []))
+        if shared:
+            got = f"{len(shared)} specimens of the calibration, such as {min(shared)!r}"
+        elif data_digest(condition.measured) in digests:
+            got = "the very data of the calibration"
+        else:
+            continue
+        raise ValueError(
+            f"{condition.name}: got {got}, expected specimens that it has not seen: a model is "
+            "hardly ever rejected on those it was fitted to; test others, or pass "
+            "prb.predict(optimum, ...) and null=prb.validation.JointNull(optimum)"
         )
 
 
-def _refuse_own(condition: Condition) -> None:
-    """Raise if the model was calibrated on these specimens."""
-    notes = condition.attributes
-    calibrated = np.atleast_1d(notes.get("calibration_specimens", [])).tolist()
-    own = set(condition.labels or ()) & set(calibrated)
-    if own:
-        got = f"{len(own)} specimens of the calibration, such as {min(own)!r}"
-    elif data_digest(condition.measured) in np.atleast_1d(notes.get("calibration_data", [])):
-        got = "the very data of the calibration"
-    else:
-        return
-    raise ValueError(
-        f"{condition.name}: got {got}, expected specimens that it has not seen: a model is hardly "
-        "ever rejected on those it was fitted to; test others, or pass prb.predict(optimum, ...) "
-        "and null=prb.validation.JointNull(optimum)"
-    )
-
-
-def _refuse_unlike(case: Case) -> None:
+def _require_same_samples(case: Case) -> None:
     """Raise if conditions share specimens, but their predictions do not."""
     shapes = [c.predicted.shape for c in case.conditions]
-    notes = [c.attributes for c in case.conditions]
-    known = {attrs["specimens_id"] for attrs in notes if "specimens_id" in attrs}
-    if len(set(shapes)) > 1:
-        got = f"shapes {shapes}"
-    elif len(known) > 1:
-        got = "different specimens"
-    else:
+    attributes = [c.attributes for c in case.conditions]
+    ids = {attrs["specimens_id"] for attrs in attributes if "specimens_id" in attrs}
+    if len(set(shapes)) == 1 and len(ids) <= 1:
         return
+    got = f"shapes {shapes}" if len(set(shapes)) > 1 else "different specimens"
     raise ValueError(
         f"specimens: got the same labels in several conditions, predicted with {got}, expected the "
         "same specimens in all; pass the same inputs, n_samples, draws and random_seed to "
         "prb.predict, and stored=False if designs differ"
     )
+
+
+def u_values(
+    observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
+    predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
+    *,
+    randomize: bool = False,
+    random_seed: Seed = 0,
+) -> Floats:
+    r"""Return the probability integral transform of measured responses.
+
+    .. math:: u_i = \tfrac{1}{2} \{ P(Y < y_i) + P(Y \le y_i) \}
+
+    The predictive distribution pools all draws and samples. Several conditions pool their u-values.
+
+    Parameters
+    ----------
+    observed : array_like, shape (n,); or a mapping or list of such, by condition
+        +inf is a specimen that had failed.
+    predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
+        +inf is larger than every number; NaN are left out.
+    randomize : bool
+        Whether u is uniform between P(Y < y) and P(Y <= y) instead of the middle: then u-values of
+        ties, such as failed specimens or discrete responses, are uniform too if the model is right.
+    random_seed : int, sequence of int, numpy.random.Generator or None
+        Of that choice.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the order of ``observed``, one condition after the other.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
+
+    Notes
+    -----
+    Rounded measured values have ties, unlike predicted ones: round the predicted ones alike, as in
+    ``u_values(observed, predicted.round(2))``.
+
+    References
+    ----------
+    .. [1] Czado, C., T. Gneiting and L. Held (2009), Predictive model assessment for count data,
+       Biometrics 65, 1254-1261, doi:10.1111/j.1541-0420.2009.01191.x.
+
+    Examples
+    --------
+    >>> import numpy as np, prbayes as prb
+    >>> prb.validation.u_values([0.3, 1.5, 9.0], np.array([0.0, 1.0, 2.0, 3.0]))
+    array([0.25, 0.5 , 1.  ])
+    """
+    return read_case(observed, predicted, randomize=randomize, random_seed=random_seed).u_values()

@@ -1,8 +1,8 @@
-"""What was measured and predicted, condition by condition: one form for all arguments."""
+"""Measured and predicted responses of a validation, by condition and output."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,54 +10,47 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._validate import Floats, Seed, flag, real_array, sample_labels, seed_number
-from prbayes.metrics.base import View
+from prbayes._validate import Floats, Seed, called, flag, real_array, sample_labels, seed_number
+from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
+from prbayes.metrics.views import Centered, Projection, View
+from prbayes.metrics.whitening import whitening
 from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
 from prbayes.response.outputs import Outputs, read_observed
 from prbayes.results.predict import specimen_names
-from prbayes.validation.predictive import Predictive
-from prbayes.validation.statistic import area
-from prbayes.validation.views import views
+from prbayes.validation.probability_transform import Predictive, area
 
 Predicted = xr.DataArray | NDArray[Any]
 
-# Between the name of a condition and that of a direction in which its outputs are seen.
+# Separates the name of a condition from the number of a projection of its outputs.
 DIRECTION = ", direction "
+_SAMPLE_DIMS = ("chain", "draw", "sample")
 
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """What was measured and predicted under one condition."""
+    """Measured and predicted values of one condition, or of one projection of its outputs."""
 
     name: str
     observed: Floats  # (n,)
-    predicted: Floats  # (D, S): one row per draw
-    measured: Floats  # (n,), or (n, m) of several outputs, of which the view shows what is observed
+    predicted: Floats  # (D, S): a row for each draw
+    measured: Floats  # (n,) or (n, m): before the projection
     labels: tuple[str, ...] | None  # of the specimens
-    numbers: NDArray[np.intp]  # (n,): the specimens, over all conditions
-    # Of the prediction, as `predict` notes them.
-    attributes: Mapping[Any, Any] = field(default_factory=dict)
-    view: View = field(default_factory=View)
-    # Of the values together with which it is held against the identity, and its share there.
-    group: int = 0
-    share: float = 1.0
+    numbers: NDArray[np.intp]  # (n,): the specimens, counted over all conditions
+    attributes: Mapping[Any, Any] = field(default_factory=dict)  # of the prediction
+    projection: View = field(default_factory=View)
+    group: int = 0  # values of a group have one ECDF; the number of a projection, else 0
 
     @property
-    def of(self) -> str:
-        """The name of the condition, of which this may be one direction."""
+    def base_name(self) -> str:
+        """The name of the condition without the number of a projection."""
         return self.name.split(DIRECTION)[0]
-
-    @property
-    def identity(self) -> Identity | None:
-        """Of the problem that was calibrated, where the prediction tells."""
-        return from_attributes(self.attributes)
 
     @property
     def specimens(self) -> tuple[str, ...]:
         """Names of the specimens: labels, or else the condition and a number."""
         if self.labels is not None:
             return self.labels
-        return tuple(f"{self.of}, {i}" for i in range(self.observed.size))
+        return tuple(f"{self.base_name}, {i}" for i in range(self.observed.size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +59,11 @@ class Case:
 
     conditions: tuple[Condition, ...]
     n_specimens: int
-    shared: bool  # whether a specimen occurs in several conditions
+    shares_specimens: bool  # between conditions
     randomize: bool = False  # whether u-values of ties are random within their step
     random_seed: int | None = 0
     folded: bool = False  # whether the statistic is the area of abs(2u - 1)
-    # Of the problem whose calibration predicted all conditions, where predictions tell.
-    identity: Identity | None = None
+    identity: Identity | None = None  # of the calibrated problem, if predictions have it
 
     @property
     def size(self) -> int:
@@ -79,36 +71,36 @@ class Case:
         return sum(c.observed.size for c in self.conditions)
 
     @property
-    def draws(self) -> int:
+    def n_draws(self) -> int:
         """Number of populations predicted for each condition."""
         return len(self.conditions[0].predicted)
 
     @property
-    def dependent(self) -> bool:
+    def is_dependent(self) -> bool:
         """Whether a specimen was measured several times."""
         return self.n_specimens < self.size
 
     def statistic(self, u: Floats) -> Floats:
         """Return the statistic of u-values, (..., n) -> (...).
 
-        The area of all values together. Of several outputs the mean over the directions in which
-        they are seen, and of two areas, that of u and that of abs(2u - 1): a wrong correlation is a
-        wrong spread in some of them.
+        It is the area of all values together. For several outputs it is the mean over projections
+        of the areas of u and abs(2u - 1): a wrong correlation is a wrong spread in some of them.
+        Conditions of one output count by their number of values.
         """
         tested = self.tested(u)
-        groups = np.repeat(
-            [c.group for c in self.conditions], [c.observed.size for c in self.conditions]
-        )
-        shares = {c.group: c.share for c in self.conditions}
-        if list(shares) == [0]:
+        sizes = [c.observed.size for c in self.conditions]
+        groups = np.repeat([c.group for c in self.conditions], sizes)
+        distinct = list(dict.fromkeys(c.group for c in self.conditions))
+        if distinct == [0]:
             return area(tested)
-        areas = []
-        for group, share in shares.items():
-            own = tested[..., groups == group]
-            both = group > 0 and not self.folded
-            mean = (area(own) + area(np.abs(2 * own - 1))) / 2 if both else area(own)
-            areas.append(share * mean)
-        return np.sum(areas, axis=0)
+        terms = []
+        for group in distinct:
+            values = tested[..., groups == group]
+            mean = area(values)
+            if group > 0 and not self.folded:
+                mean = (mean + area(np.abs(2 * values - 1))) / 2
+            terms.append(values.shape[-1] / self.size * mean)
+        return np.sum(terms, axis=0)
 
     def rng(self, stream: int) -> np.random.Generator | None:
         """Return a generator for the choice within ties, or None for the mid-transform."""
@@ -124,11 +116,8 @@ class Case:
     def u_values(self) -> Floats:
         """Return the u-values, one condition after the other, shape (n,)."""
         rng = self.rng(0)
-        found = []
-        for condition in self.conditions:
-            pool = Predictive(condition.predicted)
-            found.append(pool.transform(condition.observed, rng))
-        return np.concatenate(found)
+        u = [Predictive(c.predicted).transform(c.observed, rng) for c in self.conditions]
+        return np.concatenate(u)
 
 
 def read_case(
@@ -140,13 +129,7 @@ def read_case(
     randomize: bool = False,
     random_seed: Seed = 0,
 ) -> Case:
-    """Return the conditions, checked; arguments are those of `area_test`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not as described there.
-    """
+    """Return the checked conditions; arguments and errors are those of `area_test`."""
     seed = None if random_seed is None else seed_number(random_seed)
     flag(folded, "folded")
     flag(randomize, "randomize")
@@ -154,145 +137,111 @@ def read_case(
     conditions: list[Condition] = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
         y = _measured(name, measured, simulated)
-        named = _labels(name, labels, len(y))
-        # Without labels every value is of a specimen of its own.
-        keys: Sequence[object] = [(name, i) for i in range(len(y))] if named is None else named
-        own = [numbers.setdefault(key, len(numbers)) for key in keys]
-        pool = _simulated(name, simulated, y.shape[1:])
+        names: tuple[str, ...] | None = None
+        if labels is not None:
+            names = tuple(specimen_names(sample_labels(labels, len(y), f"{name}: specimens")))
+        # Without labels every value is of another specimen.
+        keys = [(name, i) for i in range(len(y))] if names is None else names
         condition = Condition(
             name=name,
             observed=y,
-            predicted=pool,
+            predicted=_simulated(name, simulated, y.shape[1:]),
             measured=y,
-            labels=named,
-            numbers=np.array(own, dtype=np.intp),
+            labels=names,
+            numbers=np.array([numbers.setdefault(key, len(numbers)) for key in keys], np.intp),
             attributes=simulated.attrs if isinstance(simulated, xr.DataArray) else {},
         )
-        conditions += [condition] if y.ndim == 1 else _in_directions(condition)
-    conditions = _with_shares(conditions)
-    _refuse_other_draws(conditions)
-    identities = {f"{c.name}: predicted": c.identity for c in conditions}
-    identity = require_together(identities, "area_test", level=Level.OPTIMUM)
-    # The directions of one condition are of the same predictions.
-    by_name = {c.of: np.unique(c.numbers).size for c in conditions}
+        conditions += [condition] if y.ndim == 1 else _projected(condition)
+    draws = [len(c.predicted) for c in conditions]
+    if len(set(draws)) > 1:
+        raise ValueError(
+            f"predicted: got {draws} draws for the conditions {[c.name for c in conditions]}, "
+            "expected the same draws of one posterior in all; pass the same result and draws= to "
+            "prb.predict"
+        )
+    identities = {f"{c.name}: predicted": from_attributes(c.attributes) for c in conditions}
+    # Projections of one condition have the same specimens.
+    n_by_condition = {c.base_name: np.unique(c.numbers).size for c in conditions}
     return Case(
         conditions=tuple(conditions),
         n_specimens=len(numbers),
-        shared=sum(by_name.values()) > len(numbers),
+        shares_specimens=sum(n_by_condition.values()) > len(numbers),
         randomize=randomize,
         random_seed=seed,
         folded=folded,
-        identity=identity,
+        identity=require_together(identities, "area_test", level=Level.OPTIMUM),
     )
 
 
-def _in_directions(condition: Condition) -> list[Condition]:
-    """Return what is seen of several outputs in each of some directions of the predicted ones."""
-    pool = condition.predicted
-    found = []
-    for k, view in enumerate(views(pool)):
-        found.append(
-            replace(
-                condition,
-                name=f"{condition.name}{DIRECTION}{k + 1}",
-                observed=view.of(condition.measured),
-                predicted=view.of(pool),
-                view=view,
-                group=k + 1,
-            )
+def _projected(condition: Condition) -> list[Condition]:
+    """Return a condition of one output for each projection of several."""
+    return [
+        replace(
+            condition,
+            name=f"{condition.name}{DIRECTION}{k}",
+            observed=projection.of(condition.measured),
+            predicted=projection.of(condition.predicted),
+            projection=projection,
+            group=k,
         )
-    return found
+        for k, projection in enumerate(projections(condition.predicted), start=1)
+    ]
 
 
-def _with_shares(conditions: list[Condition]) -> list[Condition]:
-    """Return conditions with the shares that groups of them have in the statistic.
+def projections(pool: Floats) -> list[Projection]:
+    """Return projections of predicted outputs of all draws, shape (D, S, m).
 
-    Directions share alike; a condition of one output counts by its number of values.
+    Their directions are well spread where the predicted outputs are white. Measured values have no
+    influence, so replicates have the same projections.
     """
-    total = sum(c.observed.size for c in conditions)
-    sizes: dict[int, int] = {}
-    for c in conditions:
-        sizes[c.group] = sizes.get(c.group, 0) + c.observed.size
-    return [replace(c, share=sizes[c.group] / total) for c in conditions]
+    m = pool.shape[-1]
+    rows = pool.reshape(-1, m)
+    rows = rows[~np.isnan(rows).any(axis=1)]
+    finite = rows[np.isfinite(rows).all(axis=1)]
+    # 4096 specimens determine correlations to .02; any directions give a test of the right size.
+    sample = finite[:: -(-len(finite) // 4096)]
+    outputs = np.arange(m)
+    white = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
+    centered = Centered(outputs, failure_caps(rows), white.center)
+    return [
+        Projection(centered, white.axes @ u)
+        for u in directions(m, max(1, sufficient_directions(m)), 0)
+    ]
 
 
-def _refuse_other_draws(conditions: list[Condition]) -> None:
-    """Raise if conditions were predicted with different numbers of draws."""
-    draws = [len(c.predicted) for c in conditions]
-    if len(set(draws)) > 1:
-        names = [c.name for c in conditions]
-        raise ValueError(
-            f"predicted: got {draws} draws for the conditions {names}, expected the same draws of "
-            "one posterior in all; pass the same result and draws= to prb.predict"
-        )
-
-
-def _by_condition(
-    observed: Any, predicted: Any, specimens: Any
-) -> Iterator[tuple[str, Any, Any, Any]]:
-    """Yield name, observed, predicted and specimens of each condition, from any form."""
+def _by_condition(observed: Any, predicted: Any, specimens: Any) -> list[tuple[str, Any, Any, Any]]:
+    """Return name, observed, predicted and specimens of each condition."""
     if isinstance(predicted, Mapping):
-        yield from _by_name(observed, predicted, specimens)
-    elif isinstance(predicted, list | tuple):
-        yield from _by_position(observed, predicted, specimens)
-    elif isinstance(observed, Mapping):
+        labels = {} if specimens is None else specimens  # some conditions may have none
+        for argument, given in (("observed", observed), ("specimens", labels)):
+            keys = set(given) if isinstance(given, Mapping) else None
+            is_right = keys is not None and keys <= set(predicted)
+            if not is_right or (argument == "observed" and keys != set(predicted)):
+                got = type(given).__name__ if keys is None else sorted(map(str, keys))
+                raise ValueError(
+                    f"{argument}: got {got}, expected a mapping with the conditions of predicted, "
+                    f"{[str(name) for name in predicted]}"
+                )
+        return [(str(k), observed[k], predicted[k], labels.get(k)) for k in predicted]
+    if isinstance(predicted, list | tuple):
+        n = len(predicted)
+        labels = [None] * n if specimens is None else specimens
+        for argument, given in (("observed", observed), ("specimens", labels)):
+            is_list = isinstance(given, list | tuple)
+            if not is_list or len(given) != n or not n:
+                got = f"{len(given)} conditions" if is_list else type(given).__name__
+                raise ValueError(
+                    f"{argument}: got {got}, expected a list with the {n} conditions of predicted; "
+                    "one prediction alone is an array"
+                )
+        return [(str(i), observed[i], predicted[i], labels[i]) for i in range(n)]
+    if isinstance(observed, Mapping):
         raise ValueError(
             f"predicted: got {type(predicted).__name__}, expected a mapping with the conditions of "
             "observed"
         )
-    else:
-        name = getattr(predicted, "name", None)
-        yield str(name) if name else "observed", observed, predicted, specimens
-
-
-def _by_name(
-    observed: Any, predicted: Mapping[Any, Any], specimens: Any
-) -> Iterator[tuple[str, Any, Any, Any]]:
-    """Yield conditions of mappings; labels may be of some conditions only."""
-    labels = {} if specimens is None else specimens
-    names = set(predicted)
-    _refuse_keys("observed", observed, predicted, lambda keys: keys == names)
-    _refuse_keys("specimens", labels, predicted, lambda keys: keys <= names)
-    for name in predicted:
-        yield str(name), observed[name], predicted[name], labels.get(name)
-
-
-def _refuse_keys(
-    what: str, given: Any, predicted: Mapping[Any, Any], right: Callable[[set[Any]], bool]
-) -> None:
-    """Raise if an argument is no mapping with the right keys."""
-    if isinstance(given, Mapping) and right(set(given)):
-        return
-    got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
-    names = [str(name) for name in predicted]
-    raise ValueError(
-        f"{what}: got {got}, expected a mapping with the conditions of predicted, {names}"
-    )
-
-
-def _by_position(
-    observed: Any, predicted: Sequence[Any], specimens: Any
-) -> Iterator[tuple[str, Any, Any, Any]]:
-    """Yield conditions of lists, whose names are their numbers."""
-    n = len(predicted)
-    labels = [None] * n if specimens is None else specimens
-    for what, given in (("observed", observed), ("specimens", labels)):
-        is_list = isinstance(given, list | tuple)
-        if not is_list or len(given) != n or not n:
-            got = f"{len(given)} conditions" if is_list else type(given).__name__
-            raise ValueError(
-                f"{what}: got {got}, expected a list with the {n} conditions of predicted; one "
-                "prediction alone is an array"
-            )
-    for i in range(n):
-        yield str(i), observed[i], predicted[i], labels[i]
-
-
-def _labels(name: str, labels: Any, n: int) -> tuple[str, ...] | None:
-    """Return the labels of n observations as text."""
-    if labels is None:
-        return None
-    return tuple(specimen_names(sample_labels(labels, n, f"{name}: specimens")))
+    name = getattr(predicted, "name", None)
+    return [(str(name) if name else "observed", observed, predicted, specimens)]
 
 
 def _measured(name: str, values: Any, simulated: Any) -> Floats:
@@ -303,25 +252,25 @@ def _measured(name: str, values: Any, simulated: Any) -> Floats:
             f"{name}: observed: got shape {y.shape}, expected (n,), or (n, m) for m outputs, with "
             "n >= 1 measured responses"
         )
-    bad = int((np.isnan(y) | np.isneginf(y)).sum())
-    if bad:
+    n_bad = int((np.isnan(y) | np.isneginf(y)).sum())
+    if n_bad:
         raise ValueError(
-            f"{name}: observed: got {bad} NaN or -inf among {y.size} values, expected numbers; "
+            f"{name}: observed: got {n_bad} NaN or -inf among {y.size} values, expected numbers; "
             "leave missing specimens out, and give those that had failed as +inf"
         )
     return _in_order_of(name, y, outputs, simulated) if y.ndim > 1 else y
 
 
 def _in_order_of(name: str, y: Floats, outputs: Outputs, simulated: Any) -> Floats:
-    """Return measured outputs, (n, m), in the order of predicted ones, where both have names."""
+    """Return measured outputs, (n, m), in the order of predicted ones, if both have names."""
+    if not isinstance(simulated, xr.DataArray):
+        return y
+    dims = [dim for dim in simulated.dims if dim not in _SAMPLE_DIMS]
+    if len(dims) != 1 or dims[0] not in simulated.coords:
+        return y
     default = tuple(range(len(outputs.labels)))
-    if not isinstance(simulated, xr.DataArray) or outputs.labels == default:
-        return y
-    named = [dim for dim in simulated.dims if dim not in ("chain", "draw", "sample")]
-    if len(named) != 1 or named[0] not in simulated.coords:
-        return y
-    labels = tuple(simulated.coords[named[0]].values.tolist())
-    if labels in (default, outputs.labels):
+    labels = tuple(simulated.coords[dims[0]].values.tolist())
+    if labels == outputs.labels or default in (labels, outputs.labels):
         return y
     if set(labels) != set(outputs.labels):
         raise ValueError(
@@ -334,14 +283,13 @@ def _in_order_of(name: str, y: Floats, outputs: Outputs, simulated: Any) -> Floa
 def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
     """Return predicted values, shape (D, S, *event)."""
     if isinstance(values, xr.DataArray):
-        own = ("chain", "draw", "sample")
-        if not set(own) <= set(values.dims) or len(values.dims) != 3 + len(event):
+        if not set(_SAMPLE_DIMS) <= set(values.dims) or len(values.dims) != 3 + len(event):
             also = f", and one for the {event[0]} outputs that are observed" if event else ""
             raise ValueError(
                 f"{name}: predicted: got a DataArray with dims {values.dims}, expected (chain, "
                 f"draw, sample){also}, as prb.predict returns"
             )
-        values = values.transpose(*own, ...).values
+        values = values.transpose(*_SAMPLE_DIMS, ...).values
     y = real_array(values, f"{name}: predicted")
     n_axes = 1 + len(event)
     if y.ndim < n_axes or y.size == 0 or y.shape[y.ndim - len(event) :] != event:
@@ -355,3 +303,67 @@ def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
             "specimen"
         )
     return np.asarray(y.reshape(-1, *y.shape[y.ndim - n_axes :]))
+
+
+@dataclass(frozen=True, eq=False)
+class Comparable:
+    """Measured and predicted values of one output under one condition."""
+
+    name: str  # of the condition, with the output's as an index
+    measured: Floats  # (n,): +inf is a specimen that failed
+    predicted: Floats  # (P, S): a row for each population; NaN has no weight
+
+    @property
+    def weights(self) -> Floats:
+        """Equal weights of the numbers of each population, shape (P, S)."""
+        is_number = ~np.isnan(self.predicted)
+        return is_number / np.maximum(is_number.sum(axis=1, keepdims=True), 1)
+
+
+def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
+    """Return data and predictions of the same conditions as pairs of one output each.
+
+    Of many outputs there are eight, three rows of panels. Raises TypeError or ValueError if
+    conditions or outputs differ.
+    """
+    if not isinstance(predicted, Mapping):
+        name = str(getattr(predicted, "name", None) or "response")
+        observed, predicted = {name: observed}, {name: predicted}
+    for name, prediction in predicted.items():
+        if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
+            raise TypeError(
+                f"{caller}: {name}: predicted: got {called(prediction)}, expected the DataArray of "
+                "prb.predict"
+            )
+    if not isinstance(observed, Mapping) or list(map(str, observed)) != list(map(str, predicted)):
+        got = list(observed) if isinstance(observed, Mapping) else called(observed)
+        raise ValueError(
+            f"{caller}: observed: got {got}, expected values under the names of the predictions, "
+            f"{list(predicted)}"
+        )
+    pairs: list[Comparable] = []
+    for name, prediction in zip(observed, predicted.values(), strict=True):
+        values = real_array(observed[name], f"{caller}: {name}: observed")
+        dims = [dim for dim in prediction.dims if dim not in _SAMPLE_DIMS]
+        event = tuple(prediction.sizes[dim] for dim in dims)
+        if values.ndim != 1 + len(event) or values.shape[1:] != event or not values.size:
+            expected = ", ".join(["n", *map(str, event)])
+            raise ValueError(
+                f"{caller}: {name}: observed: got shape {values.shape}, expected ({expected}): a "
+                "value for each specimen and output"
+            )
+        samples = prediction.values.reshape(-1, prediction.sizes["sample"], *event)
+        if not event:
+            pairs.append(_comparable(str(name), values, samples))
+            continue
+        (dim,) = dims
+        labels = prediction[dim].values.tolist()
+        for j in map(round, np.linspace(0, event[0] - 1, min(event[0], 8)).tolist()):
+            pairs.append(_comparable(f"{name}[{labels[j]}]", values[:, j], samples[..., j]))
+    return pairs
+
+
+def _comparable(name: str, measured: Floats, predicted: Floats) -> Comparable:
+    """Return an output without the values that were not measured."""
+    # Panels are places in a tree, whose levels a slash separates.
+    return Comparable(name.replace("/", "\u2215"), measured[~np.isnan(measured)], predicted)

@@ -1,10 +1,9 @@
-"""Cross-validation of a discrepancy, and scores of specimens left out: `cross_validate`."""
+"""Cross-validation: discrepancies and log scores of held-out specimens."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -13,21 +12,16 @@ from numpy.typing import NDArray
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.inference.resampling import DataSets, specimens
-from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.labels import versions
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
-from prbayes.validation.scores import Scoring
-
-_ADVICE = ", so that the model cannot be calibrated anew"
-# Parts by default: four in five calibrate.
-_FOLDS = 5
+from prbayes.validation.scores import log_scores, scoring_target
 
 
-@in_turn
+@locked
 def cross_validate(
     optimum: Optimum,
     *,
@@ -35,24 +29,22 @@ def cross_validate(
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.Dataset:
-    """Calibrate on parts of the specimens, and return the discrepancy of those left out.
+    """Calibrate on parts of the specimens, and return the discrepancy of the held-out ones.
 
-    In place of LOO and WAIC, which do not apply to a discrepancy: it is one value for all specimens
-    together. The smaller the mean, the better the family of populations predicts other specimens.
-    Only discrepancies of the same metric, data and folds are to be compared: between families,
-    responses or inputs, not between metrics. Minimisations start at the optimum and, with
-    `Reweighted`, compute no response.
+    LOO and WAIC do not apply to a discrepancy, which is one value for all specimens together. The
+    smaller the mean, the better the family of populations predicts other specimens. Compare only
+    discrepancies of the same metric, data and folds: between families, responses or inputs, not
+    between metrics. Minimisations start at the optimum and, with `Reweighted`, compute no response.
 
-    Each specimen left out has a score as well, by which `prb.rank` tells
-    which of several models predicts better, and whether the data can tell.
+    `prb.rank` compares several models by the scores of the specimens.
 
     Parameters
     ----------
     optimum : Optimum
         From `minimize`, without the prior.
     folds : int, optional
-        Number of parts, five by default, or half as many as there are specimens; these are dealt
-        out at random, those with the same label together.
+        Number of parts, five by default, or half as many as there are specimens. Specimens are
+        assigned at random; observations with the same label stay together.
     random_seed : int, sequence of int, numpy.random.Generator or None
         Models with as many specimens have the same folds with the same seed.
     progressbar : bool
@@ -61,21 +53,21 @@ def cross_validate(
     Returns
     -------
     xarray.Dataset
-        Dims (fold, simulator): ``discrepancy`` of the specimens left out, ``calibrated`` of the
-        others, in units of the metric, of the log-likelihood by specimen minus its mean over the
-        specimens; ``n_held_out``; and ``converged`` by fold. Where a fold has
-        no observation of a simulator its discrepancy is NaN. Dim (specimen), in the order of the
-        observations: ``score``, the log density of what was left out under the population of the
-        others, whatever the metric, of which a hundredth is spread widely over the data; and
-        ``weight``, how many observations the specimen counts for. A specimen that several
-        simulators have seen has the sum of its scores; of several outputs a score is the mean over
-        directions, as in `Joint`. Scores are NaN where the data have no density.
+        Dims (fold, simulator): ``discrepancy`` of the held-out specimens, ``calibrated`` of the
+        other ones, in units of the metric (with the log-likelihood by specimen minus its mean over
+        the specimens); ``n_held_out``; and ``converged`` by fold. The discrepancy is NaN if a fold
+        has no observation of a simulator. Dim (specimen), in the order of the observations:
+        ``score``, the log density under the population of the other folds, whatever the metric, of
+        which a tenth is spread widely over the data; and ``weight``, the number of observations
+        that the specimen counts for. The scores of several simulators add up; of several outputs a
+        score is the mean over directions, as in `Joint`. Scores are NaN if the data have no
+        density.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, there are fewer specimens than two per fold, or nothing
-        is known of a metric or propagation (`FunctionMetric`, `Fresh`); if the prior was part of
+        If an argument is not as described, there are fewer specimens than two per fold, or a metric
+        or propagation does not allow refits (`FunctionMetric`, `Fresh`); if the prior was part of
         the optimum, or its model has changed since.
 
     References
@@ -95,39 +87,31 @@ def cross_validate(
     (('fold', 'simulator'), True)
     """
     by_specimen = is_specimen_optimum(optimum)
-    evaluator = _refitted(optimum).evaluator
-    folds = most_folds(optimum, _FOLDS) if folds is None else folds
+    evaluator = _require_refits(optimum).evaluator
+    folds = most_folds(optimum, 5) if folds is None else folds
     folds = positive_integer(folds, "folds", minimum=2)
     seed = seed_number(random_seed)
-    parts = _Folds.dealt(evaluator.simulators, folds, seed)
-
-    # Calibrate on the others of each fold.
+    held_out, kept, sizes = _folds(evaluator.simulators, folds, seed)
     with shown(progressbar):
         if by_specimen:
-            refits = specimen_refits(optimum, "cross_validate")
-            thetas, converged = refits.reweighted(parts.kept)
+            thetas, converged = specimen_refits(optimum, "cross_validate").reweighted(kept)
         else:
             observed = [node.target.observed for node in evaluator.nodes]
             sampling = optimum.sampling()
-            x, converged = sampling.refit(DataSets(observed, parts.kept))
+            x, converged = sampling.refit(DataSets(observed, kept))
             thetas = sampling.thetas(x)
-
-    # Compare what was found with both parts.
-    compare = _mean_log_losses if by_specimen else _discrepancies
-    left_out = compare(evaluator, thetas, parts.left_out)
-    calibrated = compare(evaluator, thetas, parts.kept)
-    scores, weights = _scores(evaluator, thetas, parts.left_out)
-
-    where = ["fold", "simulator"]
+    losses = _mean_log_losses if by_specimen else _discrepancies
+    scores, weights = _scores(evaluator, thetas, held_out)
+    dims = ["fold", "simulator"]
     return xr.Dataset(
         {
-            "discrepancy": (where, left_out),
-            "calibrated": (where, calibrated),
-            "n_held_out": (where, parts.sizes),
+            "discrepancy": (dims, losses(evaluator, thetas, held_out)),
+            "calibrated": (dims, losses(evaluator, thetas, kept)),
+            "n_held_out": (dims, sizes),
             "converged": ("fold", converged),
             "score": ("specimen", scores),
             "weight": ("specimen", weights),
-            "data": ("simulator", [_digest(each) for each in evaluator.simulators]),
+            "data": ("simulator", [_digest(simulator) for simulator in evaluator.simulators]),
         },
         coords={
             "fold": np.arange(folds),
@@ -137,164 +121,115 @@ def cross_validate(
     )
 
 
-def most_folds(optimum: Optimum, wanted: int) -> int:
-    """Return how many folds there are of a wanted number, each of two specimens at least."""
-    _, total = specimens(_refitted(optimum).evaluator.simulators)
-    return max(2, min(wanted, total // 2))
+def most_folds(optimum: Optimum, limit: int) -> int:
+    """Return the largest number of folds of two specimens or more, at most a limit."""
+    _, total = specimens(_require_refits(optimum).evaluator.simulators)
+    return max(2, min(limit, total // 2))
 
 
-def _refitted(optimum: Optimum) -> Optimum:
+def _require_refits(optimum: Optimum) -> Optimum:
     """Return an optimum whose model can be calibrated to parts of the specimens, or raise."""
     if is_specimen_optimum(optimum):
         specimen_refits(optimum, "cross_validate")
         return optimum
-    return require_refits(optimum, "cross_validate", _ADVICE)
+    return require_refits(
+        optimum, "cross_validate", ", so that the model cannot be calibrated anew"
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class _Folds:
-    """The parts of the specimens, as weights of the observations."""
+def _folds(
+    simulators: Sequence[PopulationSimulator], folds: int, random_seed: int
+) -> tuple[list[Floats], list[Floats], NDArray[np.intp]]:
+    """Assign specimens to folds at random.
 
-    # (folds, n_k): by simulator: weights of the observations of a fold, and of the others; those
-    # kept sum to one.
-    left_out: list[Floats]
-    kept: list[Floats]
-    sizes: NDArray[np.intp]  # (folds, simulators): observations left out
-
-    @classmethod
-    def dealt(cls, nodes: Sequence[PopulationSimulator], folds: int, random_seed: int) -> _Folds:
-        """Deal specimens out at random, those with the same label together."""
-        numbers, total = specimens(nodes)
-        if total < 2 * folds:
-            raise ValueError(
-                f"folds: got {folds} for {total} specimens, expected at most {total // 2}"
-            )
-        # The number sets these random numbers apart from others with the same seed; any does.
-        rng = np.random.default_rng([random_seed, 3])
-        fold_of = rng.permutation(np.arange(total) % folds)
-        left_out = []
-        kept = []
-        sizes = []
-        few = []
-        for node, number in zip(nodes, numbers, strict=True):
-            weights = node.weights
-            out = fold_of[number] == np.arange(folds)[:, None]
-            others = np.where(out, 0.0, weights)
-            left = (others > 0).sum(axis=1)
-            if (left < 2).any():
-                few.append(node.name)
-            left_out.append(np.where(out, weights, 0.0))
-            kept.append(others)
-            sizes.append(out.sum(axis=1))
-        if few:
-            raise ValueError(
-                f"folds: got {folds}, with fewer than 2 observations of {few} in the others, "
-                "expected fewer"
-            )
-        kept = [w / w.sum(axis=1, keepdims=True) for w in kept]
-        return cls(left_out, kept, np.array(sizes).T)
+    Return weights of held-out observations and of the other ones, which sum to one, (folds, n_k) by
+    simulator; and numbers of held-out observations, (folds, simulators).
+    """
+    numbers, total = specimens(simulators)
+    if total < 2 * folds:
+        raise ValueError(f"folds: got {folds} for {total} specimens, expected at most {total // 2}")
+    # The 3 makes random numbers differ from others with the same seed.
+    rng = np.random.default_rng([random_seed, 3])
+    fold_of = rng.permutation(np.arange(total) % folds)
+    held_out, kept, sizes, too_few = [], [], [], []
+    for simulator, number in zip(simulators, numbers, strict=True):
+        is_out = fold_of[number] == np.arange(folds)[:, None]
+        rest = np.where(is_out, 0.0, simulator.weights)
+        if ((rest > 0).sum(axis=1) < 2).any():
+            too_few.append(simulator.name)
+        held_out.append(np.where(is_out, simulator.weights, 0.0))
+        kept.append(rest)
+        sizes.append(is_out.sum(axis=1))
+    if too_few:
+        raise ValueError(
+            f"folds: got {folds}, with fewer than 2 observations of {too_few} in the others, "
+            "expected fewer"
+        )
+    return held_out, [w / w.sum(axis=1, keepdims=True) for w in kept], np.array(sizes).T
 
 
 def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
-    """Return discrepancies of populations from weighted data.
+    """Return discrepancies (folds, simulators) of populations at thetas, (folds, d).
 
-    Parameters
-    ----------
-    evaluator : Evaluator
-    thetas : ndarray, shape (folds, d)
-    data : list of ndarray, shapes (folds, n_k)
-        By simulator: weights of the observations.
-
-    Returns
-    -------
-    ndarray, shape (folds, simulators)
+    ``data`` has weights of the observations, (folds, n_k) by simulator; NaN if all are zero.
     """
     columns = []
-    for k, node in enumerate(evaluator.nodes):
+    for k, (node, by_fold) in enumerate(zip(evaluator.nodes, data, strict=True)):
         values, weights = evaluator.populations(thetas, k)
         column = []
-        for i in range(len(thetas)):
-            one = slice(i, i + 1)
-            found = _discrepancy(node.target, data[k][i], values[one], weights[one])
-            column.append(found)
+        for i, observation_weights in enumerate(by_fold):
+            total = observation_weights.sum()
+            if not total > 0:
+                column.append(np.nan)
+                continue
+            target = node.target.with_observed(node.target.observed, observation_weights / total)
+            column.append(float(target.of(values[i : i + 1], weights[i : i + 1])[0]))
         columns.append(column)
     return np.array(columns).T
 
 
 def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
-    """Return minus the mean log-likelihood of weighted specimens, (folds, simulators).
-
-    Arguments are those of `_discrepancies`.
-    """
-    by_name = evaluator.specimen_log_likelihoods(thetas)
+    """Return minus the mean log-likelihood of weighted specimens, (folds, simulators)."""
+    by_name = specimen_log_likelihoods(evaluator, thetas)
     columns = []
     for simulator, weights in zip(evaluator.emulated, data, strict=True):
         likelihood, measurement = simulator.likelihood, simulator.measurement
         numbers = likelihood.numbers(measurement)
-        specimens = numbers[simulator.rows]
-        weights = weights / np.bincount(numbers)[specimens]  # a specimen counts once
-        logs = by_name[likelihood.measurements[-1].name][:, specimens]
-        own = measurement.weights
-        if own is not None:
-            logs = logs / np.where(own > 0, own, 1.0)[simulator.rows]
+        rows = numbers[simulator.rows]
+        weights = weights / np.bincount(numbers)[rows]  # a specimen counts once
+        logs = by_name[likelihood.measurements[-1].name][:, rows]
+        if measurement.weights is not None:
+            factors = np.where(measurement.weights > 0, measurement.weights, 1.0)
+            logs = logs / factors[simulator.rows]
         total = weights.sum(axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
             columns.append(-np.where(weights > 0, weights * logs, 0.0).sum(axis=1) / total)
     return np.array(columns).T
 
 
-def _scores(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> tuple[Floats, Floats]:
-    """Return score and weight of each specimen, (specimens,), under the population of the others.
-
-    Arguments are those of `_discrepancies`.
-    """
+def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tuple[Floats, Floats]:
+    """Return scores and weights of the specimens, under populations at thetas, (folds, d)."""
     numbers, total = specimens(evaluator.simulators)
-    scores = np.zeros(total)
-    counted = np.zeros(total)
+    scores, counts = np.zeros(total), np.zeros(total)
     for k, simulator in enumerate(evaluator.simulators):
         weights = simulator.weights
-        counted += np.bincount(numbers[k], weights * weights.size, total)
-        own = _observation_scores(evaluator, thetas, data[k], k)
-        scores += np.bincount(numbers[k], own, total)
-    return scores, counted
-
-
-def _observation_scores(evaluator: Evaluator, thetas: Floats, data: Floats, k: int) -> Floats:
-    """Return the scores of the k-th simulator's observations, (n_k,); NaN without a density."""
-    simulator = evaluator.simulators[k]
-    scores = np.zeros(len(simulator.observed))
-    try:
-        scoring = Scoring.of(simulator.observed, simulator.weights)
-    except ValueError:  # as where all observations are equal
-        return np.full(scores.shape, np.nan)
-    values, weights = evaluator.populations(thetas, k)
-    for i, left_out in enumerate(data):
-        rows = np.flatnonzero(left_out)
-        scores[rows] = scoring.scores(values[i], weights[i], rows)
-    return scores
+        counts += np.bincount(numbers[k], weights * weights.size, total)
+        try:
+            target = scoring_target(simulator.observed, weights)
+        except ValueError:  # no density, for example because all observations are equal
+            observation_scores = np.full(len(simulator.observed), np.nan)
+        else:
+            observation_scores = np.zeros(len(simulator.observed))
+            values, masses = evaluator.populations(thetas, k)
+            for i, fold in enumerate(held_out[k]):
+                rows = np.flatnonzero(fold)
+                observation_scores[rows] = log_scores(target, values[i], masses[i], rows)
+        scores += np.bincount(numbers[k], observation_scores, total)
+    return scores, counts
 
 
 def _digest(simulator: PopulationSimulator) -> str:
-    """Return what observed values, weights and labels of a simulator are known by, in order."""
+    """Return a digest of observed values, weights and labels, in order."""
     labels = [] if simulator.specimens is None else simulator.specimens.tolist()
     content = simulator.observed.tobytes() + simulator.weights.tobytes() + repr(labels).encode()
     return hashlib.sha256(content).hexdigest()[:16]
-
-
-def _discrepancy(target: Discrepancy, data: Floats, values: Floats, weights: Floats) -> float:
-    """Return the discrepancy of a population from weighted data, or NaN if there are none.
-
-    Parameters
-    ----------
-    target : Discrepancy
-        Of all observations.
-    data : ndarray, shape (n,)
-        Weights of the observations.
-    values, weights : ndarray, shape (1, m)
-        The population.
-    """
-    total = data.sum()
-    if not total > 0:
-        return np.nan
-    other = target.with_observed(target.observed, data / total)
-    return float(other.of(values, weights)[0])

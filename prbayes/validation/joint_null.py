@@ -1,8 +1,8 @@
-"""`JointNull`: the area test on the very specimens of the calibration."""
+"""Null distribution of the area test on the specimens of the calibration."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
@@ -23,20 +23,20 @@ from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import data_digest, in_order, serving, specimen_names
 from prbayes.validation.conditions import Case, Condition
-from prbayes.validation.nulls import LEAST_REPLICATES, SimulatedNull
-from prbayes.validation.predictive import Predictive
+from prbayes.validation.nulls import LEAST_REPLICATES, Judgement, Null, judge_by_replicates
+from prbayes.validation.probability_transform import Predictive
 
 
 @dataclass(frozen=True)
-class JointNull(SimulatedNull):
+class JointNull(Null):
     """Calibration and test data come together from the calibrated model.
 
-    The model is calibrated anew each time.
+    The model is recalibrated in each replicate.
 
     For tests on the calibration's own specimens, under the same conditions or others: a model that
     was fitted to them follows them more closely than fresh ones. Each replicate draws specimens
     from the population at the optimum, minimises the discrepancy for their calibration data, and
-    tests their responses against the population found. The predicted population is that of
+    tests their responses against that population. The predicted population is that of
     `predict` with the optimum. Minimisations are those of the parametric `bootstrap`: with
     `Reweighted` they compute no response.
 
@@ -46,8 +46,8 @@ class JointNull(SimulatedNull):
         From `minimize`, without the prior.
     responses : tuple or mapping, optional
         ``(response, *inputs)`` of the tested condition, or such tuples by the names of conditions,
-        as they were given to `predict`. Conditions without one are the model's simulators, by name;
-        one condition alone is the only simulator.
+        as passed to `predict`. Conditions without one are the model's simulators, by name; a single
+        condition is the only simulator.
     replicates : int
     random_seed : int
 
@@ -56,8 +56,8 @@ class JointNull(SimulatedNull):
     TypeError
         If ``optimum`` is no Optimum, or a response cannot be called.
     ValueError
-        If nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`); if the prior was
-        part of the optimum, or its model has changed since.
+        If a metric or propagation does not allow refits (`FunctionMetric`, `Fresh`); if the prior
+        was part of the optimum, or its model has changed since.
 
     Examples
     --------
@@ -86,119 +86,116 @@ class JointNull(SimulatedNull):
     def __post_init__(self) -> None:
         advice = ", so that the model cannot be calibrated anew; use prb.validation.PosteriorNull()"
         require_refits(self.optimum, "JointNull", advice)
-        _refuse_responses(self.responses)
+        _require_responses(self.responses)
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)
 
-    def replicates_of(self, case: Case) -> Iterator[Floats]:
-        """Draw, calibrate, test."""
-        require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
-        sampling = self.optimum.sampling()
-        with ExitStack() as alone:
-            try:
-                served = [self._served(case, condition) for condition in case.conditions]
-            except UntoldError as untold:
-                # All on the same points: those of the runs.
-                for design in self.optimum.evaluator.designs.values():
-                    alone.enter_context(design.alone())
-                self._refuse_unsupported(untold)
-                served = [self._served(case, condition) for condition in case.conditions]
-            found = self._replicates(case, served, sampling)
-        # Designs are whole again before anyone else goes on.
-        yield found
-
-    def _refuse_unsupported(self, untold: UntoldError) -> None:
-        """Raise if the runs by themselves are too few for the population at the optimum."""
-        short = shortcomings(self.optimum.evaluator, self.optimum.theta[None])
-        if short:
-            what = "; ".join(f"{name}: {each}" for name, each in short.items())
-            raise DesignError(
-                f"JointNull: {untold}; its runs alone do not support the calibrated population "
-                f"({what})"
-            ) from untold
-
-    def _replicates(
-        self, case: Case, served: list[_Served], sampling: SamplingDistribution
-    ) -> Floats:
-        evaluator = self.optimum.evaluator
-        theta = self.optimum.theta
-        ties = case.rng(1)
-        numbers, more = _specimen_numbers(evaluator.nodes, served)
-        simulators = range(len(evaluator.nodes))
-        populations = [evaluator.populations(theta[None], k) for k in simulators]
-        for one in served:
-            values, weights = populations[one.simulator]
-            seen = one.condition.view.of(one.values_or(values[0]))
-            _refuse_other(one.condition, seen, weights[0])
-
-        # Draw specimens, and calibrate the model to what is measured on them.
-        points = simulated_points(
-            evaluator, populations, self.replicates, self.random_seed, more=more
-        )
-        thetas, converged = self._calibrated(sampling, populations, points)
-
-        # Test their responses against the population that was found.
-        u: list[Floats] = []
-        for one, number in zip(served, numbers, strict=True):
-            at_optimum, _ = populations[one.simulator]
-            drawn = points[one.simulator][converged][:, number]
-            measured = one.values_or(at_optimum[0])[drawn]
-            refitted, weights = evaluator.populations(thetas, one.simulator)
-            see = one.condition.view.of
-            measured = see(measured)
-            values = np.broadcast_to(see(one.values_or(refitted)), weights.shape)
-            found = []
-            for row, weight, y in zip(values, weights, measured, strict=True):
-                found.append(Predictive(row, weight).transform(y, ties))
-            u.append(np.array(found))
-        together = np.concatenate(u, axis=1)
-        missing = np.isnan(together).any(axis=1)
-        return np.asarray(together[~missing])
+    def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
+        """Count the observed data among the replicates."""
+        return judge_by_replicates([self._u_values(case)], case, statistic, alpha)
 
     def describe(self, case: Case) -> str:
-        """Return what is held to be true."""
+        """Return the null hypothesis in a phrase."""
         return (
             "calibration and test data come from the calibrated model, which is calibrated anew in "
             "each replicate"
         )
 
-    def _calibrated(
-        self,
-        sampling: SamplingDistribution,
-        populations: list[tuple[Floats, Floats]],
-        points: list[NDArray[np.intp]],
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the minimisers of the replicates that converged, (r, d), and which did."""
+    def _u_values(self, case: Case) -> Floats:
+        """Return u-values of the replicates, (r, n)."""
+        require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
         evaluator = self.optimum.evaluator
+        sampling = self.optimum.sampling()
+        with ExitStack() as runs_alone:
+            try:
+                tested = [self._tested(case, condition) for condition in case.conditions]
+            except UntoldError as error:
+                # All responses at the same points: those of the runs.
+                for design in evaluator.designs.values():
+                    runs_alone.enter_context(design.alone())
+                short = shortcomings(evaluator, self.optimum.theta[None])
+                if short:
+                    reasons = "; ".join(f"{name}: {reason}" for name, reason in short.items())
+                    raise DesignError(
+                        f"JointNull: {error}; its runs alone do not support the calibrated "
+                        f"population ({reasons})"
+                    ) from error
+                tested = [self._tested(case, condition) for condition in case.conditions]
+            return self._replicates(case, sampling, tested)
+
+    def _replicates(
+        self, case: Case, sampling: SamplingDistribution, tested: list[_Tested]
+    ) -> Floats:
+        """Draw specimens, recalibrate the model, and test their responses, (r, n)."""
+        evaluator, theta = self.optimum.evaluator, self.optimum.theta
+        rng_of_ties = case.rng(1)
+        numbers, n_new = _specimen_numbers(evaluator.nodes, tested)
+        populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
+        for t in tested:
+            responses, weights = populations[t.simulator]
+            t.require_population(responses[0], weights[0])
+
+        points = simulated_points(
+            evaluator, populations, self.replicates, self.random_seed, more=n_new
+        )
         x, converged = sampling.refit(sets_at(evaluator, populations, points))
-        # Replicates are then those of most data sets, and not of an odd few.
+        # With fewer the replicates would be those of unusual data sets.
         if converged.mean() < 0.5:
             raise ValueError(
                 f"JointNull: got {converged.mean():.0%} of the minimisations converged, expected "
                 "most; look at prb.diagnose(optimum)"
             )
-        return sampling.thetas(x[converged]), converged
+        thetas = sampling.thetas(x[converged])
 
-    def _served(self, case: Case, condition: Condition) -> _Served:
-        """Return the simulator whose points are the specimens, and the responses at them."""
+        u = []
+        for t, number in zip(tested, numbers, strict=True):
+            drawn = points[t.simulator][converged][:, number]
+            project = t.condition.projection.of
+            measured = project(t.values_or(populations[t.simulator][0][0])[drawn])
+            refitted, weights = evaluator.populations(thetas, t.simulator)
+            values = np.broadcast_to(project(t.values_or(refitted)), weights.shape)
+            rows = [
+                Predictive(row, weight).transform(y, rng_of_ties)
+                for row, weight, y in zip(values, weights, measured, strict=True)
+            ]
+            u.append(np.array(rows))
+        joined = np.concatenate(u, axis=1)
+        return np.asarray(joined[~np.isnan(joined).any(axis=1)])
+
+    def _tested(self, case: Case, condition: Condition) -> _Tested:
+        """Return a condition with the simulator whose points are its specimens."""
         if condition.predicted.shape[0] > 1:
             raise ValueError(
                 f"{condition.name}: predicted: got {len(condition.predicted)} draws, expected the "
                 "one population at the optimum, which JointNull calibrates anew; pass "
                 "prb.predict(optimum, ...)"
             )
+        name = condition.base_name
+        nodes = self.optimum.evaluator.nodes
         given = self.responses
         if isinstance(given, Mapping):
-            given = given.get(condition.of)
+            given = given.get(name)
         if given is None:
-            return _Served(condition, self._own_simulator(case, condition), None)
-
+            names = [node.name for node in nodes]
+            if len({c.base_name for c in case.conditions}) == len(names) == 1:
+                return _Tested(condition, 0, None)
+            if name in names:
+                return _Tested(condition, names.index(name), None)
+            raise ValueError(
+                f"JointNull: got the condition {name!r}, expected the name of a simulator, "
+                f"{names}; or pass responses={{{name!r}: (response, *inputs)}}"
+            )
         response, *inputs = given
         refuse_uncallable(condition.name, response)
-        sorted_inputs = read_inputs(condition.name, inputs, self.optimum.model)
-        called = Responses(condition.name, response, sorted_inputs, outputs=None)
-        nodes = self.optimum.evaluator.nodes
-        node = serving(_measuring_first(nodes, condition), called)
+        roots = read_inputs(condition.name, inputs, self.optimum.model)
+        responses = Responses(condition.name, response, roots, outputs=None)
+        labels = set(condition.labels or ())
+
+        def lacks_specimens(node: Node) -> bool:
+            return node.specimens is None or not labels & set(specimen_names(node.specimens))
+
+        measuring_first = sorted(nodes, key=lacks_specimens)
+        node = serving(measuring_first, responses)
         if node is None:
             raise ValueError(
                 f"{condition.name}: responses: got inputs that no simulator with prb.Reweighted "
@@ -206,28 +203,15 @@ class JointNull(SimulatedNull):
                 "to the specimens of the calibration"
             )
         assert node.design is not None
-        return _Served(condition, nodes.index(node), node.design.values_of(called))
-
-    def _own_simulator(self, case: Case, condition: Condition) -> int:
-        """Return the simulator that a condition without a response stands for."""
-        names = [node.name for node in self.optimum.evaluator.nodes]
-        tested = {one.of for one in case.conditions}
-        if len(tested) == len(names) == 1:
-            return 0
-        if condition.of in names:
-            return names.index(condition.of)
-        raise ValueError(
-            f"JointNull: got the condition {condition.of!r}, expected the name of a simulator, "
-            f"{names}; or pass responses={{{condition.of!r}: (response, *inputs)}}"
-        )
+        return _Tested(condition, nodes.index(node), node.design.values_of(responses))
 
 
-def _refuse_responses(responses: object) -> None:
+def _require_responses(responses: object) -> None:
     """Raise if they are neither a tuple of a response and its inputs, nor several by condition."""
     if responses is None:
         return
-    each = list(responses.values()) if isinstance(responses, Mapping) else [responses]
-    if not each or not all(isinstance(one, tuple) and one and callable(one[0]) for one in each):
+    pairs = list(responses.values()) if isinstance(responses, Mapping) else [responses]
+    if not pairs or not all(isinstance(p, tuple) and p and callable(p[0]) for p in pairs):
         raise TypeError(
             f"JointNull: responses: got {called(responses)}, expected a tuple (response, *inputs), "
             "or a mapping of conditions to such"
@@ -235,111 +219,76 @@ def _refuse_responses(responses: object) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Served:
+class _Tested:
     """A condition, and the simulator whose points are its specimens."""
 
     condition: Condition
     simulator: int
-    # (points,), or None: responses at the simulator's points, unless they are its own.
-    values: Floats | None
+    values: Floats | None  # (points,): responses at the simulator's points; None: the simulator's
 
-    def values_or(self, own: Floats) -> Floats:
-        """Return the responses, or the simulator's own ones."""
-        return own if self.values is None else self.values
+    def values_or(self, responses: Floats) -> Floats:
+        """Return the tested responses at points where the simulator has these."""
+        return responses if self.values is None else self.values
 
-
-def _measuring_first(nodes: list[Node], condition: Condition) -> list[Node]:
-    """Return the simulators, first those that measured a condition's specimens."""
-    labels = set(condition.labels or ())
-
-    def measured_others(node: Node) -> bool:
-        return node.specimens is None or not labels & set(specimen_names(node.specimens))
-
-    return sorted(nodes, key=measured_others)
+    def require_population(self, responses: Floats, weights: Floats) -> None:
+        """Raise if the predicted population is not that at the optimum."""
+        condition = self.condition
+        predicted = condition.predicted[~np.isnan(condition.predicted)]
+        # Between these a distribution function moves by .05, half of the smallest difference.
+        at = np.quantile(predicted, np.linspace(0.05, 0.95, 19), method="nearest")
+        values = condition.projection.of(self.values_or(responses))
+        expected = Predictive(values, weights).transform(at, None)
+        got = Predictive(condition.predicted).transform(at, None)
+        largest = np.abs(expected - got).max()
+        # 500 random samples of a population differ from it by .06 at 5%, and those of `predict` by
+        # far less; a normal population a quarter of a standard deviation away differs by .1.
+        if largest > 0.1:
+            raise ValueError(
+                f"{condition.name}: predicted: got values whose distribution function differs by "
+                f"{largest:.2f} from that of the population at the optimum, expected "
+                "prb.predict(optimum, response, *inputs) of the same condition; for another "
+                "condition than a simulator's pass responses="
+            )
 
 
 def _specimen_numbers(
-    nodes: list[Node], served: list[_Served]
+    nodes: Sequence[Node], tested: list[_Tested]
 ) -> tuple[list[NDArray[np.intp]], int]:
-    """Return the specimens of each condition, those of the calibration by their numbers.
+    """Return the numbers of each condition's specimens, (n,), and how many are new.
 
-    Returns
-    -------
-    numbers : list of ndarray of int, shapes (n,)
-        By condition.
-    more : int
-        How many specimens are not of the calibration.
+    Specimens of the calibration have their numbers there.
     """
-    own, total = specimens(nodes)
-    known = _known_specimens(nodes, own)
-    group_of = _groups_of(nodes)
-    more = 0
+    node_numbers, total = specimens(nodes)
+    # The points of a group of simulators are drawn together.
+    group_of = {k: i for i, members in enumerate(groups(nodes)) for k in members}
+    number_and_group: dict[str, tuple[int, int]] = {}
+    for k, node in enumerate(nodes):
+        if node.specimens is not None:
+            for label, number in zip(specimen_names(node.specimens), node_numbers[k], strict=True):
+                number_and_group[label] = int(number), group_of[k]
+    n_new = 0
     numbers = []
-    for j, one in enumerate(served):
-        condition = one.condition
-        node = nodes[one.simulator]
-        measured = node.target.observed
-        if data_digest(condition.measured) == data_digest(measured):
-            numbers.append(_matched(condition.measured, measured, own[one.simulator]))
+    for j, t in enumerate(tested):
+        condition, node = t.condition, nodes[t.simulator]
+        calibrated = node.target.observed
+        if data_digest(condition.measured) == data_digest(calibrated):
+            # The same values, perhaps in another order.
+            matched = np.empty(len(calibrated), dtype=np.intp)
+            matched[in_order(condition.measured)] = node_numbers[t.simulator][in_order(calibrated)]
+            numbers.append(matched)
             continue
-        group = group_of[one.simulator]
+        group = group_of[t.simulator]
         # Without labels every value is of a new specimen.
         labels = condition.labels or tuple(f"{j}, {i}" for i in range(condition.observed.size))
         for label in labels:
-            if label not in known:
-                known[label] = total + more, group
-                more += 1
-            elif known[label][1] != group:
+            if label not in number_and_group:
+                number_and_group[label] = total + n_new, group
+                n_new += 1
+            elif number_and_group[label][1] != group:
                 raise ValueError(
                     f"{condition.name}: specimens: got {label!r}, which other simulators measured "
                     f"than {node.name}, whose design points serve here; expected simulators that "
                     "share labels and .dist() objects"
                 )
-        numbers.append(np.array([known[label][0] for label in labels], dtype=np.intp))
-    return numbers, more
-
-
-def _groups_of(nodes: list[Node]) -> dict[int, int]:
-    """Return the group of each simulator; the points of a group are drawn together."""
-    found: dict[int, int] = {}
-    for number, group in enumerate(groups(nodes)):
-        found |= dict.fromkeys(group, number)
-    return found
-
-
-def _known_specimens(nodes: list[Node], own: list[NDArray[np.intp]]) -> dict[str, tuple[int, int]]:
-    """Return number and group of the specimens of the calibration, by label."""
-    group_of = _groups_of(nodes)
-    known = {}
-    for k, node in enumerate(nodes):
-        if node.specimens is None:
-            continue
-        for label, number in zip(specimen_names(node.specimens), own[k], strict=True):
-            known[label] = int(number), group_of[k]
-    return known
-
-
-def _matched(observed: Floats, measured: Floats, numbers: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the specimens of values that are those of a simulator in another order."""
-    found = np.empty(len(observed), dtype=np.intp)
-    found[in_order(observed)] = numbers[in_order(measured)]
-    return found
-
-
-def _refuse_other(condition: Condition, values: Floats, weights: Floats) -> None:
-    """Raise if the predicted population is not that at the optimum."""
-    predicted = condition.predicted[~np.isnan(condition.predicted)]
-    # Between these a distribution function moves by .05, half of what is a difference.
-    at = np.quantile(predicted, np.linspace(0.05, 0.95, 19), method="nearest")
-    expected = Predictive(values, weights).transform(at, None)
-    got = Predictive(condition.predicted).transform(at, None)
-    apart = np.abs(expected - got).max()
-    # 500 random samples of a population differ from it by .06 at 5%, and those of `predict` by far
-    # less; a normal population a quarter of a standard deviation away differs by .1.
-    if apart > 0.1:
-        raise ValueError(
-            f"{condition.name}: predicted: got values whose distribution function differs by "
-            f"{apart:.2f} from that of the population at the optimum, expected "
-            "prb.predict(optimum, response, *inputs) of the same condition; for another condition "
-            "than a simulator's pass responses="
-        )
+        numbers.append(np.array([number_and_group[label][0] for label in labels], dtype=np.intp))
+    return numbers, n_new

@@ -1,9 +1,8 @@
-"""Which of several models of the same data predicts better, and whether the data can tell."""
+"""Comparison of models of the same data by cross-validated log scores."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,12 +12,7 @@ from prbayes._validate import Floats, Seed, called, flag, positive_integer, seed
 from prbayes.optimize.optimum import Optimum
 from prbayes.validation.cross_validation import cross_validate, most_folds
 
-# Share of comparisons of candidates that predict alike in which one is said to be better.
-_CLAIMED = 0.05
-_EXAMPLE = "expected a mapping such as {'normal': optimum, 'lognormal': other}"
 _CALLER = "rank"
-# Of which nine in ten calibrate: nearly as many as there are.
-_COMPARED_BY = 10
 
 
 def rank(
@@ -28,7 +22,7 @@ def rank(
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.Dataset:
-    """Say which of several models of the same data predicts new specimens better, and how surely.
+    """Compare how well several models of the same data predict new specimens.
 
     Models may differ in the family of an input, in its parameters, in the response or in the
     metric. Each is cross-validated by `cross_validate` with the same folds; every specimen has a
@@ -38,13 +32,13 @@ def rank(
     Parameters
     ----------
     candidates : mapping
-        By label an `Optimum`, from `minimize` without the prior, or what `cross_validate` returned
-        for it. All are of the same observed values, weights and labels, in the same order.
+        By label an `Optimum`, from `minimize` without the prior, or its result of `cross_validate`.
+        All have the same observed values, weights and labels, in the same order.
     folds : int, optional
-        Of each optimum: by default those of cross-validations among the candidates, which keep
-        theirs and have to have the same; else ten, or half as many as there are specimens.
+        Of each optimum. The default is the number of cross-validations among the candidates, which
+        must agree; else ten, or half as many as there are specimens.
     random_seed : int, sequence of int, numpy.random.Generator or None
-        By which specimens are dealt out; likewise.
+        Of the assignment of specimens to folds, which must agree likewise.
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
 
@@ -52,10 +46,10 @@ def rank(
     -------
     xarray.Dataset
         Dim (candidate), the best first: ``score``, the expected log density of a new specimen;
-        ``difference``, by how much the best is ahead over all specimens together, and ``stderr``,
-        its standard error from the differences specimen by specimen; ``told_apart``, whether that
-        is beyond chance; ``verdict``, the same as a sentence; and ``converged``, the share of folds
-        whose minimisation did. Attribute ``verdict`` has all sentences.
+        ``difference``, the lead of the best one, summed over all specimens, and ``stderr``, its
+        standard error from the differences by specimen; ``told_apart``, whether that is beyond
+        chance; ``verdict``, the same as a sentence; and ``converged``, the share of folds whose
+        minimisation converged. Attribute ``verdict`` has all sentences.
 
     Raises
     ------
@@ -65,15 +59,15 @@ def rank(
 
     Notes
     -----
-    Of two candidates that predict alike one is said to be better in about 5% of data sets; of more
-    than two, at most so often for any pair (Bonferroni). A difference is held against Student's t
+    Of two candidates that predict alike one is called better in about 5% of data sets; of more than
+    two, at most so often for any pair (Bonferroni). A difference is compared with Student's t
     distribution with as many degrees of freedom as there are specimens less one. Scores are those
-    of populations calibrated on all but one fold: slightly fewer data than there are. A candidate
-    with more hyperparameters is not penalised, but by what it loses on specimens left out.
+    of populations calibrated on all but one fold: slightly fewer data than there are. The only
+    penalty of a candidate with more hyperparameters is its loss on held-out specimens.
 
-    The standard error does not see that folds share their calibrations, nor rare specimens that
-    happen to be absent: of normal and lognormal candidates it is right to a quarter in most cases,
-    and up to 1.7 times too small where the truth has a long tail (``benchmarks/families.py``).
+    The standard error ignores that folds share their calibrations, and rare specimens that happen
+    to be absent: of normal and lognormal candidates it is right to a quarter in most cases, and up
+    to 1.7 times too small where the truth has a long tail (``benchmarks/families.py``).
 
     References
     ----------
@@ -97,137 +91,137 @@ def rank(
     >>> table.candidate.values.tolist(), bool(table.told_apart[1])
     (['LogNormal', 'Normal'], True)
     """
-    _refuse(candidates)
+    _require_candidates(candidates)
     if folds is not None:
         folds = positive_integer(folds, "folds", minimum=2)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
-    known = [one.sizes["fold"] for one in candidates.values() if isinstance(one, xr.Dataset)]
-    asked = folds or (known[0] if known else None)
-    found = {}
+    given = [table.sizes["fold"] for table in candidates.values() if isinstance(table, xr.Dataset)]
+    number = folds or (given[0] if given else None)
+    tables = {}
     for label, candidate in candidates.items():
         if isinstance(candidate, Optimum):
-            number = asked or most_folds(candidate, _COMPARED_BY)
-            found[label] = cross_validate(
-                candidate, folds=number, random_seed=seed, progressbar=progressbar
+            candidate = cross_validate(
+                candidate,
+                folds=number or most_folds(candidate, 10),
+                random_seed=seed,
+                progressbar=progressbar,
             )
-        else:
-            found[label] = candidate
-    first, *others = found
-    for label in others:
-        _require_same(found[label], found[first], label, first)
-    for label, one in found.items():
-        _require_scores(one, label)
-    return _table(found)
+        tables[label] = candidate
+    first, *rest = tables
+    for label in rest:
+        _require_same(tables[label], tables[first], label, first)
+    for label, table in tables.items():
+        n_missing = int(np.isnan(table["score"].values).sum())
+        if n_missing:
+            raise ValueError(
+                f"{_CALLER}: got {label} without a score of {n_missing} of "
+                f"{table.sizes['specimen']} specimens, expected one of each: the observed values "
+                "have no density, as where all are equal, or the population of a fold has no "
+                "response; compare the discrepancies of prb.cross_validate instead"
+            )
+    return _comparison(tables)
 
 
-def _refuse(candidates: object) -> None:
-    """Raise if these are no candidates."""
+def _require_candidates(candidates: object) -> None:
+    """Raise unless these are two optima or cross-validations or more, by label."""
     if not isinstance(candidates, Mapping):
-        raise TypeError(f"{_CALLER}: candidates: got {called(candidates)}, {_EXAMPLE}")
+        raise TypeError(
+            f"{_CALLER}: candidates: got {called(candidates)}, expected a mapping such as "
+            "{'normal': optimum, 'lognormal': other}"
+        )
     if len(candidates) < 2:
         raise ValueError(
             f"{_CALLER}: candidates: got {list(candidates)}, expected at least two to compare"
         )
-    for label, one in candidates.items():
+    for label, candidate in candidates.items():
         if not isinstance(label, str):
             raise TypeError(f"{_CALLER}: candidates: got label {label!r:.60}, expected a text")
-        if isinstance(one, Optimum):
-            continue
-        if not isinstance(one, xr.Dataset) or not {"score", "weight", "data"} <= set(one):
+        is_table = isinstance(candidate, xr.Dataset) and {"score", "weight", "data"} <= set(
+            candidate
+        )
+        if not is_table and not isinstance(candidate, Optimum):
             raise TypeError(
-                f"{_CALLER}: candidates: {label}: got {called(one)}, expected an Optimum or what "
-                "prb.cross_validate returned"
+                f"{_CALLER}: candidates: {label}: got {called(candidate)}, expected an Optimum or "
+                "what prb.cross_validate returned"
             )
 
 
-def _require_same(one: xr.Dataset, other: xr.Dataset, label: str, first: str) -> None:
+def _require_same(table: xr.Dataset, reference: xr.Dataset, label: str, first: str) -> None:
     """Raise unless two cross-validations are of the same data, folds and seed."""
-    simulators = [each["simulator"].values.tolist() for each in (one, other)]
-    if simulators[0] != simulators[1]:
+    names, expected = (t["simulator"].values.tolist() for t in (table, reference))
+    if names != expected:
         raise ValueError(
-            f"{_CALLER}: got {label} with simulators {simulators[0]} and {first} with "
-            f"{simulators[1]}, expected the same names in the same order"
+            f"{_CALLER}: got {label} with simulators {names} and {first} with "
+            f"{expected}, expected the same names in the same order"
         )
-    same = one["data"].values == other["data"].values
-    if not same.all():
-        names = ", ".join(one["simulator"].values[~same].tolist())
+    is_same = table["data"].values == reference["data"].values
+    if not is_same.all():
+        differing = ", ".join(table["simulator"].values[~is_same].tolist())
         raise ValueError(
             f"{_CALLER}: got {label} and {first} with different observed values, weights or "
-            f"labels of {names}, or in another order, expected the same data; build the models of "
-            "one array"
+            f"labels of {differing}, or in another order, expected the same data; build the models "
+            "of one array"
         )
-    for what, a, b in (
-        ("folds", one.sizes["fold"], other.sizes["fold"]),
-        ("random_seed", one.attrs["random_seed"], other.attrs["random_seed"]),
+    for argument, a, b in (
+        ("folds", table.sizes["fold"], reference.sizes["fold"]),
+        ("random_seed", table.attrs["random_seed"], reference.attrs["random_seed"]),
     ):
         if a != b:
             raise ValueError(
-                f"{_CALLER}: got {label} with {what} {a} and {first} with {b}, expected the same; "
-                "pass the optima, which are then cross-validated alike"
+                f"{_CALLER}: got {label} with {argument} {a} and {first} with {b}, expected the "
+                "same; pass the optima, which are then cross-validated alike"
             )
 
 
-def _require_scores(one: xr.Dataset, label: str) -> None:
-    """Raise if a specimen has no score."""
-    missing = int(np.isnan(one["score"].values).sum())
-    if missing:
-        raise ValueError(
-            f"{_CALLER}: got {label} without a score of {missing} of {one.sizes['specimen']} "
-            "specimens, expected one of each: the observed values have no density, as where all "
-            "are equal, or the population of a fold has no response; compare the discrepancies of "
-            "prb.cross_validate instead"
-        )
-
-
-def _table(found: Mapping[str, xr.Dataset]) -> xr.Dataset:
-    """Return the candidates beside the best of them, in order."""
-    labels = sorted(found, key=lambda label: -float(found[label]["score"].sum()))
-    scores = np.array([found[label]["score"].values for label in labels])
-    weights = found[labels[0]]["weight"].values
+def _comparison(tables: Mapping[str, xr.Dataset]) -> xr.Dataset:
+    """Return the candidates compared with the best one, in order."""
+    labels = sorted(tables, key=lambda label: -float(tables[label]["score"].sum()))
+    scores = np.array([tables[label]["score"].values for label in labels])
+    weights = tables[labels[0]]["weight"].values
     differences = (scores[0] - scores).sum(axis=-1)
-    errors = np.array([_stderr(scores[0] - own, weights) for own in scores])
-
+    errors = np.array([_stderr(scores[0] - row, weights) for row in scores])
+    alpha = 0.05
     n = weights.size
-    pairs = len(labels) * (len(labels) - 1) / 2
-    beyond = student.ppf(1 - _CLAIMED / 2 / pairs, n - 1)
-    apart = differences > beyond * errors
+    n_pairs = len(labels) * (len(labels) - 1) / 2
+    critical = student.ppf(1 - alpha / 2 / n_pairs, n - 1)
+    is_apart = differences > critical * errors
+    best, *rest = labels
     sentences = [""]
-    for i in range(1, len(labels)):
-        names = labels[0], labels[i]
-        told = _sentence(*names, differences[i], errors[i], apart=bool(apart[i]))
-        sentences.append(told)
-    variables: dict[str, Any] = {
-        "score": scores.mean(axis=-1),
-        "difference": differences,
-        "stderr": errors,
-        "told_apart": apart,
-        "converged": [float(found[label]["converged"].mean()) for label in labels],
-        "verdict": np.array(sentences),
-    }
-    by_candidate = {key: ("candidate", value) for key, value in variables.items()}
-    attrs = {
-        "verdict": "; ".join(sentences[1:]),
-        "claimed": _CLAIMED,
-        "n_specimens": n,
-        "folds": found[labels[0]].sizes["fold"],
-        "random_seed": found[labels[0]].attrs["random_seed"],
-    }
-    return xr.Dataset(by_candidate, coords={"candidate": labels}, attrs=attrs)
+    for label, lead, error, apart in zip(
+        rest, differences[1:], errors[1:], is_apart[1:], strict=True
+    ):
+        by = f"{lead:.1f} nats (standard error {error:.1f})"
+        if apart:
+            sentences.append(f"{best} predicts better than {label} by {by}")
+        else:
+            sentences.append(
+                f"the data cannot tell {best} and {label} apart: {best} is ahead by {by}"
+            )
+    converged = [float(tables[label]["converged"].mean()) for label in labels]
+    return xr.Dataset(
+        {
+            "score": ("candidate", scores.mean(axis=-1)),
+            "difference": ("candidate", differences),
+            "stderr": ("candidate", errors),
+            "told_apart": ("candidate", is_apart),
+            "converged": ("candidate", converged),
+            "verdict": ("candidate", np.array(sentences)),
+        },
+        coords={"candidate": labels},
+        attrs={
+            "verdict": "; ".join(sentences[1:]),
+            "claimed": alpha,
+            "n_specimens": n,
+            "folds": tables[best].sizes["fold"],
+            "random_seed": tables[best].attrs["random_seed"],
+        },
+    )
 
 
 def _stderr(differences: Floats, weights: Floats) -> float:
-    """Return the standard error of a sum over specimens, which count with weights."""
+    """Return the standard error of a sum of differences of weighted specimens."""
     n = weights.size
-    typical = differences.sum() / weights.sum()
-    residuals = differences - weights * typical
-    variance = (residuals**2).sum() * n / (n - 1)
+    mean = differences.sum() / weights.sum()
+    variance = ((differences - weights * mean) ** 2).sum() * n / (n - 1)
     return float(np.sqrt(variance))
-
-
-def _sentence(best: str, other: str, difference: float, error: float, *, apart: bool) -> str:
-    """Return what the data say of two candidates."""
-    by = f"{difference:.1f} nats (standard error {error:.1f})"
-    if apart:
-        return f"{best} predicts better than {other} by {by}"
-    return f"the data cannot tell {best} and {other} apart: {best} is ahead by {by}"

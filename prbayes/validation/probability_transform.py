@@ -1,67 +1,70 @@
-"""`u_values`: measured values by the probability transform of the predictive distribution."""
+"""The probability integral transform, and the area between the ECDF of u-values and the identity.
+
+Czado, Gneiting and Held (2009), doi:10.1111/j.1541-0420.2009.01191.x; Ferson, Oberkampf and
+Ginzburg (2008), doi:10.1016/j.cma.2007.07.030.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import numpy as np
 
-from numpy.typing import ArrayLike
-
-from prbayes._validate import Floats, Seed
-from prbayes.validation.conditions import Predicted, read_case
+from prbayes._stats import cumulated
+from prbayes._validate import Floats
 
 
-def u_values(
-    observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
-    predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
-    *,
-    randomize: bool = False,
-    random_seed: Seed = 0,
-) -> Floats:
-    r"""Return where measured responses stand in the pooled predictive distribution.
+class Predictive:
+    """The pooled predictive distribution of all draws and samples.
 
-    This is the probability integral transform:
-
-    .. math:: u_i = \tfrac{1}{2} \{ P(Y < y_i) + P(Y \le y_i) \}
-
-    over all draws and samples of the prediction together. Several conditions pool their u-values.
-
-    Parameters
-    ----------
-    observed : array_like, shape (n,); or a mapping or list of such, by condition
-        +inf is a specimen that had failed.
-    predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
-        +inf counts as larger than every number; NaN are left out.
-    randomize : bool
-        Whether u is uniform between P(Y < y) and P(Y <= y), and not the middle: then u-values of
-        ties, such as failed specimens or discrete responses, are uniform too if the model is right.
-    random_seed : int, sequence of int, numpy.random.Generator or None
-        Of that choice.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        In the order of ``observed``, one condition after the other.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not as described.
-
-    Notes
-    -----
-    Measured values that are rounded have ties that predicted ones have not: round the predicted
-    ones alike, as in ``u_values(observed, predicted.round(2))``.
-
-    References
-    ----------
-    .. [1] Czado, C., T. Gneiting and L. Held (2009), Predictive model assessment for count data,
-       Biometrics 65, 1254-1261, doi:10.1111/j.1541-0420.2009.01191.x.
-
-    Examples
-    --------
-    >>> import numpy as np, prbayes as prb
-    >>> prb.validation.u_values([0.3, 1.5, 9.0], np.array([0.0, 1.0, 2.0, 3.0]))
-    array([0.25, 0.5 , 1.  ])
+    ``values`` of any shape, of which NaN are left out and +inf is the largest, have equal weights
+    or ``weights`` of the same shape.
     """
-    case = read_case(observed, predicted, randomize=randomize, random_seed=random_seed)
-    return case.u_values()
+
+    def __init__(self, values: Floats, weights: Floats | None = None) -> None:
+        is_number = ~np.isnan(values)
+        numbers = values[is_number]
+        if weights is None:
+            self._values = np.sort(numbers)
+            # An empty pool has probability zero everywhere.
+            self._cumulative = np.arange(numbers.size + 1) / max(1, numbers.size)
+            return
+        order = np.argsort(numbers)
+        self._values = numbers[order]
+        cumulative = cumulated(weights[is_number], order)
+        self._cumulative = cumulative / cumulative[-1]
+
+    def steps(self, y: Floats) -> tuple[Floats, Floats]:
+        """Return P(Y < y) and P(Y <= y), of the shape of y; NaN where y is."""
+        nan = np.where(np.isnan(y), np.nan, 0.0)
+        n_smaller = np.searchsorted(self._values, y, side="left")
+        n_not_larger = np.searchsorted(self._values, y, side="right")
+        return self._cumulative[n_smaller] + nan, self._cumulative[n_not_larger] + nan
+
+    def transform(self, y: Floats, rng: np.random.Generator | None) -> Floats:
+        """Return the middle between P(Y < y) and P(Y <= y), or a uniform number between them."""
+        lower, upper = self.steps(y)
+        return between(lower, upper, rng)
+
+
+def between(lower: Floats, upper: Floats, rng: np.random.Generator | None) -> Floats:
+    """Return the middle of the two, or with a generator uniform numbers between them."""
+    fraction = 0.5 if rng is None else rng.random(lower.shape)
+    return np.asarray(lower + fraction * (upper - lower))
+
+
+def area(u: Floats) -> Floats:
+    r"""Return the exact areas between ECDFs of u, (..., n), and the identity on [0, 1], (...).
+
+    .. math:: A = \int_0^1 |F_n(v) - v| \, dv
+
+    Between two values the ECDF is constant, and the integral of an absolute value of a line
+    follows from that of :math:`|v|`, which is :math:`v |v| / 2`.
+    """
+    *leading, n = u.shape
+    zero = np.zeros((*leading, 1))
+    one = np.ones((*leading, 1))
+    ends = np.concatenate([zero, np.sort(u, axis=-1), one], axis=-1)
+    ecdf = np.arange(n + 1) / n
+    above = ends[..., 1:] - ecdf
+    below = ends[..., :-1] - ecdf
+    doubled = above * np.abs(above) - below * np.abs(below)
+    return np.asarray(doubled.sum(axis=-1) / 2)

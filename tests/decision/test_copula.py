@@ -29,7 +29,7 @@ def test_normal_draws_are_found_again() -> None:
 
 @pytest.mark.parametrize("i", range(3))
 def test_a_redrawn_element_has_the_same_distribution_with_the_others(i: int) -> None:
-    found = COPULA.redrawn(Z, FRESH, i)
+    found = COPULA.element_given_rest(Z, FRESH, i)
     np.testing.assert_array_equal(np.delete(found, i, 1), np.delete(Z, i, 1))
     np.testing.assert_allclose(np.cov(found.T), COPULA.correlation, atol=0.05)
     # Given the others, the old and the new are independent.
@@ -44,7 +44,7 @@ def test_a_redrawn_element_has_the_same_distribution_with_the_others(i: int) -> 
 @pytest.mark.parametrize("i", range(3))
 def test_others_are_redrawn_given_an_element(i: int) -> None:
     elsewhere = FRESH @ COPULA.root.T
-    found = COPULA.others_redrawn(Z, elsewhere, i)
+    found = COPULA.rest_given_element(Z, elsewhere, i)
     np.testing.assert_allclose(found[:, i], Z[:, i])
     np.testing.assert_allclose(np.cov(found.T), COPULA.correlation, atol=0.05)
     for j in {0, 1, 2} - {i}:

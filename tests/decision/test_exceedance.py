@@ -11,16 +11,16 @@ from decisions import doubled, normal, posterior, same
 from scipy.special import ndtr
 
 import prbayes as prb
-from prbayes.decision.exceedance import _error_of_points
+from prbayes.decision.exceedance import _jackknife_error
 
 MU, SIGMA = (posterior().posterior[name].values[0] for name in ("mu", "sigma"))
 THINNED = np.unique(np.linspace(0, 3999, 2000).round().astype(int))
 
 
-def exact(limit: float, level: float = 0.89) -> tuple[float, Any]:
+def exact(limit: float, prob: float = 0.89) -> tuple[float, Any]:
     """Return the probability of a new specimen, and the interval over the posterior."""
     each = ndtr((MU[THINNED] - limit) / SIGMA[THINNED])
-    return float(each.mean()), np.quantile(each, [(1 - level) / 2, (1 + level) / 2])
+    return float(each.mean()), np.quantile(each, [(1 - prob) / 2, (1 + prob) / 2])
 
 
 def ask(limit: float, response: Any = same, *more: Any, **given: Any) -> Any:
@@ -51,7 +51,7 @@ def test_from_points_where_it_matters() -> None:
 
 
 def test_the_error_counts_that_draws_are_few() -> None:
-    few, many = (ask(2.8, points=2000, n_draws=n) for n in (50, 2000))
+    few, many = (ask(2.8, points=2000, n_draws=draws) for draws in (50, 2000))
     scatter = float(few.by_draw.std(ddof=1)) / np.sqrt(50)
     assert float(few.error) > scatter > 2 * float(many.error)
     assert abs(float(few.probability) - exact(2.8)[0]) < 3 * float(few.error)
@@ -80,17 +80,15 @@ def test_below_is_above_of_the_opposite() -> None:
 def test_the_error_of_equal_points_is_that_of_their_blocks_means() -> None:
     values = np.arange(64.0)
     blocks = np.arange(64) % 8
-    thetas = np.zeros((3, 1))
-    told = SimpleNamespace(
-        populations=SimpleNamespace(thetas=thetas),
+    sample = SimpleNamespace(
         values=values,
         blocks=blocks,
-        mean_weights=lambda thetas: np.full(64, 1 / 64),
+        mean_weights=lambda: np.full(64, 1 / 64),
     )
     quantity = prb.decision.Exceedance(same, normal()[1], limit=42.0)
     means = [(values[blocks == b] > 42).mean() for b in range(8)]
     expected = np.std(means, ddof=1) / np.sqrt(8)
-    assert _error_of_points(told, quantity) == pytest.approx(expected)  # type: ignore[arg-type]
+    assert _jackknife_error(sample, quantity) == pytest.approx(expected)  # type: ignore[arg-type]
 
 
 def shifted(x: Any, by: Any) -> Any:

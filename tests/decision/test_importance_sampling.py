@@ -9,8 +9,8 @@ import pytest
 from scipy.special import ndtr, ndtri
 
 from prbayes._validate import Floats
-from prbayes.decision.importance_sampling import Rare, rare
-from prbayes.decision.inverse_transform import Specimens
+from prbayes.decision.importance_sampling import RareEvent, rare_event
+from prbayes.decision.populations import InverseTransform
 from prbayes.response.inputs import read_inputs
 
 SEEDS = 12
@@ -18,15 +18,15 @@ SEEDS = 12
 
 def found(
     size: int, respond: Callable[[Floats], Any], limit: float, mu: Any = (0.0,), n: int = 1000
-) -> list[Rare]:
+) -> list[RareEvent]:
     """Return probabilities of responses of independent normal inputs, by seed."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu") * np.ones(size), 1.0)
     inputs = read_inputs("f", [x], model)
     roots = [np.asarray(mu, dtype=float)]
-    specimens = Specimens("f", inputs, [np.zeros(1)])
+    transform = InverseTransform("f", inputs, [np.zeros(1)])
     return [
-        rare(specimens, roots, respond, limit, n, np.random.default_rng(seed))
+        rare_event(transform, roots, respond, limit, n, np.random.default_rng(seed))
         for seed in range(SEEDS)
     ]
 

@@ -9,7 +9,7 @@ from decisions import OBSERVED, doubled, jeffreys, normal, same
 from scipy.special import ndtr
 
 import prbayes as prb
-from prbayes.decision.p_box import _functions
+from prbayes.decision.p_box import _distribution_functions
 from prbayes.decision.populations import Populations
 
 DRAWS = 999
@@ -26,21 +26,21 @@ def functions(y: Any) -> Any:
     return ndtr((y - MU[:, None]) / SIGMA[:, None])
 
 
-@pytest.mark.parametrize("level", [0.9, pytest.param(0.5, marks=pytest.mark.slow)])
-def test_bands_hold_what_they_say(level: float) -> None:
-    found = box(prob=level)
+@pytest.mark.parametrize("prob", [0.9, pytest.param(0.5, marks=pytest.mark.slow)])
+def test_bands_hold_what_they_say(prob: float) -> None:
+    found = box(prob=prob)
     each = functions(found.y.values)
     pointwise = found.sel(band="pointwise")
-    expected = np.quantile(each, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    expected = np.quantile(each, [(1 - prob) / 2, (1 + prob) / 2], axis=0)
     np.testing.assert_allclose([pointwise.lower, pointwise.upper], expected, atol=0.01)
     entire = found.sel(band="simultaneous")
     model, x = normal()
-    told = Populations.of(POSTERIOR, model, DRAWS, "prb.decision.p_box").told(same, (x,), None)
-    own = _functions(told, found.y.values)
+    populations = Populations.of(POSTERIOR, model, DRAWS, "prb.decision.p_box")
+    own = _distribution_functions(populations.sample(same, (x,), None), found.y.values)
     np.testing.assert_allclose(own, each, atol=0.012)
     inside = (entire.lower.values <= own) & (own <= entire.upper.values)
     # Draws are left out by the same number on both sides, at each of their places.
-    assert level <= inside.all(axis=1).mean() < level + 0.03
+    assert prob <= inside.all(axis=1).mean() < prob + 0.03
     np.testing.assert_allclose(found["mean"], each.mean(axis=0), atol=0.01)
 
 

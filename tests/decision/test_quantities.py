@@ -9,6 +9,7 @@ from decisions import same
 from scipy.special import ndtri
 
 import prbayes as prb
+from prbayes.decision.quantities import interval_grid, interval_values
 
 VALUES = np.array([1.0, 2.0, 2.5, 7.0])
 WEIGHTS = np.array([[0.25, 0.25, 0.25, 0.25], [0.5, 0.0, 0.5, 0.0]])
@@ -50,3 +51,19 @@ def test_what_counts_of_a_specimen() -> None:
     quantile = prb.decision.Quantile(same, X, probability=0.5)
     np.testing.assert_array_equal(quantile.of_specimen(VALUES, 2.2), [0, 0, 1, 1])
     np.testing.assert_array_equal(prb.decision.Mean(same, X).of_specimen(VALUES, 0), VALUES)
+
+
+TWO = [prb.decision.Interval(1, 2), "x", prb.decision.Interval(-1, 1)]
+
+
+def test_every_combination_with_the_ends() -> None:
+    found = interval_grid(TWO, 3)
+    assert len(found) == 9
+    assert {(1.0, "x", -1.0), (1.5, "x", 0.0), (2.0, "x", 1.0)} <= set(found)
+    assert interval_grid(["x", 2.6], 3) == [("x", 2.6)]
+    assert interval_values(TWO, found[-1]) == "2, 1"
+
+
+def test_no_interval_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"high: got 1 with low = 1, expected more"):
+        prb.decision.Interval(1, 1)

@@ -1,12 +1,25 @@
-"""Shares of hyperparameters beside closed forms."""
+"""Sobol' indices: estimators, hyperparameters and inputs, beside closed forms and SALib."""
+
+from functools import cache
+from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
 import xarray as xr
 from decisions import doubled, normal, optimum, posterior, same
 
 import prbayes as prb
-from prbayes.decision import sensitivity as influence
+from prbayes._validate import Floats
+from prbayes.decision import sensitivity as module
+from prbayes.decision.populations import Populations
+from prbayes.decision.sensitivity import (
+    Indices,
+    derivative_bound,
+    first_order,
+    input_indices,
+    total_order,
+)
 
 
 def test_a_quantile_of_a_normal_population() -> None:
@@ -83,9 +96,238 @@ def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch
     model, x = normal()
     quantity = prb.decision.Quantile(same, x, probability=0.9)
     before = prb.sensitivity(posterior(), quantity, model=model, n_samples=256)
-    monkeypatch.setattr(influence, "_WEIGHT_STEP", factor * influence._WEIGHT_STEP)
+    monkeypatch.setattr(module, "_STEP", factor * module._STEP)
     after = prb.sensitivity(posterior(), quantity, model=model, n_samples=256)
     own = ["mu", "sigma"]
     np.testing.assert_allclose(
         after.derivative.sel(factor=own), before.derivative.sel(factor=own), atol=0.01
     )
+
+
+# -- estimators ----------------------------------------------------------------------------------
+
+# Sobol' indices of Ishigami's function with 7 and 0.1 (Ishigami and Homma 1990).
+VARIANCE = 49 / 8 + 0.1 * np.pi**4 / 5 + 0.01 * np.pi**8 / 18 + 0.5
+FIRST = np.array([0.5 * (1 + 0.1 * np.pi**4 / 5) ** 2, 49 / 8, 0.0]) / VARIANCE
+BOTH = 0.01 * np.pi**8 * (1 / 18 - 1 / 50) / VARIANCE
+TOTAL = FIRST + BOTH * np.array([1, 0, 1])
+R, SIZE = 16, 4096
+
+
+def ishigami(x: Floats) -> Any:
+    a, b, c = np.moveaxis(x, -1, 0)
+    return np.sin(a) + 7 * np.sin(b) ** 2 + 0.1 * c**4 * np.sin(a)
+
+
+def matched(seed: int = 0) -> tuple[Floats, list[Floats], list[Floats]]:
+    """Return points, and for each factor points that share it, and points that share all others."""
+    here, elsewhere = np.random.default_rng(seed).uniform(-np.pi, np.pi, (2, R, SIZE, 3))
+    same, other = [], []
+    for i in range(3):
+        pick = np.arange(3) == i
+        same.append(np.where(pick, here, elsewhere))
+        other.append(np.where(pick, elsewhere, here))
+    return here, same, other
+
+
+@pytest.fixture(scope="module")
+def indices() -> Indices:
+    here, same, other = matched()
+    y = ishigami(here)
+    rows = [
+        [first_order(y, ishigami(a)), total_order(y, ishigami(b)), np.zeros(R)]
+        for a, b in zip(same, other, strict=True)
+    ]
+    return Indices.of_replicates(np.array(rows))
+
+
+def test_ishigami(indices: Indices) -> None:
+    off = np.abs(indices.values[:2] - [FIRST, TOTAL])
+    assert (off < 5 * indices.errors[:2]).all()
+    assert (indices.errors < 0.01).all()
+
+
+def test_ishigami_beside_salib(indices: Indices) -> None:
+    pytest.importorskip("SALib")
+    from SALib.analyze import sobol
+    from SALib.sample import sobol as design
+
+    problem = {"num_vars": 3, "names": ["a", "b", "c"], "bounds": [[-np.pi, np.pi]] * 3}
+    x = design.sample(problem, 4096, calc_second_order=False, seed=1)
+    theirs = sobol.analyze(problem, ishigami(x), calc_second_order=False, seed=1)
+    for row, key in enumerate(("S1", "ST")):
+        # Their intervals are 95% ones.
+        both = np.hypot(indices.errors[row], np.array(theirs[f"{key}_conf"]) / 1.96)
+        assert (np.abs(indices.values[row] - theirs[key]) < 5 * both).all()
+
+
+def test_estimators_on_the_same_points_as_salib() -> None:
+    pytest.importorskip("SALib")
+    from SALib.analyze import sobol
+
+    here, _, other = matched(1)
+    base, mixed = ishigami(here[0]), [ishigami(x[0]) for x in other]
+    theirs = sobol.total_order(base, mixed[0], base)
+    # They divide by the variance of the first set alone.
+    ours = total_order(base[None], mixed[0][None])
+    np.testing.assert_allclose(ours, theirs, rtol=0.1)
+
+
+def test_a_linear_function_has_shares_that_sum_to_one_and_equal_bounds() -> None:
+    rng = np.random.default_rng(2)
+    slopes = np.array([1.0, -2.0, 0.0])
+    z, fresh = rng.normal(size=(2, R, SIZE, 3))
+    y = z @ slopes
+    for i, expected in enumerate(slopes**2 / 5):
+        only, without = fresh.copy(), z.copy()
+        only[..., i], without[..., i] = z[..., i], fresh[..., i]
+        first = first_order(y, only @ slopes)
+        total = total_order(y, without @ slopes)
+        bound = derivative_bound(np.full_like(y, slopes[i] ** 2), y)
+        for found in (first, total, bound):
+            assert abs(found.mean() - expected) <= 5 * found.std(ddof=1) / np.sqrt(R) + 1e-12
+
+
+def test_shares_do_not_depend_on_unit_and_zero() -> None:
+    here, same, other = matched(3)
+    y = ishigami(here)
+    for function, points in ((first_order, same[0]), (total_order, other[0])):
+        np.testing.assert_allclose(
+            function(1e6 + 3 * y, 1e6 + 3 * ishigami(points)),
+            function(y, ishigami(points)),
+            rtol=1e-6,
+        )
+
+
+def test_what_is_not_known_is_left_out_and_what_does_not_vary_has_no_share() -> None:
+    rng = np.random.default_rng(4)
+    y, other = rng.normal(size=(2, 1, 1000))
+    gone = other.copy()
+    gone[:, :500] = np.nan
+    np.testing.assert_allclose(first_order(y, gone), first_order(y[:, 500:], other[:, 500:]))
+    np.testing.assert_allclose(total_order(y, gone), total_order(y[:, 500:], other[:, 500:]))
+    assert np.isnan(first_order(np.ones((1, 9)), np.ones((1, 9))))
+
+
+# -- inputs --------------------------------------------------------------------------------------
+
+
+def ishigami_and_linear(a: Any, b: Any, c: Any, d: Any) -> Any:
+    return ishigami(np.stack([a, b, c], axis=-1)) + d
+
+
+def bounds(a: Any, b: Any, c: Any, d: Any) -> Any:
+    return a + 2 * d
+
+
+SHARE = VARIANCE / (VARIANCE + 1)
+FIRST_OF_FOUR = np.array([*FIRST * SHARE, 1 - SHARE])
+TOTAL_OF_FOUR = np.array([*TOTAL * SHARE, 1 - SHARE])
+
+
+@cache
+def problem(emulator: str | None = "auto", n: int = 256) -> tuple[prb.Optimum, list[Any]]:
+    rng = np.random.default_rng(1)
+    with pm.Model() as model:
+        inputs = [pm.Uniform.dist(-np.pi, np.pi) for _ in range(3)]
+        inputs.append(pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0))
+        data = ishigami_and_linear(*rng.uniform(-np.pi, np.pi, (3, 200)), rng.normal(0, 1, 200))
+        prb.Simulator(
+            *("y", ishigami_and_linear, *inputs),
+            metric=prb.ProbabilityResidual(),
+            observed=data,
+            propagation=prb.Reweighted(n, emulator=emulator),
+        )
+    return prb.minimize(model, refine=False, starts=0, progressbar=False), inputs
+
+
+@pytest.mark.slow
+def test_two_inputs_that_act_together_emulated_and_called() -> None:
+    def together(a: Any, b: Any) -> Any:
+        return a + b + a * b
+
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        b = pm.Normal.dist(0.0, 1.0)
+        z = np.random.default_rng(1).normal(size=(2, 100))
+        prb.Simulator(
+            *("y", together, a, b),
+            metric=prb.ProbabilityResidual(),
+            observed=together(*z),
+            propagation=prb.Reweighted(64),
+        )
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    # mu + a + (1 + mu) b + a b, with a and b standard normal.
+    slope = 1 + float(optimum.point["mu"])
+    alone = np.array([1.0, slope**2])
+    for computed in (False, True):
+        quantity = prb.decision.Mean(together, a, b)
+        table = prb.sensitivity(optimum, quantity, n_samples=512, computed=computed)
+        own = table.sel(factor=["a", "b"])
+        for key, part in (("first", alone), ("total", alone + 1)):
+            off = np.abs(own[key] - part / (alone.sum() + 1))
+            assert (off < 5 * own[f"{key}_error"]).all()
+            assert (own[f"{key}_error"] < 0.05).all()
+        assert (table.attrs["responses"] > 0) == computed
+
+
+@pytest.mark.slow
+def test_ishigami_emulated_from_few_runs_and_called() -> None:
+    optimum, inputs = problem()
+    quantity = prb.decision.Mean(ishigami_and_linear, *inputs)
+    for computed in (False, True):
+        table = prb.sensitivity(optimum, quantity, computed=computed)
+        own = table.sel(factor=list("abcd"))
+        for key, expected in (("first", FIRST_OF_FOUR), ("total", TOTAL_OF_FOUR)):
+            off = np.abs(own[key] - expected)
+            assert (off < 5 * own[f"{key}_error"]).all()
+            assert (own[f"{key}_error"] < 0.03).all()
+        assert (own.derivative > own.total - 0.02).all()
+        assert (table.attrs["responses"] > 0) == computed
+
+
+@pytest.mark.slow
+def test_derivatives_bound_a_linear_response_as_tightly_as_they_can() -> None:
+    optimum, inputs = problem()
+    quantity = prb.decision.Mean(bounds, *inputs)
+    own = prb.sensitivity(optimum, quantity, computed=True).sel(factor=list("abcd"))
+    # a is uniform: 2 pi times the distribution function of z, whose squared derivative has the
+    # mean 1 / (2 pi sqrt(3)).
+    shares = np.array([np.pi**2 / 3, 0, 0, 4.0])
+    np.testing.assert_allclose(own["total"], shares / shares.sum(), atol=0.01)
+    np.testing.assert_allclose(own.derivative[3], own["total"][3], atol=0.01)
+    np.testing.assert_allclose(own.derivative[0], 2 * np.pi / np.sqrt(3) / shares.sum(), atol=0.01)
+    np.testing.assert_allclose(own.derivative[1:3], 0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_without_an_emulator_nothing_tells_what_is_between_the_runs() -> None:
+    optimum, inputs = problem(None, 4096)
+    quantity = prb.decision.Mean(ishigami_and_linear, *inputs)
+    table = prb.sensitivity(optimum, quantity, n_samples=64)
+    assert np.isnan(table["first"].sel(factor="a"))
+    assert "computed=True" in table.attrs["inputs"]
+
+
+def test_where_the_nearest_run_failed_a_line_ends() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        observed = np.random.default_rng(1).normal(0, 1, 40)
+        prb.Simulator("y", np.sinh, x, metric=prb.AreaMetric(), observed=observed)
+    optimum = prb.minimize(model, progressbar=False)
+    broken = prb.decision.Exceedance(lambda x: np.where(x > 1, np.inf, x), x, limit=1.0)
+    populations = Populations.of(optimum, None, 50, "prb.sensitivity")
+    sample = populations.sample(broken.response, broken.inputs, None)
+    indices, _ = input_indices(sample, broken, 64, 0, computed=False)
+    assert indices.values[1] == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_the_step_of_inputs_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    optimum, inputs = problem()
+    quantity = prb.decision.Mean(ishigami_and_linear, *inputs)
+    before = prb.sensitivity(optimum, quantity, n_samples=64, computed=True)
+    monkeypatch.setattr(module, "_STEP", factor * module._STEP)
+    after = prb.sensitivity(optimum, quantity, n_samples=64, computed=True)
+    np.testing.assert_allclose(after.derivative[1:], before.derivative[1:], rtol=0.01)

@@ -19,7 +19,8 @@ from um_server import Real
 
 import prbayes as prb
 from prbayes.model.random_variable import nodes
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.executors import Capacity, capacity
 from prbayes.response.outputs import Outputs
 from prbayes.response.store import Store

@@ -14,7 +14,8 @@ from hostile import EXECUTORS
 from um_server import Real
 
 import prbayes as prb
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 
 LIMIT = 0.4
 

@@ -17,7 +17,8 @@ import pytest
 from hostile import ENDING, EXECUTORS, REASONS, hostile
 
 import prbayes as prb
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.failures import OnFailure, ResponseError
 from prbayes.response.store import Store
 

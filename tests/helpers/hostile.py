@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 import prbayes as prb
-from prbayes.response.call import Calling, Points, Tally, respond
+from prbayes.response.call import Points
+from prbayes.response.chunks import Calling, Tally, respond
 from prbayes.response.failures import OnFailure, ResponseError
 from prbayes.response.store import Store
 

@@ -33,7 +33,7 @@ def normal_means(metric: prb.Metric, n: int = 1, **keywords: Any) -> list[Inform
                 propagation=prb.Reweighted(256),
                 **keywords,
             )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     return [Information(evaluator, k, np.array([1.0])) for k in range(n)]
 
 
@@ -128,7 +128,7 @@ def test_of_a_sum_of_two_means_only_the_sum_is_identified(metric: prb.Metric) ->
             observed=OBSERVED,
             propagation=prb.Reweighted(256),
         )
-    information = [Information(Evaluator(model), 0, np.array([0.5, 0.5]))]
+    information = [Information(Evaluator.of(model), 0, np.array([0.5, 0.5]))]
     local = local_sampling(information, np.ones(1))
     sd = information[0].prior_sd
     # The gradient of a + b in units of the priors' spreads; what is orthogonal to it is not seen.

@@ -32,7 +32,7 @@ def two(name: str) -> tuple[Evaluator, DataSets]:
                 observed=factor * OBSERVED,
                 propagation=prb.Reweighted(128),
             )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     return evaluator, reweighted_sets(evaluator, 3)
 
 

@@ -39,7 +39,7 @@ def model_of(data: Any) -> pm.Model:
 
 def told(data: Any) -> str:
     """Return what is said of data against the population at zero."""
-    evaluator = Evaluator(model_of(data))
+    evaluator = Evaluator.of(model_of(data))
     sampling = SamplingDistribution.of(evaluator, np.zeros(1), np.ones(1))
     (sentence,) = disagreement(Refitted.there(sampling, 200, 0))
     return sentence

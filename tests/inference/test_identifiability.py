@@ -158,7 +158,7 @@ def test_of_a_sum_of_two_means_an_area_identifies_only_the_sum() -> None:
         prb.Simulator(
             "y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=R256
         )
-    information = Information(Evaluator(model), 0, np.array([0.5, 0.5]), n_sets=50)
+    information = Information(Evaluator.of(model), 0, np.array([0.5, 0.5]), n_sets=50)
     seen = identified_by_area(information)
     assert seen.shape == (2, 1)
     # In units of the priors' spreads, which are known from draws to some per cent.
@@ -185,8 +185,8 @@ def test_what_is_looked_at_stays_when_the_design_grows() -> None:
             "y", lambda x, y: x + y, x, y, metric=prb.AreaMetric(), observed=OBSERVED,
             propagation=prb.Reweighted(1024, emulator=None),
         )  # fmt: skip
-    evaluator = Evaluator(model)
-    theta = evaluator.initial
+    evaluator = Evaluator.of(model)
+    theta = evaluator.hyperparameters.initial
     information = Information(evaluator, 0, theta, n_sets=20)
     before = identified_by_area(information)
     (design,) = evaluator.designs.values()

@@ -73,7 +73,7 @@ def sum_of(names: list[str]) -> Evaluator:
             observed=OBSERVED,
             propagation=prb.Reweighted(256),
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def test_the_mean_of_a_sample_scatters_by_its_standard_error() -> None:
@@ -129,7 +129,7 @@ def test_a_kolmogorov_distance_knows_less_than_the_likelihood() -> None:
 def test_data_sets_are_drawn_at_the_optimum() -> None:
     evaluator = sum_of(["mu"])
     refits = Refits.at(evaluator, np.array([2.0]), np.ones(1))
-    minimisers = 2.0 + refits.shifts[:, 0] * evaluator.prior_sd[0]
+    minimisers = 2.0 + refits.shifts[:, 0] * evaluator.hyperparameters.prior_sd[0]
     assert abs(minimisers.mean() - 2.0) < 4 * 0.5 / (N * 200) ** 0.5
     # A minimiser is nowhere worse than theta, and the mean gain is that of one squared standard
     # error.

@@ -51,7 +51,7 @@ def pair() -> Evaluator:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
         prb.Simulator("a", same, x, observed=OBSERVED, **shared)
         prb.Simulator("b", double, x, observed=2 * OBSERVED, **shared)
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 @cache
@@ -80,7 +80,7 @@ def test_what_is_not_seen_is_left_over() -> None:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
         pm.Normal("idle", 0, 3)
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     sampling = SamplingDistribution.of(evaluator, np.array([1.0, 0.0]), np.ones(1))
     x = sampling.coordinates(np.array([[1.5, 2.0]]))
     assert x.shape == (1, 1)
@@ -126,7 +126,7 @@ def test_clouds_come_closer_at_the_rate_of_their_dimension(monkeypatch: pytest.M
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
         z = pm.Normal.dist(0, 1)
         prb.Simulator("y", lambda a, b: a + b, x, z, metric=METRICS["kl"], observed=[0.0, 1.0, 3.0])
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     evaluator(np.zeros((1, 1)))
     sampling = SamplingDistribution.of(evaluator, np.zeros(1), np.ones(1))
     monkeypatch.setattr(SamplingDistribution, "_of_clouds", True)
@@ -177,7 +177,7 @@ def test_two_simulators_are_weighed_by_their_scales() -> None:
     sampling = SamplingDistribution.of(evaluator, TRUTH, np.array([1 / N, 1e9]))
     sets = reweighted_sets(evaluator, 20)
     only_a, _ = sampling.refit(sets)
-    alone = Evaluator(build(METRICS["kl"], sd=0.5))
+    alone = Evaluator.of(build(METRICS["kl"], sd=0.5))
     by_itself = SamplingDistribution.of(alone, TRUTH, np.array([1 / N]))
     expected, _ = by_itself.refit(DataSets(sets.values[:1], sets.weights[:1]))
     np.testing.assert_allclose(sampling.thetas(only_a), by_itself.thetas(expected), atol=0.003)
@@ -195,7 +195,9 @@ def test_mean_hessian_of_a_parabola() -> None:
 
 def test_the_standard_error_of_a_mean() -> None:
     # Of N normal values of known spread, in the coordinates' own unit and in theta.
-    sampling = SamplingDistribution.of(Evaluator(build(METRICS["kl"], sd=0.5)), TRUTH, np.ones(1))
+    sampling = SamplingDistribution.of(
+        Evaluator.of(build(METRICS["kl"], sd=0.5)), TRUTH, np.ones(1)
+    )
     expected = 0.5 / N**0.5
     np.testing.assert_allclose(sampling.local.in_theta[0, 0] ** 0.5, expected, rtol=0.01)
     step = sampling.thetas(np.ones(1)) - TRUTH
@@ -204,7 +206,9 @@ def test_the_standard_error_of_a_mean() -> None:
 
 def test_a_minimiser_goes_where_its_data_go() -> None:
     # One data set is all on one side: the sign of the shift.
-    sampling = SamplingDistribution.of(Evaluator(build(METRICS["kl"], sd=0.5)), TRUTH, np.ones(1))
+    sampling = SamplingDistribution.of(
+        Evaluator.of(build(METRICS["kl"], sd=0.5)), TRUTH, np.ones(1)
+    )
     above = (np.median(OBSERVED) < OBSERVED).astype(float)
     weights = np.array([above, 1 - above])
     weights /= weights.sum(axis=1, keepdims=True)
@@ -317,8 +321,8 @@ def of_two_outputs(metric: prb.Metric = METRICS["kl"]) -> SamplingDistribution:
             observed=np.column_stack([a, a + b]),
             propagation=prb.Reweighted(1024, emulator=None),
         )
-    evaluator = Evaluator(model)
-    theta = evaluator.unconstrained({"mu": 1.0, "sigma": 0.5, "tau": 0.3})
+    evaluator = Evaluator.of(model)
+    theta = evaluator.hyperparameters.unconstrained({"mu": 1.0, "sigma": 0.5, "tau": 0.3})
     return SamplingDistribution.of(evaluator, theta, np.ones(1))
 
 

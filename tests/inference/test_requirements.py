@@ -38,7 +38,7 @@ CASES: list[tuple[prb.Metric, Any, str | None]] = [
 def test_reasons_name_the_simulator(
     metric: prb.Metric, propagation: Any, reason: str | None
 ) -> None:
-    evaluator = Evaluator(model_of(metric, propagation))
+    evaluator = Evaluator.of(model_of(metric, propagation))
     for obstacle in (sampling_obstacle(evaluator), refit_obstacle(evaluator)):
         if reason is None:
             assert obstacle is None
@@ -52,7 +52,7 @@ def test_other_terms_forbid_refits_only() -> None:
     model = model_of(KL, prb.Reweighted(64))
     with model:
         pm.Potential("z", -(model["mu"] ** 2))
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     assert sampling_obstacle(evaluator) is None
     assert "likelihood terms or potentials" in str(refit_obstacle(evaluator))
 
@@ -64,4 +64,4 @@ def test_one_metric_of_ones_own_makes_all_responses_count() -> None:
         prb.Simulator(
             "z", np.positive, x, metric=KL, observed=OBSERVED, propagation=prb.Resimulated(64)
         )
-    assert "responses of z are not stored" in str(sampling_obstacle(Evaluator(model)))
+    assert "responses of z are not stored" in str(sampling_obstacle(Evaluator.of(model)))

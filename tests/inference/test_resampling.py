@@ -79,7 +79,7 @@ def pair(
             observed=OBSERVED[:9],
             propagation=propagation,
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def means(sets: DataSets) -> list[Floats]:
@@ -106,7 +106,7 @@ def test_numbers_and_groups_of_specimens() -> None:
     assert siblings(shared, {"c"}) == {"c"}
     assert aligned(shared[:2])
     assert not aligned(shared)
-    repeated = Evaluator(build(specimens=np.arange(N) // 2)).nodes
+    repeated = Evaluator.of(build(specimens=np.arange(N) // 2)).nodes
     assert specimens(repeated)[1] == N // 2
     assert dependent(repeated)
 
@@ -130,7 +130,7 @@ def test_specimens_are_shared_through_others() -> None:
                 specimens=list(labels),
                 propagation=R256,
             )
-    nodes = Evaluator(model).nodes
+    nodes = Evaluator.of(model).nodes
     assert groups(nodes) == [[0, 1, 2], [3]]
     assert siblings(nodes, {"a"}) == {"a", "b", "c"}
 
@@ -140,7 +140,7 @@ def test_specimens_are_shared_through_others() -> None:
 
 
 def test_simulated_sets_are_samples_of_the_population() -> None:
-    sets = simulated_sets(Evaluator(build()), TRUTH, 2000)
+    sets = simulated_sets(Evaluator.of(build()), TRUTH, 2000)
     (values,), (weights,) = sets.values, sets.weights
     assert weights.shape == (2000, values.size)
     np.testing.assert_allclose(weights.sum(axis=1), 1)
@@ -149,20 +149,20 @@ def test_simulated_sets_are_samples_of_the_population() -> None:
     (mean,) = means(sets)
     assert abs(mean.mean() - 1) < 4 * 0.5 / (N * 2000) ** 0.5
     np.testing.assert_allclose(mean.std(), 0.5 / N**0.5, rtol=4 * 0.016)
-    again = simulated_sets(Evaluator(build()), TRUTH, 2000)
+    again = simulated_sets(Evaluator.of(build()), TRUTH, 2000)
     np.testing.assert_array_equal(again.weights[0], weights)
-    other = simulated_sets(Evaluator(build()), TRUTH, 2000, seed=1)
+    other = simulated_sets(Evaluator.of(build()), TRUTH, 2000, seed=1)
     assert (other.weights[0] != weights).any()
 
 
 def test_repeated_measurements_of_a_specimen_are_one_draw() -> None:
-    (mean,) = means(simulated_sets(Evaluator(build(specimens=np.arange(N) // 4)), TRUTH, 2000))
+    (mean,) = means(simulated_sets(Evaluator.of(build(specimens=np.arange(N) // 4)), TRUTH, 2000))
     np.testing.assert_allclose(mean.std(), 0.5 / (N / 4) ** 0.5, rtol=4 * 0.016)
 
 
 def test_the_observations_own_weights_go_with_the_draws() -> None:
     weights = np.random.default_rng(3).dirichlet(np.full(N, 0.5))
-    (mean,) = means(simulated_sets(Evaluator(build(weights=weights)), TRUTH, 2000))
+    (mean,) = means(simulated_sets(Evaluator.of(build(weights=weights)), TRUTH, 2000))
     np.testing.assert_allclose(mean.std(), 0.5 * (weights**2).sum() ** 0.5, rtol=4 * 0.016)
 
 
@@ -210,7 +210,7 @@ def of_failing(metric: Any) -> Evaluator:
         propagation = prb.Reweighted(256, max_lost=0.9)
         observed = OBSERVED[OBSERVED < 1]
         prb.Simulator("y", failing, x, metric=metric, observed=observed, propagation=propagation)
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def test_specimens_without_a_response_cannot_be_observed() -> None:
@@ -241,7 +241,7 @@ def test_specimens_that_failed_are_observed_as_such() -> None:
 
 @pytest.mark.parametrize("propagation", [R256, prb.Resimulated(64)])
 def test_fresh_data_call_the_response(propagation: Any) -> None:
-    evaluator = Evaluator(build(propagation=propagation))
+    evaluator = Evaluator.of(build(propagation=propagation))
     rng = np.random.default_rng(4)
     draws = np.array([fresh_data(evaluator, TRUTH, rng)["y"] for _ in range(50)])
     assert draws.shape == (50, N)
@@ -259,9 +259,9 @@ def test_fresh_data_of_shared_and_repeated_specimens() -> None:
     assert not np.isin(data["c"], data["a"]).any()
     apart = fresh_data(pair(None, None), TRUTH, np.random.default_rng(5))
     assert abs(np.corrcoef(apart["a"], apart["b"])[0, 1]) < 4 / N**0.5
-    repeated = fresh_data(Evaluator(build(specimens=labels // 2)), TRUTH, np.random.default_rng(5))[
-        "y"
-    ]
+    repeated = fresh_data(
+        Evaluator.of(build(specimens=labels // 2)), TRUTH, np.random.default_rng(5)
+    )["y"]
     np.testing.assert_array_equal(repeated[::2], repeated[1::2])
     assert np.unique(repeated).size == N // 2
 
@@ -272,13 +272,13 @@ def test_fresh_data_of_shared_and_repeated_specimens() -> None:
 
 def test_dirichlet_weights() -> None:
     own = np.random.default_rng(3).dirichlet(np.full(N, 2.0))
-    (weights,) = reweighted_sets(Evaluator(build()), 4000).weights
+    (weights,) = reweighted_sets(Evaluator.of(build()), 4000).weights
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     np.testing.assert_allclose(weights.mean(axis=0), 1 / N, rtol=4 / 4000**0.5)
     # Var of an element of Dirichlet(1, ..., 1); the variance of 4000 squares of nearly exponential
     # numbers: 5%.
     np.testing.assert_allclose(weights.var(axis=0).mean(), (N - 1) / (N**2 * (N + 1)), rtol=0.03)
-    (weighted,) = reweighted_sets(Evaluator(build(weights=own)), 4000).weights
+    (weighted,) = reweighted_sets(Evaluator.of(build(weights=own)), 4000).weights
     np.testing.assert_allclose(
         weighted, weights * own / (weights * own).sum(axis=1, keepdims=True), rtol=1e-10
     )
@@ -290,7 +290,7 @@ def test_shared_specimens_have_one_weight() -> None:
     np.testing.assert_allclose(a, b[:, ::-1])
     a, b, _ = reweighted_sets(pair(None, None), 5).weights
     assert (a != b).all()
-    (repeated,) = reweighted_sets(Evaluator(build(specimens=labels // 2)), 5).weights
+    (repeated,) = reweighted_sets(Evaluator.of(build(specimens=labels // 2)), 5).weights
     np.testing.assert_allclose(repeated[:, ::2], repeated[:, 1::2])
 
 
@@ -304,12 +304,12 @@ def test_observing_is_the_model_of_other_data(name: str) -> None:
     data = np.random.default_rng(7).normal(0.5, 0.7, N)
     weights = np.random.default_rng(8).dirichlet(np.full(N, 3.0))
     model = build(metric, sd=None, weights=weights)
-    evaluator = Evaluator(model)
-    thetas = evaluator.prior_thetas(20, 1)
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.prior_thetas(20, 1)
     before = evaluator(thetas).discrepancies
     other, built = (
         evaluator.observing({"y": data}),
-        Evaluator(build(metric, data, sd=None, weights=weights)),
+        Evaluator.of(build(metric, data, sd=None, weights=weights)),
     )
     for size in (1, 20):
         found, expected = other(thetas[:size]), built(thetas[:size])
@@ -334,7 +334,7 @@ def test_observing_is_the_model_of_other_data(name: str) -> None:
 
 def test_observing_another_number_of_responses_drops_the_weights() -> None:
     weights = np.random.default_rng(8).dirichlet(np.full(N, 3.0))
-    other = Evaluator(build(weights=weights)).observing({"y": OBSERVED[:10]})
+    other = Evaluator.of(build(weights=weights)).observing({"y": OBSERVED[:10]})
     np.testing.assert_allclose(other.nodes[0].target.weights, 0.1)
 
 
@@ -343,9 +343,9 @@ def test_observing_another_number_of_responses_drops_the_weights() -> None:
 
 
 def test_batches_added_inside_are_undone() -> None:
-    evaluator = Evaluator(build(KL, sd=None))
+    evaluator = Evaluator.of(build(KL, sd=None))
     (design,) = evaluator.designs.values()
-    thetas = evaluator.prior_thetas(30, 1)
+    thetas = evaluator.hyperparameters.prior_thetas(30, 1)
     before, support = evaluator(thetas).discrepancies, evaluator.support(thetas)["y"]
     inside = []
     for at in (
@@ -365,14 +365,14 @@ def test_batches_added_inside_are_undone() -> None:
     graph = evaluator.objective(prior=False, gradient=False)(thetas[0], np.ones(1))[0]
     np.testing.assert_allclose(graph, before[0, 0], rtol=1e-10)
     # Two designs of equal size are two designs: nothing of the first is remembered in the second.
-    fresh = Evaluator(build(KL, sd=None))
+    fresh = Evaluator.of(build(KL, sd=None))
     fresh.nodes[0].bound.add(fresh.roots(thetas[3:6], 0))
     np.testing.assert_allclose(inside[1], fresh(thetas).discrepancies, rtol=1e-10)
     assert not np.allclose(inside[0], inside[1], rtol=1e-6)
 
 
 def test_a_failure_inside_is_undone_too() -> None:
-    evaluator = Evaluator(build())
+    evaluator = Evaluator.of(build())
     (design,) = evaluator.designs.values()
 
     def fail() -> None:
@@ -393,7 +393,7 @@ def test_designs_of_the_same_points() -> None:
         b.add([np.zeros(3)])
         assert not a.same_points(b)
     assert a.same_points(b)
-    assert not a.same_points(Evaluator(build(propagation=prb.Resimulated(256))).nodes[0].bound)
+    assert not a.same_points(Evaluator.of(build(propagation=prb.Resimulated(256))).nodes[0].bound)
 
 
 # -- a data set at each theta
@@ -407,7 +407,7 @@ def sets_along(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -
 
 
 def test_each_theta_has_a_data_set_from_its_own_population() -> None:
-    evaluator = Evaluator(build(observed=np.arange(20.0) / 10, sd=None))
+    evaluator = Evaluator.of(build(observed=np.arange(20.0) / 10, sd=None))
     low, high = np.array([0.5, np.log(0.3)]), np.array([1.4, np.log(0.6)])
     thetas = np.repeat([low, high], 300, axis=0)
     sets = sets_along(evaluator, thetas, np.random.default_rng(1))
@@ -440,7 +440,7 @@ def test_specimens_are_shared_at_each_theta() -> None:
 
 
 def test_one_data_set_has_a_row_for_each_specimen() -> None:
-    evaluator = Evaluator(build())
+    evaluator = Evaluator.of(build())
     sets = simulated_sets(evaluator, TRUTH, 5, seed=3)
     data, weights = one_set(evaluator, sets, 2)
     assert data["y"].shape == (N,)
@@ -451,7 +451,7 @@ def test_one_data_set_has_a_row_for_each_specimen() -> None:
 
 def test_one_data_set_of_specimens_that_count_differently() -> None:
     own = np.random.default_rng(8).dirichlet(np.full(N, 3.0))
-    evaluator = Evaluator(build(weights=own))
+    evaluator = Evaluator.of(build(weights=own))
     sets = simulated_sets(evaluator, TRUTH, 5, seed=3)
     data, weights = one_set(evaluator, sets, 2)
     np.testing.assert_allclose(weights["y"].sum(), 1)
@@ -461,7 +461,7 @@ def test_one_data_set_of_specimens_that_count_differently() -> None:
 
 
 def test_one_data_set_of_specimens_that_were_weighted_anew() -> None:
-    evaluator = Evaluator(build())
+    evaluator = Evaluator.of(build())
     sets = reweighted_sets(evaluator, 3, 1)
     data, weights = one_set(evaluator, sets, 1)
     np.testing.assert_array_equal(data["y"], OBSERVED)

@@ -30,7 +30,7 @@ def known_sd(metric: prb.Metric, propagation: Any = R256, **keywords: Any) -> In
         prb.Simulator(
             "y", np.positive, x, metric=metric, observed=OBSERVED, propagation=propagation
         )
-    return Information(Evaluator(model), 0, np.array([MEAN]), **keywords)
+    return Information(Evaluator.of(model), 0, np.array([MEAN]), **keywords)
 
 
 @cache
@@ -38,7 +38,7 @@ def mean_and_sd(metric: prb.Metric) -> Information:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         prb.Simulator("y", np.positive, x, metric=metric, observed=OBSERVED, propagation=R256)
-    return Information(Evaluator(model), 0, np.array([MEAN, np.log(SPREAD)]))
+    return Information(Evaluator.of(model), 0, np.array([MEAN, np.log(SPREAD)]))
 
 
 def closed_form(h: float, s: float, factor: float) -> tuple[float, float]:
@@ -167,7 +167,7 @@ def test_one_prior_however_wide_leaves_the_other_s_error_as_it_is() -> None:
                 "y", lambda x: x, x, metric=AREA, observed=OBSERVED,
                 propagation=prb.Resimulated(512),
             )  # fmt: skip
-        information = Information(Evaluator(model), 0, np.array([MEAN, np.log(SPREAD)]))
+        information = Information(Evaluator.of(model), 0, np.array([MEAN, np.log(SPREAD)]))
         covariance = local_sampling([information], np.ones(1)).in_theta
         return list(np.sqrt(np.diag(covariance)))
 
@@ -206,7 +206,7 @@ def test_responses_beyond_the_grid_leave_the_curvature_as_it_is(metric: prb.Metr
             prb.Simulator(
                 "y", np.positive, x, metric=metric, observed=observed, propagation=propagation
             )
-        return Information(Evaluator(model), 0, np.array([1.0, np.log(spread)]))
+        return Information(Evaluator.of(model), 0, np.array([1.0, np.log(spread)]))
 
     moved = information(prb.Resimulated(2048))
     weighed = information(prb.Reweighted(1024))
@@ -234,7 +234,7 @@ def test_noise_of_gradients_with_tails_is_that_of_the_whole_population() -> None
             propagation=prb.Reweighted(4096, emulator=None),
             progressbar=False,
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     information = Information(evaluator, 0, np.array([0.3, -0.5]))
     values, weights = information._center
     batches = [slice(i, i + 64) for i in range(0, len(values), 64)]

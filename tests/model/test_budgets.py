@@ -25,7 +25,7 @@ def test_a_design_is_what_it_was_where_work_is_interrupted(stops: Any, points: i
     at = [np.array([2.5]), np.array([0.7])]
 
     def work() -> None:
-        with designs_as_before(Evaluator(model)):
+        with designs_as_before(Evaluator.of(model)):
             design.add(at)
             values.append(design.values[16:])
             raise stops

@@ -18,7 +18,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.propagation.specimen_points import PointOptions
 from prbayes.response.compile import PLAIN
@@ -331,9 +331,9 @@ def test_different_outputs_of_a_specimen_in_different_rows_are_no_repeats() -> N
 
 
 def test_a_specimen_with_repeated_readings_counts_once_in_a_held_out_loss() -> None:
-    evaluator = Evaluator(repeated())
-    thetas = evaluator.thetas_of([np.array([0.8]), np.exp([-0.5])])
-    (logs,) = evaluator.specimen_log_likelihoods(thetas)["y"]
+    evaluator = Evaluator.of(repeated())
+    thetas = evaluator.hyperparameters.thetas_of([np.array([0.8]), np.exp([-0.5])])
+    (logs,) = specimen_log_likelihoods(evaluator, thetas)["y"]
     # Three readings of specimen 0, one of specimen 19
     held_out = np.isin(LABELS, [0, 19]).astype(float)[None]
     loss = _mean_log_losses(evaluator, thetas, [held_out])

@@ -1,10 +1,8 @@
-"""What a model costs is what it then computes."""
+"""The cost of a model is the number of runs that it then computes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +11,8 @@ import pytest
 from first_use import first_use
 
 import prbayes as prb
-from prbayes.model.cost import listening
-from prbayes.model.random_variable import nodes
+from prbayes.propagation.base import Propagation
+from prbayes.response.budget import Cost, RunCost, SimulatorCost, duration
 
 OBSERVED = np.array([1.0, 2.0, 2.5, 4.0])
 
@@ -58,69 +56,17 @@ def test_nothing_is_computed_and_as_much_is_needed_then(
     build = builder(response, propagation)
     cost = prb.cost(build)
     assert response.calls == 0
-    assert (cost.runs, cost.runs_each, np.isnan(cost.seconds)) == (first, each, True)
+    assert (cost.runs, cost.runs_each) == (first, each)
     model = build()
     assert str(prb.cost(model)) == str(cost)
     assert response.calls == 0
     first_use(model)
     assert response.calls == first
     again = prb.cost(model)
-    assert (again.runs, again.simulators[0].first, again.runs_each) == (0, first, each)
+    assert (again.runs, again.simulators[0].needed.first, again.runs_each) == (0, first, each)
     with model:
         assert prb.cost().simulators == again.simulators
     assert response.calls == first
-    assert listening() is None
-
-
-def test_specimens_that_come_again_are_counted_once() -> None:
-    response = Counted()
-    build = builder(response, prb.Reweighted(64), x=lambda mu: pm.Poisson.dist(pm.math.exp(mu)))
-    cost = prb.cost(build)
-    assert cost.runs < 64
-    first_use(build())
-    assert response.calls == cost.runs
-
-
-def test_a_dry_run_is_one_of_those_that_are_needed_and_goes_on_the_executor(
-    tmp_path: Path,
-) -> None:
-    response = Counted()
-    with ThreadPoolExecutor(3) as threads:
-        settings = {"executor": threads, "store": tmp_path, "version": "1"}
-        build = builder(response, prb.Reweighted(32, **settings))
-        cost = prb.cost(build, dry_run=True)
-        (only,) = cost.simulators
-        assert response.calls == 1
-        assert (only.first, only.known, only.missing, only.workers) == (32, 1, 31, 3)
-        tried = only.dry_run
-        assert tried is not None
-        assert tried.outputs == {"y": 2 * tried.inputs[0]}
-        assert cost.seconds == 11 * tried.seconds
-        model = build()
-        (node,) = nodes(model).values()
-    assert response.calls == 32
-    (points,) = node.bound.known_points
-    rank = int((points < tried.inputs[0]).sum())
-    assert rank in (15, 16), "in the middle of 32"
-
-
-def test_a_dry_run_of_a_response_of_arrays_and_of_several_outputs() -> None:
-    def both(x: Any) -> dict[str, Any]:
-        return {"b": x + 1, "a": 2 * x}
-
-    def build() -> None:
-        with pm.Model():
-            x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-            a = np.random.default_rng(0).normal(size=9)
-            prb.Simulator(
-                "y", both, x, metric=prb.Joint(prb.AreaMetric()), observed={"a": a, "b": a**2},
-                propagation=prb.Reweighted(16),
-            )  # fmt: skip
-
-    (only,) = prb.cost(build, dry_run=True).simulators
-    assert only.dry_run is not None
-    (x,) = only.dry_run.inputs
-    assert only.dry_run.outputs == {"a": 2 * x, "b": x + 1}
 
 
 def test_simulators_that_share_runs_need_them_once() -> None:
@@ -136,22 +82,69 @@ def test_simulators_that_share_runs_need_them_once() -> None:
                 )
         return model
 
-    cost = prb.cost(build, dry_run=True)
-    first, second = cost.simulators
-    assert (first.first, second.first, cost.runs) == (16, 0, 16)
-    assert second.propagation.endswith("with the runs of y")
-    assert response.function.calls == 1
     model = build()
-    assert [one.first for one in prb.cost(model).simulators] == [16, 0]
+    cost = prb.cost(model)
+    first, second = cost.simulators
+    assert (first.needed.first, second.needed.first, cost.runs) == (16, 0, 16)
+    assert second.propagation.endswith("with the runs of y")
     first_use(model)
-    assert response.function.calls == 17
+    assert response.function.calls == 16
+    assert prb.cost(model).runs == 0
 
 
-def test_what_is_no_model_is_refused_and_leaves_nothing_behind() -> None:
-    with pytest.raises(ValueError, match=r"cost: model: got function .*made no prb.Simulator, ex"):
-        prb.cost(lambda: None)
+def test_what_is_no_model_is_refused() -> None:
+    with pytest.raises(
+        TypeError, match=r"cost: model: got a function that returns NoneType None, expected a"
+    ):
+        prb.cost(lambda: None)  # type: ignore[arg-type, return-value]
     with pytest.raises(ZeroDivisionError):
-        prb.cost(lambda: 1 / 0)
-    assert listening() is None
+        prb.cost(lambda: 1 / 0)  # type: ignore[arg-type, return-value]
     with pytest.raises(TypeError, match=r"prb.cost\(\): got no model on the context"):
         prb.cost()
+
+
+FIRST = SimulatorCost("y", "Reweighted(64)", RunCost(64, 0, 2048, "up to 2048"), 10, 8)
+SECOND = SimulatorCost("z", "Fresh(50)", RunCost(16, 50, None, "as asked"), 0, 1)
+
+
+def test_simulators_add_up_and_read_as_sentences() -> None:
+    cost = Cost((FIRST, SECOND))
+    assert (cost.runs, cost.runs_each) == (70, 50)
+    assert repr(cost) == (
+        "y: Reweighted(64)\n"
+        "  at first: 64 runs, 10 of them computed, 8 at a time\n"
+        "  for each value of the hyperparameters: no run\n"
+        "  more: up to 2048\n"
+        "z: Fresh(50)\n"
+        "  at first: 16 runs, 0 of them computed, one at a time\n"
+        "  for each value of the hyperparameters: 50 runs\n"
+        "  more: as asked"
+    )
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0123, "0.012 s"),
+        (9.4, "9.4 s"),
+        (119.0, "119 s"),
+        (120.0, "2.0 min"),
+        (7199.0, "120.0 min"),
+        (7200.0, "2.0 h"),
+        (2e6, "23.1 days"),
+    ],
+)
+def test_durations_have_their_unit(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_propagations_state_their_runs() -> None:
+    class Custom(Propagation):
+        bind = None  # type: ignore[assignment]
+
+    cost = prb.Reweighted(64, max_points=96).cost
+    assert (cost.first, cost.each, cost.most) == (64, 0, 96)
+    assert cost.growth.startswith("up to 96 in all, ")
+    assert prb.Reweighted(64).cost.most == 2048
+    assert (prb.Resimulated(50).cost.each, prb.Fresh(7).cost.each) == (50, 7)
+    assert Custom().cost == RunCost(0, 0, None, "as Custom asks for them")

@@ -17,7 +17,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, coarser_evaluator, is_current
 from prbayes.propagation.base import Propagation
 from prbayes.response.compile import PLAIN
 
@@ -116,7 +116,7 @@ def with_input(case: Case, propagation: Propagation) -> tuple[Evaluator, Floats]
             observed=OBSERVED,
             propagation=propagation,
         )
-    return Evaluator(model), np.array([list(case.at.values())], dtype=np.float64)
+    return Evaluator.of(model), np.array([list(case.at.values())], dtype=np.float64)
 
 
 def check_population(values: Floats, weights: Floats, expected: Any, tolerance: float) -> None:
@@ -195,9 +195,12 @@ def test_epistemic_variables_data_and_constants(propagation: Propagation, black:
             observed=OBSERVED,
             propagation=propagation,
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     thetas = np.array(
-        [evaluator.unconstrained({"mu": 2.0, "sigma": 0.5, "slope": s}) for s in (1.0, -0.5)]
+        [
+            evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.5, "slope": s})
+            for s in (1.0, -0.5)
+        ]
     )
     for level in (3.0, 4.0):
         model.set_data("level", level)
@@ -224,7 +227,7 @@ def test_inputs_that_depend_on_each_other_are_drawn_fresh() -> None:
             observed=OBSERVED,
             propagation=prb.Fresh(20_000),
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     values, weights = evaluator.populations(np.array([[1.0], [3.0]]), 0)
     for v, w, m in zip(values, weights, (1.0, 3.0), strict=True):
         check_population(v, w, stats.norm(0.5 * m, np.hypot(0.3, 0.8)), 0.03)
@@ -259,14 +262,14 @@ both = pytest.mark.parametrize(
 def test_one_implementation(metric: str, propagation: Propagation) -> None:
     weights = None if metric == "own" else np.random.default_rng(5).dirichlet(np.full(N, 9.0))
     model, _ = build(propagation, metric=METRICS[metric], weights=weights, epsilon=0.37)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     values, w = evaluator.populations(THETAS, 0)
     direct = METRICS[metric](values, OBSERVED, weights=w, observed_weights=weights)
     assert direct.shape == (3,)
     np.testing.assert_allclose(evaluator(THETAS).discrepancies[:, 0], direct, rtol=1e-9)
     logp = model.compile_logp(mode=PLAIN)
     for theta, d in zip(THETAS, direct, strict=True):
-        point = dict(zip(evaluator.names, theta, strict=True))
+        point = dict(zip(evaluator.hyperparameters.names, theta, strict=True))
         prior = (
             stats.norm(2, 1).logpdf(theta[0]) + stats.halfnorm.logpdf(np.exp(theta[1])) + theta[1]
         )
@@ -323,7 +326,7 @@ def test_an_invalid_particle_leaves_the_others_alone(name: str, black: bool) -> 
             epsilon=EPSILON,
             propagation=PROPAGATIONS[name],
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     thetas = np.column_stack([np.linspace(1, 3, 7), np.full(7, 0.6)])
     thetas[2, 1], thetas[4, 1] = -0.6, np.nan
     batch = evaluator(thetas)
@@ -358,7 +361,7 @@ def test_an_invalid_correlation_leaves_the_others_alone() -> None:
                 observed=OBSERVED,
                 propagation=propagation,
             )
-        found = Evaluator(model)(np.array([[0.0], [1.3], [-0.9], [0.9]])).discrepancies[:, 0]
+        found = Evaluator.of(model)(np.array([[0.0], [1.3], [-0.9], [0.9]])).discrepancies[:, 0]
         np.testing.assert_array_equal(np.isinf(found), [False, True, False, False])
         # The mean is 1.5 too large whatever the correlation.
         assert (found[[0, 2, 3]] > 1.2).all()
@@ -382,7 +385,7 @@ def test_data_above_the_inputs_is_followed(propagation: Propagation) -> None:
             propagation=propagation,
         )
     evaluator, logp, point = (
-        Evaluator(model),
+        Evaluator.of(model),
         model.compile_logp(mode=PLAIN),
         {"mu": 2.0, "sigma_log__": 0.0},
     )
@@ -419,8 +422,8 @@ def test_large_designs_have_coarser_ones() -> None:
                 observed=np.linspace(-1, 3, 9),
                 propagation=prb.Reweighted(n, emulator=None),
             )
-    evaluator = Evaluator(model)
-    coarser = evaluator.coarser()
+    evaluator = Evaluator.of(model)
+    coarser = coarser_evaluator(evaluator)
     assert coarser is not None
     assert [node.bound.n_points for node in coarser.nodes] == [128, 1024]
     assert [node.bound.n_points for node in evaluator.nodes] == [128, 8192]
@@ -432,13 +435,13 @@ def test_large_designs_have_coarser_ones() -> None:
     np.testing.assert_array_equal(found.discrepancies[:, 0], expected.discrepancies[:, 0])
     assert np.all(found.discrepancies[:, 1] != expected.discrepancies[:, 1])
     np.testing.assert_allclose(found.discrepancies[:, 1], expected.discrepancies[:, 1], rtol=0.1)
-    assert coarser.coarser() is None
+    assert coarser_evaluator(coarser) is None
 
 
 def test_an_evaluator_of_other_data_travels_with_them() -> None:
-    evaluator = Evaluator(build(prb.Reweighted(POINTS))[0])
+    evaluator = Evaluator.of(build(prb.Reweighted(POINTS))[0])
     other = evaluator.observing({"y": OBSERVED + 1})
-    thetas = evaluator.prior_thetas(5, 1)
+    thetas = evaluator.hyperparameters.prior_thetas(5, 1)
     for one in (evaluator, other):
         back = pickle.loads(pickle.dumps(one))
         np.testing.assert_array_equal(back(thetas).discrepancies, one(thetas).discrepancies)
@@ -454,8 +457,8 @@ def test_an_evaluator_of_a_model_that_got_another_simulator_is_not_current() -> 
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
         given = {"metric": prb.AreaMetric(), "observed": [0.0, 1.0, 2.0]}
         prb.Simulator("y", lambda x: x, x, **given)
-    evaluator = Evaluator(model)
-    assert evaluator.is_current
+    evaluator = Evaluator.of(model)
+    assert is_current(evaluator)
     with model:
         prb.Simulator("z", lambda x: 2 * x, x, **given)
-    assert not evaluator.is_current
+    assert not is_current(evaluator)

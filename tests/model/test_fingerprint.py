@@ -84,7 +84,7 @@ def base() -> pm.Model:
 
 @cache
 def identity() -> Identity:
-    return identity_of(Evaluator(base()))
+    return identity_of(Evaluator.of(base()))
 
 
 @cache
@@ -129,7 +129,7 @@ CHANGES: dict[str, tuple[Problem, Level, str]] = {
 @pytest.mark.parametrize("change", CHANGES)
 def test_changes_are_told_from_their_level_on(change: str) -> None:
     problem, level, message = CHANGES[change]
-    other = identity_of(Evaluator(problem.model()))
+    other = identity_of(Evaluator.of(problem.model()))
     for at in Level:
         if at < level:
             assert differences(other, identity(), at) == []
@@ -139,7 +139,7 @@ def test_changes_are_told_from_their_level_on(change: str) -> None:
 
 
 def test_the_same_model_built_again_is_the_same_problem() -> None:
-    assert identity_of(Evaluator(Problem().model())) == identity()
+    assert identity_of(Evaluator.of(Problem().model())) == identity()
 
 
 def test_what_an_input_is_called_makes_no_other_problem() -> None:
@@ -157,7 +157,7 @@ class _Named:
 
 def test_clones_and_copies_are_the_same_problem() -> None:
     for other in (clone_model(base()), cloudpickle.loads(cloudpickle.dumps(base()))):
-        found = identity_of(Evaluator(other))
+        found = identity_of(Evaluator.of(other))
         assert differences(found, identity(), Level.RUN) == []
 
 
@@ -176,7 +176,7 @@ def test_clones_that_order_variables_otherwise_are_the_same_problem() -> None:
                 )
         return model
 
-    one, other = (identity_of(Evaluator(model_of(names))) for names in ("ab", "ba"))
+    one, other = (identity_of(Evaluator.of(model_of(names))) for names in ("ab", "ba"))
     assert differences(one, other, Level.OPTIMUM) == []
 
 
@@ -185,14 +185,14 @@ def test_a_design_that_has_grown_is_another_run_of_the_same_problem() -> None:
     (node,) = nodes(model).values()
     assert node.design is not None
     node.design.add([np.array([1.0, 2.0])])
-    grown = identity_of(Evaluator(model))
+    grown = identity_of(Evaluator.of(model))
     assert differences(grown, identity(), Level.POSTERIOR) == []
     assert "number of responses of y" in differences(grown, identity(), Level.RUN)[0]
 
 
 def test_the_order_of_data_does_not_matter() -> None:
     reordered = Problem(observed=OBSERVED[::-1]).model()
-    assert differences(identity_of(Evaluator(reordered)), identity(), Level.OPTIMUM) == []
+    assert differences(identity_of(Evaluator.of(reordered)), identity(), Level.OPTIMUM) == []
 
 
 def test_data_of_the_model_that_move_the_prior_are_noticed() -> None:
@@ -214,7 +214,7 @@ def test_a_potential_that_changes_its_values_is_noticed() -> None:
         pm.Potential("penalty", -((mu - pm.Data("at", 0.0)) ** 2))
         x = pm.Normal.dist(mu, 1.0)
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     before = identity_of(evaluator)
     model.set_data("at", 1.0)
     assert (
@@ -230,7 +230,7 @@ def test_a_metric_whose_function_changes_is_noticed() -> None:
 
         return Problem(metric=prb.FunctionMetric(distance, weighted=True)).model()
 
-    one, other = (identity_of(Evaluator(model_of(power))) for power in (1.0, 2.0))
+    one, other = (identity_of(Evaluator.of(model_of(power))) for power in (1.0, 2.0))
     assert "discrepancy of y has other values" in differences(one, other, Level.OPTIMUM)[0]
 
 
@@ -243,7 +243,7 @@ def test_rounding_is_tolerated_and_more_is_not() -> None:
 
 def test_no_response_is_computed_for_an_identity() -> None:
     for propagation in (prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64)):
-        evaluator = Evaluator(Problem(propagation=propagation).model())
+        evaluator = Evaluator.of(Problem(propagation=propagation).model())
         (node,) = evaluator.nodes
         count, draws = node.bound.responses.count, node.bound.draws
         found = identity_of(evaluator)
@@ -287,12 +287,12 @@ def test_results_carry_it(tmp_path: Path) -> None:
     with xr.open_datatree(tmp_path / "draws.nc", engine="h5netcdf") as saved:
         found = from_attributes(saved["posterior"].attrs)
     assert found is not None
-    assert differences(found, identity_of(Evaluator(base())), Level.POSTERIOR) == []
+    assert differences(found, identity_of(Evaluator.of(base())), Level.POSTERIOR) == []
 
 
 def test_priors_that_print_the_same_are_compared_by_their_densities() -> None:
     one, other = (Problem(prior=(1.0, sd)).model() for sd in (1.0, 1.0 + 1e-4))
-    found = [identity_of(Evaluator(model)) for model in (one, other)]
+    found = [identity_of(Evaluator.of(model)) for model in (one, other)]
     assert found[0].priors == found[1].priors, "else this tests nothing"
     assert "the priors have other densities" in differences(*found, Level.OPTIMUM)
 
@@ -325,7 +325,7 @@ def test_the_optimum_is_taken_to_the_order_of_a_clone() -> None:
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED)
     found = prb.minimize(model, starts=0, **QUIET)
     clone = clone_model(model)
-    assert Evaluator(clone).names == found.names[::-1], "else this tests nothing"
+    assert Evaluator.of(clone).hyperparameters.names == found.names[::-1], "else this tests nothing"
     arguments: dict[str, Any] = {"chains": 1, "optimum": found, **QUIET}
     one, other = (prb.sample_smc(200, model=m, **arguments) for m in (model, clone))
     for name in ("mu", "sigma"):

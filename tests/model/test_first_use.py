@@ -247,7 +247,7 @@ def test_after_an_error_the_next_use_tries_again(
     model = build(response, propagation)
     for _ in range(2):
         with pytest.raises(prb.response.ResponseError, match=r"^y: .*FileNotFoundError"):
-            Evaluator(model)
+            Evaluator.of(model)
     response.file.touch()
     (node,) = first_use(model).values()
     counts = node.bound.responses

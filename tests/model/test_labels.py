@@ -25,7 +25,7 @@ def evaluator() -> Evaluator:
             dims="specimen",
             propagation=prb.Reweighted(64),
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def test_dimensions_and_coordinates_are_the_models() -> None:
@@ -64,7 +64,7 @@ def with_outputs(**observed: object) -> Evaluator:
                 observed=values,
                 propagation=prb.Reweighted(64),
             )
-        return Evaluator(pm.modelcontext(None))
+        return Evaluator.of(pm.modelcontext(None))
 
 
 def frequencies(units: object) -> xr.DataArray:

@@ -14,7 +14,7 @@ import pytest
 from line_problem import build
 
 import prbayes as prb
-from prbayes.model.locking import in_turn
+from prbayes.model.locking import locked
 
 QUIET: dict[str, Any] = {"progressbar": False}
 at_work: list[str] = []
@@ -25,7 +25,7 @@ def black_box(x: Any) -> Any:
     return 0.75 * np.asarray(x, dtype=np.float64)
 
 
-@in_turn
+@locked
 def work(what: Any = None, **others: Any) -> None:
     """Note how many are at work at a time."""
     at_work.append("")
@@ -86,7 +86,7 @@ def test_one_thread_at_a_time_is_inside_on_one_model() -> None:
 def test_models_do_not_wait_for_each_other() -> None:
     inside = threading.Barrier(2, timeout=60)
 
-    @in_turn
+    @locked
     def meet(model: pm.Model) -> int:
         # Broken after the time limit, where one waits outside for the other.
         return inside.wait()
@@ -98,7 +98,7 @@ def test_models_do_not_wait_for_each_other() -> None:
 def test_two_models_in_any_order_are_no_deadlock_and_calls_may_be_nested() -> None:
     one, other = pm.Model(), pm.Model()
 
-    @in_turn
+    @locked
     def outer(*models: pm.Model) -> None:
         work(models[0])
 
@@ -109,7 +109,7 @@ def test_two_models_in_any_order_are_no_deadlock_and_calls_may_be_nested() -> No
 def test_a_failure_ends_the_turn() -> None:
     model = pm.Model()
 
-    @in_turn
+    @locked
     def fails(model: pm.Model) -> None:
         raise ValueError("no")
 

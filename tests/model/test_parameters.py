@@ -24,7 +24,7 @@ THETAS = np.array([[0.0, 4.0, 0.3], [2.0, 6.0, -0.4]])
 
 
 def test_names_and_shapes() -> None:
-    found = Hyperparameters(model_of())
+    found = Hyperparameters.of(model_of())
     assert found.names == ["mu[0]", "mu[1]", "sigma_log__"]
     assert found.readable_names == ["mu[0]", "mu[1]", "sigma"]
     assert found.shapes == {"mu": (2,), "sigma_log__": ()}
@@ -36,7 +36,7 @@ def test_names_have_the_coordinates_of_the_model_and_its_order_has_not() -> None
     with pm.Model(coords={"supplier": ["Adler", "Busch"]}) as model:
         pm.HalfNormal("sigma", 3.0, dims="supplier")
         pm.Dirichlet("p", np.ones(2), dims="supplier")
-    found = Hyperparameters(model)
+    found = Hyperparameters.of(model)
     # A variable that has fewer places unconstrained than in its own units is numbered.
     assert found.names == ["sigma_log__[Adler]", "sigma_log__[Busch]", "p_simplex__[0]"]
     assert found.readable_names == ["sigma[Adler]", "sigma[Busch]", "p[0]"]
@@ -44,14 +44,14 @@ def test_names_have_the_coordinates_of_the_model_and_its_order_has_not() -> None
 
 
 def test_the_log_prior_has_the_jacobian() -> None:
-    found = Hyperparameters(model_of()).log_prior(THETAS)
+    found = Hyperparameters.of(model_of()).log_prior(THETAS)
     normal = stats.norm([1.0, 5.0], 2.0).logpdf(THETAS[:, :2]).sum(axis=1)
     half = stats.halfnorm(scale=3.0).logpdf(np.exp(THETAS[:, 2])) + THETAS[:, 2]
     np.testing.assert_allclose(found, normal + half, rtol=1e-7)
 
 
 def test_constrained_values_and_back() -> None:
-    hyperparameters = Hyperparameters(model_of())
+    hyperparameters = Hyperparameters.of(model_of())
     values = hyperparameters.constrained(THETAS)
     np.testing.assert_allclose(values["sigma"], np.exp(THETAS[:, 2]))
     np.testing.assert_allclose(values["total"], [4.0, 8.0])
@@ -78,25 +78,25 @@ def test_points_that_are_none(
     point: dict[str, object], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        Hyperparameters(model_of()).unconstrained(point)
+        Hyperparameters.of(model_of()).unconstrained(point)
 
 
 def test_discrete_hyperparameters_are_refused() -> None:
     with pm.Model() as model:
         pm.Poisson("k", 3)
     with pytest.raises(TypeError, match=r"discrete hyperparameters \['k'\]"):
-        Hyperparameters(model)
+        Hyperparameters.of(model)
 
 
 def test_support() -> None:
     with pm.Model() as model:
         pm.Uniform("u", 0, 1, default_transform=None)
-    found = Hyperparameters(model).in_support(np.array([[0.5], [-0.1], [1.1]]))
+    found = Hyperparameters.of(model).in_support(np.array([[0.5], [-0.1], [1.1]]))
     np.testing.assert_array_equal(found, [True, False, False])
 
 
 def test_draws_of_the_prior_are_kept_apart() -> None:
-    hyperparameters = Hyperparameters(model_of())
+    hyperparameters = Hyperparameters.of(model_of())
     first = hyperparameters.prior_thetas(16, 3)
     first[:] = np.nan
     again = hyperparameters.prior_thetas(16, 3)
@@ -108,17 +108,17 @@ def test_the_spread_is_robust_and_never_zero() -> None:
     with pm.Model() as model:
         pm.Normal("wide", 0, 10.0)
         pm.Cauchy("heavy", 0, 1.0)
-    hyperparameters = Hyperparameters(model)
+    hyperparameters = Hyperparameters.of(model)
     # 256 draws: a quantile of level .16 has a standard error of 9% of the spread.
     assert hyperparameters.prior_sd[0] == pytest.approx(10.0, rel=0.3)
     assert hyperparameters.prior_sd[1] == pytest.approx(1.8, rel=0.5)
     with pm.Model() as still:
         pm.Normal("fixed", 2.0, 1e-300)
-    np.testing.assert_array_equal(Hyperparameters(still).prior_sd, [1.0])
+    np.testing.assert_array_equal(Hyperparameters.of(still).prior_sd, [1.0])
 
 
 def test_points_of_the_prior_are_even() -> None:
-    points = Hyperparameters(model_of()).prior_points(64, seed=0)
+    points = Hyperparameters.of(model_of()).prior_points(64, seed=0)
     levels = stats.norm(1.0, 2.0).cdf(points[:, 0])
     counts = np.histogram(levels, bins=16, range=(0, 1))[0]
     np.testing.assert_array_equal(counts, np.full(16, 4))
@@ -132,7 +132,7 @@ def test_fixed_points_follow_names_and_not_order(prior: type) -> None:
             for name in names:
                 prior(name, {"a": 0.0, "b": 1.0}[name], 2.0)
         for one in (model, clone_model(model)):
-            hyperparameters = Hyperparameters(one)
+            hyperparameters = Hyperparameters.of(one)
             points = hyperparameters.fixed_points(4)
             assert len(np.unique(points[:, 0])) == 4
             found.append(points[:, np.argsort(hyperparameters.names)])
@@ -144,7 +144,7 @@ def test_a_batch_of_no_thetas_has_no_values_of_any_variable() -> None:
     with pm.Model() as model:
         factor = pm.LKJCorr("factor", n=2, eta=2)
         pm.Deterministic("correlation", factor @ factor.T)
-    found = Hyperparameters(model).constrained(np.empty((0, 1)))
+    found = Hyperparameters.of(model).constrained(np.empty((0, 1)))
     assert {name: value.shape for name, value in found.items()} == {
         "factor": (0, 2, 2),
         "correlation": (0, 2, 2),

@@ -91,12 +91,12 @@ def test_conditioned_models_have_the_same_discrepancy(name: str) -> None:
         "observe": (pm.observe(model, {"sigma": sigma}), {"mu": mu}),
         "clone": (clone_model(model), AT),
     }
-    expected = Evaluator(model)(THETA).discrepancies[0, 0]
+    expected = Evaluator.of(model)(THETA).discrepancies[0, 0]
     tolerance = {"rtol": 0.1} if name == "Fresh" else {"rtol": 1e-9}
     for clone, at in conditioned.values():
-        evaluator = Evaluator(clone)
-        assert sorted(evaluator.names) == sorted(at)
-        theta = np.array([[at[n] for n in evaluator.names]])
+        evaluator = Evaluator.of(clone)
+        assert sorted(evaluator.hyperparameters.names) == sorted(at)
+        theta = np.array([[at[n] for n in evaluator.hyperparameters.names]])
         found = evaluator(theta).discrepancies[0, 0]
         np.testing.assert_allclose(found, expected, **tolerance)
         np.testing.assert_allclose(log_density(clone)(at), -expected / 0.1, **tolerance)
@@ -180,12 +180,12 @@ def test_the_owner_of_a_node_keeps_it() -> None:
 
 def test_counts_of_resimulated_responses_are_apart() -> None:
     model = build(prb.Resimulated(64))
-    first = Evaluator(model)
+    first = Evaluator.of(model)
     first.populations(THETA, 0)
     count = node_of(model).bound.responses.count
     clone = clone_model(model)
-    Evaluator(clone).populations(THETA, 0)
-    Evaluator(clone)(THETA)
+    Evaluator.of(clone).populations(THETA, 0)
+    Evaluator.of(clone)(THETA)
     assert node_of(model).bound.responses.count == count
     assert node_of(clone).bound.responses.count == count + 2 * 64
 
@@ -328,16 +328,16 @@ def test_pymc_observe_prepares_the_metric_for_other_data() -> None:
     before = log_density(model)(AT)
     other = pm.observe(model, {"y": OBSERVED + 1})
     expected = prb.AreaMetric().against(OBSERVED + 1)
-    values, weights = Evaluator(other).populations(_theta(other), 0)
+    values, weights = Evaluator.of(other).populations(_theta(other), 0)
     found = -0.1 * log_density(other)(AT)
     assert found == pytest.approx(float(expected(values[0], weights[0])), rel=1e-9)
-    assert Evaluator(other)(_theta(other)).discrepancies[0, 0] == pytest.approx(found, rel=1e-9)
+    assert Evaluator.of(other)(_theta(other)).discrepancies[0, 0] == pytest.approx(found, rel=1e-9)
     assert node_of(other).bound.responses.count == 64, "no response is computed anew"
     assert log_density(model)(AT) == before
 
 
 def _theta(model: pm.Model) -> Floats:
-    return np.array([[AT[name] for name in Evaluator(model).names]])
+    return np.array([[AT[name] for name in Evaluator.of(model).hyperparameters.names]])
 
 
 @pytest.mark.long
@@ -348,7 +348,7 @@ def test_data_that_are_set_anew_are_those_of_a_model_made_with_them(metric: prb.
     compiled = log_density(model) if metric.likelihood else None
     pm.set_data({"data": NEW}, model=model)
     # The first minimisation let the design grow.
-    found, expected = (Evaluator(m)(THETA).discrepancies for m in (model, new))
+    found, expected = (Evaluator.of(m)(THETA).discrepancies for m in (model, new))
     np.testing.assert_allclose(found, expected, rtol=0.02)
     np.testing.assert_equal(node_of(model).epsilon_value, node_of(new).epsilon_value)
     drawn = pm.draw(model["y"], random_seed=1)
@@ -361,7 +361,7 @@ def test_data_that_are_set_anew_are_those_of_a_model_made_with_them(metric: prb.
             compiled(AT)
         assert log_density(model)(AT) == pytest.approx(log_density(new)(AT), rel=0.02)
     pm.set_data({"data": OBSERVED}, model=model)
-    assert Evaluator(model)(THETA).discrepancies == first.evaluator(THETA).discrepancies
+    assert Evaluator.of(model)(THETA).discrepancies == first.evaluator(THETA).discrepancies
 
 
 def test_data_of_whole_numbers_may_be_set_too() -> None:
@@ -450,7 +450,7 @@ def test_the_default_epsilon_is_one_for_other_data_too(n: int) -> None:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
         given = {"observed": data, "propagation": prb.Reweighted(64)}
         prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), **given)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     (other,) = evaluator.observing({"y": data + 1.0}).nodes
     assert evaluator.nodes[0].epsilon_is_default
     assert other.epsilon_is_default

@@ -66,7 +66,7 @@ def model_of(name: str) -> tuple[pm.Model, Node]:
 @cache
 def reference(name: str) -> dict[str, tuple[float, float]]:
     """Posterior mean and sd on a grid, for the same node; Fresh has that of Resimulated, blurred by its noise."""
-    evaluator = Evaluator(model_of("Resimulated" if name == "Fresh" else name)[0])
+    evaluator = Evaluator.of(model_of("Resimulated" if name == "Fresh" else name)[0])
     grid = np.stack(np.meshgrid(np.linspace(1.5, 2.5, 41), np.linspace(-1, 0.4, 41)), -1).reshape(
         -1, 2
     )
@@ -325,7 +325,7 @@ def test_what_is_seen_of_the_data_at_once_is_told(caplog: pytest.LogCaptureFixtu
 def test_resimulated_counts_its_responses(response: Any) -> None:
     model, node = build(prb.Resimulated(64), response)
     assert node.bound.symbolic == (response is line)
-    evaluator, before = Evaluator(model), node.bound.responses.count
+    evaluator, before = Evaluator.of(model), node.bound.responses.count
     evaluator(np.zeros((5, 2)))
     evaluator.populations(np.zeros((2, 2)), 0)
     assert node.bound.responses.count - before == 7 * 64
@@ -496,7 +496,7 @@ def test_simulators_of_one_response_share_their_design_s_runs() -> None:
     assert not asked
     first_use(model)
     assert asked == [128]
-    first, second = Evaluator(model).nodes
+    first, second = Evaluator.of(model).nodes
     np.testing.assert_array_equal(first.design.values, second.design.values)
     narrow = np.array([[2.0, np.log(0.05)]])
     prb.refine(model, thetas=narrow)
@@ -511,8 +511,8 @@ def test_simulators_of_one_response_share_a_population_s_runs(propagation: Propa
     first_use(model)
     assert sum(size for size in asked if size == 16) == 16  # tried once
     before = len(asked)
-    evaluator = Evaluator(model)
-    found = evaluator(evaluator.prior_thetas(3, 0))
+    evaluator = Evaluator.of(model)
+    found = evaluator(evaluator.hyperparameters.prior_thetas(3, 0))
     assert asked[before:] == [3 * 128]
     assert np.isfinite(found.discrepancies).all()
 
@@ -520,8 +520,8 @@ def test_simulators_of_one_response_share_a_population_s_runs(propagation: Propa
 @pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64)])
 def test_another_constant_is_another_run(propagation: Propagation) -> None:
     model, _ = two_of_one(propagation, second=3.0)
-    evaluator = Evaluator(model)
-    theta = evaluator.unconstrained({"mu": 2.0, "sigma": 0.5})[None]
+    evaluator = Evaluator.of(model)
+    theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.5})[None]
     means = []
     for k in range(2):
         values, weights = evaluator.populations(theta, k)
@@ -531,10 +531,10 @@ def test_another_constant_is_another_run(propagation: Propagation) -> None:
 
 def test_shared_runs_give_what_each_would_have_computed() -> None:
     model, _ = two_of_one(prb.Fresh(128))
-    evaluator = Evaluator(model)
-    thetas = evaluator.prior_thetas(4, 1)
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.prior_thetas(4, 1)
     together = evaluator(thetas).discrepancies
     alone, _ = two_of_one(prb.Fresh(128), second=1.0)
-    evaluator = Evaluator(alone)
+    evaluator = Evaluator.of(alone)
     for k in (1, 0):
         np.testing.assert_array_equal(evaluator.discrepancies(thetas, k), together[:, k])

@@ -123,7 +123,7 @@ def test_no_run_is_made_when_a_model_is_written_and_128_at_its_first_use() -> No
     response = Line()
     model = build(response)
     assert response.runs == 0
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     assert response.runs == 0
     values(model)
     assert response.runs == 128
@@ -363,7 +363,7 @@ def test_a_metric_and_a_likelihood_in_one_model() -> None:
         x = pm.Normal.dist(*priors())
         prb.Simulator("by specimen", Line(), x, observed=Y)
         prb.Simulator("by metric", lambda x: 3 * x, x, metric=metric, observed=(Y - 1) * 1.5)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     assert [node.name for node in evaluator.nodes] == ["by metric"]
     assert [each.name for each in evaluator.likelihoods] == ["by specimen"]
     optimum = prb.minimize(model, progressbar=False)
@@ -448,7 +448,7 @@ def test_other_data_of_the_same_model() -> None:
     assert np.allclose(ours, exact(observed=other), atol=0.03)
     assert not np.allclose(ours, before, atol=0.03)
     # The runs cover the roots of the other data too.
-    assert Evaluator(model).n_responses == response.runs == 128
+    assert Evaluator.of(model).n_responses == response.runs == 128
     with model:
         pm.set_data({"data": Y})
     assert np.array_equal(values(model), before)

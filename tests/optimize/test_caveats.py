@@ -54,9 +54,11 @@ def test_a_mirror_is_told_by_standard_deviations_and_correlations() -> None:
         chol, _, _ = pm.LKJCholeskyCov("cov", n=2, eta=2, sd_dist=sds)
         x = pm.MvNormal.dist(mean, chol=chol, shape=2)
         prb.Simulator("y", np.positive, x, metric=prb.Joint(prb.AreaMetric()), observed=response)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     point = {"mean": [1.0, 2.0], "cov": [0.5, -0.3, 0.4]}
-    rival = Rival(evaluator.unconstrained(point), 0.1, comparable=True, better=False)
+    rival = Rival(
+        evaluator.hyperparameters.unconstrained(point), 0.1, comparable=True, better=False
+    )
     (line,) = caveats(evaluator, None, (rival,), 0.0)
     assert (
         "come from mean[rod] = 1, mean[pin] = 2, cov_stds[0] = 0.5, cov_stds[1] = 0.5, "
@@ -66,7 +68,7 @@ def test_a_mirror_is_told_by_standard_deviations_and_correlations() -> None:
 
 def edges(model: pm.Model, *theta: float) -> tuple[str, ...]:
     found = elements_at_edge(
-        Evaluator(model), np.array(theta), np.ones(1), size=1.0, tolerance=1e-6, seed=0
+        Evaluator.of(model), np.array(theta), np.ones(1), size=1.0, tolerance=1e-6, seed=0
     )
     return found
 
@@ -138,7 +140,7 @@ def test_a_value_between_responses_far_apart_is_told_of(largest: float, said: bo
             metric=prb.LogLikelihood(density=prb.GaussianKDE()),
             observed=observed,
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     found = between_runs(evaluator, np.array([0.0, np.log(0.3)]))
     assert len(found) == said
     if said:
@@ -147,4 +149,4 @@ def test_a_value_between_responses_far_apart_is_told_of(largest: float, said: bo
     with pm.Model() as model:
         x = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
         prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), observed=observed)
-    assert between_runs(Evaluator(model), np.array([0.0, np.log(0.3)])) == []
+    assert between_runs(Evaluator.of(model), np.array([0.0, np.log(0.3)])) == []

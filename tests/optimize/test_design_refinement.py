@@ -51,7 +51,7 @@ def test_a_refusal_tells_what_the_data_do_not() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     short = shortcomings(evaluator, np.array([[30.0]]))
     told = "the data tell less than the prior about mu"
     with pytest.raises(DesignError, match=rf"y: .*; narrow the priors, .*\. There {told}"):
@@ -70,7 +70,7 @@ def test_the_runs_that_are_left_follow_from_the_error_and_the_room() -> None:
             observed=np.linspace(-1, 3, 20),
             propagation=prb.Reweighted(64, max_points=192, emulator=None),
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     assert runs_left(evaluator, DesignErrors(points=0.15, emulators=np.nan)) == pytest.approx(
         64 * (1.5 ** (1 / 0.65) - 1), abs=1
     )
@@ -91,4 +91,4 @@ def test_a_pilot_goes_towards_data_that_are_far() -> None:
             propagation=prb.Reweighted(128),
         )
     # Of 1024 draws of the prior the best quarter lies above .67.
-    assert (pilot(Evaluator(model), np.ones(1)) > 0.67).all()
+    assert (pilot(Evaluator.of(model), np.ones(1)) > 0.67).all()

@@ -67,7 +67,7 @@ def test_both_optima_are_found(name: str) -> None:
     assert abs(abs(optimum.point["mu"] - 1) - 1) < 4 * optimum.stderr["mu"]
     assert abs(np.log(optimum.point["sigma"] / rival["point"]["sigma"])) < 0.1
     np.testing.assert_allclose(rival["discrepancy"], optimum.discrepancy, rtol=0.05)
-    evaluator = Evaluator(optimum.model)
+    evaluator = Evaluator.of(optimum.model)
     assert evaluator(rival["theta"][None]).discrepancies[0, 0] == pytest.approx(
         rival["discrepancy"]
     )
@@ -78,7 +78,7 @@ def test_both_optima_are_found(name: str) -> None:
 
 def test_rivals_are_minima() -> None:
     optimum = fit("pr")
-    evaluator = Evaluator(optimum.model)
+    evaluator = Evaluator.of(optimum.model)
     for theta in (optimum.theta, *(r["theta"] for r in optimum.rivals if r["comparable"])):
         around = theta + 0.05 * np.vstack([np.eye(2), -np.eye(2)])
         assert (evaluator(around).discrepancies > evaluator(theta[None]).discrepancies).all()
@@ -155,7 +155,7 @@ def test_a_linear_problem_has_no_rivals(name: str) -> None:
 
 def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
     optimum = fit("pr")
-    evaluator = Evaluator(optimum.model)
+    evaluator = Evaluator.of(optimum.model)
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
     best = Best(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
     assert rivals(best, starts=16, seed=0)
@@ -277,7 +277,7 @@ def around(starts: int) -> Best:
     """Return what is known of the optimum, to look for others."""
     optimum = followed(starts)
     evaluator = optimum.evaluator
-    local = Local(evaluator.prior_sd, np.eye(3), np.zeros((3, 0)), 1e-3 * np.eye(3))
+    local = Local(evaluator.hyperparameters.prior_sd, np.eye(3), np.zeros((3, 0)), 1e-3 * np.eye(3))
     return Best(evaluator, optimum.theta, np.ones(1), local, 0.05)
 
 
@@ -389,6 +389,6 @@ def test_where_a_descent_was_stopped_in_a_valley_is_no_optimum(
     best = Best(evaluator, np.ones(2), np.ones(1), local, noise=0.01)
     short = partial(descend, max_iterations=iterations)
     monkeypatch.setattr("prbayes.optimize.local_optima.descend", short)
-    found = best.descended(best.shifts(evaluator.prior_points(16, 1)), np.eye(2))
+    found = best.descended(best.shifts(evaluator.hyperparameters.prior_points(16, 1)), np.eye(2))
     assert found.converged.all() == (iterations == 40)
     assert rivals(best, starts=16, seed=0) == []

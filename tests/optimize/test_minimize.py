@@ -563,7 +563,7 @@ def test_the_start_is_honoured() -> None:
     np.testing.assert_allclose(optimum.trace["theta"][0], [0.5, np.log(0.9)], rtol=1e-12)
     assert optimum.n_screened == 0
     assert fitted("pr").n_screened == 257
-    first = Evaluator(model)(optimum.trace["theta"][:1]).discrepancies[0, 0]
+    first = Evaluator.of(model)(optimum.trace["theta"][:1]).discrepancies[0, 0]
     np.testing.assert_allclose(optimum.trace["discrepancy"][0], first, rtol=1e-9)
 
 
@@ -882,7 +882,9 @@ def test_a_search_is_held_where_the_data_do_not_tell_and_names_what_it_is() -> N
         assert np.isinf(optimum.stderr[name])
         assert any("the data tell less than the prior" in w and name in w for w in optimum.warnings)
         # Within the prior, where populations are supported.
-        prior = optimum.evaluator.constrained(optimum.evaluator.prior_thetas(1000, 1))[name]
+        prior = optimum.evaluator.hyperparameters.constrained(
+            optimum.evaluator.hyperparameters.prior_thetas(1000, 1)
+        )[name]
         low, high = np.quantile(prior, [0.01, 0.99])
         assert low < optimum.point[name] < high
     error = optimum.stderr["ratio"]
@@ -901,9 +903,9 @@ def test_where_a_gradient_is_no_number_the_search_goes_on() -> None:
         data = values[values > 0][:40]
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=data, propagation=R256)
     start = {"mu": 0.9, "w": 1.4, "sd": 0.5}
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     exact = evaluator.objective(prior=False, gradient=True)
-    value, gradient = exact(evaluator.unconstrained(start), np.ones(1))
+    value, gradient = exact(evaluator.hyperparameters.unconstrained(start), np.ones(1))
     assert np.isfinite(value)
     assert np.isnan(gradient).any()
     found = prb.minimize(model, start=start, starts=0, refine=False)

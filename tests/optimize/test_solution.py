@@ -39,12 +39,12 @@ def _factor() -> Evaluator:
         pm.Deterministic("angle", pm.math.stack([1.0 + 0 * a, a / b]))
         x = pm.Normal.dist(a, pm.math.exp(b))
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def test_a_function_of_what_is_not_identified_may_be_identified() -> None:
     evaluator = _factor()
-    unit = evaluator.prior_sd
+    unit = evaluator.hyperparameters.prior_sd
     theta = np.array([3.0, 4.0])
     # The length is known, to a tenth, and the place on the circle is not.
     outwards = theta / unit / np.linalg.norm(theta / unit)
@@ -81,9 +81,9 @@ def _normal(metric: prb.Metric, propagation: Any) -> pm.Model:
 def test_a_population_far_from_all_data_is_known_by_its_overlap(
     metric: prb.Metric, propagation: Any, far: bool
 ) -> None:
-    evaluator = Evaluator(_normal(metric, propagation))
-    there = evaluator.unconstrained({"mu": 6.0, "sigma": 0.3})
-    here = evaluator.unconstrained({"mu": 0.5, "sigma": 0.4})
+    evaluator = Evaluator.of(_normal(metric, propagation))
+    there = evaluator.hyperparameters.unconstrained({"mu": 6.0, "sigma": 0.3})
+    here = evaluator.hyperparameters.unconstrained({"mu": 0.5, "sigma": 0.4})
     assert apart_from_data(evaluator, there) is far
     assert apart_from_data(evaluator, here) is False
 

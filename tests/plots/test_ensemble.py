@@ -51,7 +51,7 @@ def test_a_model_is_given_or_on_the_context(optimum: prb.Optimum, posterior: xr.
 def test_before_is_what_it_says(optimum: prb.Optimum) -> None:
     evaluator = optimum.evaluator
     theta, text = read_before(optimum, evaluator, None)
-    np.testing.assert_array_equal(theta[0], evaluator.initial)
+    np.testing.assert_array_equal(theta[0], evaluator.hyperparameters.initial)
     assert text == "prior's initial point"
     started = prb.minimize(optimum.model, start={"mu": -1.0, "sigma": 1.5})
     theta, text = read_before(started, evaluator, None)
@@ -71,7 +71,7 @@ def test_what_the_design_does_not_reach_is_not_supported(
     thetas = np.array([[1.0, -0.7], [60.0, -0.7], [np.nan, 0.0], [1.0, -9.0]])
     found = supported(optimum.evaluator, thetas)
     np.testing.assert_array_equal(found, [True, False, False, False])
-    everywhere = supported(Evaluator(build(prb.Resimulated(64))), thetas)
+    everywhere = supported(Evaluator.of(build(prb.Resimulated(64))), thetas)
     np.testing.assert_array_equal(everywhere, [True, True, False, True])
 
 

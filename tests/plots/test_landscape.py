@@ -102,7 +102,7 @@ def test_the_landscape_of_another_metric(
     pc = prb.plot_landscape(optimum, model=other, pair="mu", points=9)
     x, y = read.xy(pc, "landscape", "landscape")
     thetas = np.column_stack([x, np.full(x.size, optimum.theta[1])])
-    np.testing.assert_allclose(y, Evaluator(other)(thetas).discrepancies[:, 0])
+    np.testing.assert_allclose(y, Evaluator.of(other)(thetas).discrepancies[:, 0])
     with pytest.raises(
         ValueError, match=r"plot_landscape: .*hyperparameters: got mu, sigma_log__, expected mu"
     ):

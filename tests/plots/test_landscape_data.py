@@ -24,7 +24,7 @@ def test_the_landscape_has_the_objective_at_its_places(optimum: prb.Optimum) -> 
     assert evaluator.n_responses == before
     s, m = found.axes
     for i, j in ((4, 4), (2, 7), (7, 3)):
-        theta = evaluator.unconstrained({"mu": m[j], "sigma": s[i]})
+        theta = evaluator.hyperparameters.unconstrained({"mu": m[j], "sigma": s[i]})
         height = evaluator(theta[None]).discrepancies[0, 0]
         assert found.heights[i, j] == pytest.approx(height)
     np.testing.assert_allclose(found.optimum, [[optimum.point["sigma"], optimum.point["mu"]]])

@@ -45,7 +45,7 @@ def two_inputs(propagation: Propagation) -> tuple[pm.Model, list[object]]:
 @pytest.mark.long
 def test_margins_are_the_closed_forms_and_named_as_the_response_names_them() -> None:
     model, (load, gap) = two_inputs(prb.Resimulated(64))
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     known = margins(evaluator)
     assert [m.name for m in known] == ["load[0]", "load[1]", "gap"]
     assert select_margins(known, ["gap"]) == select_margins(known, [gap]) == known[2:]
@@ -54,7 +54,7 @@ def test_margins_are_the_closed_forms_and_named_as_the_response_names_them() -> 
         select_margins(known, ["nothing"])
     thetas = np.array(
         [
-            evaluator.unconstrained({"mu": m, "size": s})
+            evaluator.hyperparameters.unconstrained({"mu": m, "size": s})
             for m, s in (([1, 3], 1.0), ([1.2, 2.5], 1.5))
         ]
     )
@@ -86,9 +86,9 @@ def test_margins_without_a_density_of_their_own_are_drawn() -> None:
             observed=np.arange(9.0),
             propagation=prb.Fresh(50),
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     found = margin_densities(
-        evaluator, margins(evaluator), evaluator.unconstrained({"mu": 3.0})[None]
+        evaluator, margins(evaluator), evaluator.hyperparameters.unconstrained({"mu": 3.0})[None]
     )
     grid, y = found["x"]
     np.testing.assert_allclose(y[0], stats.norm.pdf(grid, 3, 1), atol=0.06)

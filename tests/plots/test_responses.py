@@ -34,7 +34,7 @@ def test_responses_are_the_closed_forms(
     inner = read.sides(narrow, "band", "y", some)
     assert np.ptp(inner, axis=0).max() < 0.6 * (high - low).max()
     x, y = read.xy(pc, "before", "y")
-    at_start = np.exp(optimum.evaluator.initial[1])
+    at_start = np.exp(optimum.evaluator.hyperparameters.initial[1])
     np.testing.assert_allclose(y, stats.norm.pdf(x, 0, at_start), atol=0.02)
     np.testing.assert_allclose(read.xy(pc, "rug", "y"), [known.observed, np.zeros(30)])
     np.testing.assert_allclose(np.trapezoid(*read.xy(pc, "measured", "y")[::-1]), 1)

@@ -106,7 +106,7 @@ def test_several_outputs_are_looked_at_as_the_metric_is_prepared_for_them(parame
 
 
 def own_values(evaluator: Any, thetas: Any) -> Any:
-    values = evaluator.constrained(thetas)
+    values = evaluator.hyperparameters.constrained(thetas)
     return np.column_stack([values[name] for name in ("mu", "tau")])
 
 

@@ -47,7 +47,7 @@ def evaluator(name: str) -> Evaluator:
             epsilon=0.05,
             propagation=PROPAGATIONS[name],
         )
-    return Evaluator(model)
+    return Evaluator.of(model)
 
 
 def run(name: str, path: Path | None = None) -> Particles:

@@ -115,7 +115,7 @@ def problem() -> Any:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED)
-    return identity_of(Evaluator(model))
+    return identity_of(Evaluator.of(model))
 
 
 def test_arrays_and_notes_come_back(problem: Any, tmp_path: Path) -> None:

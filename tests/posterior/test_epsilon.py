@@ -68,7 +68,7 @@ def area_fit(unit: float = 1.0) -> prb.Optimum:
 def known_sd(n: int | None = 256) -> tuple[prb.Optimum, Information]:
     propagation = prb.Resimulated(1024) if n is None else prb.Reweighted(n)
     optimum = prb.minimize(build(PR, sd=0.5, propagation=propagation))
-    evaluator = Evaluator(optimum.model)
+    evaluator = Evaluator.of(optimum.model)
     return optimum, Information(evaluator, 0, optimum.theta)
 
 
@@ -118,7 +118,7 @@ def test_the_posterior_width_that_it_gives() -> None:
     optimum, information = known_sd()
     epsilon = prb.calibrate_epsilon(optimum)["y"]
     thetas = np.linspace(-0.4, 0.4, 161)[:, None] + optimum.theta
-    logs = -Evaluator(optimum.model)(thetas).discrepancies[:, 0] / epsilon
+    logs = -Evaluator.of(optimum.model)(thetas).discrepancies[:, 0] / epsilon
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     mean = weights @ thetas[:, 0]
@@ -134,7 +134,7 @@ def test_the_posterior_width_that_it_gives() -> None:
 
 def test_area_epsilon_is_about_0_28_of_the_noise_floor() -> None:
     optimum = area_fit()
-    evaluator = Evaluator(optimum.model)
+    evaluator = Evaluator.of(optimum.model)
     floor = Information(evaluator, 0, optimum.theta).noise_floor
     # The floor is a mean over 200 data sets whose distances vary by 40%; the bisected coverage has
     # a standard error of 1.6%, hence epsilon one of about 4%: 5% together. Bounds from the studies:
@@ -298,7 +298,7 @@ def test_set_epsilon_changes_what_is_named_and_nothing_on_error() -> None:
 
 def test_set_epsilon_scales_the_log_density() -> None:
     model = build(AREA, sd=0.5, n=64)
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     thetas = np.array([[0.5], [1.0]])
     found = evaluator(thetas)
     for epsilon in (0.1, 0.4):

@@ -23,7 +23,7 @@ def names() -> Hyperparameters:
             "y", np.positive, pm.Normal.dist(mu[0] + mu[1], sigma), metric=prb.AreaMetric(),
             observed=[0.0, 1.0, 2.0], propagation=prb.Reweighted(64),
         )  # fmt: skip
-    return Evaluator(model).hyperparameters
+    return Evaluator.of(model).hyperparameters
 
 
 def test_own_units_and_transformed_values_are_the_same_thetas() -> None:

@@ -42,7 +42,7 @@ def area_model() -> pm.Model:
 
 @cache
 def evaluator() -> Evaluator:
-    return Evaluator(area_model())
+    return Evaluator.of(area_model())
 
 
 def begun(draws: int = 60, **keywords: Any) -> BatchedKernel:

@@ -66,7 +66,7 @@ def posterior(likelihood: RefitLikelihood) -> dict[str, Floats]:
     modes = laplace(density, likelihood.starts, likelihood.scale)
     sample = importance_sample(density, modes, DRAWS, seed=0)
     assert sample.pareto_k < 0.7
-    return likelihood.evaluator.constrained(sample.draws)
+    return likelihood.evaluator.hyperparameters.constrained(sample.draws)
 
 
 def mean_model(prior: Callable[[], Any], y: Floats, metric: Any = MEAN) -> pm.Model:
@@ -280,16 +280,16 @@ def test_populations_go_on_beyond_the_ends_of_a_prior() -> None:
             metric=prb.AreaMetric(), propagation=prb.Reweighted(256),
         )  # fmt: skip
     evaluator = prb.minimize(model=model, progressbar=False).evaluator
-    thetas = evaluator.prior_thetas(20, 0)
+    thetas = evaluator.hyperparameters.prior_thetas(20, 0)
     continuation = continuation_of(evaluator, thetas[:1])
     assert continuation.below.tolist() == [True, False]  # no negative standard deviation
     assert continuation.above.tolist() == [True, True]
     coordinates = continuation.coordinates(thetas)
-    values = evaluator.constrained(thetas)
+    values = evaluator.hyperparameters.constrained(thetas)
     np.testing.assert_allclose(coordinates[:, 0], values["mu"])
     np.testing.assert_allclose(coordinates[:, 1], np.log(values["sigma"]))
     np.testing.assert_allclose(continuation.within(coordinates), thetas, atol=1e-6)
-    continued = ContinuedEvaluator.of(evaluator, continuation)
+    continued = ContinuedEvaluator.continuing(evaluator, continuation)
     outside = np.array([[-0.5, np.log(1.5)], [2.5, np.log(0.5)]])
     mu_roots, sigma_roots = continued.roots(outside, 0)
     np.testing.assert_allclose(mu_roots, [-0.5, 2.5], rtol=1e-6)

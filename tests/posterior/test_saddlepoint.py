@@ -202,7 +202,7 @@ def moments_of(likelihood: EstimateLikelihood) -> Moments:
     """Return those of the posterior given the estimate."""
     sample = sample_of(likelihood)
     assert sample.pareto_k < 0.7
-    values = likelihood.evaluator.constrained(sample.draws)
+    values = likelihood.evaluator.hyperparameters.constrained(sample.draws)
     pair = np.stack([values["mu"], np.log(values["sigma"])], axis=1)
     return Moments(pair.mean(axis=0), pair.std(axis=0))
 
@@ -221,7 +221,7 @@ def test_the_posterior_of_a_normal_population(parameters: Parameters) -> None:
 
 def at_another_point(optimum: prb.Optimum) -> EstimateLikelihood:
     """Return the likelihood by the score a standard deviation of the prior away."""
-    shifted = replace(optimum, theta=optimum.theta + optimum.evaluator.prior_sd)
+    shifted = replace(optimum, theta=optimum.theta + optimum.evaluator.hyperparameters.prior_sd)
     likelihood = estimate_likelihood(optimum.evaluator, shifted)
     np.testing.assert_allclose(likelihood.point, shifted.theta)
     return likelihood
@@ -256,7 +256,7 @@ def test_a_population_of_bounded_support() -> None:
     assert likelihood.groups[0].combinations.shape == (2, 2)
     sample = sample_of(likelihood)
     assert sample.pareto_k < 0.7
-    draws = likelihood.evaluator.constrained(sample.draws)
+    draws = likelihood.evaluator.hyperparameters.constrained(sample.draws)
     for name, values in draws.items():
         # The prior is vague, and a posterior of 20 specimens is wider than the standard error.
         assert 0.9 < values.std() / optimum.stderr[name] < 1.4, name
@@ -316,7 +316,7 @@ def test_the_posterior_of_an_unidentified_hyperparameter_is_its_prior() -> None:
     likelihood = likelihood_of(normal_model(parameters, KLD, y))
     assert likelihood.groups[0].combinations.shape == (3, 2)
     sample = sample_of(likelihood)
-    place = likelihood.evaluator.names.index("unused")
+    place = likelihood.evaluator.hyperparameters.names.index("unused")
     draws = sample.draws[:, place]
     # Four standard errors of 1000 independent draws.
     assert abs(draws.mean() - 3) < 4 * 2 / np.sqrt(1000)
@@ -333,7 +333,7 @@ def test_an_estimate_at_an_edge_is_moved_inside() -> None:
     optimum = prb.minimize(model=model, progressbar=False)
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
     assert likelihood.groups[0].combinations.shape[1] == 2
-    draws = likelihood.evaluator.constrained(sample_of(likelihood).draws)
+    draws = likelihood.evaluator.hyperparameters.constrained(sample_of(likelihood).draws)
     y = 1 + noise
     mu_grid = np.linspace(0.2, 1.8, 401)[:, None]
     sigma_grid = np.linspace(1e-3, 1.5, 600)[None]
@@ -375,14 +375,14 @@ def test_two_outputs_by_a_joint_metric(metric: Metric) -> None:
         )
     optimum = prb.minimize(model=model, progressbar=False)
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
-    draws = likelihood.evaluator.constrained(sample_of(likelihood).draws)
+    draws = likelihood.evaluator.hyperparameters.constrained(sample_of(likelihood).draws)
     for mean_name, sd_name, inputs in (("mu", "sigma", x[:, 0]), ("nu", "tau", x[:, 1])):
         exact = exact_moments(LOG_PRIORS[vague], inputs)
         pair = np.stack([draws[mean_name], np.log(draws[sd_name])], axis=1)
         require_close(Moments(pair.mean(axis=0), pair.std(axis=0)), exact)
     by_data = EstimateLikelihoodOptions(rounds=0)
     narrow = estimate_likelihood(optimum.evaluator, optimum, by_data)
-    tau = narrow.evaluator.constrained(sample_of(narrow).draws)["tau"]
+    tau = narrow.evaluator.hyperparameters.constrained(sample_of(narrow).draws)["tau"]
     assert (np.log(tau).mean() - exact.mean[1]) / exact.sd[1] < -0.2
 
 

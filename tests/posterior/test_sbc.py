@@ -112,7 +112,7 @@ def test_ranks_do_not_depend_on_where_they_are_found(
     assert all(vars(type(rv.owner.op))[name] is value for name, value in before.items())
     prb.set_epsilon(model, {"y": 1.0})
     assert model.compile_logp(mode=PLAIN)({"mu": 0.0}) == pytest.approx(
-        -Evaluator(model)(np.zeros((1, 1))).discrepancies[0, 0] - 0.5 * np.log(2 * np.pi)
+        -Evaluator.of(model)(np.zeros((1, 1))).discrepancies[0, 0] - 0.5 * np.log(2 * np.pi)
     )
 
 

@@ -66,7 +66,7 @@ def area_grid() -> tuple[Floats, Floats, float]:
     log_prior = (
         norm.logpdf(thetas[:, 0], 0, 2) + np.log(2) + norm.logpdf(sigma, 0, 1) + thetas[:, 1]
     )
-    distance = Evaluator(area_run()[0])(thetas).discrepancies[:, 0]
+    distance = Evaluator.of(area_run()[0])(thetas).discrepancies[:, 0]
     logs = log_prior - distance / 0.02
     weights = np.exp(logs - logs.max())
     edges = weights.reshape(81, 81)
@@ -394,7 +394,7 @@ def test_the_tree_is_complete() -> None:
     np.testing.assert_allclose(
         calibration["theta"].sel(element="sigma_log__"), np.log(idata.posterior["sigma"])
     )
-    again = Evaluator(model)(calibration["theta"].values.reshape(-1, 2)).discrepancies.reshape(
+    again = Evaluator.of(model)(calibration["theta"].values.reshape(-1, 2)).discrepancies.reshape(
         4, 500, 1
     )
     np.testing.assert_allclose(calibration["discrepancy"], again)

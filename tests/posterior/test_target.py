@@ -55,7 +55,7 @@ def target_moments(model: pm.Model, y: Floats) -> Moments:
     mu = y.mean() + np.linspace(-6, 6, 41) * error
     log_sd = np.log(y.std()) + np.linspace(-1.2, 1.6, 41)
     thetas = np.stack(np.meshgrid(mu, log_sd, indexing="ij"), axis=-1).reshape(-1, 2)
-    assert target.evaluator.names == ["mu", "sigma_log__"]
+    assert target.evaluator.hyperparameters.names == ["mu", "sigma_log__"]
     return grid_moments(mu, log_sd, target.log_posterior(thetas).reshape(41, 41))
 
 

@@ -108,11 +108,11 @@ def test_the_tree_of_a_sampler() -> None:
     calibration = tree["calibration"]
     assert calibration["discrepancy"].dims == ("chain", "draw", "simulator")
     thetas = calibration["theta"].values.reshape(-1, 3)
-    found = Evaluator(model())(thetas)
+    found = Evaluator.of(model())(thetas)
     np.testing.assert_allclose(
         calibration["discrepancy"].values.reshape(-1, 2), found.discrepancies, rtol=1e-9
     )
-    support = Evaluator(model()).support(thetas)
+    support = Evaluator.of(model()).support(thetas)
     for name in ("first", "second"):
         one = calibration.to_dataset().sel(simulator=name)
         assert int(one["n_points"]) % 256 == 0
@@ -138,7 +138,7 @@ def test_metrics_are_described_the_same_in_every_session() -> None:
 
 
 def test_chains_with_different_numbers_of_stages() -> None:
-    evaluator = Evaluator(model())
+    evaluator = Evaluator.of(model())
     thetas = np.zeros((2, 3, 3))
     stats: list[dict[str, list[float]]] = [
         {"beta": [0.2, 1.0], "n_steps": [2, 4]},

@@ -54,7 +54,7 @@ def build(beside: Any = coarse, response: Any = fine, n: int = 64, **keywords: A
 
 
 def design_of(model: pm.Model) -> Design:
-    return Evaluator(model).designs["y"]
+    return Evaluator.of(model).designs["y"]
 
 
 def off(design: Design) -> float:
@@ -82,10 +82,10 @@ def test_emulators_that_lack_runs_follow_it_too() -> None:
 
 
 def test_runs_that_are_added_have_a_coarse_response_as_well() -> None:
-    evaluator = Evaluator(build())
+    evaluator = Evaluator.of(build())
     design = evaluator.designs["y"]
     with design.undone():
-        design.add(evaluator.roots(evaluator.prior_thetas(32, 3), 0), 32)
+        design.add(evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0), 32)
         known = design.batches.coarse
         assert known is not None
         np.testing.assert_allclose(known[:, 0], coarse(*design.batches.points))
@@ -98,11 +98,11 @@ def test_runs_that_are_added_where_there_is_none_are_no_mistake() -> None:
     def partly(a: Any, b: Any, scale: Any) -> Any:
         return np.where(a > 4, np.nan, coarse(a, b))
 
-    evaluator = Evaluator(build(partly))
+    evaluator = Evaluator.of(build(partly))
     design = evaluator.designs["y"]
     far = [
         np.full_like(root, 30.0 if i == 0 else 1.0)
-        for i, root in enumerate(evaluator.roots(evaluator.prior_thetas(32, 3), 0))
+        for i, root in enumerate(evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0))
     ]
     design.add(far, 16)
     assert design.n_runs == 80
@@ -117,7 +117,7 @@ def test_its_calls_are_neither_counted_nor_limited() -> None:
         return coarse(a, b, scale)
 
     with limited(None, max_runs=64):
-        evaluator = Evaluator(build(called))
+        evaluator = Evaluator.of(build(called))
     assert evaluator.n_responses == 64
     assert sum(calls) == 64 + CLOUD
 
@@ -220,7 +220,7 @@ def test_another_coarse_response_is_another_problem() -> None:
         return lambda a, b, scale: coarse(a, b) + by * np.sin(9 * a)
 
     def simulator(beside: Any) -> SimulatorIdentity:
-        return identity_of(Evaluator(build(beside))).simulators[0]
+        return identity_of(Evaluator.of(build(beside))).simulators[0]
 
     one, again, other = map(simulator, (biased(0.1), biased(0.1), biased(1.0)))
     assert one == again

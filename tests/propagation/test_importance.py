@@ -57,7 +57,7 @@ def build(response: Any = smooth, n: int = 64, *, known: bool = False, **keyword
 
 
 def design_of(model: pm.Model) -> tuple[Evaluator, Design]:
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     return evaluator, evaluator.designs["y"]
 
 
@@ -122,7 +122,7 @@ def test_the_prior_stays_in_reach() -> None:
     far = theta_of(evaluator) + np.array([1.0, 1.0, -2.0, -2.0])
     for _ in range(3):
         design.reach(evaluator.roots(np.repeat(far, 16, axis=0), 0))
-    prior = evaluator.prior_thetas(200, 1)
+    prior = evaluator.hyperparameters.prior_thetas(200, 1)
     assert np.median(evaluator.support(prior)["y"]["mean_weight"]) == pytest.approx(1, abs=0.05)
 
 
@@ -378,7 +378,7 @@ def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
                 propagation=stored,
                 specimens=specimens,
             )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     assert aligned(evaluator.nodes)
     far = theta_of(evaluator) + np.array([0.5, -1.5, 0.5, -1.5])
     _reach(evaluator, far, {"one"})
@@ -425,7 +425,7 @@ def test_clouds_are_of_populations_that_matter_and_the_prior_stays() -> None:
 
 def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
     evaluator, design = design_of(build())
-    thetas = evaluator.prior_thetas(2, 0)
+    thetas = evaluator.hyperparameters.prior_thetas(2, 0)
     _, counts = design._place(evaluator.roots(thetas, 0), 1024, 3, np.array([0.125, 0.875]))
     np.testing.assert_array_equal(counts, [128, 896])
 

@@ -128,7 +128,7 @@ def test_an_input_without_hyperparameters_stays() -> None:
             observed=np.arange(9.0),
             propagation=prb.Reweighted(1024),
         )
-    assert not Evaluator(model).nodes[0].bound.support_moves
+    assert not Evaluator.of(model).nodes[0].bound.support_moves
 
 
 def test_a_discrete_support_that_moves_is_refused() -> None:
@@ -139,8 +139,8 @@ def test_a_discrete_support_that_moves_is_refused() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("metric", METRICS, ids=of_kind)
 def test_the_gradient_is_that_of_the_discrepancy_where_an_edge_is(metric: prb.Metric) -> None:
-    evaluator = Evaluator(uniform(metric))
-    theta = evaluator.unconstrained({"start": 2.013, "width": 3.05})
+    evaluator = Evaluator.of(uniform(metric))
+    theta = evaluator.hyperparameters.unconstrained({"start": 2.013, "width": 3.05})
     _, gradient = evaluator.objective(prior=False, gradient=True)(theta, np.ones(1))
     assert np.abs(gradient).min() > 1e-3
     step = 1e-6
@@ -223,8 +223,8 @@ def test_nuts_agrees_with_itself_and_with_smc() -> None:
 
 def test_the_weights_follow_the_design_when_it_grows() -> None:
     model = uniform(prb.AreaMetric(), prb.Reweighted(64))
-    evaluator = Evaluator(model)
-    theta = evaluator.unconstrained({"start": 2.0, "width": 3.0})[None]
+    evaluator = Evaluator.of(model)
+    theta = evaluator.hyperparameters.unconstrained({"start": 2.0, "width": 3.0})[None]
     prb.refine(model, thetas=np.array([[2.0, np.log(3.0)]]))
     values, weights = evaluator.populations(theta, 0)
     assert float(weights[0] @ values[0]) == pytest.approx(3.5, abs=0.02)

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 import prbayes as prb
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_log_likelihoods
 from prbayes.propagation.exponential_families import ExponentialForm
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.response.distributions import compiled_log_density
@@ -152,9 +152,9 @@ def test_an_evaluator_has_the_log_likelihood_of_pymc(gross_errors: bool) -> None
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         metric = prb.LogLikelihood(gross_errors=gross_errors)
         prb.Simulator("y", lambda x: 2 * x, x, metric=metric, observed=observed)
-    evaluator = Evaluator(model)
-    thetas = evaluator.prior_points(16, 0)
-    graphs = evaluator.hyperparameters.compile(evaluator.specimen_graphs())
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.prior_points(16, 0)
+    graphs = evaluator.hyperparameters.compile(specimen_graphs(evaluator))
     expected = graphs(thetas)[0]
-    assert np.allclose(evaluator.specimen_log_likelihoods(thetas)["y"], expected, rtol=1e-11)
+    assert np.allclose(specimen_log_likelihoods(evaluator, thetas)["y"], expected, rtol=1e-11)
     assert np.allclose(evaluator.log_other(thetas), expected.sum(axis=1), rtol=1e-11)

@@ -15,6 +15,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._validate import Floats
+from prbayes.metrics.multivariate import CompositeDiscrepancy
 from prbayes.model.coverage import shortcomings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
@@ -118,8 +119,8 @@ def test_a_density_that_is_infinite_at_its_edge_leaves_weights_that_are_numbers(
         x = pm.Beta.dist(1.0, pm.HalfNormal("b", 0.3))
         y = pm.Normal.dist(0.0, 1.0)
         prb.Simulator("y", np.add, x, y, metric=AREA, observed=OBSERVED)
-    evaluator = Evaluator(model)
-    mass = evaluator.support(evaluator.prior_thetas(50, 1))["y"]["mean_weight"]
+    evaluator = Evaluator.of(model)
+    mass = evaluator.support(evaluator.hyperparameters.prior_thetas(50, 1))["y"]["mean_weight"]
     assert np.isfinite(mass).all()
     assert 0.9 < np.median(mass) < 1.1
 
@@ -181,7 +182,7 @@ def test_mass_out_of_reach_shows_in_the_mean_weight() -> None:
     far = design(once()).support([np.array([60.0]), np.array([0.1])])
     assert far["weight_ess"][0] == pytest.approx(1.0)
     assert far["mean_weight"][0] < 1e-100
-    short = str(shortcomings(Evaluator(once()), np.array([[0.0, np.log(100.0)]]))["y"])
+    short = str(shortcomings(Evaluator.of(once()), np.array([[0.0, np.log(100.0)]]))["y"])
     assert "mean raw weight from" in short
     assert "expected within 0.8 to 1.25" in short
 
@@ -202,7 +203,7 @@ def test_a_design_is_deterministic() -> None:
 
 def test_two_seeds_agree_in_the_discrepancy() -> None:
     thetas = np.array([[1.0, np.log(0.5)], [0.5, np.log(0.8)], [-1.0, 0.0]])
-    one, two = (Evaluator(line(seed=s))(thetas).discrepancies[:, 0] for s in (0, 1))
+    one, two = (Evaluator.of(line(seed=s))(thetas).discrepancies[:, 0] for s in (0, 1))
     np.testing.assert_allclose(one, two, atol=0.01)  # in units of the response: 2% of the data's sd
 
 
@@ -219,7 +220,7 @@ def test_blocks_of_populations_change_nothing(
         prb.Simulator(
             "y", same, x, metric=metric, observed=[0.5, 1.0, 1.5], propagation=prb.Reweighted(64)
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     thetas = np.linspace(-1.0, 1.5, 11)[:, None]
     thetas[4] = 3.0  # no population at all
     whole = evaluator.discrepancies(thetas, 0)
@@ -280,7 +281,7 @@ def test_lost_mass_is_the_probability_of_failure() -> None:
     np.testing.assert_allclose(
         d.support([mu, sigma])["lost_mass"], norm.cdf(-mu / sigma), atol=0.01
     )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     assert not shortcomings(evaluator, np.array([[1.0, 0.0]]))  # 16%
     short = str(shortcomings(evaluator, np.array([[0.5, 0.0]]))["y"])
     assert "lost mass: 3" in short  # 31%
@@ -350,7 +351,7 @@ def around_the_truth(size: int = 128) -> Floats:
 def test_refinement_of_two_correlated_inputs(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, logger="prbayes"):
         model, responses = hard(AREA)
-    evaluator, thetas = Evaluator(model), around_the_truth()
+    evaluator, thetas = Evaluator.of(model), around_the_truth()
     assert [r.count for r in responses] == [512, 512]
     short = shortcomings(evaluator, thetas)
     assert set(short) == {"sum", "difference"}
@@ -386,11 +387,11 @@ def test_two_designs_agree_in_the_optimum_of_the_hard_case(metric: prb.Metric) -
     for seed in (0, 1):
         model, responses = hard(metric, 1024, seed, pairs)
         thetas = around_the_truth()
-        assert shortcomings(Evaluator(model), thetas)
+        assert shortcomings(Evaluator.of(model), thetas)
         optimum = prb.minimize(model)
         assert optimum.converged
         assert optimum.n_responses == sum(r.count for r in responses) > 2 * 1024
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         assert not shortcomings(evaluator, optimum.theta[None])
         for name, support in evaluator.support(optimum.theta[None]).items():
             assert support["weight_ess"][0] > design(model, name).required_ess
@@ -494,7 +495,7 @@ def test_minimize_refines_where_the_answer_is_far_out_in_the_prior() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 0.5), 0.5)
         prb.Simulator("y", same, x, metric=AREA, observed=data, propagation=prb.Reweighted(128))
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     assert shortcomings(evaluator, np.array([[10.0]]))
     optimum = prb.minimize(model)
     assert optimum.n_responses == design(model).n_points > 128
@@ -711,7 +712,7 @@ def test_another_response_is_computed_at_the_new_points_only() -> None:
             asked.append(np.size(x))
         return 2 * x
 
-    (design,) = Evaluator(model).designs.values()
+    (design,) = Evaluator.of(model).designs.values()
     inputs = read_inputs("later", [x], model)
     for batches in range(1, 4):
         # A new description of the same response, as each call of predict makes one.
@@ -733,7 +734,7 @@ def test_a_value_with_probability_itself_has_its_share_of_points_and_weight() ->
         prb.Simulator(
             "y", same, censored, metric=AREA, observed=OBSERVED, propagation=prb.Reweighted(512)
         )
-    evaluator = Evaluator(model)
+    evaluator = Evaluator.of(model)
     mu = np.array([[0.5], [1.5]])
     values, weights = evaluator.populations(mu, 0)
     at_the_bound = (weights * (values == 0)).sum(axis=-1)
@@ -751,7 +752,7 @@ def test_a_mixture_is_reweighted() -> None:
         prb.Simulator(
             "y", same, mixture, metric=AREA, observed=OBSERVED, propagation=prb.Reweighted(512)
         )
-    values, weights = Evaluator(model).populations(np.array([[0.5], [1.5]]), 0)
+    values, weights = Evaluator.of(model).populations(np.array([[0.5], [1.5]]), 0)
     for mu, w in zip((0.5, 1.5), weights, strict=True):
         for at in (0.0, 1.0, 3.0, 5.0):
             expected = 0.3 * norm.cdf(at, mu, 1.0) + 0.7 * norm.cdf(at, 5.0, 0.5)
@@ -775,7 +776,7 @@ def test_data_that_were_set_anew_are_refused_where_points_are_added() -> None:
             "y", lambda x: x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
             propagation=prb.Reweighted(64),
         )  # fmt: skip
-    design = Evaluator(model).designs["y"]
+    design = Evaluator.of(model).designs["y"]
     components = [np.linspace(-1, 1, 16)]
     model.set_data("shift", 1.0)
     with pytest.raises(prb.propagation.DesignError, match="got other values of shift, which is"):
@@ -804,7 +805,7 @@ def test_where_a_basis_would_be_too_large_nothing_else_changes(
             )
         own = design(model)
         own.add([np.array([0.9, 1.1])])
-        evaluator = Evaluator(model)
+        evaluator = Evaluator.of(model)
         at = evaluator.objective(prior=False, gradient=True)(np.array([0.9]), np.ones(1))
         sizes = [s.get_value().size for s in own._shared]
         return at, evaluator(np.array([[0.9], [1.2]])).discrepancies, sizes
@@ -812,7 +813,7 @@ def test_where_a_basis_would_be_too_large_nothing_else_changes(
     at, many, sizes = found()
     assert max(sizes) > 128 * 100
     monkeypatch.setattr("prbayes.propagation.reweighted._MOST_NUMBERS", 100)
-    monkeypatch.setattr("prbayes.metrics.base.AT_ONCE", 100)
+    monkeypatch.setattr(CompositeDiscrepancy.basis, "__defaults__", (100,))
     compact_at, compact_many, compact_sizes = found()
     assert max(compact_sizes) == 128 * 4
     np.testing.assert_allclose(compact_at[0], at[0], rtol=1e-10)

@@ -27,16 +27,8 @@ from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.random_variable import nodes
-from prbayes.response.call import (
-    Calling,
-    Points,
-    Tally,
-    checked,
-    chunk_size,
-    chunks,
-    compute,
-    respond,
-)
+from prbayes.response.call import Points, checked, compute
+from prbayes.response.chunks import Calling, Tally, chunk_size, chunks, respond
 from prbayes.response.executors import has_slipped
 from prbayes.response.failures import Abort, OnFailure, Replace
 from prbayes.response.store import Store
@@ -234,9 +226,9 @@ def test_the_size_of_a_chunk(
 
 def test_a_tally_forgets_old_chunks_slowly() -> None:
     tally = Tally()
-    tally.take(10, 5.0)
+    tally.count(10, 5.0)
     assert tally == Tally(computed=10, seconds=0.5)
-    tally.take(2, 3.0)
+    tally.count(2, 3.0)
     assert tally.computed == 12
     assert tally.seconds == pytest.approx(0.7 * 0.5 + 0.3 * 1.5)
 

@@ -17,7 +17,7 @@ from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.random_variable import nodes
-from prbayes.response.time_limit import limited
+from prbayes.response.executors import time_limit
 
 SEES_PROCESSES = pytest.mark.skipif(
     not Path("/proc/self/stat").exists(), reason="no /proc to see processes in"
@@ -186,18 +186,17 @@ def ended(pids: list[int]) -> bool:
 
 @pytest.mark.long
 @SEES_PROCESSES
-def test_the_time_limit_of_a_worker_s_thread_ends_the_program(tmp_path: Path) -> None:
+def test_the_time_limit_of_a_worker_ends_the_program(tmp_path: Path) -> None:
     code = "import os, time; print(os.getpid(), {x}, flush=True); time.sleep(600)"
     run = prb.command([*PYTHON, code], inputs=["x"], read=printed, folder=tmp_path)
 
     def late() -> None:
-        with limited(1.5):
+        with time_limit(1.5):
             run(1.0)
 
     clock = time.monotonic()
-    with ThreadPoolExecutor(1) as pool:
-        error = pool.submit(late).exception()
-    assert isinstance(error, TimeoutError)
+    with pytest.raises(TimeoutError):
+        late()
     assert time.monotonic() - clock < 60
     (kept,) = tmp_path.iterdir()
     assert ended([int((kept / "stdout.txt").read_text().split()[0])])

@@ -277,7 +277,7 @@ def test_a_model_that_is_built_again_has_its_functions(compilations: list[Any]) 
             x = pm.Normal.dist(pm.Normal("mu", mean, 1), 0.5)
             y = [1.0, 2.0]
             prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=y)
-        return Evaluator(model).hyperparameters.log_prior(np.zeros((1, 1)))[0]
+        return Evaluator.of(model).hyperparameters.log_prior(np.zeros((1, 1)))[0]
 
     first = log_prior(0.0)
     before = len(compilations)

@@ -6,7 +6,13 @@ import gc
 import logging
 import os
 import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
 import weakref
+from collections.abc import Callable
 from concurrent.futures import (
     BrokenExecutor,
     CancelledError,
@@ -27,9 +33,10 @@ from prbayes.response.executors import (
     Pool,
     capacity,
     failure_of,
+    failure_text,
     is_loss,
     refuse_timeout,
-    told,
+    time_limit,
 )
 from prbayes.response.failures import ResponseError
 
@@ -108,6 +115,159 @@ def test_processes_keep_a_time_limit() -> None:
         refuse_timeout(-1, pool)
 
 
+MAIN_OR_THREAD = pytest.mark.parametrize("where", ["main", "thread"])
+
+
+def spin(seconds: float) -> None:
+    """Work in Python for so long."""
+    until = time.perf_counter() + seconds
+    while time.perf_counter() < until:
+        pass
+
+
+def run(where: str, work: Callable[[], object]) -> object:
+    if where == "main":
+        return work()
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(work).result()
+
+
+def nothing_is_left() -> bool:
+    return (
+        not executors._deadlines
+        and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+        and signal.getitimer(signal.ITIMER_REAL)[0] == 0
+    )
+
+
+def test_what_runs_in_python_is_ended() -> None:
+    begun = time.perf_counter()
+    with (
+        pytest.raises(TimeoutError, match=r"^no result within timeout = 0.05 s$"),
+        time_limit(0.05),
+    ):
+        spin(10.0)
+    assert time.perf_counter() - begun < 1.0
+    assert nothing_is_left()
+
+
+@MAIN_OR_THREAD
+def test_what_is_in_time_is_left_alone(where: str) -> None:
+    def quick() -> int:
+        for _ in range(200):
+            with time_limit(0.02):
+                pass
+        # None of those that were set comes later.
+        spin(0.04)
+        return 3
+
+    assert run(where, quick) == 3
+    assert nothing_is_left()
+
+
+def test_a_limit_at_the_very_end_is_one_or_the_other() -> None:
+    late = 0
+    for i in range(60):
+        try:
+            with time_limit(0.002):
+                spin(0.002 + 1e-5 * (i - 30))
+        except TimeoutError:
+            late += 1
+    time.sleep(0.01)
+    assert 0 <= late <= 60
+    assert nothing_is_left()
+
+
+def test_an_alarm_while_the_clock_is_stopped_comes_too_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stop = signal.setitimer
+
+    def stopped(which: int, seconds: float) -> None:
+        if seconds == 0:
+            signal.raise_signal(signal.SIGALRM)
+        stop(which, seconds)
+
+    monkeypatch.setattr(signal, "setitimer", stopped)
+    with time_limit(5.0):
+        spin(0.001)
+    assert nothing_is_left()
+
+
+def test_a_time_limit_of_the_response_s_own_is_its_own() -> None:
+    def own() -> None:
+        with time_limit(5.0):
+            raise TimeoutError("no answer from the license server")
+
+    with pytest.raises(TimeoutError, match="license server"):
+        own()
+    with time_limit(None):
+        assert nothing_is_left()
+
+
+def test_an_exception_of_another_kind_that_replaces_the_alarm_is_a_time_limit() -> None:
+    def respond() -> None:
+        try:
+            spin(10.0)
+        except BaseException as error:
+            raise RuntimeError("Failed to instantiate model") from error
+
+    def late() -> None:
+        with time_limit(0.05):
+            respond()
+
+    with pytest.raises(TimeoutError, match=r"^no result within timeout = 0.05 s$"):
+        late()
+    assert nothing_is_left()
+
+
+def test_two_threads_have_a_clock_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    wound: list[float] = []
+    monkeypatch.setattr(
+        "faulthandler.dump_traceback_later", lambda left, **_: wound.append(round(left, 1))
+    )
+    first, second = threading.Event(), threading.Event()
+
+    def long() -> None:
+        with time_limit(20.0):
+            first.set()
+            second.wait(10)
+
+    thread = threading.Thread(target=long)
+    thread.start()
+    first.wait(10)
+    with time_limit(2.0):
+        pass
+    second.set()
+    thread.join()
+    # The shorter one is first, and then the longer one again.
+    assert wound == [31.0, 4.0, 31.0]
+    assert nothing_is_left()
+
+
+HANGS = """
+import threading, time
+from prbayes.response.executors import time_limit
+
+def hangs():
+    with time_limit(0.05):
+        time.sleep(600)
+
+thread = threading.Thread(target=hangs)
+thread.start()
+thread.join()
+"""
+
+
+def test_what_hangs_elsewhere_ends_its_process() -> None:
+    start = time.perf_counter()
+    command = [sys.executable, "-c", HANGS]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert done.stderr == ""
+    assert 1.0 < time.perf_counter() - start < 40.0
+
+
 # -- losses --------------------------------------------------------------------------------------
 
 
@@ -117,11 +277,13 @@ def test_losses_are_told_from_ends_and_failures() -> None:
 
     for loss in (BrokenExecutor("x"), KilledWorker("x")):
         assert is_loss(loss)
-        assert told(loss) == f"a worker was lost ({type(loss).__name__}: x)"
+        assert failure_text(loss) == f"a worker was lost ({type(loss).__name__}: x)"
     for other in (None, CancelledError(), ValueError()):
         assert not is_loss(other)
-    assert told(CancelledError("x")).startswith("the executor was closed while it was at work (")
-    assert told(pickle.PicklingError("x")) == "the executor failed (PicklingError: x)"
+    assert failure_text(CancelledError("x")).startswith(
+        "the executor was closed while it was at work ("
+    )
+    assert failure_text(pickle.PicklingError("x")) == "the executor failed (PicklingError: x)"
 
 
 def test_a_future_that_was_cancelled_has_a_failure() -> None:
@@ -158,7 +320,7 @@ def test_an_executor_that_cannot_be_renewed_is_not_kept() -> None:
     gc.freeze()  # what other tests left is not looked at
     executor = ThreadPoolExecutor(1)
     Pool("y", executor).renew(BrokenExecutor())
-    assert executor not in executors._renewed
+    assert executor not in executors._replacements
     there = weakref.ref(executor)
     del executor
     gc.collect()

@@ -11,11 +11,14 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+from first_use import first_use
 
+import prbayes as prb
+from prbayes.model.random_variable import nodes
 from prbayes.response.call import scalar
 from prbayes.response.failures import Abort, Replace, ResponseError
 from prbayes.response.inputs import Inputs, read_inputs
-from prbayes.response.response import Responses, refuse_uncallable
+from prbayes.response.response import Known, Responses, once_each, refuse_uncallable
 
 with pm.Model() as MODEL:
     MU = pm.Normal("mu")
@@ -197,3 +200,199 @@ def test_a_function_that_knows_its_sizes_is_told_those_of_a_simulator() -> None:
 
     Responses("y", scalar(Sized()), inputs(PAIR, [1.0, 2.0, 3.0], X, MU, X), outputs=None)
     assert told == [("y", [2, 3, 1, 1, 1], None)]
+
+
+# -- batches that mix their specimens ----------------------------------------------------------
+
+OBSERVED = np.linspace(-1, 1, 20)
+
+
+def simulate(
+    response: Any, *, observed: Any = OBSERVED, metric: Any = None, **keywords: Any
+) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1)
+        metric = metric or prb.AreaMetric()
+        propagation = prb.Reweighted(64)
+        prb.Simulator(
+            "y", response, x, metric=metric, observed=observed, propagation=propagation, **keywords
+        )
+    first_use(model)
+
+
+@pytest.mark.parametrize(
+    "response",
+    [
+        lambda x: x[..., ::-1],
+        lambda x: x - x.mean(),
+        lambda x: np.sort(x)[..., ::-1],
+        lambda x: np.cumsum(x, axis=-1)[..., ::-1],
+        lambda x: x / np.abs(x).max(),
+    ],
+    ids=["flip", "mean", "sort", "sum", "maximum"],
+)
+def test_a_response_that_mixes_its_specimens_is_refused(response: Any) -> None:
+    with pytest.raises(
+        prb.response.ResponseError,
+        match=r"y: the response of a specimen depends on .* by itself, and .* among 64, expected",
+    ):
+        simulate(response)
+
+
+def test_of_several_outputs_one_is_enough() -> None:
+    def two(x: Any) -> Any:
+        return np.stack([x, x[..., ::-1]], axis=-1)
+
+    with pytest.raises(prb.response.ResponseError, match="depends on those that it is computed"):
+        simulate(
+            two,
+            observed=np.random.default_rng(0).normal(size=(20, 2)),
+            metric=prb.Joint(prb.AreaMetric()),
+        )
+
+
+def test_a_first_batch_of_one_specimen_is_no_look() -> None:
+    def two(x: Any) -> Any:
+        return np.stack([x, x[..., ::-1]], axis=-1)
+
+    with pm.Model() as model:
+        inputs = read_inputs("y", [pm.Normal.dist(pm.Normal("mu", 0, 1), 1)], model)
+    responses = Responses("y", two, inputs, outputs=None)
+    responses([np.array([0.5])], [])
+    with pytest.raises(prb.response.ResponseError, match="depends on those that it is computed"):
+        responses([np.arange(4.0)], [])
+
+
+def test_others_are_not_refused() -> None:
+    rng = np.random.default_rng(0)
+    simulate(np.exp)
+    simulate(lambda x: np.where(x > 0, x, np.nan))
+    simulate(lambda x: x + 1e-4 * x.mean())  # as much as a solver's steps differ
+    simulate(lambda x: x + rng.normal(size=x.shape))  # scatter of its own
+    simulate(lambda x: x * 0.0 + 2.0)
+
+    def of_many(x: Any) -> Any:
+        assert x.size > 1, "takes no single specimen"
+        return x
+
+    simulate(of_many)
+
+
+def test_it_costs_one_run_that_is_not_counted() -> None:
+    sizes = []
+
+    def line(x: Any) -> Any:
+        sizes.append(x.size)
+        return x
+
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1)
+        prb.Simulator(
+            "y",
+            line,
+            x,
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            propagation=prb.Reweighted(64),
+        )
+        optimum = prb.minimize(progressbar=False)
+    assert sizes.count(1) == 1
+    assert optimum.n_responses == sum(sizes) - 1
+
+
+# -- points that repeat ------------------------------------------------------------------------
+
+
+class Counted:
+    """A response that keeps what it was asked for; a specimen by itself is no run."""
+
+    def __init__(self, function: Any) -> None:
+        self.function = function
+        self.asked: list[int] = []
+
+    def __call__(self, *inputs: Any) -> Any:
+        if np.size(inputs[0]) > 1:
+            self.asked.append(int(np.size(inputs[0])))
+        return self.function(*inputs)
+
+
+def responses_of(function: Any, n_inputs: int = 1) -> Responses:
+    with pm.Model() as model:
+        rate = pm.HalfNormal("rate", 3)
+        inputs = [pm.Poisson.dist(rate) for _ in range(n_inputs)]
+        return Responses("y", function, read_inputs("y", inputs, model))
+
+
+@pytest.mark.exact
+def test_each_different_point_is_computed_once_and_four_of_them_twice_at_first() -> None:
+    response = Counted(lambda a, b: 10 * a + b)
+    responses = responses_of(response, 2)
+    rng = np.random.default_rng(0)
+    points = [rng.integers(0, 3, 500), rng.integers(0, 4, 500)]
+    found = once_each(responses, points, None)
+    np.testing.assert_array_equal(found, 10 * points[0] + points[1])
+    assert response.asked == [12 + 4]
+    # Known ones are not computed, and none is again.
+    more = [rng.integers(0, 4, 300), rng.integers(0, 4, 300)]
+    found = once_each(responses, more, Known(points, found))
+    np.testing.assert_array_equal(found, 10 * more[0] + more[1])
+    assert response.asked == [16, 4]
+    assert responses.count == 800
+    assert responses.computed == 20
+    assert once_each(responses, more, Known(more, found)) == pytest.approx(found)
+    assert response.asked == [16, 4]
+
+
+@pytest.mark.exact
+def test_different_points_are_one_call_with_all_of_them() -> None:
+    response = Counted(np.exp)
+    points = [np.random.default_rng(1).normal(size=100)]
+    found = once_each(responses_of(response), points, None)
+    np.testing.assert_array_equal(found, np.exp(points[0]))
+    assert response.asked == [100]
+
+
+def test_a_response_with_scatter_of_its_own_is_computed_everywhere() -> None:
+    rng = np.random.default_rng(2)
+    response = Counted(lambda x: x + rng.normal(size=np.shape(x)))
+    responses = responses_of(response)
+    x = np.repeat([0.0, 1.0], 200)
+    found = once_each(responses, [x], None)
+    assert sum(response.asked) == 400
+    assert np.unique(found).size == 400
+    assert np.std(found - x) == pytest.approx(1, abs=0.2)
+    once_each(responses, [x], Known([x], found))
+    assert response.asked[-1] == 400
+
+
+@pytest.mark.exact
+def test_failed_points_fail_again() -> None:
+    responses = responses_of(lambda x: np.where(x > 1, np.nan, x))
+    found = once_each(responses, [np.array([0, 2, 2, 1, 0])], None)
+    np.testing.assert_array_equal(found, [0, np.nan, np.nan, 1, 0])
+    assert responses.scatters is False
+
+
+@pytest.mark.exact
+def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinement() -> None:
+    response = Counted(lambda x: 2.0 * x)
+    with pm.Model() as model:
+        x = pm.Binomial.dist(16, pm.Beta("p", 2, 2))
+        propagation = prb.Reweighted(256)
+        prb.Simulator(
+            "y",
+            response,
+            x,
+            metric=prb.AreaMetric(),
+            observed=[8.0, 10.0, 12.0],
+            propagation=propagation,
+        )
+    (node,) = nodes(model).values()
+    assert sum(response.asked) <= 17 + 4
+    prb.refine(model, thetas=np.full((1, 1), 2.0))
+    node.design.add([np.array([0.9, 0.95])])
+    assert sum(response.asked) <= 17 + 4
+    np.testing.assert_array_equal(node.design.values, 2.0 * node.design.batches.points[0])
+    optimum = prb.minimize(model, progressbar=False)
+    assert optimum.n_computed <= 17 + 4
+    assert optimum.n_responses == node.design.n_points

@@ -128,7 +128,9 @@ def test_compare_scores_each_result_under_every_metric(
     assert total.sel(result="ABC") > total.sel(result="optimum")
     # A metric that the model does not have: by the direct call, at the posterior mean
     mean = {k: np.asarray(idata["posterior"][k].mean(("chain", "draw"))) for k in ("mean", "sigma")}
-    values, weights = optimum.evaluator.populations(optimum.evaluator.unconstrained(mean)[None], 0)
+    values, weights = optimum.evaluator.populations(
+        optimum.evaluator.hyperparameters.unconstrained(mean)[None], 0
+    )
     direct = prb.ProbabilityResidual().against(DATA[:, 0])(values, weights)
     np.testing.assert_allclose(table["first ProbabilityResidual"].sel(result="ABC"), direct)
     few = prb.compare(results, model=model, metrics=[prb.ProbabilityResidual(scale_base=1)])
@@ -240,7 +242,7 @@ def test_scores_of_a_model_that_was_built_again_are_those_of_the_first() -> None
     optimum = prb.minimize(first)
     there = prb.compare({"optimum": optimum}, model=first)
     again = build()
-    design = Evaluator(again).designs["y"]
+    design = Evaluator.of(again).designs["y"]
     before = design.contents
     here = prb.compare({"optimum": optimum.to_datatree()}, model=again)
     for name in ("ProbabilityResidual", "KullbackLeibler", "AreaMetric"):

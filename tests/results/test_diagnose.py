@@ -250,8 +250,8 @@ def test_the_evidence_is_a_plain_number_with_its_spread() -> None:
     by_chain = idata["sample_stats"]["log_marginal_likelihood"].max("stage").values
     assert attrs["log_marginal_likelihood"] == pytest.approx(np.log(np.exp(by_chain).mean()))
     assert attrs["log_marginal_likelihood_sd"] == pytest.approx(by_chain.std(ddof=1))
-    evaluator = Evaluator(model)
-    thetas = evaluator.prior_thetas(20_000, seed=9)
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.prior_thetas(20_000, seed=9)
     logs = -evaluator(thetas).discrepancies[:, 0] / float(idata["calibration"]["epsilon"][0])
     likelihood = np.exp(logs)
     exact, error = (
@@ -268,8 +268,8 @@ def test_the_evidence_is_a_plain_number_with_its_spread() -> None:
 
 
 def test_monte_carlo_error_of_the_discrepancy_of_fresh_responses() -> None:
-    evaluator = Evaluator(build(prb.Fresh(128), prb.KullbackLeibler()))
-    theta = evaluator.unconstrained({"mu": 1.1, "sigma": 0.5})[None]
+    evaluator = Evaluator.of(build(prb.Fresh(128), prb.KullbackLeibler()))
+    theta = evaluator.hyperparameters.unconstrained({"mu": 1.1, "sigma": 0.5})[None]
     values = [float(evaluator(theta).discrepancies[0, 0]) for _ in range(100)]
     roots = evaluator.roots(theta, 0)
     errors = [evaluator.nodes[0].bound.discrepancy_error(roots) for _ in range(50)]
@@ -282,8 +282,8 @@ def test_monte_carlo_error_of_the_discrepancy_of_fresh_responses() -> None:
 def test_monte_carlo_error_of_common_points_is_a_bound(propagation: Any) -> None:
     found = []
     for n in (4096, 128):
-        evaluator = Evaluator(build(propagation(n), prb.KullbackLeibler()))
-        theta = evaluator.unconstrained({"mu": 1.1, "sigma": 0.5})[None]
+        evaluator = Evaluator.of(build(propagation(n), prb.KullbackLeibler()))
+        theta = evaluator.hyperparameters.unconstrained({"mu": 1.1, "sigma": 0.5})[None]
         error = evaluator.nodes[0].bound.discrepancy_error(evaluator.roots(theta, 0))
         found.append((float(evaluator(theta).discrepancies[0, 0]), error))
     (exact, small), (value, error) = found
@@ -296,8 +296,8 @@ def test_monte_carlo_error_of_a_function_that_takes_no_weights_and_of_few_points
         lambda simulated, observed: np.abs(simulated.mean(axis=-1) - observed.mean())
     )
     for n in (60, 8):
-        evaluator = Evaluator(build(prb.Fresh(n), metric))
-        theta = evaluator.unconstrained({"mu": 3.0, "sigma": 0.5})[None]
+        evaluator = Evaluator.of(build(prb.Fresh(n), metric))
+        theta = evaluator.hyperparameters.unconstrained({"mu": 3.0, "sigma": 0.5})[None]
         error = evaluator.nodes[0].bound.discrepancy_error(evaluator.roots(theta, 0))
         # The standard error of a mean; the jackknife's own is a quarter of it.
         assert np.isnan(error) if n == 8 else error == pytest.approx(0.5 / np.sqrt(60), rel=0.9)
@@ -471,7 +471,7 @@ def test_draws_that_lose_too_much_are_counted_and_told() -> None:
 def test_an_answer_is_refused_where_most_draws_lose_too_much(
     of_draws: float, refused: bool
 ) -> None:
-    evaluator = Evaluator(failing(prb.Resimulated(16, on_failure=REPLACED)))
+    evaluator = Evaluator.of(failing(prb.Resimulated(16, on_failure=REPLACED)))
     lost = np.where(np.arange(50) < 50 * of_draws, 0.3, 0.0).reshape(1, 50, 1)
     with nullcontext() if not refused else pytest.raises(DesignError, match=r"got 30\.0% of the"):
         _refuse_lost(evaluator, lost, {"y": {"lost_mass": 0.0}})

@@ -1,4 +1,4 @@
-"""Arguments of a test in one form: conditions, specimens, what is refused."""
+"""Measured and predicted values by condition, specimen, output and projection."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from prbayes.validation.conditions import read_case
+from prbayes.validation.conditions import comparables, projections, read_case
 
 DRAWS = np.arange(12.0).reshape(3, 4)
 
@@ -14,10 +14,10 @@ DRAWS = np.arange(12.0).reshape(3, 4)
 def test_one_condition_two_and_named_ones() -> None:
     one = read_case([1.0, 2.0], DRAWS)
     assert [c.name for c in one.conditions] == ["observed"]
-    assert (one.size, one.n_specimens, one.draws) == (2, 2, 3)
+    assert (one.size, one.n_specimens, one.n_draws) == (2, 2, 3)
     listed = read_case([[1.0, 2.0], [3.0]], [DRAWS, DRAWS])
     assert [c.name for c in listed.conditions] == ["0", "1"]
-    assert (listed.size, listed.n_specimens, listed.shared) == (3, 3, False)
+    assert (listed.size, listed.n_specimens, listed.shares_specimens) == (3, 3, False)
     # In the order of the predictions.
     named = read_case({"a": [1.0], "b": [2.0, 3.0]}, {"b": DRAWS, "a": DRAWS})
     assert [c.name for c in named.conditions] == ["b", "a"]
@@ -28,10 +28,10 @@ def test_specimens_are_counted_over_all_conditions() -> None:
     labels = {"a": [7, 8], "b": [8.0, 9.0]}
     case = read_case({"a": [1.0, 2.0], "b": [3.0, 4.0]}, {"a": DRAWS, "b": DRAWS}, labels)
     assert [c.numbers.tolist() for c in case.conditions] == [[0, 1], [1, 2]]
-    assert (case.n_specimens, case.shared, case.dependent) == (3, True, True)
+    assert (case.n_specimens, case.shares_specimens, case.is_dependent) == (3, True, True)
     assert case.conditions[1].specimens == ("8", "9")
     twice = read_case([1.0, 2.0], DRAWS, ["x", "x"])
-    assert (twice.n_specimens, twice.shared, twice.dependent) == (1, False, True)
+    assert (twice.n_specimens, twice.shares_specimens, twice.is_dependent) == (1, False, True)
     assert read_case([1.0], DRAWS).conditions[0].specimens == ("observed, 0",)
 
 
@@ -47,8 +47,8 @@ def test_predictions_have_their_name_dims_and_notes() -> None:
     assert condition.attributes["specimens_id"] == "x"
     np.testing.assert_array_equal(condition.predicted, DRAWS)
     # One population needs no axis of draws, several may have two.
-    assert read_case([1.0], DRAWS[0]).draws == 1
-    assert read_case([1.0], DRAWS.reshape(1, 3, 4)).draws == 3
+    assert read_case([1.0], DRAWS[0]).n_draws == 1
+    assert read_case([1.0], DRAWS.reshape(1, 3, 4)).n_draws == 3
 
 
 def test_folded_values_are_the_distance_from_the_middle() -> None:
@@ -73,3 +73,59 @@ def test_folded_values_are_the_distance_from_the_middle() -> None:
 def test_refusals(observed: Any, predicted: Any, specimens: Any, match: str) -> None:
     with pytest.raises(ValueError, match=match):
         read_case(observed, predicted, specimens)
+
+
+def seen(pool):
+    """Return what is seen of all specimens in each direction."""
+    return np.array([view.of(pool).ravel() for view in projections(pool)])
+
+
+def correlated(rng, m):
+    """Return predicted outputs with correlation .9, in units of a thousand."""
+    root = np.linalg.cholesky(np.full((m, m), 0.9) + 0.1 * np.eye(m))
+    return 1e3 * rng.standard_normal((20, 400, m)) @ root.T
+
+
+def test_outputs_are_white_in_every_direction():
+    for m in (2, 4):
+        spreads = seen(correlated(np.random.default_rng(1), m)).std(axis=1)
+        assert np.ptp(spreads) < 0.1 * spreads.mean()
+
+
+def test_specimens_that_failed_are_seen_at_the_end_and_those_without_response_nowhere():
+    pool = correlated(np.random.default_rng(2), 2)
+    pool[0, 0, 0] = np.inf
+    pool[0, 1, 1] = np.nan
+    for view in projections(pool):
+        numbers = view.of(pool)
+        assert np.isfinite(numbers[0, 0])
+        assert np.isnan(numbers[0, 1])
+        assert np.isfinite(numbers[1:]).all()
+
+
+def test_outputs_and_what_was_not_measured() -> None:
+    predicted = xr.DataArray(
+        np.arange(24.0).reshape(1, 2, 4, 3), dims=("chain", "draw", "sample", "place")
+    )
+    measured = np.array([[1.0, np.nan, 3.0], [4.0, 5.0, np.inf]])
+    found = comparables({"a/b": measured}, {"a/b": predicted}, "test")
+    assert [one.name for one in found] == ["a∕b[0]", "a∕b[1]", "a∕b[2]"]  # noqa: RUF001
+    assert [one.measured.tolist() for one in found] == [[1.0, 4.0], [5.0], [3.0, np.inf]]
+    np.testing.assert_array_equal(found[1].predicted, predicted.values[0, :, :, 1])
+
+
+def test_weights_leave_out_what_is_not_known() -> None:
+    values = np.array([[1.0, np.nan, 2.0, np.inf], [1.0, 2.0, 3.0, 4.0]])
+    predicted = xr.DataArray(values[None], dims=("chain", "draw", "sample"), name="y")
+    (one,) = comparables([1.0], predicted, "test")
+    np.testing.assert_allclose(one.weights, [[1 / 3, 0, 1 / 3, 1 / 3], [0.25] * 4])
+
+
+def test_of_many_outputs_some_are_shown() -> None:
+    predicted = xr.DataArray(
+        np.zeros((1, 1, 4, 30)), dims=("chain", "draw", "sample", "t"), name="curve"
+    )
+    found = comparables(np.zeros((2, 30)), predicted, "test")
+    assert [one.name for one in found][:2] == ["curve[0]", "curve[4]"]
+    assert len(found) == 8
+    assert found[-1].name == "curve[29]"

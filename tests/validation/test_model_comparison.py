@@ -11,6 +11,7 @@ from arviz_stats import compare as arviz_compare
 from arviz_stats.utils import ELPDData
 
 import prbayes as prb
+from prbayes.validation.scores import log_scores, scoring_target
 
 compare = prb.rank
 SKEWED = np.exp(np.random.default_rng(0).normal(0.0, 0.7, 60))
@@ -129,9 +130,9 @@ def test_a_score_is_that_of_a_population_that_has_not_seen_the_specimen() -> Non
     out = np.flatnonzero(fold == 2)
     other = minimized(lognormal, SKEWED[fold != 2])
     population = prb.predict(other, np.positive, _input(other), n_samples=20_000, **QUIET)
-    scoring = prb.validation.cross_validation.Scoring.of(SKEWED, np.full(60, 1 / 60))
+    target = scoring_target(SKEWED, np.full(60, 1 / 60))
     values = population.values.ravel()
-    expected = scoring.scores(values, np.full(values.size, 1 / values.size), out)
+    expected = log_scores(target, values, np.full(values.size, 1 / values.size), out)
     np.testing.assert_allclose(found.score.values[out], expected, atol=0.1)
 
 

@@ -1,6 +1,8 @@
-"""The null of a posterior: one population per replicate, one sample per specimen."""
+"""Null distributions: replicates of a posterior, and the table of an exact population."""
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +12,16 @@ from scipy.special import ndtri
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.validation.conditions import Case, Condition, read_case
-from prbayes.validation.nulls import SimulatedNull
-from prbayes.validation.statistic import area
+from prbayes.validation.nulls import judge_by_replicates, table
+from prbayes.validation.probability_transform import area
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks import area_null
 
 Posterior = Callable[..., Any]
 EXACT = prb.validation.ExactModel()
+PUBLISHED = {5: 0.2567, 10: 0.1828, 15: 0.1500, 20: 0.1297, 30: 0.1057, 50: 0.0824, 100: 0.0580}
 QUICK = prb.validation.PosteriorNull(999)
 GRID = ndtri((np.arange(1000) + 0.5) / 1000)  # a standard normal population
 
@@ -34,15 +41,7 @@ def test_an_uncertain_population_is_rejected_less_easily(posterior: Posterior) -
 
 
 def test_p_values_of_replicates_count_the_observed_data_in() -> None:
-    AREAS = np.linspace(0.01, 0.49, 19)
-
-    class Fixed(SimulatedNull):
-        def replicates_of(self, case: Case) -> Iterator[Floats]:
-            yield AREAS[:, None]
-
-        def describe(self, case: Case) -> str:
-            return ""
-
+    u = np.linspace(0.01, 0.49, 19)[:, None]
     case = Case(
         (Condition("a", np.zeros(1), np.zeros((1, 1)), np.zeros(1), None, np.zeros(1, dtype=int)),),
         1,
@@ -50,15 +49,15 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
     )
 
     def judged(statistic: float, alpha: float) -> tuple[float, float]:
-        found = Fixed().judge(case, statistic, alpha)
+        found = judge_by_replicates([u], case, statistic, alpha)
         return found.p_value, found.critical_value
 
-    areas = area(AREAS[:, None])  # falling
+    areas = area(u)  # falling
     assert judged(0.5, 0.05) == (1 / 20, areas[0])
     assert judged(areas[0], 0.05)[0] == 2 / 20
     assert judged(0.0, 0.10) == (1.0, areas[1])
     with pytest.raises(ValueError, match=r"alpha: got 0\.01 with 19 replicates"):
-        Fixed().judge(case, 0.5, 0.01)
+        judge_by_replicates([u], case, 0.5, 0.01)
 
 
 def test_nan_is_left_out_of_populations(posterior: Posterior) -> None:
@@ -170,3 +169,79 @@ def test_refusals() -> None:
         prb.validation.PosteriorNull(5)
     with pytest.raises(ValueError, match="PosteriorNull: random_seed: got -1"):
         prb.validation.PosteriorNull(random_seed=-1)
+
+
+@pytest.mark.parametrize(("n", "published"), PUBLISHED.items())
+def test_published_critical_values(n: int, published: float) -> None:
+    assert EXACT.critical_value(n) == pytest.approx(published, abs=4e-4)
+
+
+def test_the_limit_for_many_values() -> None:
+    scaled = [np.sqrt(n) * EXACT.critical_value(n) for n in (500, 1000, 10_000)]
+    np.testing.assert_allclose(scaled, 0.5821, atol=2e-4)
+
+
+def test_one_value_has_a_closed_form() -> None:
+    # A = 1/4 + (u - 1/2)^2
+    for alpha in (0.5, 0.1, 0.05, 0.01):
+        assert EXACT.critical_value(1, alpha) == pytest.approx(
+            0.25 + ((1 - alpha) / 2) ** 2, abs=1e-4
+        )
+    assert EXACT.p_value(0.25 + 0.3**2, 1) == pytest.approx(0.4, abs=2e-3)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 7, 23, 60, pytest.param(170, marks=pytest.mark.slow)])
+def test_the_table_against_simulation(n: int) -> None:
+    size = 100_000
+    found = area(np.random.default_rng(n).random((size, n)))
+    for alpha in (0.9, 0.5, 0.1, 0.05, 0.01, 0.001):
+        share = float((found > EXACT.critical_value(n, alpha)).mean())
+        assert abs(share - alpha) < 4.5 * np.sqrt(alpha * (1 - alpha) / size)
+
+
+@pytest.mark.long
+def test_the_table_is_what_its_script_makes() -> None:
+    sizes, rows = table().sizes, table().quantiles
+    for n in (1, 9):
+        np.testing.assert_allclose(area_null.quantiles(n), rows[sizes == n][0], atol=2e-6)
+    np.testing.assert_allclose(area_null.areas(np.array([0.2, 0.5])), area(np.array([0.2, 0.5])))
+
+
+def test_the_table_is_monotone() -> None:
+    sizes, logs, rows = table().sizes, table().logs, table().quantiles
+    assert (np.diff(sizes) > 0).all()
+    assert (np.diff(logs) > 0).all()
+    assert (np.diff(rows, axis=1) >= 0).all()
+    assert (sizes[0], sizes[-1]) == (1, 1000)
+
+
+@pytest.mark.parametrize("n", [1, 2, 8, 20, 77, 1000, 5000])
+def test_p_values_and_critical_values_belong_together(n: int) -> None:
+    for alpha in (0.2, 0.05, 0.01, 1e-4):
+        assert EXACT.p_value(EXACT.critical_value(n, alpha), n) == pytest.approx(alpha, rel=1e-6)
+    p = [EXACT.p_value(a, n) for a in np.linspace(0, 0.5, 200)]
+    assert (np.diff(p) <= 0).all()
+    assert p[0] > 0.999
+    assert 0 <= p[-1] < 1e-4
+
+
+def test_the_far_tail_falls_like_that_of_a_brownian_bridge() -> None:
+    x = np.array([1.6, 1.8])
+    logs = np.log([EXACT.p_value(v / np.sqrt(1000), 1000) for v in x])
+    assert (logs[1] - logs[0]) / (x[1] ** 2 - x[0] ** 2) == pytest.approx(-6, abs=0.6)
+
+
+def test_sizes_between_those_of_the_table_lie_between_them() -> None:
+    for alpha in (0.5, 0.05, 1e-3):
+        scaled = [np.sqrt(n) * EXACT.critical_value(n, alpha) for n in (22, 23, 24, 25)]
+        falls = np.diff(scaled)
+        assert (falls > 0).all() or (falls < 0).all()
+
+
+def test_the_slope_of_the_far_tail_does_not_hang_on_where_it_is_taken() -> None:
+    found = table()
+    logs = found.logs
+    for n in (20, 100, 1000):
+        squares = found.at(n) ** 2
+        slopes = [(logs[-1] - logs[-1 - k]) / (squares[-1] - squares[-1 - k]) for k in range(1, 13)]
+        np.testing.assert_allclose(slopes, slopes[6], rtol=0.055)

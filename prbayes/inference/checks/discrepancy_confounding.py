@@ -37,7 +37,7 @@ def confounded(evaluator: Evaluator, local: Local) -> list[str]:
         own, others = _elements(evaluator, node)
         if not own.size or not others.size:
             continue
-        names = evaluator.readable_names
+        names = evaluator.hyperparameters.readable_names
         found = _mixed(local, own, others, names) or _alike(local, own, others, names)
         if found:
             lines.append(
@@ -93,7 +93,9 @@ def _places(evaluator: Evaluator, roots: Sequence[Any]) -> Places:
     names = {rv.name for rv in roots}
     model = evaluator.model
     belongs: list[bool] = []
-    for value, shape in zip(model.value_vars, evaluator.shapes.values(), strict=True):
+    for value, shape in zip(
+        model.value_vars, evaluator.hyperparameters.shapes.values(), strict=True
+    ):
         size = int(np.prod(shape, dtype=int))
         belongs += [model.values_to_rvs[value].name in names] * size
     return np.flatnonzero(belongs)

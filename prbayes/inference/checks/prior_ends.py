@@ -15,7 +15,7 @@ from prbayes._finding import Finding
 from prbayes._pages import more_in
 from prbayes._validate import Floats
 from prbayes.inference.refits import SamplingDistribution
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.parameters import THETAS
 
 # Part of the prior that is its end.
@@ -52,9 +52,9 @@ def at_prior_ends(sampling: SamplingDistribution, seed: int = 0) -> list[PriorEn
     if not local.unidentified.size or not all(node.bound.stored for node in evaluator.nodes):
         return []
     alone = (local.unidentified**2).sum(axis=1) > _BY_ITSELF
-    alone &= ~evaluator.told_by_prior
+    alone &= ~only_through_prior(evaluator)
     theta = sampling.theta
-    prior = evaluator.prior_thetas(THETAS, seed)
+    prior = evaluator.hyperparameters.prior_thetas(THETAS, seed)
     below = (prior <= theta).mean(axis=0)
     outermost = (below < _TAIL_OF_PRIOR) | (below > 1 - _TAIL_OF_PRIOR)
     found = []
@@ -62,16 +62,16 @@ def at_prior_ends(sampling: SamplingDistribution, seed: int = 0) -> list[PriorEn
         up = bool(below[i] > 0.5)
         value, bound = end_of_range(evaluator, theta, int(i), up=up)
         if np.isfinite(bound) and _pushed(sampling, int(i), float(np.median(prior[:, i]))):
-            found.append(PriorEnd(evaluator.readable_names[i], value, bound))
+            found.append(PriorEnd(evaluator.hyperparameters.readable_names[i], value, bound))
     return found
 
 
 def end_of_range(evaluator: Evaluator, theta: Floats, i: int, *, up: bool) -> tuple[float, float]:
     """Return an element in the users' own units, and where its range ends on one side, or NaN."""
     steps = np.outer([0.0, *_FAR_OUTSIDE, *np.negative(_FAR_OUTSIDE)], np.eye(theta.size)[i])
-    thetas = theta + steps * evaluator.prior_sd
+    thetas = theta + steps * evaluator.hyperparameters.prior_sd
     with np.errstate(over="ignore"):
-        own = evaluator.constrained(thetas)
+        own = evaluator.hyperparameters.constrained(thetas)
     values = np.column_stack([np.reshape(one, (len(thetas), -1)) for one in own.values()])
     if values.shape != thetas.shape:  # elements that are no numbers of their own, as of a simplex
         return np.nan, np.nan
@@ -109,7 +109,7 @@ def _pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
 
     def along(x: Floats) -> float:
         moved = back.copy()
-        moved[others] += x * evaluator.prior_sd[others]
+        moved[others] += x * evaluator.hyperparameters.prior_sd[others]
         (value,) = evaluator.total(moved[None], sampling.scales)
         return float(value)
 
@@ -122,7 +122,7 @@ def _pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
         "xatol": 1e-2,
     }
     found = minimize(along, begin, method="Nelder-Mead", options=options)
-    back[others] += found.x * evaluator.prior_sd[others]
+    back[others] += found.x * evaluator.hyperparameters.prior_sd[others]
     return is_worse(back)
 
 

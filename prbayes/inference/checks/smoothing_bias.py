@@ -13,6 +13,7 @@ from prbayes._pages import more_in
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.projections import number_parts
+from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import slopes
 from prbayes.numerics.stencils import hessian_of, stencil
@@ -52,7 +53,7 @@ def wide_kernels(
     smoothed = [
         k
         for k, node in enumerate(evaluator.nodes)
-        if node.bound.stored and any(p.target.resolution > 0 for p in number_parts(node.target))
+        if node.bound.stored and any(kernel_width(p.target) > 0 for p in number_parts(node.target))
     ]
     if local is None or not smoothed or not local.covariance.size:
         return []
@@ -90,7 +91,7 @@ def _gain(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
     total = np.zeros(len(thetas))
     for part in number_parts(evaluator.nodes[k].target):
         seen = part.of(values)
-        total += part.share * (part.target.narrowed(0.5).of(seen, weights))
+        total += part.share * with_narrower_kernel(part.target, 0.5).of(seen, weights)
         total -= part.share * part.target.of(seen, weights)
     return total
 
@@ -98,11 +99,11 @@ def _gain(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
 def _told(evaluator: Evaluator, k: int, bias: Floats) -> str:
     node = evaluator.nodes[k]
     worst = int(bias.argmax())
-    name = evaluator.readable_names[worst]
+    name = evaluator.hyperparameters.readable_names[worst]
     kernel = ""
     parts = number_parts(node.target)
     if len(parts) == 1:
-        width = parts[0].target.resolution * np.sqrt(_AIMED / bias[worst])
+        width = kernel_width(parts[0].target) * np.sqrt(_AIMED / bias[worst])
         kernel = f"prb.LogLikelihood(density=prb.GaussianKDE({width:.2g})), or "
     size = f"about {bias[worst]:.1f} standard errors"
     if bias[worst] > _ONE_STEP:

@@ -42,7 +42,7 @@ def narrow(name: str) -> Any:
 
 
 def ends(found: pm.Model, theta: Any) -> list[PriorEnd]:
-    evaluator = Evaluator(found)
+    evaluator = Evaluator.of(found)
     sampling = SamplingDistribution.of(evaluator, np.array(theta), np.ones(1))
     return at_prior_ends(sampling)
 
