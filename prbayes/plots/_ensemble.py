@@ -11,6 +11,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
+from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.model.coverage import VISIBLE, supports_each
 from prbayes.model.evaluator import Evaluator
@@ -146,6 +147,15 @@ def read_before(
         if path is not None and len(path):
             return path[:1], "optimiser's first point"
     return evaluator.hyperparameters.initial[None], "prior's initial point"
+
+
+def if_supported(evaluator: Evaluator, theta: Floats, name: str) -> Floats:
+    """Return theta, (0 or 1, d), or none and a finding if stored responses do not support it."""
+    if not len(theta) or supported(evaluator, theta)[0]:
+        return theta
+    text = f"{name}: left out, because stored responses do not reach there."
+    report(Finding("population-left-out", text))
+    return theta[:0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,12 +28,10 @@ from prbayes.plots._canvas import (
     round_ticks,
 )
 from prbayes.plots._curves import axis_range, central_range
-from prbayes.plots._ensemble import read_before, read_result, supported
+from prbayes.plots._ensemble import if_supported, read_before, read_result
 from prbayes.plots._labels import refuse_labels
 from prbayes.plots._panels import Output, outputs_of
 from prbayes.plots._regions import outlines
-
-_log = logging.getLogger("prbayes")
 
 # Most outputs of one picture: the pairs of more are too small to be read.
 _MOST = 7
@@ -127,12 +124,7 @@ def plot_outputs(
     k = _simulator_index(evaluator, simulator)
     columns = _shown_outputs(evaluator, k, outputs)
     refuse_labels(labels, evaluator.simulators[k].outputs.names, evaluator=evaluator)
-    if len(start) and not supported(evaluator, start)[0]:
-        _log.warning(
-            "plot_outputs: before (%s): left out, because stored responses do not reach there",
-            text,
-        )
-        start = start[:0]
+    start = if_supported(evaluator, start, f"plot_outputs: before ({text})")
     after = _Population.of(evaluator, ensemble.mixture, k)
     earlier = _Population.of(evaluator, start, k) if len(start) else None
     limits = [_axis_limits(output, after, earlier) for output in columns]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -25,7 +24,7 @@ from prbayes.plots._curves import (
     smooth_densities,
     staircase,
 )
-from prbayes.plots._ensemble import Calibrated, Ensemble, read_before, read_result, supported
+from prbayes.plots._ensemble import Calibrated, Ensemble, if_supported, read_before, read_result
 from prbayes.plots._labels import refuse_labels
 from prbayes.plots._panels import (
     LEVELS,
@@ -36,8 +35,6 @@ from prbayes.plots._panels import (
     panels_of,
     quantiles,
 )
-
-_log = logging.getLogger("prbayes")
 
 
 @locked
@@ -128,12 +125,7 @@ def plot_responses(
     ensemble = read_result(result, model, "prb.plot_responses", n_draws)
     evaluator = ensemble.evaluator
     start, text = read_before(result, evaluator, before)
-    if len(start) and not supported(evaluator, start)[0]:
-        _log.warning(
-            "plot_responses: before (%s): left out, because stored responses do not reach there",
-            text,
-        )
-        start = start[:0]
+    start = if_supported(evaluator, start, f"plot_responses: before ({text})")
     by_simulator = panels_of(evaluator.simulators)
     names = [output.name for panels in by_simulator for output in panels]
     refuse_labels(labels, names, evaluator=evaluator)
