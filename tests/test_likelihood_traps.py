@@ -26,7 +26,7 @@ from prbayes.model.data_checks import data_findings
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.specimen_points import PointOptions
+from prbayes.propagation.specimen_emulation import PointOptions
 from prbayes.response.failures import ResponseError
 from prbayes.results.likelihood_checks import check_draws, check_optimum
 

@@ -17,7 +17,7 @@ from prbayes.model.specimen_likelihood import (
     require_simulator,
     specimen_likelihoods,
 )
-from prbayes.propagation.specimen_points import first_runs
+from prbayes.propagation.specimen_emulation import first_runs
 from prbayes.response.budget import Cost, RunCost, SimulatorCost
 from prbayes.response.inputs import model_on_context
 

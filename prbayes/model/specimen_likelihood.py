@@ -63,13 +63,8 @@ from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.propagation.response_share import ResponseShare, response_share
 from prbayes.propagation.roots import Roots
-from prbayes.propagation.specimen_points import (
-    Emulation,
-    PointOptions,
-    SpecimenPoints,
-    draw_points,
-    emulate,
-)
+from prbayes.propagation.specimen_emulation import Emulation, PointOptions, emulate
+from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
 from prbayes.response.budget import duration
 from prbayes.response.distributions import log_density
 from prbayes.response.groups import is_group

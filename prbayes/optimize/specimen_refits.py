@@ -21,7 +21,8 @@ from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_params
 from prbayes.model.specimen_likelihood import SpecimenLikelihood
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
-from prbayes.propagation.specimen_points import draw_points, specimen_roots
+from prbayes.propagation.specimen_emulation import specimen_roots
+from prbayes.propagation.specimen_points import draw_points
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
 
 

@@ -14,7 +14,6 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.propagation.base import N_BLOCKS
-from prbayes.propagation.exponential_families import PointDensity, normalise
 from prbayes.propagation.importance import (
     SIZES,
     CoarseResponse,
@@ -27,6 +26,7 @@ from prbayes.propagation.importance import (
 )
 from prbayes.propagation.moving_support import averaged_log_density, cells_around, moving_inputs
 from prbayes.propagation.points import Mixture, MixtureSampler
+from prbayes.propagation.population_density import PopulationDensity, normalise
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import Inputs
@@ -177,7 +177,7 @@ class DesignSampler:
         self.inputs = inputs
         self.options = options
         self.coarse = coarse
-        self.density = PointDensity(inputs)
+        self.density = PopulationDensity(inputs)
         self._mixtures = MixtureSampler(name, inputs, self.density)
 
     def with_runs(
@@ -292,7 +292,7 @@ def _responses_at(points: Sequence[Floats], responses: Responses, design: Design
 class WeightFunction:
     """Log weights log p(x given theta) - log g(x) of a design's points, compiled once."""
 
-    def __init__(self, inputs: Inputs, density: PointDensity) -> None:
+    def __init__(self, inputs: Inputs, density: PopulationDensity) -> None:
         self.inputs = inputs
         self._density = density
         self._function: Any = None

@@ -34,7 +34,6 @@ from prbayes.propagation.base import (
     valid_roots,
 )
 from prbayes.propagation.design import Design, DesignSampler, WeightFunction, common_rows, is_line
-from prbayes.propagation.exponential_families import normalise
 from prbayes.propagation.importance import (
     SIZES,
     CoarseResponse,
@@ -44,6 +43,7 @@ from prbayes.propagation.importance import (
     fit_emulator,
 )
 from prbayes.propagation.ops import stored_discrepancy
+from prbayes.propagation.population_density import normalise
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import prior_draws, refuse_without_density
 from prbayes.response.inputs import Inputs
