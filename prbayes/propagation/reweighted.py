@@ -304,7 +304,8 @@ class ReweightedBound(Bound):
         coarse = None
         if config.coarse is not None:
             coarse = CoarseResponse(config.coarse, responses, config.executor)
-        self._sampler = DesignSampler(name, inputs, config, coarse)
+        emulator = config.emulator if config.emulates(inputs) else None
+        self._sampler = DesignSampler(name, inputs, config.random_seed, emulator, coarse)
         self._log_weights = WeightFunction(inputs, self._sampler.density)
         self._data = {key: np.array(data.get_value()) for key, data in inputs.data.items()}
         # Arrays of PyMC's graphs, once there is one.
@@ -513,7 +514,7 @@ class ReweightedBound(Bound):
     def _graph_basis(self, values: Floats) -> Basis:
         """Return the basis for compiled graphs; its form stays the same while the design grows."""
         most = self.config.most
-        if self.config.emulates(self.inputs):
+        if self._sampler.emulator is not None:
             most = max(most, SIZES.largest)
         return self.target.basis(values, _MAX_BASIS * len(values) / most)
 
