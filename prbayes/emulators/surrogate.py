@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import (
     Floats,
@@ -308,7 +309,8 @@ class Surrogate:
         value = cast(Replace, self.outside).value
         # Once: a sampler calls thousands of times, and a simulator reports the mass it loses.
         level = logging.DEBUG if self._warned else logging.WARNING
-        _log.log(level, "%s; they give %s; this is told once", text, value)
+        once = f"{text}; they give {value}; this is told once."
+        report(Finding("outside-ranges", once), level=level)
         self._warned[:] = [True]
         return value
 
@@ -490,11 +492,13 @@ class Surrogate:
         values[has_coarse] = self._followed(unit[has_coarse], coarse[has_coarse])
         if not has_coarse.all():
             values[~has_coarse] = self._predict(unit[~has_coarse])
-            _log.warning(
-                "surrogate: coarse: got no number at %d of %d points, where the surface goes on "
-                "without it",
-                (~has_coarse).sum(),
-                has_coarse.size,
+            n_lost = (~has_coarse).sum()
+            report(
+                Finding(
+                    "coarse-without-number",
+                    f"surrogate: coarse: got no number at {n_lost} of {len(unit)} points, where "
+                    "the surface goes on without it.",
+                )
             )
         return values
 
