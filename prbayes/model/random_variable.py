@@ -38,14 +38,14 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.shape import Shape
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.model.first_look import tell_far_data
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
-from prbayes.propagation.reweighted import Design, design_of
+from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
 from prbayes.response.budget import duration
 from prbayes.response.compile import PLAIN
 from prbayes.response.inputs import Inputs
@@ -128,9 +128,9 @@ class Node:
         return self.bound.populations(list(roots))
 
     @property
-    def design(self) -> Design | None:
-        """The stored responses, None where the propagation stores none."""
-        return design_of(self.bound)
+    def reweighted(self) -> ReweightedBound | None:
+        """The propagation with its design, None where it stores no responses."""
+        return reweighted_of(self.bound)
 
     @property
     def epsilon_value(self) -> float:
@@ -178,7 +178,8 @@ class Node:
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
         bound = self.bound.copied()
-        bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
+        dimensions = bound.inputs.dimensions
+        bound.target = target.metric.beside(target, bound.first_responses, dimensions)
         other = replace(self, target=bound.target, bound=bound)
         if self.epsilon_is_default:
             other.epsilon.set_value(np.asarray(1 / other.n_specimens))
@@ -237,8 +238,9 @@ class Specification:
         responses.on_start = partial(_log_first_runs, self.propagation, responses)
         with shown(self.progressbar):
             bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
-            target = self.target
-            bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
+            dimensions = bound.inputs.dimensions
+            metric = self.target.metric
+            bound.target = metric.beside(self.target, bound.first_responses, dimensions)
         responses.on_start = None
         tell_far_data(self.name, self.target.observed, bound.first_responses, self.outputs.names)
         return Node(
@@ -468,12 +470,14 @@ class SimulatorRV(RandomVariable):
         if not others or self._warned:
             return
         self._warned = True
-        _log.warning(
-            "%s has inputs that %s has too, the same specimens; PyMC's predictive sampling draws "
-            "each variable by itself, and so as independent of the others: use prb.predict for "
-            "responses of the same specimens",
-            self.simulator.name,
-            ", ".join(others),
+        report(
+            Finding(
+                "independent-draws",
+                f"{self.simulator.name} has inputs that {', '.join(others)} has too, the same "
+                "specimens; PyMC's predictive sampling draws each variable by itself, and so "
+                "as independent of the others: use prb.predict for responses of the same "
+                "specimens.",
+            )
         )
 
 
@@ -538,18 +542,19 @@ def _log_density(
     (value,) = values
     known = known_value(value)
     node = op.node if known is None else _observing(op.node, known)
-    unset = (
+    unset = Finding(
+        "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
         "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use "
-        "prb.sample_smc, which calibrates it"
-        f"{more_in('choose.md#epsilon-and-the-width-of-the-posterior')}"
+        "prb.sample_smc, which calibrates it.",
+        "choose.md#epsilon-and-the-width-of-the-posterior",
     )
     if np.isnan(node.epsilon_value):
         # nutpie tells no more of an error than its number; nobody else has to be told who may yet
         # calibrate it
         blunt = "nutpie" in sys.modules and not _QUIET.get()
-        _log.log(logging.WARNING if blunt else logging.DEBUG, "%s", unset)
-    check = CheckParameterValue(unset)
+        report(unset, level=logging.WARNING if blunt else logging.DEBUG)
+    check = CheckParameterValue(str(unset))
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs
     density = log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)

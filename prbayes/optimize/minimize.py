@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._validate import (
     Floats,
@@ -82,8 +81,6 @@ from prbayes.optimize.optimum import Optimum
 from prbayes.optimize.solution import assemble, rival_record
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
-
-_log = logging.getLogger("prbayes")
 
 
 @locked
@@ -162,7 +159,7 @@ def refine(
                 if not refine_at(evaluator, wanted):
                     break
             refuse(shortcomings(evaluator, wanted), evaluator)
-    return {name: design.n_runs for name, design in evaluator.designs.items()}
+    return {name: bound.n_runs for name, bound in evaluator.reweighted.items()}
 
 
 def _thetas(hyperparameters: Hyperparameters, thetas: Any) -> Floats:
@@ -593,10 +590,10 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
         If they still fall short after the last round.
     """
     evaluator = plan.evaluator
-    if not (plan.refine and evaluator.designs):
+    if not (plan.refine and evaluator.reweighted):
         return state
     near = state.cloud
-    emulated = all(design.contents.cloud for design in evaluator.designs.values())
+    emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if near is None or (emulated and state.local is not None):
         # Points of clouds follow wherever it goes; runs are added where the pilot has led.
         near = spread_around(
@@ -734,8 +731,8 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
         hold=state.hold,
     )
     search = partial(rivals, best, starts=plan.starts, seed=plan.seed)
-    clouds = any(design.contents.cloud for design in evaluator.designs.values())
-    if clouds and plan.refine:
+    emulated = any(bound.design.is_emulated for bound in evaluator.reweighted.values())
+    if emulated and plan.refine:
         found = _visited(best, search())
     else:
         found = _supported(plan, search)
@@ -817,15 +814,13 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         responses_before=plan.responses_before,
     )
     refuse_lost(evaluator, {name: each["lost_mass"] for name, each in found.support.items()})
-    warnings = (
+    findings = report(
         *breakdown(edge, jump),
         *heavy_tails(evaluator, state.theta),
         *between_runs(evaluator, state.theta),
         *wide_kernels(evaluator, state.theta, state.scales, state.local),
         *caveats(evaluator, state.sampling, state.others, state.design_error),
     )
-    for line in warnings:
-        _log.warning("%s", line)
     ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
     told = _told_of_designs(evaluator, state.design_error)
     told += _HELD if state.hold is not None else ""
@@ -837,7 +832,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         seconds=time.perf_counter() - plan.clock,
         design_error=state.design_error,
         rivals=tuple(rival_record(evaluator, o) for o in state.others),
-        warnings=warnings,
+        findings=findings,
         at_edge=edge,
         at_jump=jump,
     )
@@ -863,7 +858,8 @@ def _told_by_prior(evaluator: Evaluator) -> str:
 
 def _told_of_designs(evaluator: Evaluator, error: float) -> str:
     """Say how many runs emulators rest on, and how far another design's optimum would be."""
-    told = [d.told for d in evaluator.designs.values() if d.contents.emulation is not None]
+    designs = {name: bound.design for name, bound in evaluator.reweighted.items()}
+    told = [design.summary(name) for name, design in designs.items() if design.is_emulated]
     if not told:
         return ""
     if np.isfinite(error):
@@ -883,13 +879,15 @@ def _stopped(plan: _Plan, begun: _Beginning, state: _State, reason: str) -> Opti
         responses_before=plan.responses_before,
         stopped=reason,
     )
-    line = (
+    finding = Finding(
+        "budget-spent",
         f"{reason} before the minimisation was finished, so that this is no answer yet; "
         f"{kept(plan.evaluator.model)}; call prb.minimize with a larger budget, on a model that is "
-        f"built again, to go on{more_in('expensive.md#a-night-is-not-enough')}"
+        "built again, to go on.",
+        "expensive.md#a-night-is-not-enough",
     )
-    _log.warning("%s", line)
-    return replace(found, seconds=time.perf_counter() - plan.clock, warnings=(line,))
+    seconds = time.perf_counter() - plan.clock
+    return replace(found, seconds=seconds, findings=report(finding))
 
 
 def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -5,10 +5,8 @@ Whether the whole procedure gives posteriors of the right width for a model.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -17,6 +15,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
@@ -30,9 +29,9 @@ from prbayes.optimize.specimen_refits import (
 from prbayes.posterior.sample import draw_posterior
 from prbayes.posterior.smc import Adjustment, Sampling, refuse_adjustment, sample
 from prbayes.posterior.trees import calibration_tree
+from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 
-_log = logging.getLogger("prbayes")
 # Data sets that a worker analyses before it reports: seconds of work, against milliseconds of
 # sending the model.
 _CHUNK = 10
@@ -136,18 +135,17 @@ def simulation_based_calibration(
     for start in starts:
         numbers = range(start, min(start + _CHUNK, n))
         jobs.append(_Job(numbers, draws, adjustment, seed))
-    with shown(progressbar), progress("data sets", n) as report:
+    with shown(progressbar), progress("data sets", n) as advance:
         if executor is None:
-            parts = [_analyse(evaluator, job, lambda: report(1, "")) for job in jobs]
+            parts = [_analyse(evaluator, job, lambda: advance(1, "")) for job in jobs]
         else:
-            parts = _on_executor(executor, model, jobs, lambda size: report(size, ""))
+            parts = _on_executor(executor, model, jobs, lambda size: advance(size, ""))
     rows = list(chain.from_iterable(parts))
     good = [row for row in rows if isinstance(row, dict)]
     failed = [row for row in rows if isinstance(row, str)]
     if failed:
-        _log.warning(
-            "%d of %d data sets could not be analysed; the first: %s", len(failed), n, failed[0]
-        )
+        text = f"{len(failed)} of {n} data sets could not be analysed; the first: {failed[0]}"
+        report(Finding("data-sets-not-analysed", text))
     if len(failed) > n / 2:
         raise RuntimeError(
             f"simulation_based_calibration: {len(failed)} of {n} data sets failed; "
@@ -198,10 +196,7 @@ def _analyse(
     rows: list[_Row] = []
     for i in job.which:
         rng = np.random.default_rng([job.random_seed, i])
-        with ExitStack() as stack:
-            stack.enter_context(shown(False))
-            for design in evaluator.designs.values():
-                stack.enter_context(design.undone())
+        with shown(False), designs_restored(evaluator.reweighted.values()):
             try:
                 rows.append(_one(evaluator, job, rng))
             except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
@@ -34,7 +35,7 @@ def posterior_tree(
     sampler: Mapping[str, Any],
     sample_stats: xr.Dataset | None = None,
     adjustment: str = "none",
-    warnings: tuple[str, ...] = (),
+    findings: tuple[Finding, ...] = (),
     errors: Floats | None = None,
     missing: Mapping[str, Mapping[str, float]] | None = None,
     stopped: str = "",
@@ -61,7 +62,7 @@ def posterior_tree(
         Statistics of another sampler than SMC, in place of those by stage.
     adjustment : str
         "estimate" of draws given the estimate, else "none".
-    warnings : tuple of str
+    findings : tuple of Finding
     errors : ndarray, shape (k,), or None
         Monte Carlo errors of the discrepancies.
     missing : mapping, optional
@@ -82,7 +83,7 @@ def posterior_tree(
         "adjustment": adjustment,
         **sampler,
         "stopped": stopped,
-        "warnings": "\n".join(warnings),
+        "findings": as_json(findings),
         **versions(),
     }
     if errors is None:
@@ -246,8 +247,8 @@ def share_of_lossy(lost: Floats, max_lost: float) -> float:
 def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
     """Return the settings of each simulator."""
     nodes = evaluator.nodes
-    designs = [node.design for node in nodes]
-    required = [np.nan if design is None else design.required_ess for design in designs]
+    bounds = [node.reweighted for node in nodes]
+    required = [np.nan if bound is None else bound.required_ess for bound in bounds]
     return {
         "epsilon": ("simulator", evaluator.epsilon),
         "required_ess": ("simulator", required),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from prbayes._finding import Finding
 from prbayes._validate import Floats, called, real_array
 from prbayes.response.call import scalar
 
@@ -104,7 +105,7 @@ class ModelDiscrepancy(ABC):
         -------
         callable
             For `Simulator`, `predict` and all that takes a response. If the condition is outside
-            ``seen``, each use logs a warning, and predictions have it in the attribute ``caveats``.
+            ``seen``, each use logs a warning, and predictions have it in their ``findings``.
 
         Raises
         ------
@@ -118,8 +119,8 @@ class ModelDiscrepancy(ABC):
         >>> hot = rise.of(lambda k: k, 1000.0)
         >>> hot(5.0, 2.5)
         array(7.5)
-        >>> rise.of(lambda k: k, 1200.0).caveats
-        ('<lambda> at 1200: extrapolates its model discrepancy, seen from 20 to 1000',)
+        >>> print(*rise.of(lambda k: k, 1200.0).findings)
+        <lambda> at 1200: extrapolates its model discrepancy, seen from 20 to 1000.
         """
         label = f"prb.response.{type(self).__name__}.of"
         if not callable(response) or isinstance(response, type):
@@ -247,15 +248,16 @@ class Corrected:
         return " to ".join(f"{end:g}" for end in ends)
 
     @property
-    def caveats(self) -> tuple[str, ...]:
+    def findings(self) -> tuple[Finding, ...]:
         """A warning if the condition is outside the data's."""
         low, high = self.discrepancy.low, self.discrepancy.high
         if not ((self.condition < low) | (self.condition > high)).any():
             return ()
-        return (
+        text = (
             f"{self.__name__} at {self._conditions}: extrapolates its model discrepancy, seen from "
-            f"{low:g} to {high:g}",
+            f"{low:g} to {high:g}."
         )
+        return (Finding("extrapolated-discrepancy", text),)
 
     def __call__(self, *inputs: Any) -> Floats:
         """Return the response with its discrepancy."""
@@ -291,7 +293,7 @@ def has_discrepancy(function: Callable[..., Any]) -> bool:
     return isinstance(inner, Corrected)
 
 
-def caveats_of(function: Callable[..., Any]) -> tuple[str, ...]:
+def findings_of(function: Callable[..., Any]) -> tuple[Finding, ...]:
     """Return the warnings that a function declares for its users."""
     inner = function.function if isinstance(function, scalar) else function
-    return tuple(getattr(inner, "caveats", ()))
+    return tuple(getattr(inner, "findings", ()))

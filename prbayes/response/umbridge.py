@@ -6,7 +6,6 @@ The protocol: https://um-bridge-benchmarks.readthedocs.io, version 1.0.
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 import socket
@@ -20,11 +19,10 @@ import urllib3
 from urllib3.connection import HTTPConnection
 from urllib3.exceptions import HTTPError, LocationParseError, ProtocolError, ReadTimeoutError
 
+from prbayes._finding import Finding, report
 from prbayes._validate import Floats, called, plain_text, positive_number
 from prbayes.response.call import scalar
 from prbayes.response.outputs import Outputs
-
-_log = logging.getLogger("prbayes")
 
 
 def umbridge(
@@ -262,9 +260,8 @@ class RemoteModel:
                 reason = f"{type(error).__name__}: {error}"
             if not give_up_at:
                 give_up_at = time.monotonic() + self.patience
-                _log.warning(
-                    "%s: the server at %s is away (%s); waiting", self.model, self.url, reason
-                )
+                text = f"{self.model}: the server at {self.url} is away ({reason}); waiting."
+                report(Finding("server-away", text))
             if time.monotonic() > give_up_at:
                 raise ConnectionError(
                     f"{self.model}: the server at {self.url} is away for more than patience = "

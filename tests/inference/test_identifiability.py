@@ -86,9 +86,9 @@ def test_a_sum_hides_a_difference(name: str) -> None:
             propagation=prb.Resimulated(256),
         )  # fmt: skip
     optimum = prb.minimize(model)
-    (line,) = optimum.warnings
-    assert line.startswith(
-        "the data tell less than the prior about a - 0.5 b[0] (in units of the priors'"
+    (finding,) = optimum.findings
+    assert finding.text.startswith(
+        "The data tell less than the prior about a - 0.5 b[0] (in units of the priors'"
     )
     assert np.isinf(optimum.stderr["a"])
     assert np.isinf(optimum.stderr["b"]).all()
@@ -108,9 +108,9 @@ def test_a_ridge_under_the_area_metric_is_seen_through_few_points(n: int) -> Non
         prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
     optimum = prb.minimize(model)
     assert all(np.isinf(optimum.stderr[name]) for name in ("sigma", "noise"))
-    (line,) = optimum.warnings
-    assert "sigma" in line
-    assert "noise" in line
+    (finding,) = optimum.findings
+    assert "sigma" in finding.text
+    assert "noise" in finding.text
 
 
 def test_what_is_seen_under_the_area_metric_is_seen_through_few_points_as_well() -> None:
@@ -125,7 +125,7 @@ def test_what_is_seen_under_the_area_metric_is_seen_through_few_points_as_well()
         prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
     optimum = prb.minimize(model)
     assert all(np.isfinite(optimum.stderr[name]) for name in ("mu", "sigma"))
-    assert optimum.warnings == ()
+    assert optimum.findings == ()
 
 
 def test_a_standard_error_of_the_priors_spread_is_the_limit() -> None:
@@ -189,9 +189,9 @@ def test_what_is_looked_at_stays_when_the_design_grows() -> None:
     theta = evaluator.hyperparameters.initial
     information = Information(evaluator, 0, theta, n_sets=20)
     before = identified_by_area(information)
-    (design,) = evaluator.designs.values()
-    design.add([np.atleast_1d(values) for values in evaluator.roots(theta[None], 0)], 512)
-    assert design.n_points == 1536
+    (bound,) = evaluator.reweighted.values()
+    bound.add([np.atleast_1d(values) for values in evaluator.roots(theta[None], 0)], 512)
+    assert bound.n_points == 1536
     np.testing.assert_array_equal(identified_by_area(information), before)
 
 

@@ -21,6 +21,7 @@ from prbayes.optimize.design_refinement import refine_at
 from prbayes.optimize.local_optima import Best, Rival, _joined, _separate, rivals, standing, visit
 from prbayes.optimize.minimize import _visited
 from prbayes.optimize.objective import Hold
+from prbayes.propagation.reweighted import designs_restored
 
 DATA = (np.random.default_rng(3).normal(2.0, 0.3, 40) - 1) ** 2
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -71,9 +72,9 @@ def test_both_optima_are_found(name: str) -> None:
     assert evaluator(rival["theta"][None]).discrepancies[0, 0] == pytest.approx(
         rival["discrepancy"]
     )
-    (line,) = optimum.warnings
-    assert "the data could as well come from mu = " in line
-    assert f"{rival['point']['mu']:.3f}"[:4] in line
+    (finding,) = optimum.findings
+    assert "The data could as well come from mu = " in finding.text
+    assert f"{rival['point']['mu']:.3f}"[:4] in finding.text
 
 
 def test_rivals_are_minima() -> None:
@@ -89,13 +90,13 @@ def test_rivals_are_minima() -> None:
 def test_warnings_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, logger="prbayes"):
         optimum = prb.minimize(mirrored(METRICS["pr"]))
-    assert [r.message for r in caplog.records] == list(optimum.warnings)
-    assert len(optimum.warnings) == 1
+    assert [r.message for r in caplog.records] == list(map(str, optimum.findings))
+    assert len(optimum.findings) == 1
 
 
 def test_starts() -> None:
     none = prb.minimize(mirrored(METRICS["pr"]), starts=0)
-    assert none.rivals == none.warnings == ()
+    assert none.rivals == none.findings == ()
     np.testing.assert_allclose(none.theta, fit("pr").theta)
     # Each theta costs responses: looked for only if asked.
     propagation = prb.Resimulated(128)
@@ -111,7 +112,7 @@ def test_a_prior_that_excludes_one_leaves_one() -> None:
         prb.Simulator("y", parabola, x, metric=METRICS["pr"], observed=DATA, propagation=R256)
     optimum = prb.minimize(model)
     assert not [r for r in optimum.rivals if r["comparable"]]
-    assert optimum.warnings == ()
+    assert optimum.findings == ()
     assert abs(optimum.point["excess"] - 1) < 4 * optimum.stderr["excess"]
 
 
@@ -133,7 +134,7 @@ def test_a_worse_optimum_is_left_for_the_better_one() -> None:
     (other,) = found.rivals
     assert abs(other["point"]["mu"] + 2) < 0.2
     assert not other["comparable"]
-    assert found.warnings == ()
+    assert found.findings == ()
 
 
 @pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), "area"])
@@ -150,7 +151,7 @@ def test_a_linear_problem_has_no_rivals(name: str) -> None:
         )
     optimum = prb.minimize(model)
     assert optimum.rivals == ()
-    assert optimum.warnings == ()
+    assert optimum.findings == ()
 
 
 def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
@@ -193,10 +194,11 @@ def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
         prb.Simulator("y", same, x, metric=METRICS["pr"], observed=OBSERVED, propagation=R256)
     optimum = prb.minimize(model)
     assert optimum.rivals == ()
-    (line,) = optimum.warnings
+    (finding,) = optimum.findings
+    line = str(finding)
     assert "about idle (" in line
     assert "it is not identified by them, and its posterior rests on the prior; measure" in line
-    assert line.endswith("; see docs/optimum_or_abc.md#no-answer")
+    assert line.endswith("; see docs/optimum_or_abc.md#no-answer.")
 
 
 def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> None:
@@ -208,7 +210,7 @@ def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> 
     comparable = [r for r in optimum.rivals if r["comparable"]]
     assert len(comparable) == 1
     assert comparable[0]["point"]["idle"] == pytest.approx(optimum.point["idle"], abs=1e-6)
-    assert len(optimum.warnings) == 2
+    assert len(optimum.findings) == 2
 
 
 @pytest.mark.long
@@ -232,7 +234,7 @@ def test_one_output_of_many_excludes_a_mirror(slope: float, comparable: bool) ->
     optimum = prb.minimize(model)
     assert optimum.rivals
     assert any(rival["comparable"] for rival in optimum.rivals) == comparable
-    assert ("mirror solution" in "".join(optimum.warnings)) == comparable
+    assert ("second-mode" in {f.code for f in optimum.findings}) == comparable
 
 
 # -- optima of designs whose points follow the search
@@ -286,13 +288,13 @@ def test_what_few_points_tell_is_looked_at_with_more(
     mu: float | None, sigma: float, real: bool
 ) -> None:
     optimum = followed(0)
-    design = optimum.evaluator.designs["y"]
+    bound = optimum.evaluator.reweighted["y"]
     mirror = 2 - optimum.point["mu"]
     there = optimum.theta.copy()
     there[:2] = mirror + 0.05 if mu is None else mu, np.log(sigma)
-    before = design.contents
+    before = bound.design
     found = visit(around(0), there)
-    assert design.contents is before  # and not a run more
+    assert bound.design is before  # and not a run more
     if not real:
         assert found is None
         return
@@ -309,12 +311,12 @@ def test_clouds_that_reach_a_mirror_reach_the_best_optimum_as_well() -> None:
     def at_the_best() -> float:
         return float(best.evaluator.support(best.theta[None])["y"]["weight_ess"][0])
 
-    design = best.evaluator.designs["y"]
-    with design.undone():
+    bound = best.evaluator.reweighted["y"]
+    with designs_restored([bound]):
         (found,) = _visited(best, [far])
         beside = at_the_best()
     assert found.theta[0] == pytest.approx(there[0], abs=0.05)
-    with design.undone():
+    with designs_restored([bound]):
         refine_at(best.evaluator, found.theta[None])
         alone = at_the_best()
     assert beside > 1.2 * alone
@@ -341,7 +343,7 @@ class Landscape:
     """A discrepancy that is a formula, in place of a model."""
 
     formula: Any
-    designs: dict[str, Any] = field(default_factory=dict)
+    reweighted: dict[str, Any] = field(default_factory=dict)
     nodes: tuple[Any, ...] = ()
 
     def total(self, thetas: Floats, scales: Floats) -> Floats:
