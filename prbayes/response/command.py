@@ -146,7 +146,7 @@ def _read_templates(write: object) -> dict[str, str]:
         raise TypeError(
             f"command: write: got {called(write)}, expected templates by the name of their file"
         )
-    texts = {}
+    texts: dict[str, str] = {}
     for name, template in write.items():
         path = Path(name) if isinstance(name, str) else Path()
         if not path.parts or path.is_absolute() or ".." in path.parts:
@@ -158,8 +158,9 @@ def _read_templates(write: object) -> dict[str, str]:
                 f"command: write: got {called(template)} for {name}, expected the text of a "
                 "template, or its path"
             )
-        is_path = isinstance(template, PathLike)
-        texts[name] = Path(template).read_text(encoding="utf-8") if is_path else template
+        if isinstance(template, PathLike):
+            template = Path(template).read_text(encoding="utf-8")
+        texts[name] = template
     return texts
 
 
