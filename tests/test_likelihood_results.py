@@ -356,7 +356,7 @@ def test_conflict_of_prior_and_data() -> None:
     posterior = prb.sample_smc(model=model, draws=200, chains=2, random_seed=1, progressbar=False)
     found = prb.diagnose(posterior, model=model)
     assert [finding.code for finding in found.findings] == ["prior-conflict"]
-    assert found.messages[0].startswith("Mu: got prior")
+    assert found.messages[0].startswith("mu: got prior")
 
 
 def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:

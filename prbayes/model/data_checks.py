@@ -322,7 +322,7 @@ def _rounded(label: str, values: Floats, step: float, largest: float) -> Finding
         "rounded-data",
         f"{label}: got {len(values)} values that are all multiples of a step of {step:.4g} "
         f"({share:.3g} standard deviations), expected exact values, or a step of at most "
-        f"{largest:g} standard deviations; pass rounded={step:.4g}",
+        f"{largest:g} standard deviations; pass rounded={step:.4g}.",
         "likelihood.md#rounded-data",
     )
 
@@ -333,7 +333,7 @@ def _censored(label: str, side: str, count: int, n: int, limit: float) -> Findin
         "censored-data",
         f"{label}: got {count} of {n} values equal to the {side}, {limit:.6g}, expected fewer "
         f"without a limit of measurement; pass censored={limits} if they lie beyond it, or "
-        "leave out copies",
+        "leave out copies.",
         "likelihood.md#censored-data",
     )
 
@@ -343,8 +343,8 @@ def _identical(groups: tuple[tuple[int, ...], ...]) -> Finding:
     more = f" and {len(groups) - 3} groups more" if len(groups) > 3 else ""
     return Finding(
         "identical-specimens",
-        f"got specimens {shown}{more} (counted from 0) with identical values of all outputs, "
+        f"Got specimens {shown}{more} (counted from 0) with identical values of all outputs, "
         "expected different ones; leave out copies, pass specimens= and error= for repeated "
-        "readings, or rounded= for coarse ones",
+        "readings, or rounded= for coarse ones.",
         "likelihood.md#identical-specimens",
     )

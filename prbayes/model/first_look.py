@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 
 import numpy as np
 
+from prbayes._finding import Finding, report
 from prbayes._validate import Floats
-
-_log = logging.getLogger("prbayes")
 
 # Responses that a range is told from: of fewer it says little of the prior.
 _FEWEST_OF_A_RANGE = 16
@@ -34,17 +32,15 @@ def tell_far_data(name: str, observed: Floats, responses: Floats, outputs: Seque
         low, high = measured.min(), measured.max()
         lowest, highest = there.min(), there.max()
         if high < lowest or low > highest:
-            _log.warning(
-                "%s: got observed values from %.4g to %.4g, all %s the first %d responses, from "
-                "%.4g to %.4g: look at the units, and at whether the priors reach that far, before "
-                "more runs are made",
-                label,
-                low,
-                high,
-                "below" if high < lowest else "above",
-                there.size,
-                lowest,
-                highest,
+            side = "below" if high < lowest else "above"
+            report(
+                Finding(
+                    "data-out-of-reach",
+                    f"{label}: got observed values from {low:.4g} to {high:.4g}, all {side} "
+                    f"the first {there.size} responses, from {lowest:.4g} to {highest:.4g}: "
+                    "look at the units, and at whether the priors reach that far, before more "
+                    "runs are made.",
+                )
             )
             return
 
@@ -62,13 +58,14 @@ def tell_copies(name: str, observed: Floats) -> None:
     different, counts = np.unique(rows, axis=0, return_counts=True)
     if len(rows) < _FEWEST_COPIED or counts.min() < 2 or _on_few_steps(rows):
         return
-    _log.warning(
-        "%s: got %d observed values of which only %d are different, each at least twice: if these "
-        "are repeated readings of a specimen, say so by specimens=, and leave out what is there "
-        "twice by mistake; else every specimen counts, and the uncertainty is too small",
-        name,
-        len(rows),
-        len(different),
+    report(
+        Finding(
+            "duplicated-data",
+            f"{name}: got {len(rows)} observed values of which only {len(different)} are "
+            "different, each at least twice: if these are repeated readings of a specimen, say "
+            "so by specimens=, and leave out what is there twice by mistake; else every "
+            "specimen counts, and the uncertainty is too small.",
+        )
     )
 
 

@@ -38,7 +38,7 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.shape import Shape
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
@@ -468,12 +468,14 @@ class SimulatorRV(RandomVariable):
         if not others or self._warned:
             return
         self._warned = True
-        _log.warning(
-            "%s has inputs that %s has too, the same specimens; PyMC's predictive sampling draws "
-            "each variable by itself, and so as independent of the others: use prb.predict for "
-            "responses of the same specimens",
-            self.simulator.name,
-            ", ".join(others),
+        report(
+            Finding(
+                "independent-draws",
+                f"{self.simulator.name} has inputs that {', '.join(others)} has too, the same "
+                "specimens; PyMC's predictive sampling draws each variable by itself, and so "
+                "as independent of the others: use prb.predict for responses of the same "
+                "specimens.",
+            )
         )
 
 
@@ -538,18 +540,19 @@ def _log_density(
     (value,) = values
     known = known_value(value)
     node = op.node if known is None else _observing(op.node, known)
-    unset = (
+    unset = Finding(
+        "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
         "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use "
-        "prb.sample_smc, which calibrates it"
-        f"{more_in('choose.md#epsilon-and-the-width-of-the-posterior')}"
+        "prb.sample_smc, which calibrates it.",
+        "choose.md#epsilon-and-the-width-of-the-posterior",
     )
     if np.isnan(node.epsilon_value):
         # nutpie tells no more of an error than its number; nobody else has to be told who may yet
         # calibrate it
         blunt = "nutpie" in sys.modules and not _QUIET.get()
-        _log.log(logging.WARNING if blunt else logging.DEBUG, "%s", unset)
-    check = CheckParameterValue(unset)
+        report(unset, level=logging.WARNING if blunt else logging.DEBUG)
+    check = CheckParameterValue(str(unset))
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs
     density = log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)

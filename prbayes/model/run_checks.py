@@ -236,7 +236,7 @@ def emulator_findings(
             f"readings, expected at most {largest}: the response has a pole, a jump or a kink "
             "in the range of the priors, or more detail than the runs; posterior means may be off "
             "by more than .1 standard deviations. Narrow the priors, give more first runs with "
-            "propagation=prb.Reweighted(n), or use metric=prb.ProbabilityResidual()",
+            "propagation=prb.Reweighted(n), or use metric=prb.ProbabilityResidual().",
             "likelihood.md#emulator-error",
         ),
     )

@@ -248,7 +248,7 @@ class SpecimenLikelihood:
             if refined is not emulation and not self._is_partial:
                 # Specimens beside the failing region have points on its right side now.
                 refined, points, findings = self._prepare(populations, refined)
-            return refined, points, report(findings), share
+            return refined, points, report(*findings), share
         except DesignError as error:
             raise DesignError(f"{error}{self._causes()}") from None
         finally:
@@ -719,7 +719,7 @@ def misfit_findings(
             f"{poor.size} of {int(has_root.sum())} specimens, which are off by {outputs} (root "
             "mean square, by output), expected less than the error of the readings; pass "
             "prb.LogLikelihood(error=...) with its standard deviation, or gross_errors=True for "
-            "single specimens, or look at the response and the priors",
+            "single specimens, or look at the response and the priors.",
             "likelihood.md#readings-that-no-inputs-reproduce",
         )
     ]

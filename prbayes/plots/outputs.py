@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._finding import Finding, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, positive_integer
 from prbayes.model.emulated import PopulationSimulator
@@ -24,8 +24,6 @@ from prbayes.plots._names import refuse_labels
 from prbayes.plots._panels import Output, outputs_of
 from prbayes.plots._regions import outlines
 from prbayes.plots._ticks import round_ticks
-
-_log = logging.getLogger("prbayes")
 
 # Outputs of a picture unless others are asked for: ten pairs, by judgement; and of a curve, whose
 # neighbours look alike.
@@ -127,9 +125,12 @@ def plot_outputs(
     chosen = _chosen(evaluator, k, outputs)
     refuse_labels(labels, evaluator.simulators[k].outputs.names, evaluator=evaluator)
     if len(start) and not supported(evaluator, start)[0]:
-        _log.warning(
-            "plot_outputs: before (%s): left out, because stored responses do not reach there",
-            what,
+        report(
+            Finding(
+                "population-left-out",
+                f"plot_outputs: before ({what}): left out, because stored responses do not reach "
+                "there.",
+            )
         )
         start = start[:0]
     thetas = shown.center if len(shown.center) else shown.thetas

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._finding import Finding, report
 from prbayes._validate import Floats, flag, positive_integer, share
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
@@ -29,8 +29,6 @@ from prbayes.plots._lines import LEVELS, Axis, draw_lines, quantiles
 from prbayes.plots._names import refuse_labels
 from prbayes.plots._panels import Output, in_one_panel, panels_of
 from prbayes.plots._populations import calibrated, draw_calibrated
-
-_log = logging.getLogger("prbayes")
 
 
 @locked
@@ -124,9 +122,12 @@ def plot_responses(
     shown = read_result(result, model, "prb.plot_responses", n_draws)
     start, what = read_before(result, shown.evaluator, before)
     if len(start) and not supported(shown.evaluator, start)[0]:
-        _log.warning(
-            "plot_responses: before (%s): left out, because stored responses do not reach there",
-            what,
+        report(
+            Finding(
+                "population-left-out",
+                f"plot_responses: before ({what}): left out, because stored responses do not reach "
+                "there.",
+            )
         )
         start = start[:0]
     by_simulator = panels_of(shown.evaluator.simulators)

@@ -312,9 +312,7 @@ def sample_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.Dat
         return tree
 
 
-def estimate_of(
-    evaluator: Evaluator, settings: SamplingSettings, caller: str
-) -> Optimum | None:
+def estimate_of(evaluator: Evaluator, settings: SamplingSettings, caller: str) -> Optimum | None:
     """Return the estimate that the posterior is given, by a search if needed.
 
     With a log-likelihood by specimen it is the optimum that was passed, if any. Raises ValueError
@@ -355,7 +353,9 @@ def result_of(
             evaluation = evaluator(thetas.reshape(-1, evaluator.hyperparameters.size))
             discrepancies = evaluation.discrepancies.reshape(shape)
         draws = replace(draws, discrepancies=discrepancies, lost=lost)
-        groups = arviz_groups(evaluator, draws, settings.random_seed) if settings.with_groups else {}
+        groups = (
+            arviz_groups(evaluator, draws, settings.random_seed) if settings.with_groups else {}
+        )
         findings = [*budget, *_lost_findings(evaluator, lost)]
         if optimum is None:
             findings += [f for likelihood in evaluator.likelihoods for f in likelihood.findings]
@@ -458,20 +458,23 @@ def _sample_kernel(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
     with _epsilons_restored(evaluator), designs_as_before(evaluator) as restore_designs:
         optimum = _set_epsilons(evaluator, settings)
         draws, _ = _draws_on_designs(evaluator, settings, optimum)
-        assert draws.discrepancies is not None
-        assert draws.lost is not None
+        discrepancies, lost = draws.discrepancies, draws.lost
+        assert discrepancies is not None
+        assert lost is not None
         errors, missing = None, None
         try:
-            errors, missing = _at_best(evaluator, draws.thetas, draws.discrepancies)
+            errors, missing = _at_best(evaluator, draws.thetas, discrepancies)
         except BudgetError as spent:
             draws = replace(draws, stopped=draws.stopped or str(spent))
         else:
-            _refuse_lost(evaluator, draws.lost, missing)
+            _refuse_lost(evaluator, lost, missing)
         with unlimited():
             groups = {}
             if settings.with_groups:
-                kernels = np.asarray(log_kernel(draws.discrepancies, evaluator.epsilon))
-                other = evaluator.log_other(draws.thetas.reshape(-1, evaluator.hyperparameters.size))
+                kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
+                other = evaluator.log_other(
+                    draws.thetas.reshape(-1, evaluator.hyperparameters.size)
+                )
                 logs = kernels.sum(axis=-1) + other.reshape(draws.thetas.shape[:2])
                 draws = replace(draws, log_likelihood=logs)
                 groups = arviz_groups(evaluator, draws, settings.random_seed)
@@ -481,7 +484,7 @@ def _sample_kernel(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
                 adjustment="none",
                 findings=(
                     *_budget_findings(draws, settings),
-                    *_lost_findings(evaluator, draws.lost),
+                    *_lost_findings(evaluator, lost),
                     *(() if optimum is None else optimum.findings),
                 ),
                 errors=errors,
@@ -576,9 +579,7 @@ def _draws_on_designs(
         if evaluator.nodes and settings.adjustment is not None:
             assert optimum is not None
             log_likelihood = estimate_target(evaluator, optimum).log_likelihood
-        chains = Chains(
-            evaluator, settings, log_likelihood, starts, checkpoint, tuple(refinements)
-        )
+        chains = Chains(evaluator, settings, log_likelihood, starts, checkpoint, tuple(refinements))
         draws = chains.run(children)
         if not (settings.refine and evaluator.designs):
             break
@@ -632,7 +633,7 @@ def _checkpoint(
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """The chains of one round, on the designs as they are; their state is saved after each stage."""
+    """The chains of one round on the designs as they are, saved after each stage."""
 
     evaluator: Evaluator
     settings: SamplingSettings
@@ -685,8 +686,17 @@ class Chains:
                 stages.append(chain_stages)
         if not finished:
             raise BudgetError(stopped)
-        arrays = {name: np.array([arrays[name] for arrays in finished]) for name in _SAVED}
-        return Draws(**arrays, sampler={"sampler": "SMC"}, stages=stages, stopped=stopped)
+        thetas, discrepancies, lost = (
+            np.array([arrays[name] for arrays in finished]) for name in _SAVED
+        )
+        return Draws(
+            thetas=thetas,
+            sampler={"sampler": "SMC"},
+            discrepancies=discrepancies,
+            lost=lost,
+            stages=stages,
+            stopped=stopped,
+        )
 
     def _begin(
         self,

@@ -21,6 +21,7 @@ from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
+from prbayes._finding import Finding, report
 from prbayes._validate import IN_CACHE, Floats, positive_integer
 from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
@@ -73,8 +74,6 @@ from prbayes.response.response import (
     refuse_coarse,
     refuse_other_number,
 )
-
-_log = logging.getLogger("prbayes")
 
 # Components of a batch's mixture density: as many as there are points would be as good, and cost
 # their square.
@@ -416,16 +415,13 @@ class Design(Bound):
                 f"{self.dimensions} inputs are many for stored responses alone: {leave}use "
                 "propagation=prb.Resimulated(n), which has no design"
             )
-        _log.log(
-            level,
-            "%s: the design of %d runs supports a typical population of the prior with a weight "
-            "effective sample size of %.0f, where %.0f make its error small; %s",
-            self.name,
-            self.config.n,
-            size,
-            self.required_ess,
-            advice,
+        finding = Finding(
+            "thin-design",
+            f"{self.name}: the design of {self.config.n} runs supports a typical population of the "
+            f"prior with a weight effective sample size of {size:.0f}, where "
+            f"{self.required_ess:.0f} make its error small; {advice}.",
         )
+        report(finding, level=level)
 
     # -- What the design is --
 

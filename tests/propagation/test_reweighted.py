@@ -446,11 +446,11 @@ def test_the_error_of_a_design_is_measured() -> None:
     found = np.sqrt(2) * np.max(np.std([o.theta for o in small], axis=0, ddof=1) / sd)
     assert said > 0.1
     assert 0.7 < said / found < 4  # what blocks tell is too much rather than too little
-    assert any("another design would differ by about" in line for o in small for line in o.warnings)
+    assert "design-error" in {finding.code for o in small for finding in o.findings}
     large = prb.minimize(product(0), starts=0)
     assert large.design_error <= 0.1
     assert 1024 < large.n_responses <= 32 * 512
-    assert not large.warnings
+    assert not large.findings
     assert np.isnan(prb.minimize(once(), starts=0).design_error)  # one input
 
 

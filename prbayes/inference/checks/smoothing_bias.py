@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.projections import number_parts
@@ -35,7 +35,7 @@ _ONE_STEP = 1.5
 
 def wide_kernels(
     evaluator: Evaluator, theta: Floats, scales: Floats, local: Local | None
-) -> list[str]:
+) -> list[Finding]:
     """Say which likelihood is smoothed by so much that the optimum is where it is because of that.
 
     By a step to the optimum under kernels of half the width; of stored responses only.
@@ -61,7 +61,7 @@ def wide_kernels(
     thetas = theta + _DIFFERENCE_STEP * stencil(axes.shape[1]) @ axes.T
     step = np.full(axes.shape[1], _DIFFERENCE_STEP)
     hessian = hessian_of(evaluator.total(thetas, scales), step.size)
-    lines = []
+    findings = []
     for k in smoothed:
         gain = _gain(evaluator, thetas, k) / scales[k]
         # On the way to the other optimum the curvature is the mean of both.
@@ -73,8 +73,8 @@ def wide_kernels(
         stderr = np.sqrt((axes**2).sum(axis=1))
         bias = np.abs(shift) / np.where(stderr > 0, stderr, np.inf) / _OF_BIAS
         if bias.max() > _BIASED:
-            lines.append(_told(evaluator, k, bias))
-    return lines
+            findings.append(_finding(evaluator, k, bias))
+    return findings
 
 
 def _axes(local: Local) -> Floats:
@@ -96,7 +96,7 @@ def _gain(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
     return total
 
 
-def _told(evaluator: Evaluator, k: int, bias: Floats) -> str:
+def _finding(evaluator: Evaluator, k: int, bias: Floats) -> Finding:
     node = evaluator.nodes[k]
     worst = int(bias.argmax())
     name = evaluator.hyperparameters.readable_names[worst]
@@ -108,8 +108,10 @@ def _told(evaluator: Evaluator, k: int, bias: Floats) -> str:
     size = f"about {bias[worst]:.1f} standard errors"
     if bias[worst] > _ONE_STEP:
         size = "more than a standard error"
-    return (
+    return Finding(
+        "smoothing-bias",
         f"{node.name}: the kernel of the log-likelihood is wide beside what it smooths, as where "
         f"responses lie in groups or a long tail: {name} is off by {size} for that; use {kernel}"
-        f"prb.KullbackLeibler(){more_in('choosing_metric.md#advice')}"
+        "prb.KullbackLeibler().",
+        "choosing_metric.md#advice",
     )
