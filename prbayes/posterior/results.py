@@ -188,7 +188,8 @@ def _calibration(
         )
         for key in ("lost_mass", "failed_mass")
     }
-    required = [np.nan if node.design is None else node.design.required_ess for node in nodes]
+    bounds = [node.reweighted for node in nodes]
+    required = [np.nan if bound is None else bound.required_ess for bound in bounds]
     by_metric = xr.Dataset(
         {
             "discrepancy": (_BY_DRAW, draws.discrepancies),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -28,6 +27,7 @@ from prbayes.optimize.specimen_refits import (
 )
 from prbayes.posterior.sample import draw_posterior
 from prbayes.posterior.smc import Adjustment, SamplingSettings, require_adjustment, sample
+from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 
 # Data sets that a worker analyses in seconds; sending the model takes milliseconds.
@@ -232,10 +232,7 @@ def _analyse(
     results: list[_Result] = []
     for i in job.numbers:
         rng = np.random.default_rng([job.random_seed, i])
-        with ExitStack() as stack:
-            stack.enter_context(shown(False))
-            for design in evaluator.designs.values():
-                stack.enter_context(design.undone())
+        with shown(False), designs_restored(evaluator.reweighted.values()):
             try:
                 results.append(_ranks(evaluator, job, rng))
             except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:

@@ -53,7 +53,7 @@ from prbayes.posterior.results import (
     share_of_lossy,
 )
 from prbayes.posterior.target import estimate_target, prior_conflicts, require_density
-from prbayes.propagation.base import Missing
+from prbayes.propagation.base import Missing, discrepancy_error
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -548,7 +548,7 @@ def _at_best(
     errors = []
     missing = {}
     for k, node in enumerate(evaluator.nodes):
-        errors.append(node.bound.discrepancy_error(evaluator.roots(best[None], k)))
+        errors.append(discrepancy_error(node.bound, evaluator.roots(best[None], k)))
         missing[node.name] = missing_mass(evaluator, best, k)
     return np.array(errors), missing
 
@@ -581,7 +581,7 @@ def _draws_on_designs(
             log_likelihood = estimate_target(evaluator, optimum).log_likelihood
         chains = Chains(evaluator, settings, log_likelihood, starts, checkpoint, tuple(refinements))
         draws = chains.run(children)
-        if not (settings.refine and evaluator.designs):
+        if not (settings.refine and evaluator.reweighted):
             break
         rows = draws.thetas.reshape(-1, evaluator.hyperparameters.size)
         thetas = np.random.default_rng(seeds).permutation(rows)[:THETAS]
