@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.emulators.mixing_weight import share_of_runs
 from prbayes.emulators.multifidelity import Following
 from prbayes.emulators.selection import (
     Runs,
@@ -18,6 +17,7 @@ from prbayes.emulators.selection import (
     chosen,
     emulated,
     emulated_without_each,
+    share_of_runs,
 )
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import N_BLOCKS
