@@ -25,7 +25,7 @@ from prbayes._validate import (
     share,
 )
 from prbayes.emulators.cross_validation import CrossValidation, cross_validated, points_needed
-from prbayes.emulators.io import SavedSurrogate, read, settings_of, shipped, write
+from prbayes.emulators.io import read, write
 from prbayes.emulators.multifidelity import Followed, Following, followed
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
@@ -366,21 +366,7 @@ class Surrogate:
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        record = SavedSurrogate(
-            ranges=self.domain,
-            points=self.points,
-            responses=self.responses,
-            error=self.error,
-            kind=type(self.model).__name__,
-            settings=settings_of(self.model),
-            outside=self.outside,
-            noise=self.noise,
-            n_runs=self.n_runs,
-            probes=self._probes(),
-            joined=None if self.coarse is None else self._joined,
-            outputs=self._named,
-        )
-        write(path, record)
+        write(path, self, self._probes())
 
     @classmethod
     def load(
@@ -412,8 +398,7 @@ class Surrogate:
             If a regressor is needed, or the surface is not that which was saved.
         """
         record = read(file_path(path, "path"))
-        if model is None:
-            model = shipped(record.kind, record.settings)
+        model = record.model if model is None else model
         if model is None:
             raise TypeError(
                 f"Surrogate.load: got no model, expected the {record.kind} it was fitted with; "
@@ -424,20 +409,10 @@ class Surrogate:
                 "Surrogate.load: got no coarse response, expected the one that the surrogate "
                 "follows: a file does not keep it; pass coarse="
             )
-        surrogate = cls(
-            domain=record.ranges,
-            points=record.points,
-            responses=record.responses,
-            model=model,
-            outside=record.outside,
-            n_runs=record.n_runs,
-            error=record.error,
-            noise=record.noise,
-            coarse=None if record.joined is None else coarse,
-            _joined=bool(record.joined),
-            _named=record.outputs,
-        )._completed()
-        spread = np.asarray(_spread(record.responses[_usable(record.responses)]))
+        coarse = None if record.joined is None else coarse
+        surrogate = cls(**record.fields, model=model, coarse=coarse)._completed()
+        responses = surrogate.responses
+        spread = np.asarray(_spread(responses[_usable(responses)]))
         size = np.where(spread > 0, spread, 1.0)
         probes, saved = surrogate._probes() / size, record.probes / size
         # The tolerance is above rounding on another processor, below the effect of a setting.
