@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+import prbayes.metrics.grid as loops
 from prbayes._validate import Floats
 from prbayes.metrics.density import GaussianKDE, Histogram
 from prbayes.metrics.grid import KernelCells, product
-import prbayes.metrics.grid as loops
-from prbayes.metrics.density import GaussianKDE
 
 H, INF, NAN = 0.5, np.inf, np.nan
 OBSERVED = np.array([-2.0, -0.3, 0.1, 0.7, 2.1])
