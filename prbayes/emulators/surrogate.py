@@ -67,8 +67,7 @@ class Surrogate:
     noise : int or None
         The seed of residual noise, see `with_error`.
     coarse : callable or None
-        The coarse response that it follows. It is called wherever the surrogate is, and travels
-        with it by pickle, if it can.
+        The coarse response that it follows, and calls; pickled with it, if possible.
 
     See Also
     --------
@@ -132,8 +131,8 @@ class Surrogate:
     ) -> Surrogate:
         """Compute the response on a scrambled Sobol design, and fit a surface.
 
-        The populations of many inputs are far from nearly all corners of their ranges: the design
-        is then better where they are, ``points="predictive"``, and the surface a process.
+        With many inputs nearly all corners of the ranges are far from the populations: prefer
+        ``points="predictive"`` and a `GaussianProcess`.
 
         Parameters
         ----------
@@ -150,21 +149,19 @@ class Surrogate:
         model : object, optional
             `RadialBasis` (default), `Polynomial`, `GaussianProcess`, which is better with many
             inputs, or any regressor with ``fit(X, y)`` and ``predict(X)``, as those of
-            scikit-learn; it gets inputs scaled to [0, 1] and responses
-            of mean 0 and spread 1, and is left as it is.
+            scikit-learn. A copy is fitted to inputs in [0, 1], responses of mean 0 and spread 1.
         coarse : callable, optional
-            A cheap response of the same inputs that is about the expensive one, such as that of a
-            coarser mesh. The surrogate follows it if its cross-validated error is smaller then; it
-            calls it wherever it is called. Where it raises, or is not finite, the surface goes on
-            without it, and the log says so. For a response of one output; several follow one under
-            ``prb.Reweighted(coarse=)``.
+            A cheap approximation of a response of one output, such as that of a coarser mesh. The
+            surrogate follows, and calls, it if that reduces the cross-validated error. Where it
+            raises, or is not finite, the surface continues without it, with a warning. Several
+            outputs follow one under ``prb.Reweighted(coarse=)``.
         outside : OnFailure, optional
-            `Replace` (default): points outside the ranges give its value, NaN, with a warning in
-            the log. A simulator with `Reweighted` reports them as lost mass, and refuses an answer
-            that rests on them. `Abort`: they raise; take that with `Resimulated`.
+            `Replace` (default): points outside the ranges give its value, NaN, with a warning. A
+            simulator with `Reweighted` reports them as lost mass, and refuses an answer that
+            depends on them. `Abort`: they raise, for `Resimulated`.
         points : {"even", "predictive"}
-            Where the design is: evenly in all ranges, or each input by its own prior predictive
-            distribution, inside its range; those that are given as a range evenly.
+            The design: even in all ranges, or with each random input distributed as its prior
+            predictive distribution inside its range.
         prob : float
         name : str
             For messages, and of the store.
@@ -221,23 +218,10 @@ class Surrogate:
         if store is not None:
             database = Store(store, name, columns=design.shape[1], version=version)
         calling = Calling(name, response, executor, database, policy, retry_failed, outputs=None)
-        tally = Tally()
-        rows = Points(domain.arguments(design), domain.varying)
         with shown(progressbar):
-            _learn_names(calling, rows, tally)
-            responses = respond(calling, rows, tally)
+            responses, tally = _computed(calling, Points(domain.arguments(design), domain.varying))
         usable = _usable(responses)
-        if usable.sum() < n_needed:
-            raise ResponseError(
-                f"{name}: got {usable.sum()} numbers from {len(responses)} responses, too few for "
-                "a surface"
-            )
-        if coarse is not None and responses.ndim > 1:
-            raise ResponseError(
-                f"{name}: coarse: got one number a point beside a response of "
-                f"{responses.shape[1]} outputs, expected a response of one; leave coarse= out, or "
-                "use prb.Reweighted(n, coarse=)"
-            )
+        _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
         # Estimate the error, then fit the surface.
         x, y = domain.scaled(design)[usable], responses[usable]
@@ -567,6 +551,28 @@ def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
         raise StoreError(
             f"{calling.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
             "numbers are stored in another order, expected the same one; pass another version="
+        )
+
+
+def _computed(calling: Calling, points: Points) -> tuple[Floats, Tally]:
+    """Return the responses at points, and the count of runs."""
+    tally = Tally()
+    _learn_names(calling, points, tally)
+    return respond(calling, points, tally), tally
+
+
+def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool) -> None:
+    """Raise if too few runs have a response, or several outputs would follow a coarse one."""
+    n_usable = _usable(responses).sum()
+    if n_usable < needed:
+        raise ResponseError(
+            f"{name}: got {n_usable} numbers from {len(responses)} responses, too few for a surface"
+        )
+    if has_coarse and responses.ndim > 1:
+        raise ResponseError(
+            f"{name}: coarse: got one number a point beside a response of {responses.shape[1]} "
+            "outputs, expected a response of one; leave coarse= out, or use "
+            "prb.Reweighted(n, coarse=)"
         )
 
 

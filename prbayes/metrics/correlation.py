@@ -78,7 +78,7 @@ class MarginalCorrelation(LiftedMetric):
 
     @property
     def minimum(self) -> Minimum:  # type: ignore[override]
-        """Quadratic if the metric's is, or else nothing is known: correlations have squares."""
+        """Quadratic if the metric's is, else unknown: correlations have squares."""
         quadratic = self.metric.minimum is Minimum.QUADRATIC
         return Minimum.QUADRATIC if quadratic else Minimum.UNKNOWN
 
