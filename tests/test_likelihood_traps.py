@@ -24,7 +24,9 @@ from prbayes.inference.checks.population_test import population_statistics, popu
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.data_checks import data_findings
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
-from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.specimen_points import PointOptions
 from prbayes.response.failures import ResponseError
@@ -120,7 +122,7 @@ def outcome(monkeypatch: pytest.MonkeyPatch) -> Callable[[pm.Model], list[str]]:
     def run(model: pm.Model, *, optimum: bool) -> list[str]:
         codes.clear()
         try:
-            _ = likelihood_of(model).points
+            _ = prepared(likelihood_of(model)).points
             if optimum:
                 prb.minimize(model, progressbar=False, starts=1)
         except tuple(BAD) as error:
@@ -476,7 +478,7 @@ def folded_shift(seed: int, starts: int) -> tuple[float, int]:
 
     bounds = np.array([[-1.1, np.log(0.2)], [1.1, np.log(1.2)]])
     shifted = shift(model, *over_box(bounds), exact)
-    return shifted, int(likelihood.points.n_roots.sum())
+    return shifted, int(prepared(likelihood).points.n_roots.sum())
 
 
 @pytest.mark.long
@@ -526,7 +528,7 @@ def test_a_mirror_root_that_is_nearly_as_good() -> None:
     # Without the third output both roots are kept.
     y = frame.data(20, 0)[:, :2]
     model = model_of(lambda a, b: frame_response(a, b)[..., :2], frame_inputs, y)
-    assert np.mean(likelihood_of(model).points.n_roots == 2) >= 0.9
+    assert np.mean(prepared(likelihood_of(model)).points.n_roots == 2) >= 0.9
 
 
 @pytest.mark.slow
@@ -829,7 +831,7 @@ def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
     data = [line(sample(np.random.default_rng([seed, 16]))) for seed in range(200)]
     # One model, whose runs serve all data sets.
     base = likelihood_of(model_of(line, normal_input, data[0]))
-    _ = base.points
+    _ = prepared(base).points
     flagged = [bool(base.observing({base.name: y}).findings) for y in data]
     assert np.mean(flagged) <= 0.07
 
@@ -837,4 +839,4 @@ def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
 def test_both_roots_beside_an_output_with_a_large_reading_error() -> None:
     observed = frame.data(20, 0)
     model = model_of(frame_response, frame_inputs, observed, error=[0.002, 0.002, 0.2])
-    assert (likelihood_of(model).points.n_roots == 2).all()
+    assert (prepared(likelihood_of(model)).points.n_roots == 2).all()

@@ -30,7 +30,7 @@ from prbayes._validate import (
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.first_look import tell_copies
-from prbayes.model.measurement import Measurement
+from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
     AnySimulator,
     SimulatorDistribution,
@@ -41,9 +41,8 @@ from prbayes.model.random_variable import (
     shared_epsilon,
     simulators,
 )
-from prbayes.model.specimen_likelihood import (
+from prbayes.model.specimen_variable import (
     SpecimenDistribution,
-    SpecimenLikelihood,
     measurements_of,
     set_likelihood,
     specimen_likelihoods,
@@ -271,7 +270,7 @@ def _by_specimen(
     joined = [rv for rv, joint in specimen_likelihoods(model).items() if joint in partners]
     simulators = tuple(m.name for m in likelihood.measurements)
     named = [rv.name for rv in joined if model.named_vars_to_dims.get(rv.name)]
-    if likelihood.labels is not None and (named or dims is not None):
+    if specimen_labels(likelihood) is not None and (named or dims is not None):
         raise ValueError(
             f"{name}: dims: got dimensions of {(named or [name])[0]}, whose specimens have several "
             "readings, expected none: log-likelihoods are by specimen; leave dims= out"

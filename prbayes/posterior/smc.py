@@ -629,7 +629,9 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floa
 def _warnings(evaluator: Evaluator, optimum: Optimum | None, thetas: Floats) -> tuple[str, ...]:
     """Return the reports of the data, the runs and the optimum, and conflicts with the prior."""
     if optimum is None:
-        findings = [finding for each in evaluator.likelihoods for finding in each.findings]
+        findings = [
+            finding for each in evaluator.likelihoods for finding in prepared(each).findings
+        ]
         return tuple(map(str, findings))
     conflicts = prior_conflicts(optimum, evaluator, thetas) if evaluator.nodes else ()
     return (*optimum.warnings, *map(str, conflicts))

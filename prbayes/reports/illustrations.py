@@ -14,7 +14,7 @@ import pymc as pm
 from prbayes.model.elements import variable_of
 from prbayes.model.emulated import population_simulators
 from prbayes.model.random_variable import nodes
-from prbayes.model.specimen_likelihood import measurements_of
+from prbayes.model.specimen_variable import measurements_of
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.landscape import plot_landscape
 from prbayes.plots.optimizer import plot_optimizer
@@ -74,7 +74,7 @@ def _first(results: Mapping[str, Any]) -> Any:
 
 def _computes_responses(model: pm.Model) -> bool:
     """Return whether a draw of the model's simulators computes responses: a report spends none."""
-    return any(simulator.runs_per_theta for simulator in population_simulators(model))
+    return any(not simulator.has_specimens for simulator in population_simulators(model))
 
 
 def _population(m: Material) -> Request:
