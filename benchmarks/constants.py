@@ -264,7 +264,7 @@ def sampled(optimum: prb.Optimum, random_seed: int) -> dict[str, Any]:
         "sd": draws.std(axis=0),
         "responses": np.array([posterior["posterior"].attrs["n_responses"]], dtype=float),
         "p": np.empty(0),
-        "verdict": (bool(optimum.converged), len(optimum.warnings)),
+        "verdict": (bool(optimum.converged), len(optimum.findings)),
     }
 
 
@@ -415,7 +415,7 @@ def result_of_first(found: Any) -> list[Any]:
     for design in optimum.evaluator.designs.values():
         parts += [design.values, design.required_ess]
     digits = [np.asarray(part).tobytes() for part in parts]
-    return [*digits, optimum.scales, optimum.converged, optimum.warnings]
+    return [*digits, optimum.scales, optimum.converged, optimum.findings]
 
 
 class Reading:

@@ -25,7 +25,7 @@ from scipy.special import ndtr, ndtri
 
 from benchmarks import record
 from prbayes.metrics.density import twice_silverman
-from prbayes.metrics.directions import directions
+from prbayes.metrics.multivariate import directions
 from prbayes.metrics.whitening import whitening
 
 # Outputs, and numbers of directions.

@@ -151,7 +151,9 @@ def memory(metric: str, outputs: int, points: int) -> dict[str, Any]:
         "before": round(before_points),
         "with points": round(with_points),
         "peak": round(peak()),
-        "basis": round(target.columns * points * 8 / 2**20),
+        "basis": round(
+            target.basis(np.zeros((1, outputs)), np.inf).arrays[0].size * points / 2**17
+        ),
         "objective": round(between - begun, 3),
         "batch": round(done - between, 3),
     }

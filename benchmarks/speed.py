@@ -269,13 +269,13 @@ def peak() -> float:
 def memory(problem: str) -> dict[str, Any]:
     """Return what `prb.sample` adds to the peak memory after import, beside Numba's own."""
     import prbayes as prb
-    from prbayes.metrics import _loops
+    from prbayes.metrics.area import sum_below
 
     job = by_likelihood(problem)
     _ = prb.sample, prb.Simulator
     imported = peak()
     # One cached loop: what Numba itself takes.
-    _loops.sum_below(
+    sum_below(
         np.ones((1, 1)), np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.intp), np.ones((1, 1))
     )
     with_numba = peak()

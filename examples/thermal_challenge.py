@@ -278,7 +278,7 @@ def study():
         500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
     )
     found["runs"] = optimum.n_responses
-    found["warnings"] = list(optimum.warnings)
+    found["warnings"] = list(map(str, optimum.findings))
     found["population"] = {
         name: {
             "optimum": float(optimum.point[name]),

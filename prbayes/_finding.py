@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
-
-from prbayes._pages import more_in
+from dataclasses import asdict, dataclass
 
 _log = logging.getLogger("prbayes")
 
@@ -18,9 +17,10 @@ class Finding:
     Parameters
     ----------
     code : str
-        Stable identifier, such as ``"rounded-data"``, by which findings are filtered.
+        Stable identifier, such as ``"rounded-data"``, by which findings are filtered;
+        ``docs/findings.md`` lists all.
     text : str
-        One or two sentences for the reader. The final period may be missing.
+        One or two sentences for the reader: got, expected, what to do.
     page : str, optional
         Documentation page with details and the heading, such as ``"likelihood.md#rounded-data"``.
         A constant: tests check that page and heading exist.
@@ -28,8 +28,9 @@ class Finding:
     Examples
     --------
     >>> from prbayes._finding import Finding
-    >>> str(Finding("rounded-data", "the data are rounded", "likelihood.md#rounded-data"))
-    'the data are rounded; see docs/likelihood.md#rounded-data'
+    >>> finding = Finding("rounded-data", "The data are rounded.", "likelihood.md#rounded-data")
+    >>> print(finding)
+    The data are rounded; see docs/likelihood.md#rounded-data.
     """
 
     code: str
@@ -42,22 +43,38 @@ class Finding:
             return self.text
         sentence = self.text.removesuffix(".")
         period = self.text[len(sentence) :]
-        return f"{sentence}{more_in(self.page)}{period}"
+        # The pages are in the repository and in the source distribution.
+        return f"{sentence}; see docs/{self.page}{period}"
 
 
-def report(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Log findings as warnings of the logger ``prbayes``.
+def report(*findings: Finding, level: int = logging.WARNING) -> tuple[Finding, ...]:
+    """Log findings by the logger ``prbayes``, each in a record with its ``code``; return them."""
+    for finding in findings:
+        _log.log(level, "%s", finding, extra={"code": finding.code})
+    return findings
 
-    Parameters
-    ----------
-    findings : iterable of Finding
 
-    Returns
-    -------
-    tuple of Finding
-        The findings, in their order.
+def as_json(findings: Iterable[Finding]) -> str:
+    """Return findings as one attribute of a stored result."""
+    return json.dumps([asdict(finding) for finding in findings])
+
+
+def from_json(text: str) -> tuple[Finding, ...]:
+    """Return the findings of an attribute of a stored result.
+
+    Raises
+    ------
+    ValueError
+        If the text is no list of records of code, text and page.
     """
-    reported = tuple(findings)
-    for finding in reported:
-        _log.warning("%s", finding)
-    return reported
+    try:
+        records = json.loads(text)
+        return tuple(
+            Finding(*(str(record[key]) for key in ("code", "text", "page")))
+            for record in (records if isinstance(records, list) else [records])
+        )
+    except (TypeError, KeyError, ValueError):
+        raise ValueError(
+            f"findings: got {text[:80]!r}, expected a JSON list of records of code, text and page; "
+            "the file was changed, or is of another version"
+        ) from None

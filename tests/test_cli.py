@@ -15,6 +15,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
+from prbayes._finding import Finding, as_json
 from prbayes.cli import main
 
 
@@ -199,7 +200,9 @@ def test_nothing_read_is_executed(folder: Path, capsys: pytest.CaptureFixture[st
     tree = results()["p.nc"].copy()
     assert isinstance(tree, xr.DataTree)
     tree["posterior"].attrs["model"] = "__import__('pathlib').Path('owned').touch()"
-    tree["posterior"].attrs["warnings"] = "<script>alert(1)</script> | is here"
+    tree["posterior"].attrs["findings"] = as_json(
+        [Finding("not-identified", "<script>alert(1)</script> | is here")]
+    )
     tree.to_netcdf(folder / "bad.nc", engine="h5netcdf")
     assert main(["report", "bad.nc", "--no-pictures"]) == 0
     assert "<script" not in (folder / "report.html").read_text(encoding="utf-8")

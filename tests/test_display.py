@@ -8,6 +8,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes._display import view
+from prbayes._finding import Finding
 
 
 def build() -> pm.Model:
@@ -39,7 +40,8 @@ def test_an_optimum_is_a_table() -> None:
 
 def test_a_diagnosis_says_what_is_wrong_first() -> None:
     support = xr.Dataset()
-    bad = prb.Diagnosis(("do this", "do that"), support, ("by the way",))
+    first, second, remark = (Finding("code", text) for text in ("do this", "do that", "by the way"))
+    bad = prb.Diagnosis((first, second), support, (remark,))
     text = bad._repr_html_()
     assert "2 problems" in text
     assert text.index("do this") < text.index("do that") < text.index("by the way")

@@ -36,7 +36,6 @@ _GROUND = (
     "_validate",
     "_finding",
     "_display",
-    "_pages",
     "_progress",
     "_stats",
     "datasets",
@@ -226,7 +225,6 @@ def test_no_module_at_the_top_has_the_name_of_a_public_function() -> None:
 # How work is done, by keyword, after what is done; in this order.
 TAIL = (
     "labels",
-    "backend",
     "executor",
     "store",
     "version",
@@ -689,6 +687,17 @@ def test_inner_names_of_executors_are_listed_and_have_contracts() -> None:
     others = [path for path in FILES if path.stem != "executors"]
     texts = [path.read_text(encoding="utf-8") for path in others]
     assert not any(f'"{name}"' in text for text in texts for name in INNER_OF_EXECUTORS)
+
+
+def test_the_page_of_findings_has_every_code() -> None:
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in FILES]
+    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    findings = [call.args[0] for call in calls if getattr(call.func, "id", "") == "Finding"]
+    codes = {code.value for code in findings if isinstance(code, ast.Constant)}
+    page = (ROOT / "docs" / "findings.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w-]+)` \|", page, flags=re.MULTILINE)
+    assert len(rows) == len(set(rows))
+    assert set(rows) == codes
 
 
 def test_promises_name_tests_that_are_there() -> None:

@@ -158,34 +158,11 @@ def test_notebooks_are_kept_without_results(path: Path) -> None:
 
 
 def pages_of_messages() -> list[str]:
-    """Return all pages that messages and findings name, each with the heading to look under."""
-    paths = set((ROOT / "prbayes").rglob("*.py")) - {ROOT / "prbayes" / "_finding.py"}
+    """Return all pages that findings name, each with a heading: constants such as `a.md#b`."""
+    paths = (ROOT / "prbayes").rglob("*.py")
     trees = [ast.parse(path.read_text(encoding="utf-8")) for path in paths]
-    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
-    return sorted({page for call in calls for page in pages_of_call(call)})
-
-
-def pages_of_call(call: ast.Call) -> list[str]:
-    """Return the pages that a call of `more_in` or `Finding` names: constants, not expressions."""
-    arguments: list[ast.expr] = []
-    if getattr(call.func, "id", "") == "more_in":
-        arguments = call.args
-    elif getattr(call.func, "id", "") == "Finding":
-        arguments = call.args[2:]
-        arguments += [keyword.value for keyword in call.keywords if keyword.arg == "page"]
-    return [ast.literal_eval(argument) for argument in arguments]
-
-
-def test_pages_of_findings_are_checked() -> None:
-    def pages(code: str) -> list[str]:
-        call = ast.parse(code, mode="eval").body
-        assert isinstance(call, ast.Call)
-        return pages_of_call(call)
-
-    assert pages('Finding("code", "text", "a.md#b")') == ["a.md#b"]
-    assert pages('Finding("code", "text", page="a.md#b")') == ["a.md#b"]
-    assert pages('Finding(code="code", text="text")') == []
-    assert pages('more_in("a.md#b")') == ["a.md#b"]
+    constants = [n.value for t in trees for n in ast.walk(t) if isinstance(n, ast.Constant)]
+    return sorted({c for c in constants if re.fullmatch(r"[\w-]+\.md#[\w-]+", str(c))})
 
 
 @pytest.mark.parametrize("named", pages_of_messages())

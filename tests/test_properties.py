@@ -154,7 +154,7 @@ def test_the_area_is_that_of_plain_sums(simulated: Any, observed: Any, scale: fl
     found = metric(scale * x, scale * y, weights=w, observed_weights=v)
     assert found / scale == pytest.approx(plain_area(x, w, y, v), rel=1e-12, abs=1e-13)
     prepared = metric.against(scale * y, v)
-    stored = prepared.outer(*prepared.from_basis(w, prepared.basis(scale * x), np), xp=np)
+    stored = prepared.outer(*prepared.basis(scale * x).features(w), xp=np)
     assert float(stored) / scale == pytest.approx(found / scale, rel=1e-12, abs=1e-13)
 
 

@@ -71,7 +71,7 @@ def answers(kind: str, factor: float) -> dict[str, Any]:
         "responses": optimum.n_responses,
         "rivals": len(optimum.rivals),
         "posterior": [draws.mean(), draws.std()],
-        "warnings": len(optimum.warnings),
+        "findings": len(optimum.findings),
         "converged": optimum.converged,
     }
 

@@ -353,8 +353,8 @@ def main():
         print(f"\n{label}")
         shown = prb.compare({"optimum": optimum, "posterior": posterior}, model=model)
         print(shown[["estimate", "sd", "lower", "upper"]].to_dataframe().round(2).to_string())
-        for line in optimum.warnings:
-            print(f"  said by prb.minimize: {line}")
+        for finding in optimum.findings:
+            print(f"  reported by prb.minimize: {finding}")
 
     print(
         "\nSTEP 2: contact stiffness from 15 crest factors, through a surrogate "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._finding import Finding, report
 from prbayes._validate import (
     Floats,
     Seed,
@@ -35,8 +35,6 @@ from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum
 from prbayes.propagation.base import MAX_LOST, N_BLOCKS, DesignError
 from prbayes.response.response import Responses, refuse_uncallable
-
-_log = logging.getLogger("prbayes")
 
 
 @locked
@@ -310,11 +308,10 @@ def _warn_of_large_error(response: Any, means: Floats, errors: Floats, points: i
         return
     worst = int(np.argmax(excess))
     more = f"more than points={points}" if points else "points=1000, which computes as many"
-    _log.warning(
-        "%s: a probability of %.2g has a standard error of %.2g; pass %s responses where the "
-        "limit is exceeded",
-        response_name(response),
-        means[worst],
-        errors[worst],
-        more,
+    report(
+        Finding(
+            "rough-probability",
+            f"{response_name(response)}: a probability of {means[worst]:.2g} has a standard error "
+            f"of {errors[worst]:.2g}; pass {more} responses where the limit is exceeded.",
+        )
     )

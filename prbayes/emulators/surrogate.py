@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import (
     Floats,
@@ -302,7 +303,8 @@ class Surrogate:
         value = cast(Replace, self.outside).value
         # Once: a sampler asks thousands of times, and a simulator tells of the mass it loses.
         level = logging.DEBUG if self._warned else logging.WARNING
-        _log.log(level, "%s; they give %s; this is told once", text, value)
+        once = f"{text}; they give {value}; this is told once."
+        report(Finding("outside-ranges", once), level=level)
         self._warned.append(True)
         del self._warned[1:]
         return value
@@ -501,11 +503,12 @@ class Surrogate:
         if not known.all():
             values[~known] = self._predict(unit[~known])
             lost = (~known).sum()
-            _log.warning(
-                "surrogate: coarse: got no number at %d of %d points, where the surface goes on "
-                "without it",
-                lost,
-                known.size,
+            report(
+                Finding(
+                    "coarse-without-number",
+                    f"surrogate: coarse: got no number at {lost} of {known.size} points, where "
+                    "the surface goes on without it.",
+                )
             )
         return values
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from prbayes._validate import Floats
 from prbayes.inference.resampling import DataSets
-from prbayes.metrics.base import Cellwise, Discrepancy
+from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.threads import one_thread
 
@@ -29,7 +28,7 @@ class BatchObjective:
     simulators: tuple[int, ...]  # which of them count
     targets: list[Discrepancy]  # of those, each against all B data sets
     values: list[Floats]  # (n_k,) or (n_k, m): of those, the stored responses
-    bases: list[tuple[NDArray[Any], ...]]  # what turns weights of stored responses into features
+    bases: list[Basis]  # from weights of stored responses to features
     # (n_k,): of those that count: the block that each point of the design belongs to. Where there
     # are several, the b-th data set is compared with the b-th block alone.
     blocks: Sequence[NDArray[np.intp]] = ()
@@ -66,7 +65,7 @@ class BatchObjective:
             own = design.values if other is None else other
             targets.append(target)
             responses.append(own)
-            bases.append(target.stored(own))
+            bases.append(target.basis(own))
         return cls(
             evaluator=evaluator,
             scales=scales,
@@ -107,22 +106,11 @@ class BatchObjective:
         total: Any = 0.0
         for i, k in enumerate(self.simulators):
             weights = self.weights(thetas, rows, i)
-            over = self.sums[i]
-            if over is None:
-                target = self.targets[i].rows(rows)
-                features = target.from_basis(weights, self.bases[i], np)
-                discrepancies = target.outer(*features, xp=np)
-            else:
-                (density,) = self.targets[i].from_basis(weights, self.bases[i], np)
-                discrepancies = over.rows(rows).outer(density, xp=np)
+            features = self.bases[i].rows(rows).features(weights)
+            discrepancies = self.targets[i].rows(rows).outer(*features, xp=np)
             total = total + discrepancies / self.scales[k]
         values = np.nan_to_num(total, nan=np.inf, posinf=np.inf)
         return np.asarray(values)
-
-    @cached_property
-    def sums(self) -> list[Cellwise | None]:
-        """Those targets that are sums over cells, as such: each row is then much smaller."""
-        return [target.cellwise for target in self.targets]
 
     def weights(self, thetas: Floats, rows: Any, i: int) -> Floats:
         """Return weights of the stored responses, (A, s, n), on the whole design or on blocks."""

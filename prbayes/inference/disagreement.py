@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from prbayes._finding import Finding
 from prbayes._stats import distribution_function
 from prbayes._validate import Floats
 from prbayes.inference.goodness_of_fit import UNLIKELY, Refitted, log_distances, probability_of
 from prbayes.inference.resampling import DataSets, observed_set
-from prbayes.metrics.lifted import failure_caps
+from prbayes.metrics.multivariate import failure_caps
 from prbayes.model.random_variable import Node
 
 # Outputs that are looked at; of more, as of a curve, some from the first to the last: neighbours
@@ -18,7 +19,7 @@ from prbayes.model.random_variable import Node
 _MOST_OUTPUTS = 12
 
 
-def disagreement(refitted: Refitted) -> list[str]:
+def disagreement(refitted: Refitted) -> list[Finding]:
     """Say for each simulator of several outputs which of them, and which pairs, disagree.
 
     Each is held against the same of data sets drawn from the model and their fits: outputs by the
@@ -32,7 +33,7 @@ def disagreement(refitted: Refitted) -> list[str]:
     return found
 
 
-def _of_simulator(refitted: Refitted, k: int, node: Node) -> str:
+def _of_simulator(refitted: Refitted, k: int, node: Node) -> Finding:
     """Say what disagrees with one simulator."""
     data = _Seen.of(refitted, observed_set(refitted.sampling.evaluator), refitted.center[None], k)
     drawn = _Seen.of(refitted, refitted.sets, refitted.x, k)
@@ -54,16 +55,20 @@ def _of_simulator(refitted: Refitted, k: int, node: Node) -> str:
                 f"{calibrated[0]:.2f}, p = {p:.2g})"
             )
     if not outputs and not pairs:
-        return (
+        return Finding(
+            "outputs-misfit",
             f"{node.name}: no output by itself, and no correlation of two, disagrees with the best "
-            "population; what does is a combination of outputs."
+            "population; what does is a combination of outputs.",
         )
     parts = []
     if outputs:
         parts.append(f"outputs {', '.join(outputs)}")
     if pairs:
         parts.append(f"correlations {', '.join(pairs)}")
-    return f"{node.name}: what disagrees with the best population are {' and '.join(parts)}."
+    return Finding(
+        "outputs-misfit",
+        f"{node.name}: what disagrees with the best population are {' and '.join(parts)}.",
+    )
 
 
 def _pairs(columns: list[int]) -> list[tuple[int, int]]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.projections import number_parts
 from prbayes.inference.refits import ARRIVED, SamplingDistribution
@@ -145,25 +145,32 @@ def _middles(values: Floats, weights: Floats, at: Floats) -> Floats:
     return np.array(rows)
 
 
-def of_held_away(probability: float) -> list[str]:
+def of_held_away(probability: float) -> list[Finding]:
     """Say so where the data cannot have come from the population that the prior holds."""
     if not probability < UNLIKELY:
         return []
     return [
-        f"the data are farther from the population at this optimum than {1 - probability:.1%} of "
-        "data sets drawn there: the prior, which is part of its objective, and the data contradict "
-        "each other, or the inputs have another family; look at prb.minimize without the prior"
+        Finding(
+            "prior-misfit",
+            "The data are farther from the population at this optimum than "
+            f"{1 - probability:.1%} of data sets drawn there: the prior, which is part of its "
+            "objective, and the data contradict each other, or the inputs have another family; "
+            "look at prb.minimize without the prior.",
+        )
     ]
 
 
-def of_another_family(probability: float) -> list[str]:
+def of_another_family(probability: float) -> list[Finding]:
     """Say so where a fit is as good as that of the data too rarely."""
     if not probability < UNLIKELY:
         return []
     return [
-        f"the data are farther from the best population than {1 - probability:.1%} or more of data "
-        "sets that the model draws there are from theirs: the inputs probably have another family, "
-        "or the response an error; look at prb.plot_responses, at outliers, and at other families, "
-        "by prb.rank"
-        f"{more_in('choosing_metric.md#a-wrong-family')}"
+        Finding(
+            "population-misfit",
+            f"The data are farther from the best population than {1 - probability:.1%} or more of "
+            "data sets that the model draws there are from theirs: the inputs probably have "
+            "another family, or the response an error; look at prb.plot_responses, at outliers, "
+            "and at other families, by prb.rank.",
+            "choosing_metric.md#a-wrong-family",
+        )
     ]

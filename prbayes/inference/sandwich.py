@@ -24,7 +24,8 @@ from prbayes.inference.resampling import (
     simulated_sets,
     thinned,
 )
-from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.base import Discrepancy, is_additive
+from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
 from prbayes.numerics.derivatives import slopes
@@ -136,7 +137,7 @@ class Information:
     @property
     def jumps(self) -> bool:
         """Whether points lose their response close to theta, where a smooth discrepancy jumps."""
-        smooth = self._target.differentiable and not self.node.bound.stored
+        smooth = is_differentiable(self._target) and not self.node.bound.stored
         return smooth and self._stencil.share > _NARROW_STEP
 
     @cached_property
@@ -146,7 +147,7 @@ class Information:
             # Over several points of those that an edge passes one after the other.
             moves = self.node.bound.support_moves
             return self._around(self.widened * _WIDE_STEP if moves else _NARROW_STEP)
-        if self._target.differentiable:
+        if is_differentiable(self._target):
             narrow = self._around(_NARROW_STEP)
             # Of several outputs one that failed is at the end of its scale, and does not jump.
             event = self._target.event
@@ -225,10 +226,10 @@ class Information:
         """Features at the stencil; they do not depend on the observed side."""
         around = self._stencil
         target = self._target
-        if target.columns and around.same:
+        has_densities = [isinstance(part.target, DensityDiscrepancy) for part in target.parts]
+        if around.same and len(has_densities) > 1 and all(has_densities):
             # Cells are filled once for all points, and not for each.
-            basis = target.stored(around.values[0])
-            return target.from_basis(around.weights, basis, np)
+            return target.basis(around.values[0]).features(around.weights)
         return target.features(around.values, around.weights, np)
 
     def _along_stencil(
@@ -285,7 +286,7 @@ class Information:
     @cached_property
     def sampling_covariance(self) -> Floats:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
-        if not self._target.additive or dependent([self.node]):
+        if not is_additive(self._target) or dependent([self.node]):
             gradients = self.gradients(*self.data_set)
             covariance = np.cov(gradients, rowvar=False)
             return np.atleast_2d(covariance)

@@ -3,7 +3,7 @@
 Smaller is better.
 """
 
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Minimum
-from prbayes.metrics.density import DensityEstimator
+from prbayes.metrics.base import Discrepancy, Minimum
+from prbayes.metrics.density import DensityDiscrepancy, DensityEstimator
 
 __all__ = ["DensityDiscrepancy", "DensityEstimator", "Discrepancy", "Minimum"]

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._stats import finite_sample, ranked, summed_below
-from prbayes._validate import Floats
-from prbayes.metrics._loops import sum_below
-from prbayes.metrics.base import Discrepancy, Metric, Minimum
-
-# Weights from which on a compiled loop repays its loading; by judgement.
-_MANY = 1 << 16
+from prbayes._validate import AT_ONCE, Floats
+from prbayes.metrics.base import Basis, Discrepancy, Features, Metric, Minimum, Part, PartSum
+from prbayes.metrics.grid import compiled
 
 
 @dataclass(frozen=True)
@@ -50,96 +47,134 @@ class AreaDiscrepancy(Discrepancy):
     def scale(self) -> float:
         """Mean absolute deviation of observed values from their mean, or one if they are equal."""
         values, weights = finite_sample(self.observed, self.weights)
-        from_least = values - values.min()  # equal values give exactly zero
-        mean = weights @ from_least
-        deviations = np.abs(from_least - mean)
-        mean_deviation = float(weights @ deviations)
+        values = values - values.min()  # equal values give exactly zero
+        mean_deviation = float(weights @ np.abs(values - weights @ values))
         return mean_deviation if mean_deviation > 0 else 1.0
 
-    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return F - S_N on each interval of the pooled values, and the interval's length."""
         observed = self.observed
-        u = self.weights
+        observed_weights = self.weights
         if xp is np:
-            batch = simulated.shape[:-1]
-            observed = np.broadcast_to(observed, (*batch, observed.size))
-            u = np.broadcast_to(u, observed.shape)
+            observed = np.broadcast_to(observed, (*simulated.shape[:-1], observed.size))
+            observed_weights = np.broadcast_to(observed_weights, observed.shape)
             weights = np.broadcast_to(weights, simulated.shape)
-        # Sort both sides together.
         pooled = xp.concatenate([simulated, observed], axis=-1)
         order = xp.argsort(pooled, axis=-1)
         pooled = xp.take_along_axis(pooled, order, axis=-1)
         # F goes up by the weight at each simulated value, S_N by that at each observed one.
-        signed = xp.concatenate([weights, -u], axis=-1)
-        signed = xp.take_along_axis(signed, order, axis=-1)
-        del order  # a population of ten million is to fit into little memory
+        steps = xp.concatenate([weights, -observed_weights], axis=-1)
+        steps = xp.take_along_axis(steps, order, axis=-1)
+        del order  # room for a population of ten million
         # The last interval begins at the largest value and has no end.
-        gap = xp.cumsum(signed, axis=-1)
-        gap = gap[..., :-1]
-        return gap, _lengths(pooled, xp)
+        gap = xp.cumsum(steps, axis=-1)[..., :-1]
+        # Intervals without an end have the length zero.
+        is_finite = xp.abs(pooled[..., 1:]) < np.inf
+        upper = xp.where(is_finite, pooled[..., 1:], 0.0)
+        lower = xp.where(is_finite, pooled[..., :-1], 0.0)
+        return gap, upper - lower
 
-    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
-        """Return the order of the values and how many are below each knot, for both sides.
-
-        The knots are all finite values; last come the lengths of the intervals between them.
-        """
-        both = np.concatenate([simulated, self.observed])
-        knots = np.unique(both[np.isfinite(both)])
+    def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
+        """Return the ranks of the values among all finite values, the knots."""
+        pooled = np.concatenate([simulated, self.observed])
+        knots = np.unique(pooled[np.isfinite(pooled)])
         starts = knots[:-1]
-        order, below = ranked(simulated, starts, kind="quicksort")
-        own, own_below = ranked(self.observed, starts, kind="quicksort")
-        lengths = np.diff(knots)
-        return order, below, own, own_below, lengths
-
-    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
-        """Return F - S_N on each interval between knots, and the interval's length."""
-        order, below, own, own_below, lengths = basis
-        if xp is np and weights.size > _MANY:
-            simulated = _many_summed_below(weights, order, below)
-        else:
-            simulated = summed_below(weights, order, below, xp)
-        observed = summed_below(self.weights, own, own_below, xp)
-        return simulated - observed, lengths
+        arrays = (
+            *ranked(simulated, starts, kind="quicksort"),
+            *ranked(self.observed, starts, kind="quicksort"),
+            np.diff(knots),
+        )
+        return RankedBasis(arrays, self.weights)
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum of |F - S_N| times length: eq. 5."""
         gap, lengths = features
-        areas = xp.abs(gap) * lengths
-        return areas.sum(axis=-1)
+        return (xp.abs(gap) * lengths).sum(axis=-1)
 
-    @staticmethod
-    def stacked(bases: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[Any], ...]:
-        """Return bases with a leading axis, padded by intervals without length."""
-        return tuple(_padded(arrays) for arrays in zip(*bases, strict=True))
+    def together(self, parts: tuple[Part, ...]) -> PartSum:
+        """Return areas whose features are their values, which take little memory."""
+        return AreaSum(parts)
 
-    @staticmethod
-    def side_by_side(
-        targets: Sequence[AreaDiscrepancy], weights: Any, basis: tuple[Any, ...], xp: Any
-    ) -> Any:
-        """Return the areas from a stacked basis, (..., K); in a graph all at a time."""
-        if xp is np:  # one after the other, as it takes less memory
+
+@dataclass(frozen=True, eq=False)
+class RankedBasis(Basis):
+    """The ranks of stored and observed values among the knots.
+
+    The arrays are, for either side, the order of the values and the number of values up to each
+    knot, then the lengths of the intervals between knots.
+    """
+
+    observed_weights: Floats
+
+    def features(self, weights: Any, xp: Any = np) -> Features:
+        """Return F - S_N on each interval between knots, and the interval's length."""
+        order, below, observed_order, observed_below, lengths = self.arrays
+        if xp is np and weights.size > 1 << 16:  # where a compiled loop repays its loading
+            rows = np.ascontiguousarray(weights).reshape(-1, weights.shape[-1])
+            simulated = np.empty((len(rows), len(below)))
+            sum_below(rows, order, below, simulated)
+            simulated = simulated.reshape(*weights.shape[:-1], -1)
+        else:
+            simulated = summed_below(weights, order, below, xp)
+        observed = summed_below(self.observed_weights, observed_order, observed_below, xp)
+        return simulated - observed, lengths
+
+    def rows(self, index: Any) -> Self:
+        """Return the ranks for some of several data sets."""
+        return replace(self, observed_weights=self.observed_weights[index])
+
+
+class AreaSum(PartSum):
+    """Areas of several projections, whose features are their values, (..., K)."""
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
+        """Return the areas, (..., K)."""
+        areas = []
+        for target, values in self.projected(simulated, xp):
+            gap_and_lengths = target.features(values, weights, xp)
+            areas.append(target.outer(*gap_and_lengths, xp=xp))
+        return (xp.stack(areas, axis=-1),)
+
+    def basis(self, simulated: Floats, most: float) -> Basis:
+        """Return the ranks of all projections."""
+        bases = [target.basis(values) for target, values in self.projected(simulated)]
+        arrays = zip(*(basis.arrays for basis in bases), strict=True)
+        weights = tuple(part.target.weights for part in self.parts)
+        return StackedRanks(tuple(_padded(rows) for rows in arrays), weights)
+
+    def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
+        """Return the sum of the areas times their shares."""
+        (areas,) = features
+        return (areas * shares).sum(axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class StackedRanks(Basis):
+    """Ranks of several projections, padded by intervals without length.
+
+    The graph of many projections is then no larger than that of one.
+    """
+
+    observed_weights: tuple[Floats, ...]
+
+    def features(self, weights: Any, xp: Any = np) -> Features:
+        """Return the areas, (..., K)."""
+        if xp is np:  # one after another takes less memory
             areas = []
-            for target, own in zip(targets, zip(*basis, strict=True), strict=True):
-                features = target.from_basis(weights, own, np)
-                areas.append(target.outer(*features, xp=np))
-            return np.stack(areas, -1)
-        order, below, own_order, own_below, lengths = basis
-        ordered = xp.take(weights, order)
-        simulated = _rows_summed_below(ordered, below, xp)
-        observed = _padded([target.weights for target in targets])
-        rows = np.arange(len(targets))[:, None]
-        own_ordered = xp.as_tensor(observed)[rows, own_order]
-        of_data = _rows_summed_below(own_ordered, own_below, xp)
-        gaps = xp.abs(simulated - of_data)
-        return (gaps * lengths).sum(axis=-1)
+            for *ranks, observed_weights in zip(*self.arrays, self.observed_weights, strict=True):
+                gap, lengths = RankedBasis(tuple(ranks), observed_weights).features(weights)
+                areas.append((np.abs(gap) * lengths).sum(axis=-1))
+            return (np.stack(areas, -1),)
+        order, below, observed_order, observed_below, lengths = self.arrays
+        simulated = _rows_summed_below(xp.take(weights, order), below, xp)
+        rows = np.arange(len(self.observed_weights))[:, None]
+        sorted_weights = xp.as_tensor(_padded(self.observed_weights))[rows, observed_order]
+        observed = _rows_summed_below(sorted_weights, observed_below, xp)
+        return ((xp.abs(simulated - observed) * lengths).sum(axis=-1),)
 
-
-def _many_summed_below(weights: Floats, order: NDArray[np.intp], below: NDArray[np.intp]) -> Floats:
-    """Return what `summed_below` does, reading and writing each number once."""
-    rows = np.ascontiguousarray(weights).reshape(-1, weights.shape[-1])
-    out = np.empty((len(rows), len(below)))
-    sum_below(rows, order, below, out)
-    return out.reshape(*weights.shape[:-1], -1)
+    def rows(self, index: Any) -> Self:
+        """Return the ranks for some of several data sets."""
+        return replace(self, observed_weights=tuple(w[index] for w in self.observed_weights))
 
 
 def _padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -157,11 +192,19 @@ def _rows_summed_below(ordered: Any, below: Any, xp: Any) -> Any:
     return xp.where(below > 0, xp.take_along_axis(total, last, axis=-1), 0.0)
 
 
-def _lengths(pooled: Any, xp: Any) -> Any:
-    """Return the lengths of intervals between sorted values, zero for those that have no end."""
-    upper = pooled[..., 1:]
-    lower = pooled[..., :-1]
-    finite = xp.abs(upper) < np.inf
-    end = xp.where(finite, upper, 0.0)
-    start = xp.where(finite, lower, 0.0)
-    return end - start
+@compiled
+def sum_below(
+    weights: Floats, order: NDArray[np.intp], below: NDArray[np.intp], out: Floats
+) -> None:
+    """Put the sums of the first ``below`` weights in an order, shape (rows, m), into ``out``.
+
+    The weights have shape (rows, n), the order (n,), ``below`` (m,).
+    """
+    sums = np.zeros(len(order) + 1)
+    for r in range(len(weights)):
+        total = 0.0
+        for i in range(len(order)):
+            total += weights[r, order[i]]
+            sums[i + 1] = total
+        for k in range(len(below)):
+            out[r, k] = sums[below[k]]

@@ -1,19 +1,19 @@
-"""What a calibration metric is: features of a weighted population, then one function of them.
+"""Calibration metrics: features of a weighted population, then one function of the features.
 
-`Metric` is configuration. ``metric.against(observed)`` prepares a `Discrepancy`, which holds the
-measured side and is called with simulated responses. It works in two steps:
+`Metric` is configuration. ``metric.against(observed)`` prepares a `Discrepancy`, which compares the
+measured values with simulated responses in two steps:
 
-- *features*: a density on cells, or a difference of distribution functions. For responses that stay
-  the same they are a linear map of the weights (`Discrepancy.basis`, `Discrepancy.from_basis`);
-- the *outer* function of the features, which takes the array namespace, so that the direct call,
+- *features*: a density on cells, or a difference of distribution functions. For stored responses
+  they are a linear map of the weights, a `Basis`;
+- the *outer* function of the features, written for any array namespace, so that the direct call,
   the optimiser's gradient and the compiled graph of a PyMC model run through the same lines.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, ClassVar, Self
 
@@ -28,15 +28,10 @@ from prbayes._validate import (
     sample_weights,
     simulated_sample,
 )
-from prbayes.metrics.grid import Cells, product
+from prbayes.metrics.grid import product
+from prbayes.metrics.views import Projection, View
 
-# Share of the uniform density that is mixed into densities before a logarithm is taken. Any value
-# up to 1e-6 gives the same minimum on normal data, to a thousandth of a standard error (test). It
-# decides for the forward divergence where an observation is far outside the fitted population:
-# among 50 values of Student's t with three degrees of freedom, 1e-7 lets the fit leave out an
-# outlier that 1e-9 and less keep in (test). A kernel has 1e-9 of its mass beyond six bandwidths,
-# where grids end.
-_FLOOR = 1e-9
+type Features = tuple[Any, ...]
 
 
 class Minimum(Enum):
@@ -45,13 +40,13 @@ class Minimum(Enum):
     Attributes
     ----------
     QUADRATIC
-        Twice differentiable in the hyperparameters: Hessian and gradient tell the sampling
+        Twice differentiable in the hyperparameters: Hessian and gradient give the sampling
         distribution.
     ABSOLUTE
         An integral of absolute differences between distribution functions, each linear in the
         weights.
     UNKNOWN
-        Nothing is declared; what is needed is measured by refits, or refused.
+        Nothing is declared; refits measure what is needed, or it is refused.
     """
 
     QUADRATIC = "quadratic"
@@ -60,60 +55,93 @@ class Minimum(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """What a part of a discrepancy sees of a response: all of it, unless it is a special view."""
-
-    def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return what is seen of simulated responses, a specimen's along the last axes."""
-        return simulated
-
-    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return what is seen of observed values, and of which rows."""
-        return self.of(values), np.arange(len(values))
-
-
-@dataclass(frozen=True, eq=False)
 class Part:
-    """One term of a discrepancy that is a sum: ``share`` times what ``target`` says.
+    """One component of a discrepancy: ``share`` times the discrepancy ``target`` of a projection.
 
     Attributes
     ----------
     target : Discrepancy
-        Of one output, or of something that stands for one; where it needs several outputs at a
-        time, ``target.event`` says so.
+        Of one number of each specimen, or of several where ``target.event`` is not empty.
     share : float
-        Its factor in the sum.
+        Factor in the sum.
     label : str
-        What a reader calls it.
+        Name for messages and plots.
     view : View
-        What it sees of a response.
+        Projection of a response.
     """
 
     target: Discrepancy
     share: float
     label: str
-    view: View = View()
+    view: View = field(default_factory=View)
 
     def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return what the target compares, (..., n, m) -> (..., n); NaN where an output is NaN."""
+        """Return the projection, (..., n, m) -> (..., n); NaN where an output is NaN."""
         return self.view.of(simulated, xp)
 
     def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return what the target compares of observed values, and of which rows.
+        """Return the projection of observed values, (n, m) -> (n',), and their rows, (n',).
 
-        Rows that lack an output that is needed are left out: (n, m) -> (n',), (n',).
+        Rows that lack a necessary output are left out.
         """
         return self.view.observed_of(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Basis(ABC):
+    """The linear map from weights of stored responses to the features of a discrepancy.
+
+    Attributes
+    ----------
+    arrays : tuple
+        The numbers of the map. A compiled graph replaces them by shared variables.
+    """
+
+    arrays: tuple[Any, ...]
+
+    @abstractmethod
+    def features(self, weights: Any, xp: Any = np) -> Features:
+        """Return the features of the stored responses with weights (..., n)."""
+
+    def rows(self, index: Any) -> Self:
+        """Return the map for some of several data sets."""
+        return self
+
+
+class DenseBasis(Basis):
+    """A matrix, (n, m): the features are ``weights @ matrix``."""
+
+    def features(self, weights: Any, xp: Any = np) -> Features:
+        """Return the features, (..., n) -> (..., m)."""
+        (matrix,) = self.arrays
+        return (product(weights, matrix) if xp is np else weights @ matrix,)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredBasis(Basis):
+    """The stored responses themselves, whose features are computed for each row of weights."""
+
+    target: Discrepancy
+
+    def features(self, weights: Any, xp: Any = np) -> Features:
+        """Return the features of the responses."""
+        (values,) = self.arrays
+        if xp is np:
+            values = np.broadcast_to(values, (*weights.shape, *self.target.event))
+        return self.target.features(values, weights, xp)
+
+    def rows(self, index: Any) -> Self:
+        """Return the map for some of several data sets."""
+        return replace(self, target=self.target.rows(index))
 
 
 @dataclass(frozen=True, eq=False)
 class Discrepancy(ABC):
     """A metric with its observed side prepared; call it with simulated responses.
 
-    Whoever adds a metric derives from this class, or from `DensityDiscrepancy` if the metric
-    compares densities, and defines the abstract methods. All of them are batched: the last axis
-    runs over the values, axes before it over populations. Records are immutable; another observed
-    side makes another record.
+    A new metric derives from this class, or from `DensityDiscrepancy` if it compares densities,
+    and defines the abstract methods. All methods are batched: the last axis runs over the values,
+    axes before it over populations. Records are immutable.
 
     Attributes
     ----------
@@ -122,7 +150,7 @@ class Discrepancy(ABC):
     observed : ndarray, shape (N,) or (N, m)
         Measured responses, of one output or of m.
     weights : ndarray, shape (N,) or (..., N)
-        Weights of the observed values; they sum to one. Several rows stand for as many data sets.
+        Weights of the observed values; they sum to one. Several rows are as many data sets.
     """
 
     metric: Metric
@@ -134,8 +162,6 @@ class Discrepancy(ABC):
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
         """Return the same metric, on the same cells, against other values; for resampling.
 
-        A metric that derives fields from the observed side derives them anew here.
-
         Parameters
         ----------
         observed : ndarray, shape (n,)
@@ -143,13 +169,11 @@ class Discrepancy(ABC):
             Equal by default. With several rows, each a data set, `outer` broadcasts the data sets
             against the features.
         """
-        w = sample_weights(weights, len(observed))
-        return replace(self, observed=observed, weights=w)
+        return replace(self, observed=observed, weights=sample_weights(weights, len(observed)))
 
     def rows(self, index: Any) -> Self:
-        """Return some of the data sets of which there are several; nothing is computed anew."""
-        chosen = {name: getattr(self, name)[index] for name in self._by_data_set}
-        return replace(self, **chosen)
+        """Return some of several data sets."""
+        return replace(self, **{name: getattr(self, name)[index] for name in self._by_data_set})
 
     @property
     def event(self) -> tuple[int, ...]:
@@ -158,53 +182,8 @@ class Discrepancy(ABC):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The terms that it is the sum of: itself, unless it is made of several."""
+        """The components of the sum: itself, unless it is a sum of several."""
         return (Part(self, 1.0, ""),)
-
-    @property
-    def told(self) -> str:
-        """What a reader has to know of what is compared, as a clause; empty if it is all."""
-        return ""
-
-    @property
-    def missed(self) -> str:
-        """What the data vary in and the comparison does not see, as a clause; empty if nothing."""
-        return ""
-
-    def beside(self, design: Floats, inputs: int) -> Discrepancy:
-        """Return the same comparison, now that the first simulated responses are known.
-
-        Itself, unless the metric chooses what it compares by the data and them together, or by how
-        many numbers a specimen's inputs are.
-        """
-        return self
-
-    @property
-    def likelihood(self) -> bool:
-        """Whether N times the discrepancy is on the scale of a log-likelihood."""
-        return self.metric.likelihood
-
-    @property
-    def exact(self) -> bool:
-        """Whether N times it is minus the log-likelihood itself, but for a narrow kernel."""
-        return False
-
-    @property
-    def resolution(self) -> float:
-        """Standard deviation of the kernel by which it reads a density at single observed values.
-
-        Zero unless it does.
-        """
-        return 0.0
-
-    def narrowed(self, factor: float) -> Discrepancy:
-        """Return the same with that kernel narrowed by a factor; itself where it has none."""
-        return self
-
-    @property
-    def additive(self) -> bool:
-        """Whether its gradient in the hyperparameters is a mean over observations."""
-        return self.metric.additive
 
     @property
     def n_effective(self) -> float:
@@ -220,8 +199,8 @@ class Discrepancy(ABC):
         """
 
     @abstractmethod
-    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
-        """Return what `outer` takes, for any simulated responses.
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
+        """Return the arguments of `outer` for any simulated responses.
 
         Parameters
         ----------
@@ -235,91 +214,34 @@ class Discrepancy(ABC):
         """
 
     @abstractmethod
-    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
-        """Return arrays that turn weights of stored values, shape (n,), into features.
-
-        They are made once for the values; `from_basis` then serves any weights.
-        """
-
-    @property
-    def columns(self) -> int:
-        """How many numbers the basis has for each value, where `compact` has fewer; else zero."""
-        return 0
-
-    def compact(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
-        """Return arrays that serve as the basis does with NumPy, and take less memory."""
-        return self.basis(simulated)
-
-    def stored(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
-        """Return the basis where it is small, and else what is compact."""
-        small = len(simulated) * self.columns <= AT_ONCE
-        return self.basis(simulated) if small else self.compact(simulated)
-
-    def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
-        """Return the derivatives for the weights, (..., n), of a sum over the only feature.
-
-        Of the sum of the feature times the cotangent, (..., m), by the compact form of the basis.
-        """
-        raise NotImplementedError
-
-    @abstractmethod
-    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
-        """Return the features of the values that the basis was made for.
-
-        Equal to ``features(simulated, weights, xp)`` up to what the outer function does not see,
-        and linear in the weights, shape (..., n), so that gradients are exact.
-        """
-
-    @abstractmethod
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the discrepancy of the features, shape (...); smaller is better.
 
         Written with ``xp`` (``numpy`` or ``pytensor.tensor``), by functions that both have.
         """
 
-    @property
-    def cellwise(self) -> Cellwise | None:
-        """How it is a sum over the cells of a density, its only feature; None if it is not."""
-        return None
+    def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
+        """Return the map from weights of stored responses, shape (n,), to features.
 
-    @staticmethod
-    def stacked(bases: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[Any], ...] | None:
-        """Return the bases of several discrepancies as one, for `side_by_side`; None if it cannot.
+        By default the responses themselves. A metric with features that are linear in the weights
+        returns a map that is computed once for the responses, and is equal to `features` up to
+        rounding.
 
-        The graph of many slices is then no larger than that of one.
+        Parameters
+        ----------
+        simulated : ndarray, shape (n,) or (n, m)
+        most : float
+            Largest size of a matrix where a smaller form exists.
         """
-        return None
+        return StoredBasis((simulated,), self)
 
-    @staticmethod
-    def side_by_side(targets: Any, weights: Any, basis: tuple[Any, ...], xp: Any) -> Any:
-        """Return the values of several discrepancies from a stacked basis, (..., K), or None."""
-        return None
-
-    @property
-    def symbolic(self) -> bool:
-        """Whether `outer` can be written as a graph; else it is an operation without gradient."""
-        return True
-
-    @property
-    def density_cells(self) -> Cells | None:
-        """The cells on which densities are compared, None where the features are none."""
-        return None
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether the discrepancy has second derivatives in the population's values and weights."""
-        return self.metric.minimum is Minimum.QUADRATIC
-
-    def overlap(self, simulated: Floats, weights: Floats) -> Floats:
-        """Return the overlap of both densities, (..., n) -> (...); one where there are none."""
-        shape = np.shape(simulated)
-        batch = shape[: len(shape) - 1 - len(self.event)]
-        return np.ones(batch)
+    def together(self, parts: tuple[Part, ...]) -> PartSum:
+        """Return components of this kind as terms that are evaluated together."""
+        return PartSum(parts)
 
     def of(self, simulated: Floats, weights: Floats) -> Any:
         """Return the discrepancy of checked values (..., n) and weights that sum to at most one."""
-        features = self.features(simulated, weights, np)
-        return self.outer(*features, xp=np)
+        return self.outer(*self.features(simulated, weights, np), xp=np)
 
     def __call__(self, simulated: ArrayLike, weights: ArrayLike | None = None) -> Any:
         """Return the discrepancy of simulated responses.
@@ -336,12 +258,91 @@ class Discrepancy(ABC):
         float or ndarray, shape (...)
         """
         values = simulated_sample(simulated, event=self.event)
-        before = values.shape[: values.ndim - len(self.event)]
-        w = sample_weights(weights, before[-1])
-        shape = np.broadcast_shapes(before, w.shape)
-        values = np.broadcast_to(values, (*shape, *self.event))
-        result = self.of(values, w)
+        leading = values.shape[: values.ndim - len(self.event)]
+        w = sample_weights(weights, leading[-1])
+        shape = np.broadcast_shapes(leading, w.shape)
+        result = self.of(np.broadcast_to(values, (*shape, *self.event)), w)
         return float(result) if np.ndim(result) == 0 else result
+
+
+def is_additive(target: Discrepancy) -> bool:
+    """Return whether the gradient is a mean over specimens: not where specimens lack outputs."""
+    return target.metric.additive and not np.isnan(target.observed).any()
+
+
+def is_likelihood(target: Discrepancy) -> bool:
+    """Return whether N times it is on the scale of a log-likelihood: not a mean over directions."""
+    return len(target.parts) == 1 and target.parts[0].target.metric.likelihood
+
+
+@dataclass(frozen=True, eq=False)
+class PartSum:
+    """Components of a sum that are evaluated together: here each with features of its own."""
+
+    parts: tuple[Part, ...]
+
+    def projected(self, simulated: Any, xp: Any = np) -> Iterator[tuple[Discrepancy, Any]]:
+        """Yield the discrepancy of each component with its projection."""
+        centered: Any = None
+        outputs: Any = None
+        for part in self.parts:
+            view = part.view
+            if not isinstance(view, Projection):
+                yield part.target, part.of(simulated, xp)
+                continue
+            if view.centered is not centered:  # outputs are centred once for many directions
+                centered = view.centered
+                outputs = centered.of(simulated, xp)
+            yield part.target, outputs @ view.direction
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
+        """Return the features of all components."""
+        return tuple(
+            feature
+            for target, values in self.projected(simulated, xp)
+            for feature in target.features(values, weights, xp)
+        )
+
+    def basis(self, simulated: Floats, most: float) -> Basis:
+        """Return the map from weights to the features."""
+        return joined([target.basis(y, most) for target, y in self.projected(simulated)])
+
+    def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
+        """Return the sum of the components times their shares, shape (..., K)."""
+        size = len(features) // len(self.parts)
+        total: Any = 0.0
+        for k, part in enumerate(self.parts):
+            value = part.target.outer(*features[k * size : (k + 1) * size], xp=xp)
+            total = total + shares[..., k] * value
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedBasis(Basis):
+    """Several maps, whose features follow one another."""
+
+    bases: tuple[Basis, ...]
+
+    def features(self, weights: Any, xp: Any = np) -> Features:
+        """Return the features of all maps."""
+        features: list[Any] = []
+        start = 0
+        for basis in self.bases:
+            stop = start + len(basis.arrays)
+            features += replace(basis, arrays=self.arrays[start:stop]).features(weights, xp)
+            start = stop
+        return tuple(features)
+
+    def rows(self, index: Any) -> Self:
+        """Return the maps for some of several data sets."""
+        return replace(self, bases=tuple(basis.rows(index) for basis in self.bases))
+
+
+def joined(bases: Sequence[Basis]) -> Basis:
+    """Return several maps as one."""
+    if len(bases) == 1:
+        return bases[0]
+    return JoinedBasis(sum((basis.arrays for basis in bases), ()), tuple(bases))
 
 
 class Metric(ABC):
@@ -349,7 +350,7 @@ class Metric(ABC):
 
     A metric of your own is a frozen dataclass that derives from this class. It defines
     ``_prepare(observed, weights)``, which gets checked values, shape (N,), and weights that sum to
-    one, and returns a `Discrepancy`. What calibration may assume of it, it declares as class
+    one, and returns a `Discrepancy`. It declares what calibration may assume of it, as class
     attributes or properties:
 
     Attributes
@@ -360,6 +361,9 @@ class Metric(ABC):
         Whether its gradient in the hyperparameters is a mean over observations, as that of an outer
         function linear in the observed density. If not, standard errors come from simulated data
         sets. Metrics with a quadratic minimum are taken for additive unless they declare it.
+    symbolic : bool
+        Whether the outer function can be written as a graph; else it is an operation without
+        gradient.
     takes_weights : bool
         Whether simulated responses may have unequal weights, as under `Reweighted`.
     counts_failures : bool
@@ -379,6 +383,7 @@ class Metric(ABC):
     minimum: ClassVar[Minimum] = Minimum.UNKNOWN
     likelihood: ClassVar[bool] = False
     distance: ClassVar[bool] = True
+    symbolic: ClassVar[bool] = True
     counts_failures: ClassVar[bool] = False
     tail_responses: ClassVar[int] = 0
 
@@ -403,24 +408,25 @@ class Metric(ABC):
         return False
 
     def like(self, metric: Metric) -> Metric:
-        """Return the metric that compares the same outputs in the same way, but by another metric.
-
-        ``metric`` itself, unless this one lifts a metric of one output to several.
-        """
+        """Return the comparison of the same outputs by another metric of one output."""
         return metric
 
-    def beside(self, observed: Floats, weights: Floats, design: Floats, inputs: int) -> Discrepancy:
-        """Return the discrepancy from checked values, now that a design's responses are known."""
-        return self._prepare(observed, weights)
+    def beside(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
+        """Return the discrepancy after the first simulated responses of a design are computed.
+
+        Itself, unless the metric chooses its projections by the data and the design together, or by
+        the number of a specimen's inputs.
+        """
+        return target
 
     @abstractmethod
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         """Return the discrepancy from these observed values, both of shape (N,) and checked."""
 
     def on_one_scale(self, slices: Sequence[Discrepancy]) -> Sequence[Discrepancy]:
-        """Return discrepancies from slices of one sample, in units in which their mean is meant.
+        """Return discrepancies of slices of one sample in units that allow their mean.
 
-        They are as they are, unless the metric takes a factor from the data.
+        Unchanged, unless the metric takes a factor from the data.
         """
         return slices
 
@@ -465,172 +471,3 @@ class Metric(ABC):
     ) -> Any:
         """Return the discrepancy between simulated (..., n) and observed (N,) responses."""
         return self.against(observed, observed_weights)(simulated, weights)
-
-
-@dataclass(frozen=True, eq=False)
-class DensityDiscrepancy(Discrepancy):
-    """A discrepancy of two densities on the same cells.
-
-    The only feature is the simulated density, shape (..., m). A metric that derives from this class
-    defines `outer`, and nothing else unless it needs further fields; ``on_cells`` makes it. In
-    ``outer``, ``self.density`` is the observed density, and an integral is a sum over the last axis
-    of values times ``self.cells.widths``. The last two cells are the mass below and above all
-    others.
-
-    Attributes
-    ----------
-    cells : Cells
-        Laid out once, from the values that the metric was prepared with.
-    density : ndarray, shape (m,) or (..., m)
-        Observed density on the cells, in 1 / units of the response; a row for each data set.
-    """
-
-    cells: Cells
-    density: Floats
-    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density")
-
-    @classmethod
-    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
-        """Return the discrepancy from observed values with their density on given cells.
-
-        Parameters
-        ----------
-        metric : Metric
-        observed, weights : ndarray, shape (N,)
-        cells : Cells
-            Usually those that the metric's estimator lays out for the observed values.
-        """
-        density = observed_density(cells, observed, weights)
-        return cls(metric, observed, weights, cells, density)
-
-    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
-        """Return the same metric, on the same cells, against other values; for resampling."""
-        w = sample_weights(weights, observed.size)
-        density = observed_density(self.cells, observed, w)
-        return replace(self, observed=observed, weights=w, density=density)
-
-    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
-        """Return the density on the cells."""
-        return (self.cells.density(simulated, weights),)
-
-    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
-        """Return the matrix A with density = weights @ A."""
-        return (self.cells.basis(simulated),)
-
-    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
-        """Return the density on the cells."""
-        return (product(weights, *basis) if xp is np else weights @ basis[0],)
-
-    @property
-    def density_cells(self) -> Cells:
-        """The cells."""
-        return self.cells
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether the densities are smooth in the simulated values too; a histogram's are not."""
-        return super().differentiable and self.cells.smooth
-
-    @property
-    def scale(self) -> float:
-        """One: divergences and log densities have no units."""
-        return 1.0
-
-    def overlap(self, simulated: Floats, weights: Floats) -> Floats:
-        """Return the cosine of simulated and observed density, shape (...).
-
-        One if they are equal, zero if disjoint. Mass outside the inner cells counts in neither.
-        """
-        p = self.cells.density(simulated, weights)
-        p = p[..., :-2]
-        q = self.density[..., :-2]
-        dz = self.cells.widths[:-2]
-        # Integrals of p q, of p squared and of q squared.
-        mixed = (p * q * dz).sum(axis=-1)
-        simulated_square = ((p**2) * dz).sum(axis=-1)
-        observed_square = ((q**2) * dz).sum(axis=-1)
-        size = np.sqrt(simulated_square * observed_square)
-        size = np.where(size > 0, size, 1.0)
-        cosine = mixed / size
-        return np.asarray(np.nan_to_num(cosine))
-
-    def floored(self, density: Any) -> Any:
-        """Mix a density with 1e-9 of the uniform density over all cells: the package's only floor.
-
-        It bounds logarithms where a population leaves the observed values alone, at
-        log(1e-9 / length).
-        """
-        return raised(density, self.least)
-
-    @property
-    def least(self) -> Any:
-        """What the floor adds to a density in each cell."""
-        length = self.cells.widths.sum()
-        return _FLOOR / length
-
-
-def raised(density: Any, least: Any) -> Any:
-    """Return a density with its floor, which has 1e-9 of the mass."""
-    return (1 - _FLOOR) * density + least
-
-
-@dataclass(frozen=True, eq=False)
-class Cellwise:
-    """A discrepancy as a sum over cells: of what its terms say, each times a share."""
-
-    of: CellwiseDiscrepancy  # whose terms these are
-    constants: tuple[Any, ...]
-    shares: Any  # (..., m), or one number
-
-    def rows(self, index: Any) -> Cellwise:
-        """Return it for some of the data sets of which there are several."""
-        # What is the same for all of them is a number, or one by cell.
-        constants = tuple(c[index] if np.ndim(c) > 1 else c for c in self.constants)
-        shares = self.shares[index] if np.ndim(self.shares) > 1 else self.shares
-        return Cellwise(self.of, constants, shares)
-
-    def outer(self, density: Any, xp: Any) -> Any:
-        """Return the sum over the cells, (..., m) -> (...)."""
-        return (self.of.terms(density, self.constants, xp) * self.shares).sum(axis=-1)
-
-
-class CellwiseDiscrepancy(DensityDiscrepancy):
-    """A discrepancy of two densities that is a sum over the cells.
-
-    Several of them, on cells of their own, are then one sum over all cells.
-    """
-
-    @property
-    @abstractmethod
-    def constants(self) -> tuple[Any, ...]:
-        """What `terms` takes beside the density: by cell, (m,) or (..., m), or one number."""
-
-    @abstractmethod
-    def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
-        """Return what each cell adds, shape (..., m); nothing else of the record than its metric.
-
-        The constants are given, since they may be those of several records side by side.
-        """
-
-    @property
-    def cellwise(self) -> Cellwise | None:
-        """Itself, unless its outer function is another one."""
-        if type(self).outer is not CellwiseDiscrepancy.outer:
-            return None
-        return Cellwise(self, self.constants, np.float64(1.0))
-
-    def outer(self, *features: Any, xp: Any) -> Any:
-        """Return the sum over the cells."""
-        (density,) = features
-        return self.terms(density, self.constants, xp).sum(axis=-1)
-
-
-def observed_density(cells: Cells, observed: Floats, weights: Floats) -> Floats:
-    """Return the density of observed values on cells, shapes (N,), (N,) -> (m,).
-
-    Weights of shape (..., N) are as many data sets: (..., m).
-    """
-    if weights.ndim == 1:
-        return cells.density(observed, weights)
-    basis = cells.basis(observed)
-    return product(weights, basis)

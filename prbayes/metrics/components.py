@@ -42,7 +42,7 @@ class Components:
         return int(self.axes.shape[1])
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """How many there are, what they leave out, and whether that is noise."""
         of = f"{self.left_out:.2g} of the variance of the data"
         if not np.isnan(self.design_left_out):
@@ -59,7 +59,7 @@ class Components:
         if self.left_out <= LEFT_OUT or self.rest_correlation < _NO_NOISE:
             return ""
         return (
-            f"{self.told}, so that it is no noise: the metric does not see it; pass more "
+            f"{self.summary}, so that it is no noise: the metric does not see it; pass more "
             "components= to prb.Joint, or measure more specimens"
         )
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._validate import Floats, positive_number, sample_weights
-from prbayes.metrics.base import Discrepancy, Minimum, Part
+from prbayes._validate import AT_ONCE, Floats, positive_number, sample_weights
+from prbayes.metrics.base import Basis, DenseBasis, Discrepancy, Features, Minimum, Part
 from prbayes.metrics.grid import product
-from prbayes.metrics.lifted import LiftedMetric, failure_caps
-from prbayes.metrics.multivariate import Centered, Projection, Standardized
+from prbayes.metrics.multivariate import CompositeDiscrepancy, LiftedMetric, failure_caps
+from prbayes.metrics.views import Centered, Projection, Standardized
 from prbayes.metrics.whitening import units
 
 # Least variance, in units of an observed output's spread squared: a population that is one number
@@ -91,32 +90,29 @@ class MarginalCorrelation(LiftedMetric):
         """No: the gradient is not linear in the observed correlations' specimens."""
         return False
 
-    def _parts(self, observed: Floats, weights: Floats) -> Sequence[Part]:
+    def _prepare_outputs(self, observed: Floats, weights: Floats) -> Discrepancy:
         caps = failure_caps(observed)
         m = observed.shape[1]
-        of_marginals, of_correlations = self.weights
+        marginal_weight, correlation_weight = self.weights
         parts: list[Part] = []
         center = np.empty(m)
         unit = np.empty(m)
         for j in range(m):
-            only = np.array([j])
-            finite = np.isfinite(observed[:, j])
-            column = observed[finite][:, only]
-            own = weights[finite]
-            own = own / own.sum()
-            center[only], unit[only] = units(column, own, only)
-            centered = Centered(only, caps[only], center[only])
-            view = Projection(centered, 1 / unit[only])
-            values, index = view.observed_of(observed)
-            target = self.metric.against(values, weights[index])
-            share = of_marginals / target.scale
-            parts.append(Part(target, share, f"output {j}", view))
-        centered = Centered(np.arange(m), caps, center)
-        together = Standardized(centered, unit)
+            index = np.array([j])
+            is_finite = np.isfinite(observed[:, j])
+            column_weights = weights[is_finite]
+            column_weights = column_weights / column_weights.sum()
+            column = observed[is_finite][:, index]
+            center[index], unit[index] = units(column, column_weights, index)
+            view = Projection(Centered(index, caps[index], center[index]), 1 / unit[index])
+            values, rows = view.observed_of(observed)
+            target = self.metric.against(values, weights[rows])
+            parts.append(Part(target, marginal_weight / target.scale, f"output {j}", view))
+        together = Standardized(Centered(np.arange(m), caps, center), unit)
         values, _ = together.observed_of(observed)
-        target = CorrelationDiscrepancy.between(self, values, weights)
-        parts.append(Part(target, of_correlations, "correlations", together))
-        return parts
+        correlations = CorrelationDiscrepancy.between(self, values, weights)
+        parts.append(Part(correlations, correlation_weight, "correlations", together))
+        return CompositeDiscrepancy.of_parts(self, observed, weights, parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +146,7 @@ class CorrelationDiscrepancy(Discrepancy):
         """The number of correlations."""
         return float(self.correlations.shape[-1])
 
-    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the moments: of order zero, one and two, (..., n, m) -> (..., M)."""
         known = xp.abs(simulated.sum(axis=-1)) < np.inf
         values = xp.where(known[..., None], simulated, 0.0)
@@ -164,14 +160,9 @@ class CorrelationDiscrepancy(Discrepancy):
         moments = xp.concatenate([total, first, second], axis=-1)
         return (moments,)
 
-    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+    def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
         """Return the powers of the values whose weighted sums are moments, (n, M)."""
-        return (_powers(simulated),)
-
-    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
-        """Return the moments."""
-        (powers,) = basis
-        return (product(weights, powers) if xp is np else weights @ powers,)
+        return DenseBasis((_powers(simulated),))
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum of squared residuals of the correlations."""

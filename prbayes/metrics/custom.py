@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._validate import Floats, flag
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Features, Metric
 
 
 @dataclass(frozen=True)
@@ -44,6 +43,7 @@ class FunctionMetric(Metric):
     function: Callable[..., Any]
     _: KW_ONLY
     weighted: bool = False
+    symbolic: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not callable(self.function):
@@ -77,16 +77,11 @@ class FunctionDiscrepancy(Discrepancy):
     size: int  # number of values in such a sample
 
     @property
-    def symbolic(self) -> bool:
-        """No: the function is called."""
-        return False
-
-    @property
     def scale(self) -> float:
         """One: nothing is known about the function."""
         return 1.0
 
-    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the value of the function; the values for several data sets, (B, ...)."""
         if self.weights.ndim > 1:
             return (self._of_each(simulated, weights),)
@@ -128,15 +123,6 @@ class FunctionDiscrepancy(Discrepancy):
                 "or use prb.Resimulated"
             )
         return function(simulated, observed)
-
-    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
-        """Return the simulated values themselves."""
-        return (simulated,)
-
-    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
-        """Return the value of the function."""
-        (values,) = basis
-        return self.features(np.broadcast_to(values, weights.shape), weights, xp)
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the value of the function."""

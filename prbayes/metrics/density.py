@@ -1,8 +1,8 @@
-"""Density estimates: Gaussian kernels, histograms, bandwidth rules.
+"""Density estimates, bandwidth rules, and discrepancies of two densities.
 
-A calibration metric compares the simulated density with the observed one on the same *cells*. The
-cells are laid out once, from the observed values; afterwards a density is linear in the weights of
-the sample, which is what makes every metric of this package cheap and differentiable.
+A metric compares the simulated density with the observed one on the same *cells*. They are laid out
+once, from the observed values; a density is then linear in the weights of the sample, which makes
+the metrics cheap and differentiable.
 """
 
 from __future__ import annotations
@@ -10,22 +10,26 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
 from prbayes._stats import finite_sample, quantile
-from prbayes._validate import Floats, positive_integer, positive_number
-from prbayes.metrics.grid import BinCells, Cells, KernelCells
+from prbayes._validate import AT_ONCE, Floats, positive_integer, positive_number, sample_weights
+from prbayes.metrics.base import Basis, DenseBasis, Discrepancy, Features, Minimum, Part, PartSum
+from prbayes.metrics.grid import BinCells, Cells, KernelCells, product
 
-# Grid nodes per bandwidth. The density is then exact to 3e-5 of a kernel's peak, which a test
-# holds; with three nodes to 1e-4, with six to 6e-6. The cost of comparing densities grows in
-# proportion.
+# Grid nodes per bandwidth: the density is exact to 3e-5 of a kernel's peak (test).
 _PER_BANDWIDTH = 4
 
-# By judgement: a limit to memory, 64 kB for the density of one population. It is met where an
-# outlier stands a thousand bandwidths away from the other observations.
+# A limit to memory, 64 kB for the density of one population.
 _MAX_CELLS = 8192
 
+# Weight of the uniform density that is mixed into densities before a logarithm is taken. Any value
+# up to 1e-6 gives the same minimum on normal data; 1e-7 lets a forward divergence leave out an
+# outlier that 1e-9 keeps in (tests). A kernel has 1e-9 of its mass where grids end.
+_FLOOR = 1e-9
 
 BandwidthRule = Callable[[Floats, Floats], float]
 
@@ -137,7 +141,14 @@ class GaussianKDE(DensityEstimator):
     def cells(self, observed: Floats, weights: Floats) -> Cells:
         """Return a grid over the observed range and a margin: six bandwidths, or half the range."""
         observed, weights = finite_sample(observed, weights)
-        h = self._bandwidth(observed, weights)
+        rule = twice_silverman if self.bandwidth is None else self.bandwidth
+        h = rule(observed, weights) if callable(rule) else float(rule)
+        if not np.isfinite(h) or h <= 0:
+            raise ValueError(
+                f"bandwidth: got {h:g} from {observed.size} observed values with spread "
+                f"{np.ptp(observed):g}, expected a positive one; pass GaussianKDE(bandwidth=...) "
+                "in units of the response, or use AreaMetric, which needs none"
+            )
         step = h / _PER_BANDWIDTH
         low, n_nodes = _grid(observed, h, step)
         tight = 2 * np.sqrt(np.pi) * h  # the integral of a kernel's square is 1 / tight
@@ -150,24 +161,11 @@ class GaussianKDE(DensityEstimator):
             kernel=_narrowed_kernel(h, step),
         )
 
-    def _bandwidth(self, observed: Floats, weights: Floats) -> float:
-        """Return the bandwidth for observed values, or raise if it is not positive."""
-        rule = twice_silverman if self.bandwidth is None else self.bandwidth
-        h = rule(observed, weights) if callable(rule) else float(rule)
-        if not np.isfinite(h) or h <= 0:
-            raise ValueError(
-                f"bandwidth: got {h:g} from {observed.size} observed values with spread "
-                f"{np.ptp(observed):g}, expected a positive one; pass GaussianKDE(bandwidth=...) "
-                "in units of the response, or use AreaMetric, which needs none"
-            )
-        return h
-
 
 def _grid(observed: Floats, h: float, step: float) -> tuple[float, int]:
     """Return the first node of a grid over observed values and their margins, and its length."""
     length = float(np.ptp(observed))
-    # Farther out a Gaussian kernel has 1e-9 of its mass, as much as the floor of logarithms
-    # (`DensityDiscrepancy.floored`).
+    # Beyond six bandwidths a kernel has 1e-9 of its mass, as much as `_FLOOR`.
     margin = max(6.0 * h, length / 2)
     low = float(observed.min()) - margin
     high = float(observed.max())
@@ -232,24 +230,18 @@ class Histogram(DensityEstimator):
                 f"histogram: got {observed.size} observed values, all {low:g}, expected at least "
                 "two different ones; use AreaMetric, which needs no bins"
             )
-        bins = self._bins(high - low, observed, weights)
+        bins = self.bins
+        if bins is None:
+            bin_width = 2 * 1.34 * spread(observed, weights) * float((weights**2).sum()) ** (1 / 3)
+            # At least five bins show the shape of few observations.
+            n_bins = np.ceil((high - low) / bin_width) if bin_width > 0 else _MAX_CELLS
+            bins = int(np.clip(n_bins, 5, _MAX_CELLS))
         width = (high - low) / bins
         return BinCells(
             widths=np.full(bins + 2, width),
             centers=low + width * (np.arange(bins, dtype=np.float64) + 0.5),
             smooth=False,
         )
-
-    def _bins(self, length: float, observed: Floats, weights: Floats) -> int:
-        """Return the number of bins over an observed range of this length."""
-        if self.bins is not None:
-            return self.bins
-        inverse_n = float((weights**2).sum())
-        width = 2 * 1.34 * spread(observed, weights) * inverse_n ** (1 / 3)
-        if not width > 0:
-            return _MAX_CELLS
-        # At least five, so that few observations still show a shape.
-        return int(np.clip(np.ceil(length / width), 5, _MAX_CELLS))
 
 
 def density_estimator(
@@ -272,3 +264,234 @@ def density_estimator(
     raise TypeError(
         f"density: got {got}, expected prb.GaussianKDE() or prb.Histogram(), perhaps with arguments"
     )
+
+
+def floored(density: Any, floor: Any) -> Any:
+    """Return a density with its floor, which has 1e-9 of the mass."""
+    return (1 - _FLOOR) * density + floor
+
+
+@dataclass(frozen=True, eq=False)
+class DensityDiscrepancy(Discrepancy):
+    """A discrepancy of two densities on the same cells.
+
+    The only feature is the simulated density, shape (..., m). A metric that derives from this class
+    defines `outer`, and nothing else unless it needs further fields; ``on_cells`` constructs it. In
+    ``outer``, ``self.density`` is the observed density, and an integral is a sum over the last axis
+    of values times ``self.cells.widths``. The last two cells are the mass below and above all
+    others.
+
+    Attributes
+    ----------
+    cells : Cells
+        Laid out once, from the values that the metric was prepared with.
+    density : ndarray, shape (m,) or (..., m)
+        Observed density on the cells, in 1 / units of the response; a row for each data set.
+    """
+
+    cells: Cells
+    density: Floats
+    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density")
+
+    @classmethod
+    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
+        """Return the discrepancy from observed values with their density on given cells.
+
+        Parameters
+        ----------
+        metric : Metric
+        observed, weights : ndarray, shape (N,)
+        cells : Cells
+            Usually those that the metric's estimator lays out for the observed values.
+        """
+        return cls(metric, observed, weights, cells, cells.density(observed, weights))
+
+    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
+        """Return the same metric, on the same cells, against other values; for resampling."""
+        w = sample_weights(weights, observed.size)
+        if w.ndim == 1:
+            density = self.cells.density(observed, w)
+        else:
+            density = product(w, self.cells.basis(observed))
+        return replace(self, observed=observed, weights=w, density=density)
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
+        """Return the density on the cells."""
+        return (self.cells.density(simulated, weights),)
+
+    def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
+        """Return the matrix A with density = weights @ A."""
+        return DenseBasis((self.cells.basis(simulated),))
+
+    def together(self, parts: tuple[Part, ...]) -> PartSum:
+        """Return densities side by side."""
+        return DensitySum(parts)
+
+    @property
+    def scale(self) -> float:
+        """One: divergences and log densities have no units."""
+        return 1.0
+
+    def floored(self, density: Any) -> Any:
+        """Mix a density with 1e-9 of the uniform density over all cells: the package's only floor.
+
+        It bounds logarithms at log(1e-9 / length) where a population leaves the observed values.
+        """
+        return floored(density, self.floor)
+
+    @property
+    def floor(self) -> Any:
+        """The floor's density in each cell."""
+        return _FLOOR / self.cells.widths.sum()
+
+
+class CellwiseDiscrepancy(DensityDiscrepancy):
+    """A discrepancy of two densities that is a sum over the cells.
+
+    Several of them, on cells of their own, are one sum over all cells.
+    """
+
+    @property
+    @abstractmethod
+    def constants(self) -> tuple[Any, ...]:
+        """Arguments of `terms` beside the density: by cell, (m,) or (..., m), or one number."""
+
+    @abstractmethod
+    def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
+        """Return the term of each cell, shape (..., m); it reads nothing but the metric and these.
+
+        The constants may be those of several records side by side.
+        """
+
+    def outer(self, *features: Any, xp: Any) -> Any:
+        """Return the sum over the cells."""
+        (density,) = features
+        return self.terms(density, self.constants, xp).sum(axis=-1)
+
+
+class DensitySum(PartSum):
+    """Components that compare densities, side by side: one product gives all densities."""
+
+    @cached_property
+    def cells(self) -> list[Cells]:
+        """The cells of each component."""
+        return [cast(DensityDiscrepancy, part.target).cells for part in self.parts]
+
+    @cached_property
+    def _slices(self) -> list[slice]:
+        """The place of each component's cells."""
+        sizes = [cells.widths.size for cells in self.cells]
+        ends = np.cumsum(sizes).tolist()
+        return [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+
+    @property
+    def n_cells(self) -> int:
+        """Number of all cells."""
+        return int(self._slices[-1].stop)
+
+    @cached_property
+    def _constants(self) -> tuple[Floats, ...] | None:
+        """The constants of one sum over all cells; None unless each component is such a sum."""
+        targets = [part.target for part in self.parts]
+        if any(type(target).outer is not CellwiseDiscrepancy.outer for target in targets):
+            return None
+        by_part = [cast(CellwiseDiscrepancy, target).constants for target in targets]
+        return tuple(self._side_by_side(numbers) for numbers in zip(*by_part, strict=True))
+
+    def _side_by_side(self, numbers: tuple[Any, ...]) -> Floats:
+        """Return numbers by cell, (..., m_k) or one for all of a component, as (..., all cells)."""
+        batch = np.broadcast_shapes(*(np.shape(x)[:-1] for x in numbers))
+        columns = [
+            np.broadcast_to(x, (*batch, cells.widths.size))
+            for x, cells in zip(numbers, self.cells, strict=True)
+        ]
+        return np.concatenate(columns, axis=-1)
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
+        """Return the densities side by side, (..., cells)."""
+        return (xp.concatenate(super().features(simulated, weights, xp), axis=-1),)
+
+    def basis(self, simulated: Floats, most: float) -> Basis:
+        """Return one matrix, (n, cells), or the projections where they are smaller."""
+        if len(self.parts) > 1 and len(simulated) * self.n_cells > most:
+            projections = np.stack([values for _, values in self.projected(simulated)], axis=-1)
+            return BinnedBasis((projections,), self)
+        matrix = np.empty((len(simulated), self.n_cells))
+        values_by_part = (values for _, values in self.projected(simulated))
+        for values, cells, place in zip(values_by_part, self.cells, self._slices, strict=True):
+            matrix[:, place] = cells.basis(values)
+        return DenseBasis((matrix,))
+
+    def binned(self, projections: Floats, weights: Floats) -> Floats:
+        """Return the densities side by side, (n, K), (..., n) -> (..., cells)."""
+        densities = [
+            cells.density(np.broadcast_to(values, weights.shape), weights)
+            for values, cells in zip(projections.T, self.cells, strict=True)
+        ]
+        return np.concatenate(densities, axis=-1)
+
+    def adjoint(self, projections: Floats, cotangent: Floats) -> Floats:
+        """Return the derivatives for the weights of the sum of `binned` times the cotangent.
+
+        Shapes (n, K), (..., cells) -> (..., n).
+        """
+        total: Any = 0.0
+        for values, cells, place in zip(projections.T, self.cells, self._slices, strict=True):
+            total = total + cells.value(values, cotangent[..., place])
+        return np.asarray(total)
+
+    def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
+        """Return the sum of the components, in one pass over all cells where possible."""
+        (densities,) = features
+        if self._constants is None:
+            by_part = tuple(densities[..., place] for place in self._slices)
+            return super().outer(by_part, shares, xp)
+        sizes = [cells.widths.size for cells in self.cells]
+        by_cell = np.repeat(shares, sizes, axis=-1)
+        first = cast(CellwiseDiscrepancy, self.parts[0].target)
+        return (first.terms(densities, self._constants, xp) * by_cell).sum(axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class BinnedBasis(Basis):
+    """Projections of stored responses, (n, K), which are binned for each row of weights."""
+
+    densities: DensitySum
+
+    def features(self, weights: Any, xp: Any = np) -> Features:
+        """Return the densities side by side, (..., n) -> (..., cells)."""
+        (projections,) = self.arrays
+        return (self.densities.binned(projections, weights),)
+
+
+def is_differentiable(target: Discrepancy) -> bool:
+    """Return whether a discrepancy has second derivatives in the population's values and weights.
+
+    A histogram has none in the values.
+    """
+    targets = [part.target for part in target.parts]
+    return all(
+        inner.metric.minimum is Minimum.QUADRATIC
+        and not (isinstance(inner, DensityDiscrepancy) and not inner.cells.smooth)
+        for inner in targets
+    )
+
+
+def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
+    """Return the smallest cosine of a simulated and an observed density, (..., n) -> (...).
+
+    One if they are equal, zero if disjoint. Mass outside the inner cells counts in neither. One for
+    components that compare no densities.
+    """
+    batch = np.shape(simulated)[: np.ndim(simulated) - 1 - len(target.event)]
+    smallest = np.ones(batch)
+    for inner, values in PartSum(target.parts).projected(simulated):
+        if not isinstance(inner, DensityDiscrepancy):
+            continue
+        p = inner.cells.density(values, weights)[..., :-2]
+        q = inner.density[..., :-2]
+        dz = inner.cells.widths[:-2]
+        size = np.sqrt(((p**2) * dz).sum(axis=-1) * ((q**2) * dz).sum(axis=-1))
+        cosine = (p * q * dz).sum(axis=-1) / np.where(size > 0, size, 1.0)
+        smallest = np.minimum(smallest, np.nan_to_num(cosine))
+    return smallest

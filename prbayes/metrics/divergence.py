@@ -6,8 +6,14 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
 from prbayes._validate import Floats, flag
-from prbayes.metrics.base import CellwiseDiscrepancy, Discrepancy, Metric, Minimum, raised
-from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
+from prbayes.metrics.base import Discrepancy, Metric, Minimum
+from prbayes.metrics.density import (
+    CellwiseDiscrepancy,
+    DensityEstimator,
+    GaussianKDE,
+    density_estimator,
+    floored,
+)
 
 
 @dataclass(frozen=True)
@@ -69,14 +75,12 @@ class DivergenceDiscrepancy(CellwiseDiscrepancy):
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """The observed density and the floor of the other, and the widths."""
-        return self.floored(self.density), self.least, self.cells.widths
+        """The observed density, the floor of the simulated one, and the widths."""
+        return self.floored(self.density), self.floor, self.cells.widths
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return the integral of a log(a / b), (a, b) = (q, p) forward, (p, q) in reverse."""
-        q, least, widths = constants
-        p = raised(density, least)
+        q, floor, widths = constants
+        p = floored(density, floor)
         a, b = (p, q) if self.metric.reverse else (q, p)
-        ratio = xp.log(a / b)
-        integrand = a * ratio
-        return integrand * widths
+        return a * xp.log(a / b) * widths

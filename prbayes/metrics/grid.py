@@ -6,16 +6,21 @@ both derivatives are given.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, update_wrapper
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.metrics._loops import SPLINE, count, read, smooth
+
+# The four uniform cubic B-splines that reach a point at fraction t between two nodes: coefficients
+# of 1, t, t^2, t^3 (any textbook on splines).
+_SPLINE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
 
 
 def product(weights: Floats, matrix: Floats) -> Floats:
@@ -183,12 +188,12 @@ class KernelCells(Cells):
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the smoothed cotangent at the sample; the kernel is its own transpose."""
         outer = cotangent[..., -2:] / self.widths[-1]
-        return self._interpolated(sample, cotangent, SPLINE, outer)
+        return self._interpolated(sample, cotangent, _SPLINE, outer)
 
     def slope(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the derivative of the smoothed cotangent at the sample."""
         powers = [1, 2, 3]
-        derivatives = SPLINE[:, 1:] * powers / self.step
+        derivatives = _SPLINE[:, 1:] * powers / self.step
         quadratics = np.pad(derivatives, [(0, 0), (0, 1)])
         constant = np.zeros(2)
         return self._interpolated(sample, cotangent, quadratics, constant)
@@ -318,3 +323,127 @@ class BinCells(Cells):
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
         shape = (*batch, sample.shape[-1])
         return np.zeros(shape)
+
+
+def compiled[**P](loop: Callable[P, None]) -> Callable[P, None]:
+    """Compile at the first call, since Numba takes long to import; keep the result on disk."""
+
+    @cache
+    def compiled() -> Callable[P, None]:
+        from numba import njit
+
+        try:
+            return njit(cache=True, nogil=True)(loop)
+        except RuntimeError:  # there is no folder where it can be kept
+            return njit(nogil=True)(loop)
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> None:
+        compiled()(*args, **kwargs)
+
+    return update_wrapper(call, loop)
+
+
+@compiled
+def count(
+    sample: Floats,
+    weights: Floats,
+    equal: bool,
+    low: float,
+    inverse: float,
+    before: int,
+    counts: Floats,
+    outside: Floats,
+) -> None:
+    """Add weights at the nodes of a grid, spread by cubic B-splines, and those outside it.
+
+    Node k is at ``(low + k - before) / inverse``. The sample has shape (1 or rows, n), the counts
+    (rows, g), ``outside`` (rows, 2); the weights are flat, and only the first counts if they are
+    equal. NaN counts nowhere.
+    """
+    n = sample.shape[1]
+    rows, g = counts.shape
+    moments = np.zeros((g, 4))  # sums of 1, t, t^2, t^3 beyond each node
+    for r in range(rows):
+        values = sample[r % len(sample)]
+        # Sum the powers of the fractions of all values beyond a node.
+        for i in range(n):
+            t = values[i] * inverse - low
+            w = weights[0] if equal else weights[r * n + i]
+            if 1 - before <= t < g - 2 - before:
+                left = math.floor(t)
+                t -= left
+                for power in range(4):
+                    moments[left + before, power] += w
+                    w *= t
+            elif t < 1 - before:
+                outside[r, 0] += w
+            elif t >= g - 2 - before:
+                outside[r, 1] += w
+        # Four splines reach these values: the nodes around them get their shares.
+        for node in range(1, g - 2):
+            m = moments[node]
+            if m.any():
+                for k in range(4):
+                    for power in range(4):
+                        counts[r, node - 1 + k] += _SPLINE[k, power] * m[power]
+                m[:] = 0
+
+
+@compiled
+def smooth(values: Floats, kernel: Floats, first_at: int, out: Floats) -> None:
+    """Add the convolution of rows, zero beyond their ends, with a kernel to ``out``.
+
+    The rows have shape (rows, g), ``out`` (rows, m); the first of g stands at ``first_at`` among
+    the m, which may be before or behind them all.
+    """
+    rows, g = values.shape
+    m = out.shape[1]
+    half = len(kernel) // 2
+    for r in range(rows):
+        for node in range(g):
+            value = values[r, node]
+            at = node + first_at
+            first = max(0, at - half)
+            last = min(m, at + half + 1)
+            if value != 0 and first < last:
+                target = out[r, first:last]
+                weights = kernel[first - at + half :]
+                for k in range(last - first):
+                    target[k] += value * weights[k]
+
+
+@compiled
+def read(
+    sample: Floats,
+    coefficients: Floats,
+    outside: Floats,
+    low: float,
+    inverse: float,
+    before: int,
+    out: Floats,
+) -> None:
+    """Evaluate piecewise cubics at a sample, shape (1 or rows, n), into ``out``, shape (rows, n).
+
+    The coefficients of 1, t, t^2, t^3 beyond each node, which are those of `count`, have shape
+    (rows, g, 4); values below and above the grid get those of ``outside``, shape (rows, 2), and NaN
+    gets zero.
+    """
+    rows, n = out.shape
+    g = coefficients.shape[1]
+    for r in range(rows):
+        values = sample[r % len(sample)]
+        for i in range(n):
+            t = values[i] * inverse - low
+            if 1 - before <= t < g - 2 - before:
+                left = math.floor(t)
+                t -= left
+                c = coefficients[r, left + before]
+                value = c[2] + t * c[3]
+                value = c[1] + t * value
+                out[r, i] = c[0] + t * value
+            elif t < 1 - before:
+                out[r, i] = outside[r, 0]
+            elif t >= g - 2 - before:
+                out[r, i] = outside[r, 1]
+            else:
+                out[r, i] = 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
@@ -17,14 +16,15 @@ from prbayes.metrics.components import (
     Components,
     principal_components,
 )
-from prbayes.metrics.directions import directions, enough
-from prbayes.metrics.lifted import LiftedMetric, failure_caps
-from prbayes.metrics.multivariate import Centered, CompositeDiscrepancy, Projection
+from prbayes.metrics.multivariate import (
+    CompositeDiscrepancy,
+    LiftedMetric,
+    directions,
+    failure_caps,
+    sufficient_directions,
+)
+from prbayes.metrics.views import Centered, Projection
 from prbayes.metrics.whitening import Whitening, units, whitening
-
-# By judgement: sets of measured outputs that are compared by themselves, each with directions of
-# its own.
-_PATTERNS = 8
 
 
 @dataclass(frozen=True)
@@ -104,114 +104,101 @@ class Joint(LiftedMetric):
             positive_integer(self.components, "components")
         positive_integer(self.random_seed, "random_seed", minimum=0)
 
-    def beside(self, observed: Floats, weights: Floats, design: Floats, inputs: int) -> Discrepancy:
-        """Return the discrepancy with principal components of a design, (k, m), as well."""
-        return self._made(observed, weights, design, inputs)
+    def beside(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
+        """Return the discrepancy with principal components of data and design together.
 
-    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
-        if observed.shape[1] == 1:
-            return super()._prepare(observed, weights)
-        return self._made(observed, weights, None, None)
+        Inputs fewer than the outputs matter as well.
+        """
+        if target.observed.ndim < 2 or target.observed.shape[1] < 2:
+            return target
+        components = target.components if isinstance(target, CompositeDiscrepancy) else ()
+        if not components and n_inputs >= target.observed.shape[1]:
+            return target
+        return self._prepare_outputs(target.observed, target.weights, design, n_inputs)
 
-    def _parts(self, observed: Floats, weights: Floats) -> Sequence[Part]:
-        return self._made(observed, weights, None, None).parts
-
-    def _made(
-        self, observed: Floats, weights: Floats, design: Floats | None, inputs: int | None
+    def _prepare_outputs(
+        self,
+        observed: Floats,
+        weights: Floats,
+        design: Floats | None = None,
+        n_inputs: int | None = None,
     ) -> Discrepancy:
+        """Return the mean over directions, for each set of outputs that specimens have."""
         caps = failure_caps(observed)
         parts: list[Part] = []
         components: list[Components] = []
         for outputs, share in patterns(observed, weights):
-            known = None
+            runs = None
             if design is not None:
-                known = _known(design[:, outputs], caps[outputs])
-            slices, found = self._slices(observed, weights, outputs, caps, share, known, inputs)
-            parts += slices
-            components += found
+                runs = design[:, outputs]
+                runs = _capped(runs[~np.isnan(runs).any(axis=1)], caps[outputs])
+            sample = observed[:, outputs]
+            white, principal = self._white(sample, weights, outputs, caps[outputs], runs, n_inputs)
+            components += principal
+            centered = Centered(outputs, caps[outputs], white.center)
+            m = white.axes.shape[1]
+            number = 1 if m == 1 else self.directions or sufficient_directions(m)
+            which = ""
+            if outputs.size < observed.shape[1]:
+                which = f" of outputs {', '.join(map(str, outputs.tolist()))}"
+            for k, direction in enumerate(directions(m, number, self.random_seed)):
+                view = Projection(centered, white.axes @ direction)
+                values, index = view.observed_of(observed)
+                target = self.metric.against(values, weights[index])
+                parts.append(Part(target, share / number, f"direction {k + 1}{which}", view))
         targets = self.metric.on_one_scale([part.target for part in parts])
         parts = [replace(p, target=target) for p, target in zip(parts, targets, strict=True)]
         return CompositeDiscrepancy.of_parts(self, observed, weights, parts, tuple(components))
 
-    def _slices(
-        self,
-        observed: Floats,
-        weights: Floats,
-        outputs: NDArray[np.intp],
-        caps: Floats,
-        share: float,
-        design: Floats | None,
-        inputs: int | None,
-    ) -> tuple[list[Part], list[Components]]:
-        """Return the parts that compare some outputs, of all specimens that have them."""
-        chosen = observed[:, outputs]
-        white, found = self._white(chosen, weights, outputs, caps[outputs], design, inputs)
-        centered = Centered(outputs, caps[outputs], white.center)
-        m = white.axes.shape[1]
-        number = 1 if m == 1 else self.directions or enough(m)
-        of = ""
-        if outputs.size < observed.shape[1]:
-            listed = ", ".join(map(str, outputs.tolist()))
-            of = f" of outputs {listed}"
-        parts = []
-        for k, direction in enumerate(directions(m, number, self.random_seed)):
-            view = Projection(centered, white.axes @ direction)
-            values, index = view.observed_of(observed)
-            target = self.metric.against(values, weights[index])
-            label = f"direction {k + 1}{of}"
-            parts.append(Part(target, share / number, label, view))
-        return parts, found
-
     def _white(
         self,
-        chosen: Floats,
+        sample: Floats,
         weights: Floats,
         outputs: NDArray[np.intp],
         caps: Floats,
         design: Floats | None,
-        inputs: int | None,
+        n_inputs: int | None,
     ) -> tuple[Whitening, list[Components]]:
         """Return white coordinates of some outputs, or of their principal components."""
-        many = outputs.size > MOST_OUTPUTS or self.components is not None
-        if outputs.size < 2 or not many:
-            finite = np.isfinite(chosen).all(axis=-1)
-            sample = chosen[finite]
-            own = weights[finite]
-            white = whitening(sample, own, outputs)
-            if inputs is not None and inputs < outputs.size:
-                white = _flat(sample, own, outputs, inputs) or white
+        uses_components = outputs.size > MOST_OUTPUTS or self.components is not None
+        if outputs.size < 2 or not uses_components:
+            is_finite = np.isfinite(sample).all(axis=-1)
+            sample, weights = sample[is_finite], weights[is_finite]
+            white = whitening(sample, weights, outputs)
+            if n_inputs is not None and n_inputs < outputs.size:
+                white = _flat(sample, weights, outputs, n_inputs) or white
             return white, []
-        has = ~np.isnan(chosen).any(axis=-1)
-        sample = _capped(chosen[has], caps)
-        own = weights[has]
-        own = own / own.sum()
-        found = principal_components(sample, own, self.components, design)
-        scores = (sample - found.center) @ found.axes
-        white = whitening(scores, own, np.arange(found.number))
-        center = found.center + found.axes @ white.center
-        axes = found.axes @ white.axes
-        return Whitening(center, axes), [found]
+        is_complete = ~np.isnan(sample).any(axis=-1)
+        sample, weights = _capped(sample[is_complete], caps), weights[is_complete]
+        weights = weights / weights.sum()
+        principal = principal_components(sample, weights, self.components, design)
+        return _whitened_scores(principal, sample, weights), [principal]
+
+
+def _whitened_scores(principal: Components, sample: Floats, weights: Floats) -> Whitening:
+    """Return white coordinates of the scores on principal components."""
+    scores = (sample - principal.center) @ principal.axes
+    white = whitening(scores, weights, np.arange(principal.number))
+    center = principal.center + principal.axes @ white.center
+    return Whitening(center, principal.axes @ white.axes)
 
 
 def _flat(
-    sample: Floats, weights: Floats, outputs: NDArray[np.intp], inputs: int
+    sample: Floats, weights: Floats, outputs: NDArray[np.intp], n_inputs: int
 ) -> Whitening | None:
     """Return white coordinates of a surface that outputs of fewer inputs lie on; None if too bent.
 
-    Whitening makes as much of how a surface is bent as of where on it specimens are, which tells
-    more of the population.
+    Whitening weights the bend of a surface as much as the places of specimens on it, which say more
+    about the population.
     """
-    own = weights / weights.sum()
-    center, unit = units(sample, own, outputs)
+    weights = weights / weights.sum()
+    center, unit = units(sample, weights, outputs)
     standard = (sample - center) / unit
-    for number in range(max(1, inputs), outputs.size):
-        found = principal_components(standard, own, number)
-        if found.left_out <= LEFT_OUT:
-            scores = (standard - found.center) @ found.axes
-            white = whitening(scores, own, np.arange(number))
-            middle = found.center + found.axes @ white.center
-            axes = found.axes @ white.axes
-            return Whitening(center + unit * middle, axes / unit[:, None])
+    for number in range(max(1, n_inputs), outputs.size):
+        principal = principal_components(standard, weights, number)
+        if principal.left_out <= LEFT_OUT:
+            white = _whitened_scores(principal, standard, weights)
+            return Whitening(center + unit * white.center, white.axes / unit[:, None])
     return None
 
 
@@ -220,16 +207,11 @@ def _capped(outputs: Floats, caps: Floats) -> Floats:
     return np.where(np.isposinf(outputs), caps, outputs)
 
 
-def _known(design: Floats, caps: Floats) -> Floats:
-    """Return the runs of a design that have outputs, failures as the cap."""
-    return _capped(design[~np.isnan(design).any(axis=1)], caps)
-
-
 def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], float]]:
     """Return the sets of outputs that are compared, and the share of each, (N, m), (N,).
 
-    They are those that specimens have, or what these have in common where there are too many, or
-    too few specimens that have them.
+    They are those of the specimens, or their intersections where there are too many sets, or too
+    few specimens with a set.
     """
     counted = weights > 0
     has = ~np.isnan(observed[counted])
@@ -238,52 +220,42 @@ def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], 
         key = frozenset(np.flatnonzero(row).tolist())
         shares[key] = shares.get(key, 0.0) + float(weight)
     while len(shares) > 1:
-        thin = [key for key in shares if len(key) > 1 and _is_thin(key, has)]
-        if thin:
-            _divide(shares, min(thin, key=_order))
-        elif len(shares) <= _PATTERNS or not _merge(shares):
+        rare = [key for key in shares if len(key) > 1 and _is_rare(key, has)]
+        if rare:
+            _divide(shares, min(rare, key=_order))
+        elif len(shares) <= 8 or not _merge(shares):  # each set has its own directions
             break
-    found = []
-    for key in sorted(shares, key=_order):
-        outputs = np.array(sorted(key))
-        found.append((outputs, shares[key]))
-    return found
+    return [(np.array(sorted(key)), shares[key]) for key in sorted(shares, key=_order)]
 
 
 def _order(key: frozenset[int]) -> tuple[int, list[int]]:
-    """Return what sorts sets of outputs: the largest first."""
+    """Return a key that sorts sets of outputs: the largest first."""
     return -len(key), sorted(key)
 
 
-def _is_thin(key: frozenset[int], has: NDArray[np.bool_]) -> bool:
+def _is_rare(key: frozenset[int], has: NDArray[np.bool_]) -> bool:
     """Return whether too few specimens have these outputs to whiten them, or their components."""
     needed = len(key) + 2 if len(key) <= MOST_OUTPUTS else FEWEST
     return int(has[:, list(key)].all(axis=-1).sum()) < needed
 
 
-def _divide(shares: dict[frozenset[int], float], thin: frozenset[int]) -> None:
-    """Give the share of a set to the largest that it has in common with another, or its members."""
-    share = shares.pop(thin)
-    common = []
-    for other in shares:
-        both = thin & other
-        if both and both != thin:
-            common.append(both)
-    heirs = [frozenset([output]) for output in thin]
+def _divide(shares: dict[frozenset[int], float], rare: frozenset[int]) -> None:
+    """Move the share of a set to its largest intersection with another, or to its members."""
+    share = shares.pop(rare)
+    common = [rare & key for key in shares if rare & key and rare & key != rare]
+    heirs = [frozenset([output]) for output in rare]
     if common:
         most = max(map(len, common))
-        largest = [both for both in common if len(both) == most]
-        heirs = [min(largest, key=_order)]
+        heirs = [min((key for key in common if len(key) == most), key=_order)]
     for heir in heirs:
         shares[heir] = shares.get(heir, 0.0) + share / len(heirs)
 
 
 def _merge(shares: dict[frozenset[int], float]) -> bool:
-    """Merge the rarest set with that with which it has most in common; whether there is one."""
+    """Replace the rarest set and its nearest by their intersection; return whether there is one."""
     rarest = min(shares, key=lambda key: (shares[key], _order(key)))
-    others = [key for key in shares if key != rarest]
-    others.sort(key=_order)
-    nearest = max(others, key=lambda key: (len(key & rarest), shares[key]))
+    candidates = sorted((key for key in shares if key != rarest), key=_order)
+    nearest = max(candidates, key=lambda key: (len(key & rarest), shares[key]))
     common = nearest & rarest
     if not common:
         return False

@@ -8,18 +8,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from prbayes._validate import Floats, flag, real_array
-from prbayes.metrics.base import (
-    CellwiseDiscrepancy,
-    Discrepancy,
-    Metric,
-    Minimum,
-    observed_density,
-    raised,
-)
+from prbayes.metrics.base import Discrepancy, Metric, Minimum
 from prbayes.metrics.density import (
+    CellwiseDiscrepancy,
     DensityEstimator,
     GaussianKDE,
     density_estimator,
+    floored,
     likelihood_bandwidth,
 )
 from prbayes.metrics.grid import Cells
@@ -247,7 +242,7 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     @classmethod
     def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
         """Return the likelihood of observed values, to be read from densities on given cells."""
-        density = observed_density(cells, observed, weights)
+        density = cells.density(observed, weights)
         reading = cells.reading(observed, weights)
         return cls(metric, observed, weights, cells, density, reading)
 
@@ -258,29 +253,28 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
         return replace(other, reading=reading)
 
     @property
-    def exact(self) -> bool:
-        """Whether the kernel is as narrow as the default."""
-        return bool(self.metric == LogLikelihood(density=GaussianKDE()))
-
-    @property
-    def resolution(self) -> float:
-        """That of a Gaussian kernel; a histogram has none."""
-        return float(getattr(self.cells, "bandwidth", 0.0))
-
-    def narrowed(self, factor: float) -> Discrepancy:
-        """Return the same with a narrower kernel; a histogram stays as it is."""
-        if not self.resolution:
-            return self
-        kernel = GaussianKDE(factor * self.resolution)
-        return LogLikelihood(density=kernel).against(self.observed, self.weights)
-
-    @property
     def constants(self) -> tuple[Any, ...]:
         """The floor of the density, and how it is read at the observed values."""
-        return self.least, self.reading
+        return self.floor, self.reading
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return what each cell adds to minus the weighted mean of log p at the observed values."""
-        least, reading = constants
-        logs = xp.log(raised(density, least))
+        floor, reading = constants
+        logs = xp.log(floored(density, floor))
         return -(logs * reading)
+
+
+def kernel_width(target: Discrepancy) -> float:
+    """Return the standard deviation of the kernel of a log-likelihood; zero if it has none."""
+    if not isinstance(target, LikelihoodDiscrepancy):
+        return 0.0
+    return float(getattr(target.cells, "bandwidth", 0.0))
+
+
+def with_narrower_kernel(target: Discrepancy, factor: float) -> Discrepancy:
+    """Return a log-likelihood with its kernel narrowed by a factor; others unchanged."""
+    width = kernel_width(target)
+    if not width:
+        return target
+    metric = LogLikelihood(density=GaussianKDE(factor * width))
+    return metric.against(target.observed, target.weights)

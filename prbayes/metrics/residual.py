@@ -9,14 +9,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from prbayes._validate import Floats, positive_number
-from prbayes.metrics.base import (
+from prbayes.metrics.base import Discrepancy, Metric, Minimum
+from prbayes.metrics.density import (
     CellwiseDiscrepancy,
-    Discrepancy,
-    Metric,
-    Minimum,
-    observed_density,
+    DensityEstimator,
+    GaussianKDE,
+    density_estimator,
 )
-from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 from prbayes.metrics.grid import Cells
 
 
@@ -73,8 +72,8 @@ class ProbabilityResidual(Metric):
 
     def on_one_scale(self, slices: Sequence[Any]) -> Sequence[Any]:
         """Return the residuals with one factor S, the smallest: that of the highest peak."""
-        smallest = min(one.scale_factor for one in slices)
-        return [replace(one, scale_factor=smallest) for one in slices]
+        smallest = min(target.scale_factor for target in slices)
+        return [replace(target, scale_factor=smallest) for target in slices]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,34 +89,31 @@ class ResidualDiscrepancy(CellwiseDiscrepancy):
 
         Against other values, by `with_observed`, it keeps this S.
         """
-        density = observed_density(cells, observed, weights)
-        peak = density.max()
-        power = np.floor(np.log10(peak))
-        scale_factor = float(metric.scale_base**-power)
+        density = cells.density(observed, weights)
+        scale_factor = float(metric.scale_base ** -np.floor(np.log10(density.max())))
         return cls(metric, observed, weights, cells, density, scale_factor)
 
     @property
     def _measure(self) -> Any:
-        """Return what a cell counts for: its width in the integral form, one in the sum form."""
+        """The measure of a cell: its width in the integral form, one in the sum form."""
         return self.cells.widths if self.cells.smooth else 1.0
 
     @property
     def _root(self) -> Any:
-        """The root of S: times a density it is of the order of one, and its square never too large.
+        """The root of S, which times a density is of the order of one.
 
-        Of NumPy's type, as PyTensor tries Python's in single precision first.
+        np.float64, because PyTensor casts Python floats to float32.
         """
         return np.sqrt(np.float64(self.scale_factor))
 
     @property
     def scale(self) -> float:
         """The residual of a population without any density: S times the integral of q squared."""
-        integrand = (self._root * self.density) ** 2 * self._measure
-        return float(integrand.sum())
+        return float(((self._root * self.density) ** 2 * self._measure).sum())
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """The root of S, the observed density, and what a cell counts for."""
+        """The root of S, the observed density, and the measure of a cell."""
         return self._root, self.density, self._measure
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import Floats
-from prbayes.metrics.base import Discrepancy, Part
+from prbayes.metrics.base import Discrepancy, Part, is_additive
 from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
 
@@ -75,9 +75,9 @@ class WeightSlopes:
     def neighbours(self, part: Part, options: ScoreOptions) -> tuple[list[Floats], list[Floats]]:
         """Return features of a part at theta plus and minus a step, (d, ...) each."""
         target = part.target
-        basis = target.stored(part.of(self.responses))
-        features = target.from_basis(self.weights[None], basis, np)
-        slopes = target.from_basis(self.slopes, basis, np)
+        basis = target.basis(part.of(self.responses))
+        features = basis.features(self.weights[None])
+        slopes = basis.features(self.slopes)
         column = self.steps(options)[:, None]
         upper, lower = [], []
         for feature, slope in zip(features, slopes, strict=True):
@@ -193,7 +193,7 @@ def specimen_scores(
     total : int
         Number of observed specimens of all simulators.
     """
-    if not target.additive:
+    if not is_additive(target):
         raise TypeError(
             f"metric: got {type(target.metric).__name__}, whose gradient is no mean over specimens "
             "of complete records, expected prb.ProbabilityResidual() or prb.KullbackLeibler()"

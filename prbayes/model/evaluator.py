@@ -276,7 +276,8 @@ class Evaluator:
                 same_size = np.shape(observed) == node.target.observed.shape
                 counted = node.target.weights if same_size else None
             target = (metric or node.metric).against(observed, counted)
-            targets.append(target.beside(node.bound.first_responses, node.bound.dimensions))
+            bound = node.bound
+            targets.append(target.metric.beside(target, bound.first_responses, bound.dimensions))
         return self.with_targets(targets)
 
     def roots(self, thetas: Floats, k: int) -> list[Floats]:

@@ -42,7 +42,7 @@ from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.model.data_checks import warn_out_of_range
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
-from prbayes.propagation.reweighted import Design, design_of
+from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
 from prbayes.response.budget import duration
 from prbayes.response.compile import PLAIN
 from prbayes.response.inputs import Inputs
@@ -109,9 +109,9 @@ class Node:
         return self.bound.populations(list(roots))
 
     @property
-    def design(self) -> Design | None:
-        """The stored responses, None where the propagation stores none."""
-        return design_of(self.bound)
+    def reweighted(self) -> ReweightedBound | None:
+        """The propagation with its design, None where it stores no responses."""
+        return reweighted_of(self.bound)
 
     @property
     def epsilon_value(self) -> float:
@@ -159,7 +159,8 @@ class Node:
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
         bound = self.bound.copied()
-        bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
+        dimensions = bound.inputs.dimensions
+        bound.target = target.metric.beside(target, bound.first_responses, dimensions)
         changed = replace(self, target=bound.target, bound=bound)
         if has_default_epsilon(self):
             changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
@@ -213,8 +214,9 @@ class Specification:
         responses.on_start = partial(_log_first_runs, self.propagation, responses)
         with shown(self.progressbar):
             bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
-            target = self.target
-            bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
+            dimensions = bound.inputs.dimensions
+            metric = self.target.metric
+            bound.target = metric.beside(self.target, bound.first_responses, dimensions)
         responses.on_start = None
         warn_out_of_range(
             self.name, self.target.observed, bound.first_responses, self.outputs.names

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pytensor import config
 from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
+from prbayes._finding import Finding, report
 from prbayes._validate import (
     Floats,
     called,
@@ -27,7 +27,7 @@ from prbayes._validate import (
     sample_labels,
     sample_weights,
 )
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.first_look import tell_copies
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
@@ -55,8 +55,6 @@ from prbayes.response.groups import Groups, is_group, places_of
 from prbayes.response.inputs import Inputs, is_labelled, model_on_context, read_inputs
 from prbayes.response.outputs import ONE, Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
-
-_log = logging.getLogger("prbayes")
 
 
 def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
@@ -493,7 +491,7 @@ def _observed_term(
     if term.labels is None:
         tell_copies(name, target.observed)
     if epsilon is None:
-        epsilon = 1 / effective_specimens(target, term.labels) if target.likelihood else np.nan
+        epsilon = 1 / effective_specimens(target, term.labels) if is_likelihood(target) else np.nan
     specification = Specification(
         name,
         target,
@@ -739,11 +737,13 @@ def _warn_of_shared_specimens(simulator: AnySimulator, others: list[AnySimulator
         if theirs is None or own.isdisjoint(theirs.tolist()):
             continue
         if has_default_epsilon(simulator) or has_default_epsilon(other):
-            _log.warning(
-                "%s and %s share specimens, and each epsilon counts them: under pm.sample they "
-                "count twice, and the posterior comes out too narrow; call "
-                "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) before, or use "
-                "prb.sample, whose posterior counts them once",
-                other.name,
-                simulator.name,
+            report(
+                Finding(
+                    "shared-specimens",
+                    f"{other.name} and {simulator.name} share specimens, and each epsilon "
+                    "counts them: under pm.sample they count twice, and the posterior comes "
+                    "out too narrow; call "
+                    "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) "
+                    "before, or use prb.sample, whose posterior counts them once.",
+                )
             )

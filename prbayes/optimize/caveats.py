@@ -6,17 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding
 from prbayes._stats import distribution_function, quantile
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.discrepancy_confounding import confounded
-from prbayes.inference.checks.prior_ends import at_prior_ends, of_prior_ends
+from prbayes.inference.checks.prior_ends import at_prior_ends, prior_end_findings
 from prbayes.inference.identifiability import unidentified_directions, without
 from prbayes.inference.projections import number_parts, one_dimensional
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import dependent
-from prbayes.metrics.base import Minimum
+from prbayes.metrics.base import Minimum, is_likelihood
+from prbayes.metrics.likelihood import kernel_width
+from prbayes.metrics.multivariate import components_missed
 from prbayes.model.elements import read_variables, split_elements, told_elements
 from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.labels import labelled
@@ -51,31 +53,35 @@ _NO_MEAN = 1.1
 # ones is the density to some per cent: by Poisson's summation 2 exp(-2 (pi / 2.5)^2) = 9% at a
 # spacing of 2.5, and .001% at one of 1.25.
 _APART_BY = 1.25
-# Where metrics are chosen by what data are like.
-_OF_METRICS = more_in("choosing_metric.md#advice")
 # Halvings of the way back to the middle of the prior: a thousandth of it is a tenth of a spread
 # where an optimum is a hundred spreads out.
 _HALVINGS = 10
 
 
-def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
+def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[Finding]:
     """Say why no sampling distribution is known: elements at an edge, simulators that jump."""
-    lines = []
+    findings = []
     if at_edge:
-        names = ", ".join(at_edge)
-        lines.append(
-            f"{names} ran to the edge of the support, where the discrepancy no longer changes; "
-            "perhaps the population has collapsed within the bandwidth of the metric: use a "
-            f"smaller bandwidth, or prb.AreaMetric(), which has none{_OF_METRICS}"
+        findings.append(
+            Finding(
+                "flat-edge",
+                f"{', '.join(at_edge)} ran to the edge of the support, where the discrepancy no "
+                "longer changes; perhaps the population has collapsed within the bandwidth of the "
+                "metric: use a smaller bandwidth, or prb.AreaMetric(), which has none.",
+                "choosing_metric.md#advice",
+            )
         )
     if at_jump:
-        names = ", ".join(at_jump)
-        lines.append(
-            f"{names}: points lose their response at the optimum, and the discrepancy jumps "
-            "there by more than it changes otherwise: use prb.AreaMetric(), prb.Reweighted(), or "
-            f"more responses{more_in('choose.md#the-propagation')}"
+        findings.append(
+            Finding(
+                "jump-at-optimum",
+                f"{', '.join(at_jump)}: points lose their response at the optimum, and the "
+                "discrepancy jumps there by more than it changes otherwise: use prb.AreaMetric(), "
+                "prb.Reweighted(), or more responses.",
+                "choose.md#the-propagation",
+            )
         )
-    return lines
+    return findings
 
 
 def no_information(evaluator: Evaluator, theta: Floats) -> bool:
@@ -182,12 +188,12 @@ def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:
     return largest
 
 
-def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[str]:
+def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
     """Say which populations have no mean, or hardly one, so that their area is not known.
 
     Of stored responses only: others would be computed for it.
     """
-    lines = []
+    findings = []
     for k, node in enumerate(evaluator.nodes):
         if node.metric.minimum is not Minimum.ABSOLUTE or not node.bound.stored:
             continue
@@ -195,14 +201,18 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[str]:
         seen = one_dimensional(node.target, values[0])
         index = min(_tail_index(numbers, weights[0]) for numbers in seen)
         if index < _NO_MEAN:
-            lines.append(
-                f"{node.name}: the tail of the simulated responses is so long (tail index "
-                f"{index:.2f}, of which one or less has no mean) that the area between "
-                "distribution functions is infinite, or rests on responses beyond all that were "
-                "computed: use prb.ProbabilityResidual() or prb.KullbackLeibler(), inputs with a "
-                f"mean, or the logarithm of the response{_OF_METRICS}"
+            findings.append(
+                Finding(
+                    "heavy-tail",
+                    f"{node.name}: the tail of the simulated responses is so long (tail index "
+                    f"{index:.2f}, of which one or less has no mean) that the area between "
+                    "distribution functions is infinite, or rests on responses beyond all that "
+                    "were computed: use prb.ProbabilityResidual() or prb.KullbackLeibler(), inputs "
+                    "with a mean, or the logarithm of the response.",
+                    "choosing_metric.md#advice",
+                )
             )
-    return lines
+    return findings
 
 
 def _tail_index(values: Floats, weights: Floats) -> float:
@@ -225,18 +235,18 @@ def _tail_index(values: Floats, weights: Floats) -> float:
     return min(found)
 
 
-def between_runs(evaluator: Evaluator, theta: Floats) -> list[str]:
+def between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
     """Say which observed values lie where a density is read between responses too far apart.
 
     Of stored responses only: common points move with theta.
     """
-    lines = []
+    findings = []
     for k, node in enumerate(evaluator.nodes):
         if not node.bound.stored:
             continue
         values, _ = evaluator.populations(theta[None], k)
         for part in number_parts(node.target):
-            width = part.target.resolution
+            width = kernel_width(part.target)
             if not width > 0:
                 continue
             observed = part.target.observed
@@ -244,13 +254,17 @@ def between_runs(evaluator: Evaluator, theta: Floats) -> list[str]:
             lonely = _nearest(part.of(values[0]), observed) > _APART_BY * width
             if lonely.any():
                 told = ", ".join(f"{value:.4g}" for value in observed[lonely][:3])
-                lines.append(
-                    f"{node.name}: {int(lonely.sum())} of {observed.size} observed values ({told}) "
-                    "lie between responses that are farther apart than the kernel is wide, so that "
-                    "their likelihood is not known: pass a larger prb.Reweighted(n), until the "
-                    f"optimum stays, or use prb.KullbackLeibler(){_OF_METRICS}"
+                findings.append(
+                    Finding(
+                        "data-between-runs",
+                        f"{node.name}: {int(lonely.sum())} of {observed.size} observed values "
+                        f"({told}) lie between responses that are farther apart than the kernel is "
+                        "wide, so that their likelihood is not known: pass a larger "
+                        "prb.Reweighted(n), until the optimum stays, or use prb.KullbackLeibler().",
+                        "choosing_metric.md#advice",
+                    )
                 )
-    return lines
+    return findings
 
 
 def _nearest(values: Floats, places: Floats) -> Floats:
@@ -266,26 +280,30 @@ def caveats(
     sampling: SamplingDistribution | None,
     others: Sequence[Rival],
     design_error: float,
-) -> tuple[str, ...]:
+) -> tuple[Finding, ...]:
     """Say what is not seen, is identified only by the prior, or could as well be elsewhere.
 
     And whether the design is too small.
     """
-    lines = [f"{node.name}: {node.target.missed}" for node in evaluator.nodes if node.target.missed]
+    missed = {node.name: components_missed(node.target) for node in evaluator.nodes}
+    findings = [
+        Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
+    ]
     if design_error > _TOLERATED:
-        lines.append(_of_design(evaluator, design_error))
+        findings.append(_of_design(evaluator, design_error))
     for rival in others:
         if rival.comparable:
-            lines.append(_of_rival(evaluator, rival))
+            findings.append(_of_rival(evaluator, rival))
     if sampling is not None:
         ends = at_prior_ends(sampling)
-        lines += of_prior_ends(ends)
-        lines += not_identified(evaluator, sampling.local, [end.name for end in ends])
-        lines += confounded(evaluator, sampling.local)
-    return tuple(lines)
+        page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
+        findings += prior_end_findings(ends, page)
+        findings += not_identified(evaluator, sampling.local, [end.name for end in ends])
+        findings += confounded(evaluator, sampling.local)
+    return tuple(findings)
 
 
-def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[str]:
+def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[Finding]:
     """Report simulators of so few specimens that the spread in common is estimated too small.
 
     Bandwidths of few data let simulators that happen to scatter little weigh most, and a sum of
@@ -293,7 +311,7 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[str]:
     """
     nodes = evaluator.nodes
     is_biased = [
-        node.metric.minimum is Minimum.ABSOLUTE or node.target.likelihood for node in nodes
+        node.metric.minimum is Minimum.ABSOLUTE or is_likelihood(node.target) for node in nodes
     ]
     fewest = min((len(node.observed) for node in nodes), default=enough)
     if len(nodes) < 2 or fewest >= enough or not any(is_biased) or dependent(nodes):
@@ -301,10 +319,13 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[str]:
     if not _have_hyperparameters_in_common(evaluator):
         return []
     return [
-        f"the optimum underestimates a spread that {len(nodes)} simulators have in common, as they "
-        f"have {fewest} specimens or more, expected at least {enough}: by 30% with 4, 10% with 10; "
-        "take the posterior of prb.sample, which corrects for it, or prb.ProbabilityResidual(), or "
-        "give one simulator all specimens of a condition"
+        Finding(
+            "small-simulators",
+            f"The optimum underestimates a spread that {len(nodes)} simulators have in common, as "
+            f"they have {fewest} specimens or more, expected at least {enough}: by 30% with 4, 10% "
+            "with 10; take the posterior of prb.sample, which corrects for it, or "
+            "prb.ProbabilityResidual(), or give one simulator all specimens of a condition.",
+        )
     ]
 
 
@@ -323,29 +344,30 @@ def _have_hyperparameters_in_common(evaluator: Evaluator) -> bool:
     return bool((count > 1).any())
 
 
-def not_identified(evaluator: Evaluator, local: Local, told: Sequence[str] = ()) -> list[str]:
+def not_identified(evaluator: Evaluator, local: Local, told: Sequence[str] = ()) -> list[Finding]:
     """Say about which directions the data tell less than the prior, without those told of."""
     hidden = without(local.unidentified, only_through_prior(evaluator))
     directions = unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
     return [_of_direction(direction) for direction in directions if direction not in told]
 
 
-def _of_design(evaluator: Evaluator, error: float) -> str:
+def _of_design(evaluator: Evaluator, error: float) -> Finding:
     designs = evaluator.designs.values()
     runs = max(design.n_runs for design in designs)
-    apart = f"the optimum of another design would differ by about {error:.2f} standard errors, "
+    apart = f"The optimum of another design would differ by about {error:.2f} standard errors, "
     apart += f"expected at most {AGREE}; "
-    more = more_in("choose.md#how-many-responses")
     if min(len(design.contents.cloud or ()) for design in designs) < LARGEST_CLOUD:
-        return f"{apart}pass a larger n or max_points to prb.Reweighted (now {runs} runs){more}"
-    return (
-        f"{apart}between its {runs} runs are {LARGEST_CLOUD} emulated points, the most there are: "
-        "more runs help as far as the emulator is off, which the message says, and the rest counts "
-        f"as another error of the optimum{more}"
-    )
+        advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
+    else:
+        advice = (
+            f"between its {runs} runs are {LARGEST_CLOUD} emulated points, the most there are: "
+            "more runs help as far as the emulator is off, which the message says, and the rest "
+            "counts as another error of the optimum"
+        )
+    return Finding("design-error", f"{apart}{advice}.", "choose.md#how-many-responses")
 
 
-def _of_rival(evaluator: Evaluator, rival: Rival) -> str:
+def _of_rival(evaluator: Evaluator, rival: Rival) -> Finding:
     # Beside another point, by which what is the same everywhere is seen.
     points = evaluator.hyperparameters.constrained(
         np.stack([rival.theta, evaluator.hyperparameters.initial])
@@ -354,17 +376,20 @@ def _of_rival(evaluator: Evaluator, rival: Rival) -> str:
     values = labelled(evaluator, {name: points[name] for name in read}, {"point": 2}).data_vars
     elements = split_elements(values)
     place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in told_elements(values))
-    return (
-        f"the data could as well come from {place}: another optimum, or mirror "
+    return Finding(
+        "second-mode",
+        f"The data could as well come from {place}: another optimum, or mirror "
         "solution, whose discrepancy differs by no more than sampling noise; state a prior that "
-        f"excludes one, or report both{more_in('optimum_or_abc.md#two-answers')}"
+        "excludes one, or report both.",
+        "optimum_or_abc.md#two-answers",
     )
 
 
-def _of_direction(direction: str) -> str:
-    more = more_in("optimum_or_abc.md#no-answer")
-    return (
-        f"the data tell less than the prior about {direction} (in units of the priors' standard "
+def _of_direction(direction: str) -> Finding:
+    return Finding(
+        "not-identified",
+        f"The data tell less than the prior about {direction} (in units of the priors' standard "
         "deviations): it is not identified by them, and its posterior rests on the prior; measure "
-        f"more outputs or conditions, or state what is known{more}"
+        "more outputs or conditions, or state what is known.",
+        "optimum_or_abc.md#no-answer",
     )

@@ -17,6 +17,7 @@ from prbayes._progress import progress
 from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
+from prbayes.metrics.density import overlap as density_overlap
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, differences
@@ -520,7 +521,8 @@ def areas(evaluator: Evaluator, scales: Floats, thetas: Floats) -> Floats:
 def overlap(evaluator: Evaluator, values: list[Floats], weights: list[Floats]) -> Floats:
     """Return the smallest overlap over simulators with densities, (P,); one where there is none."""
     overlaps = [
-        n.target.overlap(v, w) for n, v, w in zip(evaluator.nodes, values, weights, strict=True)
+        density_overlap(n.target, v, w)
+        for n, v, w in zip(evaluator.nodes, values, weights, strict=True)
     ]
     return np.min([np.ones(len(values[0])), *overlaps], axis=0)
 
@@ -536,7 +538,7 @@ def apart_from_data(evaluator: Evaluator, theta: Floats, least: float = OVERLAP)
         return False
     values, weights = _populations(evaluator, theta[None])
     every = zip(evaluator.nodes, values, weights, strict=True)
-    return all(node.target.overlap(v, w)[0] < least for node, v, w in every)
+    return all(density_overlap(node.target, v, w)[0] < least for node, v, w in every)
 
 
 def _populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[Floats], list[Floats]]:

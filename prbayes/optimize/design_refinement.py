@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 
 import numpy as np
 
+from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.identifiability import oriented
@@ -307,7 +308,7 @@ def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
 
 
 def refuse(
-    short: Mapping[str, Shortcoming], evaluator: Evaluator, caveats: Iterable[str] = ()
+    short: Mapping[str, Shortcoming], evaluator: Evaluator, findings: Iterable[Finding] = ()
 ) -> None:
     """Raise for designs that still fall short, with what else is known of where they do."""
     if not short:
@@ -316,7 +317,7 @@ def refuse(
         f"{name}: the design does not support the answer: {s}" for name, s in short.items()
     )
     design = evaluator.designs[next(iter(short))]
-    known = "".join(f". There {line}" for line in caveats)
+    known = "".join(f". {finding}" for finding in findings)
     raise DesignError(
         f"{what}; narrow the priors, pass a larger prb.Reweighted(n) (now {design.n_runs} runs "
         f"in all, of at most {design.max_points}), or use prb.Resimulated(n), which has no design"

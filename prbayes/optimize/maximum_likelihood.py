@@ -77,7 +77,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
     ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
     findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
     weights = _posterior_weights(evaluator, modes, with_prior=options.prior)
-    findings += report(_findings(evaluator, modes, weights, ends))
+    findings += report(*_findings(evaluator, modes, weights, ends))
     rivals = tuple(
         {
             "point": _in_units(evaluator, mode.theta, mode.covariance)[0],
@@ -110,7 +110,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         trace=objective.trace(best.steps),
         seconds=time.perf_counter() - clock,
         rivals=rivals,
-        warnings=tuple(str(finding) for finding in findings),
+        findings=tuple(findings),
         prior=options.prior,
         identity=identity_of(evaluator, prior_minimised=options.prior),
     )
@@ -437,7 +437,7 @@ def _findings(
                 "support-edge",
                 "The likelihood jumps at the optimum, as it does where the end of an input's "
                 "support meets a specimen; no standard errors follow from its curvature. Sample "
-                "with prb.sample_smc",
+                "with prb.sample_smc.",
                 "likelihood.md#moving-supports",
             )
         )
@@ -453,7 +453,7 @@ def _findings(
             Finding(
                 "not-identified",
                 f"The data do not identify {', '.join(flat)}; values at the optimum are arbitrary, "
-                "and the posterior keeps the prior there",
+                "and the posterior keeps the prior there.",
                 "likelihood.md#identification",
             )
         )
@@ -469,7 +469,7 @@ def _findings(
             Finding(
                 "second-mode",
                 f"A second optimum at {where} has {weight:.0%} of the posterior's mass; NUTS "
-                "chains may stay in the mode where they start; prb.sample_smc samples both",
+                "chains may stay in the mode where they start; prb.sample_smc samples both.",
                 "likelihood.md#several-modes",
             )
         )

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._validate import (
     Floats,
@@ -82,8 +81,6 @@ from prbayes.optimize.optimum import Optimum
 from prbayes.optimize.solution import assemble, rival_record
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
-
-_log = logging.getLogger("prbayes")
 
 
 @locked
@@ -817,15 +814,13 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         responses_before=plan.responses_before,
     )
     refuse_lost(evaluator, {name: each["lost_mass"] for name, each in found.support.items()})
-    warnings = (
+    findings = report(
         *breakdown(edge, jump),
         *heavy_tails(evaluator, state.theta),
         *between_runs(evaluator, state.theta),
         *wide_kernels(evaluator, state.theta, state.scales, state.local),
         *caveats(evaluator, state.sampling, state.others, state.design_error),
     )
-    for line in warnings:
-        _log.warning("%s", line)
     ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
     told = _told_of_designs(evaluator, state.design_error)
     told += _HELD if state.hold is not None else ""
@@ -837,7 +832,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         seconds=time.perf_counter() - plan.clock,
         design_error=state.design_error,
         rivals=tuple(rival_record(evaluator, o) for o in state.others),
-        warnings=warnings,
+        findings=findings,
         at_edge=edge,
         at_jump=jump,
     )
@@ -883,13 +878,15 @@ def _stopped(plan: _Plan, begun: _Beginning, state: _State, reason: str) -> Opti
         responses_before=plan.responses_before,
         stopped=reason,
     )
-    line = (
+    finding = Finding(
+        "budget-spent",
         f"{reason} before the minimisation was finished, so that this is no answer yet; "
         f"{kept(plan.evaluator.model)}; call prb.minimize with a larger budget, on a model that is "
-        f"built again, to go on{more_in('expensive.md#a-night-is-not-enough')}"
+        "built again, to go on.",
+        "expensive.md#a-night-is-not-enough",
     )
-    _log.warning("%s", line)
-    return replace(found, seconds=time.perf_counter() - plan.clock, warnings=(line,))
+    seconds = time.perf_counter() - plan.clock
+    return replace(found, seconds=seconds, findings=report(finding))
 
 
 def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, ...]]:

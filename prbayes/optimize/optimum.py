@@ -10,9 +10,11 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._display import view
+from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import read_variables, single_elements, told_of
 from prbayes.model.evaluator import Evaluator, likelihood_of, specimen_log_likelihoods
@@ -89,8 +91,8 @@ class Optimum:
     rivals : tuple of dict
         Other optima, such as mirror solutions: ``point``, ``discrepancy`` (the sum of d_k / s_k),
         ``theta``, and ``comparable``, whether the data could as well come from there.
-    warnings : tuple of str
-        What is not identified, in sentences; also logged.
+    findings : tuple of Finding
+        What is not identified, and what else to know of the answer; also logged.
     at_edge : tuple of str
         Elements that went far out, where no change of them changes the discrepancy: their best
         value is at the edge of the support, the optimiser has not converged, and nothing is known
@@ -126,7 +128,7 @@ class Optimum:
     seconds: float = 0.0
     design_error: float = np.nan
     rivals: tuple[dict[str, Any], ...] = ()
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()
     prior: bool = False
@@ -136,13 +138,13 @@ class Optimum:
     def __repr__(self) -> str:
         """Show the answer, what it cost, and what is to be said of it."""
         found = [f"{name} = {value} ± {error}" for name, value, error in self._told()]
-        return "\n  ".join([self._heading(), *found, *self._shares(), *self.warnings])
+        return "\n  ".join([self._heading(), *found, *self._shares(), *map(str, self.findings)])
 
     def _repr_html_(self) -> str:
         """Show the same in a notebook, as a table."""
         rows = [list(told) for told in self._told()]
         header = ["", "estimate", "standard error"]
-        sentences = [*self._shares(), *self.warnings]
+        sentences = [*self._shares(), *map(str, self.findings)]
         return view(self._heading(), header=header, rows=rows, sentences=sentences)
 
     def _told(self) -> list[tuple[str, str, str]]:
@@ -265,10 +267,11 @@ def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     ValueError
         If it is at the edge of a support, or at a jump.
     """
-    lines = breakdown(optimum.at_edge, optimum.at_jump)
-    if lines:
+    findings = breakdown(optimum.at_edge, optimum.at_jump)
+    if findings:
+        reasons = " ".join(map(str, findings))
         raise ValueError(
-            f"{caller}: got an optimum around which nothing is known: {'; '.join(lines)}. "
+            f"{caller}: got an optimum around which nothing is known: {reasons} "
             "prb.sample_smc(epsilon=..., adjustment=None) makes no use of it"
         )
     return optimum
@@ -358,7 +361,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
         "n_screened": optimum.n_screened,
         "n_responses": optimum.n_responses,
         "seconds": optimum.seconds,
-        "warnings": "\n".join(optimum.warnings),
+        "findings": as_json(optimum.findings),
         **versions(),
         **as_attribute(optimum.model),
         **as_attributes(optimum.identity),
@@ -403,7 +406,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     variables["covariance"] = (["element", "other_element"], optimum.covariance)
     metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
     variables["metric"] = ("simulator", [without_addresses(metric) for metric in metrics])
-    compared = [node.target.told for node in nodes] + [""] * len(measurements)
+    compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
     variables["compared"] = ("simulator", compared)
     is_likelihood = [0] * len(nodes) + [1] * len(measurements)
     variables["is_likelihood"] = ("simulator", is_likelihood)

@@ -16,7 +16,7 @@ from prbayes.inference.measured import Refits
 from prbayes.inference.requirements import simulator_obstacle
 from prbayes.inference.resampling import SETS, DataSets, groups
 from prbayes.inference.sandwich import Information, LinearArea
-from prbayes.metrics.base import Minimum
+from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.model.epsilon import Epsilon, refuse_without_epsilon
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
@@ -144,7 +144,7 @@ def _dependence(optimum: Optimum, group: list[int], epsilon: Floats) -> float:
 
 def _epsilon(information: Information) -> float:
     node = information.node
-    if node.target.likelihood:
+    if is_likelihood(node.target):
         return 1 / node.n_specimens
     obstacle = simulator_obstacle(information.evaluator, information.k)
     if obstacle is not None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.inference.resampling import SETS, aligned, groups, observable, specimens
+from prbayes.metrics.base import is_additive
 from prbayes.metrics.score import (
     ScoreOptions,
     ShiftedResponses,
@@ -463,7 +464,7 @@ def score_obstacle(evaluator: Evaluator) -> str | None:
     simulators that share specimens in part.
     """
     for node in evaluator.nodes:
-        if not node.target.additive:
+        if not is_additive(node.target):
             metric = type(node.metric).__name__
             return f"{node.name} has a {metric}, whose gradient is no mean over specimens"
         if np.ptp(node.target.weights) > 1e-12:

@@ -5,7 +5,6 @@ Whether the whole procedure gives posteriors of the right width for a model.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import ExitStack
@@ -17,6 +16,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
@@ -32,7 +32,6 @@ from prbayes.posterior.smc import Adjustment, Sampling, refuse_adjustment, sampl
 from prbayes.posterior.trees import calibration_tree
 from prbayes.response.inputs import model_on_context
 
-_log = logging.getLogger("prbayes")
 # Data sets that a worker analyses before it reports: seconds of work, against milliseconds of
 # sending the model.
 _CHUNK = 10
@@ -136,18 +135,17 @@ def simulation_based_calibration(
     for start in starts:
         numbers = range(start, min(start + _CHUNK, n))
         jobs.append(_Job(numbers, draws, adjustment, seed))
-    with shown(progressbar), progress("data sets", n) as report:
+    with shown(progressbar), progress("data sets", n) as advance:
         if executor is None:
-            parts = [_analyse(evaluator, job, lambda: report(1, "")) for job in jobs]
+            parts = [_analyse(evaluator, job, lambda: advance(1, "")) for job in jobs]
         else:
-            parts = _on_executor(executor, model, jobs, lambda size: report(size, ""))
+            parts = _on_executor(executor, model, jobs, lambda size: advance(size, ""))
     rows = list(chain.from_iterable(parts))
     good = [row for row in rows if isinstance(row, dict)]
     failed = [row for row in rows if isinstance(row, str)]
     if failed:
-        _log.warning(
-            "%d of %d data sets could not be analysed; the first: %s", len(failed), n, failed[0]
-        )
+        text = f"{len(failed)} of {n} data sets could not be analysed; the first: {failed[0]}"
+        report(Finding("data-sets-not-analysed", text))
     if len(failed) > n / 2:
         raise RuntimeError(
             f"simulation_based_calibration: {len(failed)} of {n} data sets failed; "

@@ -15,7 +15,7 @@ import pymc as pm
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes.model.budgets import designs_as_before, explained
@@ -26,6 +26,7 @@ from prbayes.model.fingerprint import identity_of, require_same
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import log_kernel
+from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
 from prbayes.optimize.optimum import Optimum, require_sampling
@@ -289,7 +290,7 @@ def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             {"sampler": "SMC"},
             log_likelihood=log_likelihood,
             stats=particles.stats,
-            warnings=_of_budget(particles.stopped, particles, asked),
+            findings=_of_budget(particles.stopped, particles, asked),
             stopped=particles.stopped,
             n_before=before,
             clock=clock,
@@ -348,10 +349,10 @@ def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                 particles.lost,
                 particles.stats,
                 sampler={"sampler": "SMC-ABC"},
-                warnings=(
+                findings=(
                     *_of_budget(stopped, particles, asked),
                     *_of_lost(evaluator, particles.lost),
-                    *(() if optimum is None else optimum.warnings),
+                    *(() if optimum is None else optimum.findings),
                 ),
                 errors=errors,
                 missing=missing,
@@ -366,18 +367,18 @@ def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         return tree
 
 
-def _of_budget(stopped: str, particles: Particles, asked: Sampling) -> list[str]:
+def _of_budget(stopped: str, particles: Particles, asked: Sampling) -> tuple[Finding, ...]:
     """Say, also in the log, that a budget was spent before everything was done."""
     if not stopped:
-        return []
+        return ()
     again = "" if asked.checkpoint is None else f" and checkpoint={asked.checkpoint}"
-    line = (
+    finding = Finding(
+        "budget-spent",
         f"{stopped}, so that {len(particles.stats)} of {asked.chains} chains are here, and what "
-        f"would have cost responses is left out; call prb.sample_smc with a larger budget{again}"
-        f"{more_in('expensive.md#a-night-is-not-enough')}"
+        f"would have cost responses is left out; call prb.sample_smc with a larger budget{again}.",
+        "expensive.md#a-night-is-not-enough",
     )
-    _log.warning("%s", line)
-    return [line]
+    return report(finding)
 
 
 def _refuse_lost(
@@ -404,25 +405,27 @@ def _refuse_lost(
     refuse_lost(evaluator, shares)
 
 
-def _of_lost(evaluator: Evaluator, lost: Floats) -> list[str]:
+def _of_lost(evaluator: Evaluator, lost: Floats) -> tuple[Finding, ...]:
     """Report, also in the log, the share of draws whose populations lack too many responses.
 
     For designs, `diagnose` reports it.
     """
-    lines = []
+    findings = []
     for k, node in enumerate(evaluator.nodes):
         most = node.bound.max_lost
         share = share_of_lossy(lost[:, :, k], most)
         if share > _FAR_OUT:
-            lines.append(
-                f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
-                f"{most:.1%} of the population has no response (NaN), so that they rest on the "
-                "specimens that have one; repair the response, return +inf for specimens that "
-                f"fail, or narrow the priors{more_in('expensive.md#when-a-run-fails')}"
+            findings.append(
+                Finding(
+                    "lost-mass",
+                    f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
+                    f"{most:.1%} of the population has no response (NaN), so that they rest on the "
+                    "specimens that have one; repair the response, return +inf for specimens that "
+                    "fail, or narrow the priors.",
+                    "expensive.md#when-a-run-fails",
+                )
             )
-    for line in lines:
-        _log.warning("%s", line)
-    return lines
+    return report(*findings)
 
 
 def _calibrated(evaluator: Evaluator, asked: Sampling) -> Optimum | None:
@@ -553,7 +556,7 @@ def result_tree(
     log_likelihood: Floats | None,
     stats: Sequence[Stages] = (),
     sample_stats: xr.Dataset | None = None,
-    warnings: Sequence[str] = (),
+    findings: Sequence[Finding] = (),
     stopped: str = "",
     n_before: int,
     clock: float,
@@ -592,10 +595,10 @@ def result_tree(
             sampler=sampler,
             sample_stats=sample_stats,
             adjustment="estimate" if evaluator.nodes else "none",
-            warnings=(
-                *warnings,
+            findings=(
+                *findings,
                 *_of_lost(evaluator, lost),
-                *_warnings(evaluator, optimum, thetas),
+                *_findings(evaluator, optimum, thetas),
             ),
             stopped=stopped,
             seed=asked.random_seed,
@@ -626,15 +629,12 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floa
     return lost
 
 
-def _warnings(evaluator: Evaluator, optimum: Optimum | None, thetas: Floats) -> tuple[str, ...]:
-    """Return the reports of the data, the runs and the optimum, and conflicts with the prior."""
+def _findings(evaluator: Evaluator, optimum: Optimum | None, thetas: Floats) -> tuple[Finding, ...]:
+    """Return the findings of the data, the runs and the optimum, and conflicts with the prior."""
     if optimum is None:
-        findings = [
-            finding for each in evaluator.likelihoods for finding in prepared(each).findings
-        ]
-        return tuple(map(str, findings))
+        return tuple(f for each in evaluator.likelihoods for f in prepared(each).findings)
     conflicts = prior_conflicts(optimum, evaluator, thetas) if evaluator.nodes else ()
-    return (*optimum.warnings, *map(str, conflicts))
+    return (*optimum.findings, *conflicts)
 
 
 @contextmanager

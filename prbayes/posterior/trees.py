@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator, likelihood_of, specimen_log_likelihoods
@@ -34,7 +36,7 @@ def posterior_tree(
     sampler: Mapping[str, Any],
     sample_stats: xr.Dataset | None = None,
     adjustment: str = "none",
-    warnings: tuple[str, ...] = (),
+    findings: tuple[Finding, ...] = (),
     errors: Floats | None = None,
     missing: Mapping[str, Mapping[str, float]] | None = None,
     stopped: str = "",
@@ -61,7 +63,7 @@ def posterior_tree(
         Statistics of another sampler than SMC, in place of those by stage.
     adjustment : str
         "estimate" of draws given the estimate, else "none".
-    warnings : tuple of str
+    findings : tuple of Finding
     errors : ndarray, shape (k,), or None
         Monte Carlo errors of the discrepancies.
     missing : mapping, optional
@@ -82,7 +84,7 @@ def posterior_tree(
         "adjustment": adjustment,
         **sampler,
         "stopped": stopped,
-        "warnings": "\n".join(warnings),
+        "findings": as_json(findings),
         **versions(),
     }
     if errors is None:
@@ -253,7 +255,7 @@ def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
         "required_ess": ("simulator", required),
         "max_lost": ("simulator", [node.bound.max_lost for node in nodes]),
         "metric": ("simulator", [without_addresses(node.metric) for node in nodes]),
-        "compared": ("simulator", [node.target.told for node in nodes]),
+        "compared": ("simulator", [components_summary(node.target) for node in nodes]),
         "propagation": ("simulator", [without_addresses(node.propagation) for node in nodes]),
         "n_points": ("simulator", [node.bound.n_points for node in nodes]),
         "n_runs": ("simulator", [node.bound.n_runs for node in nodes]),

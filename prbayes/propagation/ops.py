@@ -13,7 +13,8 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
 
-from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.base import Basis, Discrepancy
+from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy, DensitySum
 from prbayes.metrics.grid import Cells
 from prbayes.response.inputs import batch_shape, broadcast_batch
 from prbayes.response.response import Responses
@@ -23,7 +24,7 @@ from prbayes.response.response import Responses
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
-    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|Compact|OpaqueOp|abc_d)",
+    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|Binned|OpaqueOp|abc_d)",
 )
 
 
@@ -177,11 +178,15 @@ class CotangentOp(OwnOp):
         )
 
 
-class OfCompactOp(OwnOp):
-    """An operation on many stored values in their compact form, and what goes with their points."""
+class BinnedOp(OwnOp):
+    """Densities of stored projections, side by side, (n, K), (..., n) -> (..., cells)."""
 
-    __props__ = ("target",)
+    __props__ = ("densities",)
     event_ndims = (2, 1)
+
+    def __init__(self, densities: DensitySum) -> None:
+        self.densities = densities
+        self.event_shape = (densities.n_cells,)
 
     def __str__(self) -> str:
         """Return the name, and what to do where a backend has no form of it."""
@@ -191,43 +196,31 @@ class OfCompactOp(OwnOp):
             "or nuts_sampler='nutpie' or 'pymc'"
         )
 
-
-class CompactOp(OfCompactOp):
-    """The features of stored values in their compact form, (n, K), (..., n) -> (..., m)."""
-
-    __props__ = ("target",)
-    __str__ = OfCompactOp.__str__
-
-    def __init__(self, target: Discrepancy) -> None:
-        self.target = target
-        self.event_shape = (target.columns,)
-
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Bin and smooth."""
-        compact, weights = inputs
-        (outputs[0][0],) = self.target.from_basis(weights, (compact,), np)
+        outputs[0][0] = self.densities.binned(*inputs)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Return the derivatives for the weights by another operation; values are stored."""
-        compact, _ = inputs
+        projections, _ = inputs
         (cotangent,) = cotangents
-        stored = grad_undefined(self, 0, compact, "stored values do not change")
-        return [stored, CompactCotangentOp(self.target)(compact, cotangent)]
+        constant = grad_undefined(self, 0, projections, "stored values do not change")
+        return [constant, BinnedAdjointOp(self.densities)(projections, cotangent)]
 
 
-class CompactCotangentOp(OfCompactOp):
-    """A cotangent of such features at the weights, (n, K), (..., m) -> (..., n)."""
+class BinnedAdjointOp(BinnedOp):
+    """The adjoint of such densities, (n, K), (..., cells) -> (..., n)."""
 
-    __props__ = ("target",)
-    __str__ = OfCompactOp.__str__
-    event_shape = (None,)
+    __props__ = ("densities",)
+    __str__ = BinnedOp.__str__
 
-    def __init__(self, target: Discrepancy) -> None:
-        self.target = target
+    def __init__(self, densities: DensitySum) -> None:
+        self.densities = densities
+        self.event_shape = (None,)
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
-        outputs[0][0] = self.target.pulled_back(*inputs)
+        outputs[0][0] = self.densities.adjoint(*inputs)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse second derivatives."""
@@ -262,12 +255,21 @@ class OpaqueOp(OwnOp):
         )
 
 
+def stored_discrepancy(target: Discrepancy, basis: Basis, weights: Any) -> Any:
+    """Return the graph of a discrepancy for stored responses with weights (n,) of theta."""
+    if not target.metric.symbolic:
+        return OpaqueOp(target)(*basis.arrays, weights)
+    if isinstance(basis, BinnedBasis):
+        return target.outer(BinnedOp(basis.densities)(*basis.arrays, weights), xp=pt)
+    return target.outer(*basis.features(weights, pt), xp=pt)
+
+
 def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
     """Return the graph of a discrepancy for a sample that depends on theta.
 
     Shapes (n,), or (n, m) of several outputs, (n,) -> ().
     """
-    if not target.symbolic:
+    if not target.metric.symbolic:
         return OpaqueOp(target)(sample, weights)
     parts = target.parts
     if parts[0].target is not target:
@@ -277,8 +279,8 @@ def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
             for part, own in zip(parts, values, strict=True)
         ]
         return sum(graphs[1:], start=graphs[0])
-    if target.density_cells is not None:
-        density = DensityOp(target.density_cells)(sample, weights)
+    if isinstance(target, DensityDiscrepancy):
+        density = DensityOp(target.cells)(sample, weights)
         return target.outer(density, xp=pt)
     features = target.features(sample, weights, pt)
     return target.outer(*features, xp=pt)

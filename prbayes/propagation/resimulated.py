@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
@@ -14,7 +13,7 @@ from pytensor import shared
 from pytensor.compile import function
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.numerics.points import base_points, points_from
@@ -33,8 +32,6 @@ from prbayes.response.compile import PLAIN, compile_batched, ninf_for_invalid
 from prbayes.response.distributions import PopulationSampler, quantiles, valid
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
-
-_log = logging.getLogger("prbayes")
 
 
 @dataclass(frozen=True)
@@ -92,16 +89,16 @@ class Resimulated(Propagation):
         per_observation = target.metric.tail_responses
         enough = per_observation * target.n_effective
         if self.n < enough:
-            _log.warning(
-                "%s: the log-likelihood of %d resimulated responses sees too little of the tails: "
-                "its standard errors and posterior come out too narrow, expected at least "
-                "%.0f responses, %d for each observation; use prb.Reweighted(n), "
-                "prb.KullbackLeibler() or a larger n%s",
-                name,
-                self.n,
-                enough,
-                per_observation,
-                more_in("choose.md#how-many-responses"),
+            report(
+                Finding(
+                    "few-responses",
+                    f"{name}: the log-likelihood of {self.n} resimulated responses sees too "
+                    "little of the tails: its standard errors and posterior come out too "
+                    f"narrow, expected at least {enough:.0f} responses, {per_observation} for "
+                    "each observation; use prb.Reweighted(n), prb.KullbackLeibler() or a "
+                    "larger n.",
+                    "choose.md#how-many-responses",
+                )
             )
 
     def base_points(self, inputs: Inputs) -> list[Floats]:

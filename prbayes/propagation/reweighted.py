@@ -21,10 +21,11 @@ from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
+from prbayes._finding import Finding, report
 from prbayes._validate import IN_CACHE, Floats, positive_integer
 from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
-from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.numerics.points import base_points
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import (
@@ -54,7 +55,7 @@ from prbayes.propagation.moving_support import (
     moving_inputs,
     refuse_moving_atoms,
 )
-from prbayes.propagation.ops import CompactOp, OpaqueOp
+from prbayes.propagation.ops import stored_discrepancy
 from prbayes.response.budget import RunCost
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import (
@@ -73,8 +74,6 @@ from prbayes.response.response import (
     refuse_coarse,
     refuse_other_number,
 )
-
-_log = logging.getLogger("prbayes")
 
 # Components of a batch's mixture density: as many as there are points would be as good, and cost
 # their square.
@@ -416,16 +415,13 @@ class Design(Bound):
                 f"{self.dimensions} inputs are many for stored responses alone: {leave}use "
                 "propagation=prb.Resimulated(n), which has no design"
             )
-        _log.log(
-            level,
-            "%s: the design of %d runs supports a typical population of the prior with a weight "
-            "effective sample size of %.0f, where %.0f make its error small; %s",
-            self.name,
-            self.config.n,
-            size,
-            self.required_ess,
-            advice,
+        finding = Finding(
+            "thin-design",
+            f"{self.name}: the design of {self.config.n} runs supports a typical population of the "
+            f"prior with a weight effective sample size of {size:.0f}, where "
+            f"{self.required_ess:.0f} make its error small; {advice}.",
         )
+        report(finding, level=level)
 
     # -- What the design is --
 
@@ -522,11 +518,11 @@ class Design(Bound):
         """Compare with the same data in another way from here on; before anything is compiled."""
         if target is self.target:
             return
-        before = len(self._shared) - len(self._basis_of(self.values[:1]))
+        before = len(self._shared) - len(self._basis_of(self.values[:1]).arrays)
         self.target = target
         kept = self._held()[:before]
         self._shared = []
-        self._share([*kept, *self._basis_of(self.values)])
+        self._share([*kept, *self._basis_of(self.values).arrays])
 
     @property
     def known_points(self) -> Sequence[Floats]:
@@ -858,7 +854,12 @@ class Design(Bound):
     def _arrays(self) -> list[Any]:
         """Return what compiled graphs read."""
         table = self.contents.table
-        return [*table.points, table.log_g, *self._cell_ends(), *self._basis_of(table.values)]
+        return [
+            *table.points,
+            table.log_g,
+            *self._cell_ends(),
+            *self._basis_of(table.values).arrays,
+        ]
 
     def _weights_at(self, components: Sequence[Floats], table: Table) -> Floats:
         """Return weights of a table's points in some populations, (T, n): they sum to one."""
@@ -872,19 +873,10 @@ class Design(Bound):
         weights = self._weights_at(components, self.contents.table)
         return float(np.median(1 / (weights**2).sum(axis=1)))
 
-    @property
-    def _too_many(self) -> bool:
-        """Whether graphs do without a basis, as it would take too much memory.
-
-        That does not change while the design grows.
-        """
+    def _basis_of(self, values: Floats) -> Basis:
+        """Return the basis for compiled graphs; its form stays the same while the design grows."""
         most = max(self.max_points, LARGEST_CLOUD) if self.emulates else self.max_points
-        return self.target.columns * most > _MOST_NUMBERS
-
-    def _basis_of(self, values: Floats) -> tuple[NDArray[Any], ...]:
-        """Return what graphs make features of."""
-        target = self.target
-        return target.compact(values) if self._too_many else target.basis(values)
+        return self.target.basis(values, _MOST_NUMBERS * len(values) / most)
 
     def _responses_at(self, points: Sequence[Floats]) -> Floats:
         """Return the responses at points: none is computed that this or another design had."""
@@ -1166,14 +1158,8 @@ class Design(Bound):
         weights = raw / raw.sum()
         before_the_basis = len(self.inputs.aleatory) + 1 + 2 * len(self._moving or ())
         basis = tuple(self._shared[before_the_basis:])
-        if self._too_many:
-            features = CompactOp(self.target)(*basis, weights)
-            value = self.target.outer(features, xp=pt)
-        elif self.target.symbolic:
-            features = self.target.from_basis(weights, basis, pt)
-            value = self.target.outer(*features, xp=pt)
-        else:
-            value = OpaqueOp(self.target)(*basis, weights)
+        form = self._basis_of(self.values[:1])
+        value = stored_discrepancy(self.target, replace(form, arrays=basis), weights)
         return pt.switch(supported, value, np.inf)
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
@@ -1204,8 +1190,7 @@ class Design(Bound):
         """
         wanted = (target, self.contents.table)
         if any(a is not b for a, b in zip(self._basis, wanted, strict=False)):
-            made = target.stored(self.values)
-            self._basis = (*wanted, made)
+            self._basis = (*wanted, target.basis(self.values))
         *_, basis = self._basis
 
         size = len(params[0])
@@ -1216,7 +1201,7 @@ class Design(Bound):
             for first in range(0, max(1, size), step):
                 weights, supported = self._weights([p[first : first + step] for p in params])
                 weights[~supported] = 1 / self.n_points
-                features = target.from_basis(weights, basis, np)
+                features = basis.features(weights)
                 each = target.outer(*features, xp=np)
                 found.append(np.where(supported, each, np.inf))
         return np.concatenate(found)

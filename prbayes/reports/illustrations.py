@@ -11,6 +11,7 @@ from typing import Any
 
 import pymc as pm
 
+from prbayes._finding import Finding, report
 from prbayes.model.elements import variable_of
 from prbayes.model.emulated import population_simulators
 from prbayes.model.random_variable import nodes
@@ -306,7 +307,8 @@ def _picture(illustration: Illustration, material: Material) -> Section | None:
         return None
     drawn = request if isinstance(request, NotDrawn) else _drawn(illustration, request)
     if isinstance(drawn, NotDrawn):
-        _log.warning("report: no picture by %s: %s", illustration.function.__name__, drawn.reason)
+        name = illustration.function.__name__
+        report(Finding("no-picture", f"report: no picture by {name}: {drawn.reason}"))
         text = f"This picture could not be made: {drawn.reason}"
         return Section(illustration.title, text, level=3)
     return Section(

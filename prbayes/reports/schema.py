@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._finding import from_json
+
 _VARIABLES = {
     "risk": {"probability", "by_draw", "error"},
     "sensitivity": {"first", "total", "derivative"},
@@ -122,6 +124,10 @@ def _of_attributes(group: str, attrs: Mapping[Any, Any]) -> Iterator[str]:
         value = np.asarray(attrs.get(name, 0.0))
         if value.size != 1 or value.dtype.kind not in "fiu" or np.isnan(value).any():
             yield f"{group}: {name}: got {attrs[name]!r:.60}, expected a number"
+    try:
+        from_json(str(attrs.get("findings", "[]")))
+    except ValueError as error:
+        yield f"{group}: {error}"
 
 
 def _not_numbers(group: str, variables: Mapping[Any, xr.DataArray]) -> Iterator[str]:

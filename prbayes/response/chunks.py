@@ -6,7 +6,6 @@ before it waits for the next.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from prbayes._finding import Finding, report
 from prbayes._progress import progress
 from prbayes._validate import Floats
 from prbayes.response.budget import BudgetError, budget
@@ -40,8 +40,6 @@ from prbayes.response.executors import (
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.outputs import ONE, Outputs, lacking
 from prbayes.response.store import Store, StoreError
-
-_log = logging.getLogger("prbayes")
 
 # A finished chunk, with the rows of its points.
 type Done = tuple[Rows, Chunk]
@@ -266,7 +264,7 @@ def _apply_policy(
         n_nan = int(is_nan.sum())
         tally.failures += n_nan
         text = f"{n_nan} of {is_nan.size} responses failed, replaced by {policy.replacement}"
-        _log.warning("%s: %s; the first: %s", calling.name, text, first)
+        report(Finding("responses-replaced", f"{calling.name}: {text}; the first: {first}"))
         tally.record_failures(points, dict.fromkeys(map(int, np.flatnonzero(is_nan)), "it is NaN"))
         values[is_nan] = policy.replacement
     return values

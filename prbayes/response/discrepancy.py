@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from prbayes._finding import Finding
 from prbayes._validate import Floats, called, real_array
 from prbayes.response.call import scalar
 
@@ -253,15 +254,18 @@ class Corrected:
         return " to ".join(f"{end:g}" for end in ends)
 
     @property
-    def caveats(self) -> tuple[str, ...]:
-        """What is to be said where it is used: that it extrapolates."""
+    def findings(self) -> tuple[Finding, ...]:
+        """Whether it extrapolates."""
         seen = self.inadequacy
         outside = (self.condition < seen.low) | (self.condition > seen.high)
         if not outside.any():
             return ()
         return (
-            f"{self.__name__} at {self._told}: extrapolates its inadequacy, seen from "
-            f"{seen.low:g} to {seen.high:g}",
+            Finding(
+                "extrapolated-discrepancy",
+                f"{self.__name__} at {self._told}: extrapolates its inadequacy, seen from "
+                f"{seen.low:g} to {seen.high:g}.",
+            ),
         )
 
     def __call__(self, *inputs: Any) -> Floats:
@@ -305,7 +309,7 @@ def corrected(function: Callable[..., Any]) -> bool:
     return isinstance(inner, Corrected)
 
 
-def caveats_of(function: Callable[..., Any]) -> tuple[str, ...]:
-    """Return what a function says where it is used."""
+def findings_of(function: Callable[..., Any]) -> tuple[Finding, ...]:
+    """Return what a response with a model discrepancy reports where it is used."""
     inner = function.function if isinstance(function, scalar) else function
-    return tuple(getattr(inner, "caveats", ()))
+    return tuple(getattr(inner, "findings", ()))

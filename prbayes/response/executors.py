@@ -7,7 +7,6 @@ whose names may change, are read in this module only; `tests/test_contracts.py` 
 from __future__ import annotations
 
 import faulthandler
-import logging
 import os
 import signal
 import threading
@@ -30,10 +29,9 @@ from traceback import walk_tb
 from typing import Any
 from weakref import WeakKeyDictionary
 
+from prbayes._finding import Finding, report
 from prbayes._validate import called, positive_number
 from prbayes.response.failures import ResponseError
-
-_log = logging.getLogger("prbayes")
 
 
 @dataclass(frozen=True)
@@ -293,13 +291,9 @@ class Pool:
             silent += _SILENCE
             has_workers = _dask_threads(self.executor) != {}
             absences = 0 if has_workers else absences + 1
-            _log.warning(
-                "%s: no response for %.0f s; %d chunks are at work%s",
-                self.name,
-                silent,
-                len(waiting),
-                "" if has_workers else ", and there is no worker",
-            )
+            text = f"{self.name}: no response for {silent:.0f} s; {len(waiting)} chunks are at work"
+            text += "." if has_workers else ", and there is no worker."
+            report(Finding("no-response-yet", text))
             if absences == 10:  # a worker that starts again on a busy machine is away for minutes
                 for future in waiting:
                     future.cancel()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -17,18 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 
+from prbayes._finding import report
 from prbayes._validate import Floats, called, executes, folder_path
 from prbayes.response.budget import budget
 from prbayes.response.call import Points, checked, scalar, shapes
 from prbayes.response.chunks import Calling, Tally, respond
-from prbayes.response.discrepancy import caveats_of
+from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs, batch_shape, broadcast_batch
 from prbayes.response.outputs import ONE, Outputs, outputs_of_result
 from prbayes.response.store import Store
-
-_log = logging.getLogger("prbayes")
 
 
 def refuse_uncallable(name: str, function: object) -> None:
@@ -183,8 +181,7 @@ class Responses:
         refuse_uncallable(name, function)
         refuse_other_number(name, function, inputs)
         refuse_misfit(name, function, partial(_sizes, inputs), outputs)
-        for caveat in caveats_of(function):
-            _log.warning("%s", caveat)
+        report(*findings_of(function))
         policy = Abort() if on_failure is None else on_failure
         opened = None
         if store is not None:

@@ -83,21 +83,21 @@ class Checked:
     Attributes
     ----------
     findings : tuple of Finding
-    notes : tuple of str
+    remarks : tuple of Finding
         What was tested, and with which power.
     untested : tuple of str
         What was not tested, and why.
     """
 
     findings: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
+    remarks: tuple[Finding, ...] = ()
     untested: tuple[str, ...] = ()
 
     def __add__(self, other: Checked) -> Checked:
         """Return both."""
         return Checked(
             (*self.findings, *other.findings),
-            (*self.notes, *other.notes),
+            (*self.remarks, *other.remarks),
             (*self.untested, *other.untested),
         )
 
@@ -109,25 +109,29 @@ _DONE: WeakKeyDictionary[Optimum, Checked] = WeakKeyDictionary()
 def check_optimum(optimum: Optimum) -> Checked:
     """Return what the emulator and the test of the population report of an optimum."""
     if optimum not in _DONE:
-        emulators = Checked(notes=emulator_notes(optimum.evaluator))
+        emulators = Checked(remarks=emulator_remarks(optimum.evaluator))
         _DONE[optimum] = emulators + _population(optimum)
     return _DONE[optimum]
 
 
-def emulator_notes(evaluator: Evaluator) -> tuple[str, ...]:
-    """Return a sentence about the emulator and the points of each likelihood by specimen."""
-    notes = []
+def emulator_remarks(evaluator: Evaluator) -> tuple[Finding, ...]:
+    """Report the emulator and the points of each likelihood by specimen."""
+    remarks = []
     for likelihood in evaluator.likelihoods:
         emulation, points = prepared(likelihood).emulation, prepared(likelihood).points
         roots = points.n_roots
         low, high = int(roots.min()), int(roots.max())
         count = f"{low} root(s)" if low == high else f"{low} to {high} roots"
-        notes.append(
-            f"{likelihood.name}: the emulator of {len(emulation.z)} runs shifts a mean or standard "
-            f"deviation of an input by at most {max(emulation.bias, 0.005):.2f} posterior standard "
-            f"deviations; a specimen has {count}, and up to {points.log_a.shape[1]} points."
+        remarks.append(
+            Finding(
+                "emulator-bias",
+                f"{likelihood.name}: the emulator of {len(emulation.z)} runs shifts a mean or "
+                "standard deviation of an input by at most "
+                f"{max(emulation.bias, 0.005):.2f} posterior standard deviations; a specimen has "
+                f"{count}, and up to {points.log_a.shape[1]} points.",
+            )
         )
-    return tuple(notes)
+    return tuple(remarks)
 
 
 # -- population ------------------------------------------------------------------------------
@@ -156,7 +160,7 @@ def _population(optimum: Optimum) -> Checked:
     if len(null[0]) < _OPTIONS.replicates / 2:
         return _not_tested(f"{len(null[0])} of {_OPTIONS.replicates} refits converged")
     findings: list[Finding] = []
-    notes = []
+    remarks = []
     threshold = 0.05 / len(samples)
     for likelihood, (z, weights), statistics in zip(
         evaluator.likelihoods, samples, null, strict=True
@@ -169,8 +173,9 @@ def _population(optimum: Optimum) -> Checked:
         outputs = likelihood.readings.values.shape[1]
         if not misfit:
             power = power_text(len(z), z.shape[-1], outputs)
-            notes.append(f"{likelihood.name}: the test of the population found no misfit. {power}")
-    return Checked(tuple(findings), tuple(notes))
+            text = f"{likelihood.name}: the test of the population found no misfit. {power}"
+            remarks.append(Finding("population-tested", text))
+    return Checked(tuple(findings), tuple(remarks))
 
 
 def _population_obstacle(optimum: Optimum) -> str:
@@ -308,7 +313,7 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
             )
         )
     center = thetas.reshape(-1, evaluator.hyperparameters.size).mean(axis=0)
-    checked += Checked(failing_region_findings(evaluator, center), emulator_notes(evaluator))
+    checked += Checked(failing_region_findings(evaluator, center), emulator_remarks(evaluator))
     obstacle = simulation_obstacle(evaluator)
     if obstacle is not None:
         return checked + _not_tested(obstacle) + _conflict_not_tested(obstacle)
@@ -337,7 +342,7 @@ def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
             "chains-in-different-modes",
             f"The means of the chains differ by {listed} within-chain standard deviations: the "
             "chains are in different modes, and their number of draws is not the mass of a mode; "
-            "sample with prb.sample_smc, which weighs the modes",
+            "sample with prb.sample_smc, which weighs the modes.",
             "likelihood.md#chains-in-different-modes",
         ),
     )
@@ -368,7 +373,7 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
                     f"{name}: Pareto k of leave-one-out is above {limit:.2f} for {high.size} of "
                     f"{k.size} specimens (indices {places}; largest {k.max():.2f}): the posterior "
                     "depends on them, and az.loo is not reliable; look at these specimens, or use "
-                    "prb.cross_validate",
+                    "prb.cross_validate.",
                     "likelihood.md#leave-one-out",
                 )
             )
@@ -396,7 +401,8 @@ def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
         "without the prior"
     )
     if pulls[j] <= _OPTIONS.pull:
-        return Checked(notes=(f"{shift}, less than a conflict with the prior that matters.",))
+        text = f"{shift}, less than a conflict with the prior that matters."
+        return Checked(remarks=(Finding("prior-agrees", text),))
     prior = evaluator.hyperparameters.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)
     if np.isfinite(predictive).all(axis=1).mean() < 0.5:
@@ -415,13 +421,11 @@ def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
         return Checked(findings=findings)
     n = sum(len(each.readings) for each in evaluator.likelihoods)
     power = np.interp(np.log(n), np.log([10, 20, 50]), [0.86, 0.98, 1.0])
-    return Checked(
-        notes=(
-            f"{shift}; no hyperparameter is in conflict with its prior (p > .05). With {n} "
-            f"specimens the test has a power of {power:.2f} for a mean four prior standard "
-            "deviations off.",
-        )
+    text = (
+        f"{shift}; no hyperparameter is in conflict with its prior (p > .05). With {n} specimens "
+        f"the test has a power of {power:.2f} for a mean four prior standard deviations off."
     )
+    return Checked(remarks=(Finding("prior-agrees", text),))
 
 
 def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:

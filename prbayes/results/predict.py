@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, as_json, report
 from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import Floats, Seed, flag, plain_text, positive_integer, seed_number
@@ -40,14 +39,12 @@ from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.new_specimens import new_specimens
 from prbayes.propagation.reweighted import Design, UntoldError
-from prbayes.response.discrepancy import caveats_of
+from prbayes.response.discrepancy import findings_of
 from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.groups import is_group
 from prbayes.response.inputs import Inputs, model_on_context, read_inputs
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import Responses, refuse_calling, refuse_uncallable
-
-_log = logging.getLogger("prbayes")
 
 
 @locked
@@ -209,7 +206,7 @@ def predict(
             "nan": missing,
             "specimens_id": _digest(*drawn.specimens),
             "random_seed": str(seed),
-            "caveats": list(caveats_of(response)),
+            "findings": as_json(findings_of(response)),
             **_calibration(result, model),
             **as_attributes(identity_in(result) or identity_of_model(model)),
             **versions(),
@@ -302,7 +299,8 @@ def _count_missing(label: str, values: Floats, max_lost: float) -> int:
             "or pass a larger max_lost"
         )
     if missing:
-        _log.warning("%s: %d of %d predicted responses are NaN", label, missing, nan.size)
+        text = f"{label}: {missing} of {nan.size} predicted responses are NaN."
+        report(Finding("missing-predictions", text))
     return missing
 
 
@@ -431,15 +429,13 @@ def _report_rough_surface(label: str, drawn: _Drawn) -> None:
     share = float(np.max(drawn.error / np.where(spread > 0, spread, np.inf)))
     if share > 0.05:
         report(
-            [
-                Finding(
-                    "rough-prediction",
-                    f"{label}: the interpolant between runs has an error of {share:.0%} of the "
-                    "standard deviation of the predicted responses; pass stored=False, which "
-                    "computes the response at new specimens",
-                    "likelihood.md#predictions",
-                )
-            ]
+            Finding(
+                "rough-prediction",
+                f"{label}: the interpolant between runs has an error of {share:.0%} of the "
+                "standard deviation of the predicted responses; pass stored=False, which "
+                "computes the response at new specimens.",
+                "likelihood.md#predictions",
+            )
         )
 
 

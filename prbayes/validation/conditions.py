@@ -11,10 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats, Seed, called, flag, real_array, sample_labels, seed_number
-from prbayes.metrics.base import View
-from prbayes.metrics.directions import directions, enough
-from prbayes.metrics.lifted import failure_caps
-from prbayes.metrics.multivariate import Centered, Projection
+from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
+from prbayes.metrics.views import Centered, Projection, View
 from prbayes.metrics.whitening import whitening
 from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
 from prbayes.response.outputs import Outputs, read_observed
@@ -205,7 +203,10 @@ def projections(pool: Floats) -> list[Projection]:
     outputs = np.arange(m)
     white = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
     centered = Centered(outputs, failure_caps(rows), white.center)
-    return [Projection(centered, white.axes @ u) for u in directions(m, max(1, enough(m)), 0)]
+    return [
+        Projection(centered, white.axes @ u)
+        for u in directions(m, max(1, sufficient_directions(m)), 0)
+    ]
 
 
 def _by_condition(observed: Any, predicted: Any, specimens: Any) -> list[tuple[str, Any, Any, Any]]:

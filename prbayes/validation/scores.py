@@ -9,7 +9,7 @@ from scipy.stats import t as student
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import Floats
 from prbayes.metrics.base import Discrepancy, Metric, Part
-from prbayes.metrics.density import GaussianKDE, spread
+from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, spread
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
 
@@ -58,8 +58,8 @@ def _density(
 ) -> Floats:
     """Return the density of a population at points, (n',)."""
     target = part.target
-    cells = target.density_cells
-    assert cells is not None  # a log-likelihood has cells
+    assert isinstance(target, DensityDiscrepancy)  # as a log-likelihood is
+    cells = target.cells
     with_response = np.where(np.isnan(simulated), 0.0, weights)
     density = cells.density(simulated, with_response) / with_response.sum()
     at_points = cells.reading(points, np.eye(points.size)) @ density

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import re
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -126,15 +125,6 @@ def with_ends() -> pm.Model:
     return model
 
 
-def codes(findings: Iterable[Any]) -> list[str]:
-    """Return codes of findings, or the headings of their pages, in their order."""
-    result = []
-    for finding in findings:
-        heading = re.search(r"\.md#([\w-]+)", str(finding))
-        result.append(getattr(finding, "code", None) or (heading[1] if heading else "other"))
-    return result
-
-
 def of_optimum(optimum: prb.Optimum) -> Record:
     """Return what an optimum reports."""
     return {
@@ -142,8 +132,8 @@ def of_optimum(optimum: prb.Optimum) -> Record:
         "covariance": optimum.covariance,
         "discrepancy": optimum.discrepancy,
         "runs": optimum.n_responses,
-        "warnings": codes(optimum.warnings),
-        "findings": codes(prb.diagnose(optimum).findings),
+        "warnings": [finding.code for finding in optimum.findings],
+        "findings": [finding.code for finding in prb.diagnose(optimum).findings],
     }
 
 
@@ -152,7 +142,8 @@ def of_draws(idata: xr.DataTree, model: pm.Model) -> Record:
     posterior = idata.posterior
     names = [str(rv.name) for rv in model.free_RVs]
     result = {name: posterior[name].values for name in names}
-    return result | {"findings": codes(prb.diagnose(idata, model=model).findings)}
+    findings = prb.diagnose(idata, model=model).findings
+    return result | {"findings": [finding.code for finding in findings]}
 
 
 def both(model: pm.Model, sampler: str = "sample", **options: Any) -> Record:

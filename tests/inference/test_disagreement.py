@@ -41,8 +41,8 @@ def told(data: Any) -> str:
     """Return what is said of data against the population at zero."""
     evaluator = Evaluator.of(model_of(data))
     sampling = SamplingDistribution.of(evaluator, np.zeros(1), np.ones(1))
-    (sentence,) = disagreement(Refitted.there(sampling, 200, 0))
-    return sentence
+    (finding,) = disagreement(Refitted.there(sampling, 200, 0))
+    return finding.text
 
 
 def wrong_output() -> Any:

@@ -86,9 +86,9 @@ def test_a_sum_hides_a_difference(name: str) -> None:
             propagation=prb.Resimulated(256),
         )  # fmt: skip
     optimum = prb.minimize(model)
-    (line,) = optimum.warnings
-    assert line.startswith(
-        "the data tell less than the prior about a - 0.5 b[0] (in units of the priors'"
+    (finding,) = optimum.findings
+    assert finding.text.startswith(
+        "The data tell less than the prior about a - 0.5 b[0] (in units of the priors'"
     )
     assert np.isinf(optimum.stderr["a"])
     assert np.isinf(optimum.stderr["b"]).all()
@@ -108,9 +108,9 @@ def test_a_ridge_under_the_area_metric_is_seen_through_few_points(n: int) -> Non
         prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
     optimum = prb.minimize(model)
     assert all(np.isinf(optimum.stderr[name]) for name in ("sigma", "noise"))
-    (line,) = optimum.warnings
-    assert "sigma" in line
-    assert "noise" in line
+    (finding,) = optimum.findings
+    assert "sigma" in finding.text
+    assert "noise" in finding.text
 
 
 def test_what_is_seen_under_the_area_metric_is_seen_through_few_points_as_well() -> None:
@@ -125,7 +125,7 @@ def test_what_is_seen_under_the_area_metric_is_seen_through_few_points_as_well()
         prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
     optimum = prb.minimize(model)
     assert all(np.isfinite(optimum.stderr[name]) for name in ("mu", "sigma"))
-    assert optimum.warnings == ()
+    assert optimum.findings == ()
 
 
 def test_a_standard_error_of_the_priors_spread_is_the_limit() -> None:

@@ -13,9 +13,9 @@ import pytest
 from scipy.optimize import minimize
 
 from prbayes._validate import Floats
-from prbayes.metrics import base
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric
-from prbayes.metrics.density import DensityEstimator, GaussianKDE
+from prbayes.metrics import base, density
+from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.density import DensityDiscrepancy, DensityEstimator, GaussianKDE, overlap
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 
@@ -93,7 +93,7 @@ def test_rows_of_weights_are_as_many_data_sets(metric: Metric, draw: Draw) -> No
     several = metric.against(z, u).with_observed(z, sets)
     some = several.rows([3, 1])
     basis = some.basis(x)
-    found = some.outer(*some.from_basis(np.stack([[w], [w[::-1]]]), basis, np), xp=np)
+    found = some.outer(*basis.features(np.stack([[w], [w[::-1]]])), xp=np)
     one_by_one = [
         several.with_observed(z, sets[3, 0])(x, w),
         several.with_observed(z, sets[1, 0])(x, w[::-1]),
@@ -133,14 +133,14 @@ def test_basis_gives_the_same_discrepancy_in_numpy_and_pytensor_with_its_gradien
     basis = d.basis(y)
 
     def value(weights: Floats) -> Any:
-        return d.outer(*d.from_basis(weights, basis, np), xp=np)
+        return d.outer(*basis.features(weights), xp=np)
 
     rows = np.random.default_rng(7).dirichlet(np.ones(y.size), (2, 3))
     np.testing.assert_allclose(value(rows), d(y, rows), rtol=1e-10)
     direct = d.outer(*d.features(y, 0.9 * w, np), xp=np)
     np.testing.assert_allclose(value(0.9 * w), direct, rtol=1e-10)
     v = pt.vector("v")
-    graph = d.outer(*d.from_basis(v, basis, pt), xp=pt)
+    graph = d.outer(*basis.features(v, pt), xp=pt)
     function = pytensor.function([v], [graph, pytensor.grad(graph, v)], mode=PYTHON)
     result, gradient = function(w)
     np.testing.assert_allclose(result, d(y, w), rtol=1e-10)
@@ -154,8 +154,8 @@ def test_a_point_without_a_response_counts_in_no_feature(metric: Metric, draw: D
     d = metric.against(z, u)
     with_nan = np.append(x, NAN)
     some = np.append(0.8 * w, 0.2)
-    stored = d.outer(*d.from_basis(some, d.basis(with_nan), np), xp=np)
-    expected = d.outer(*d.from_basis(0.8 * w, d.basis(x), np), xp=np)
+    stored = d.outer(*d.basis(with_nan).features(some), xp=np)
+    expected = d.outer(*d.basis(x).features(0.8 * w), xp=np)
     np.testing.assert_allclose(stored, expected, rtol=1e-10)
 
 
@@ -178,12 +178,12 @@ def test_overlap_is_one_at_the_data_and_zero_away_from_them(
 ) -> None:
     x, w, z, u = draw(19)
     d = metric.against(z, u)
-    at, apart = d.overlap(z, u), d.overlap(np.stack([x + 1e3, np.full(x.size, INF)]), w)
+    at, apart = overlap(d, z, u), overlap(d, np.stack([x + 1e3, np.full(x.size, INF)]), w)
     assert at == pytest.approx(1)
     np.testing.assert_allclose(apart, [1, 1] if name == "area" else [0, 0], atol=1e-12)
     assert apart.shape == (2,)
     if name != "area":
-        assert 0.2 < d.overlap(x, w) < 0.999
+        assert 0.2 < overlap(d, x, w) < 0.999
 
 
 OK = [0.0, 1.0, 3.0]
@@ -236,7 +236,7 @@ def test_the_floor_does_not_move_the_minimum_on_normal_data(
     observed = np.random.default_rng(1).normal(size=50)
     found = []
     for floor in (1e-12, 1e-9, 1e-6):
-        monkeypatch.setattr(base, "_FLOOR", floor)
+        monkeypatch.setattr(density, "_FLOOR", floor)
         found.append(fit(metric, observed, normal(0, 1, 1024)))
     np.testing.assert_allclose(found, [found[1]] * 3, atol=1e-3 / np.sqrt(50))
 
@@ -247,7 +247,7 @@ def test_the_floor_keeps_an_outlier_in_the_forward_divergence(
     observed = np.random.default_rng(1).standard_t(3, 50)
     sd = []
     for floor in (1e-12, 1e-9, 1e-7):
-        monkeypatch.setattr(base, "_FLOOR", floor)
+        monkeypatch.setattr(density, "_FLOOR", floor)
         sd.append(np.exp(fit(KullbackLeibler(), observed, normal(0, 1, 1024))[1]))
     assert sd[0] == pytest.approx(sd[1], rel=0.02)
     assert sd[2] < 0.6 * sd[1]
@@ -270,7 +270,7 @@ def test_observed_specimens_that_failed_count_as_simulated_ones(metric: Metric, 
     assert right < few
     assert right < many
     # Weights of stored values, and other observed ones.
-    stored = d.outer(*d.from_basis(rows, d.stored(failed), np), xp=np)
+    stored = d.outer(*d.basis(failed).features(rows), xp=np)
     np.testing.assert_allclose(stored, d(failed, rows), rtol=1e-9, atol=1e-12)
     other = d.with_observed(np.append(x, INF), np.append(0.8 * w, 0.2))
     assert np.isfinite(other(failed, rows)).all()

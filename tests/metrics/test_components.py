@@ -93,7 +93,7 @@ def test_curves_that_end_early_are_compared_as_far_as_they_go():
 
 def test_what_is_left_out_is_told_and_said_if_it_is_no_noise() -> None:
     enough = principal_components(curves(30), EQUAL, 2)
-    assert "40 outputs are compared by 2 principal component(s)" in enough.told
+    assert "40 outputs are compared by 2 principal component(s)" in enough.summary
     assert not enough.missed
     too_few = principal_components(curves(30), EQUAL, 1)
     assert too_few.left_out > 0.01

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import Minimum
+from prbayes.metrics.base import Minimum, is_additive
 from prbayes.metrics.correlation import MarginalCorrelation
+from prbayes.metrics.density import is_differentiable
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.residual import ProbabilityResidual
 
@@ -95,9 +96,9 @@ def test_what_is_declared() -> None:
     assert (quadratic.minimum, absolute.minimum) == (Minimum.QUADRATIC, Minimum.UNKNOWN)
     assert not quadratic.additive
     y = sample(20, 0)
-    assert quadratic.against(y).differentiable
-    assert not absolute.against(y).differentiable
-    assert not quadratic.against(y).additive
+    assert is_differentiable(quadratic.against(y))
+    assert not is_differentiable(absolute.against(y))
+    assert not is_additive(quadratic.against(y))
     assert quadratic.like(AreaMetric()) == absolute
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from prbayes._validate import Floats
-from prbayes.metrics.directions import directions, enough, repelled
+from prbayes.metrics.multivariate import directions, repelled, sufficient_directions
 
 
 def largest_cosine(u: Floats) -> float:
@@ -30,7 +30,7 @@ def test_known_best_arrangements_are_found(m: int, number: int, best: float) -> 
 
 @pytest.mark.parametrize("m", [3, 4, 5, 8])
 def test_they_are_of_unit_length_and_see_every_direction_alike(m: int) -> None:
-    u = directions(m, enough(m), 0)
+    u = directions(m, sufficient_directions(m), 0)
     assert u.shape == ((m - 1) * (m + 2), m)
     np.testing.assert_allclose(np.linalg.norm(u, axis=-1), 1, rtol=1e-15)
     np.testing.assert_allclose(u.T @ u * m / len(u), np.eye(m), atol=0.03)

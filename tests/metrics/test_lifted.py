@@ -10,13 +10,13 @@ import pytest
 
 from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import Metric
+from prbayes.metrics.base import Metric, is_additive, is_likelihood
 from prbayes.metrics.correlation import MarginalCorrelation
 from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.joint import Joint
-from prbayes.metrics.lifted import failure_caps
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.multivariate import failure_caps
 from prbayes.metrics.residual import ProbabilityResidual
 
 INF, NAN = np.inf, np.nan
@@ -48,7 +48,7 @@ def test_one_output_is_the_metric_itself(lift: Lift, metric: Metric) -> None:
     expected = metric.against(z, u)
     assert type(flat) is type(expected)
     assert flat(x, w) == expected(x, w) == column(x[:, None], w)
-    assert (column.event, column.scale, column.likelihood) == (
+    assert (column.event, column.scale, is_likelihood(column)) == (
         (1,),
         expected.scale,
         metric.likelihood,
@@ -56,8 +56,8 @@ def test_one_output_is_the_metric_itself(lift: Lift, metric: Metric) -> None:
     basis = column.basis(x[:, None])
     rows = np.stack([w, w[::-1]])
     np.testing.assert_array_equal(
-        column.outer(*column.from_basis(rows, basis, np), xp=np),
-        expected.outer(*expected.from_basis(rows, expected.basis(x), np), xp=np),
+        column.outer(*basis.features(rows), xp=np),
+        expected.outer(*expected.basis(x).features(rows), xp=np),
     )
     others = column.with_observed(x[1:9, None]), expected.with_observed(x[1:9])
     assert others[0](x[:, None], w) == others[1](x, w)
@@ -70,7 +70,8 @@ def test_every_metric_declares_what_its_inner_one_does() -> None:
             assert getattr(joint, name) == getattr(metric, name)
         d = joint.against(sample(30))
         assert joint.takes_outputs
-        assert (d.likelihood, joint.likelihood, d.additive) == (False, False, metric.additive)
+        assert (is_likelihood(d), is_additive(d)) == (False, metric.additive)
+        assert not joint.likelihood
     assert Joint(AreaMetric(), directions=5).like(KullbackLeibler()) == Joint(
         KullbackLeibler(), directions=5
     )

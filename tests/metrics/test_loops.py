@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import prbayes.metrics._loops as loops
+import prbayes.metrics.grid as loops
 from prbayes._validate import Floats
 from prbayes.metrics.density import GaussianKDE
 
@@ -32,7 +32,7 @@ def test_without_a_folder_for_it_the_compiled_loop_is_not_kept(
         values += 1
 
     values = np.zeros(3)
-    compiled = loops._compiled(add)
+    compiled = loops.compiled(add)
     assert not asked  # nothing is compiled before it is called
     compiled(values)
     compiled(values)

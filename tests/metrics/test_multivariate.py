@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,10 @@ from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
+from prbayes.metrics.base import Discrepancy, Metric, Minimum
 from prbayes.metrics.correlation import MarginalCorrelation
 from prbayes.metrics.custom import FunctionMetric
-from prbayes.metrics.density import GaussianKDE, Histogram
+from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, Histogram, overlap
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
@@ -54,12 +55,6 @@ class MeanDiscrepancy(Discrepancy):
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         return (simulated * weights).sum(axis=-1), (simulated**2 * weights).sum(axis=-1)
-
-    def basis(self, simulated: Floats) -> tuple[Floats, ...]:
-        return simulated, simulated**2
-
-    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
-        return weights @ basis[0], weights @ basis[1]
 
     def outer(self, *features: Any, xp: Any) -> Any:
         first, second = self.weights @ self.observed, self.weights @ self.observed**2
@@ -98,8 +93,8 @@ def draw() -> tuple[Floats, Floats, Floats, Floats]:
     return x, rng.dirichlet(np.ones(30)), z, rng.dirichlet(np.ones(25))
 
 
-def from_basis(d: Discrepancy, weights: Floats, basis: Any) -> Floats:
-    return np.asarray(d.outer(*d.from_basis(weights, basis, np), xp=np))
+def by_basis(d: Discrepancy, weights: Floats, basis: Any) -> Floats:
+    return np.asarray(d.outer(*basis.features(weights), xp=np))
 
 
 def test_it_is_the_sum_of_its_parts(metric: Metric, draw: Any) -> None:
@@ -108,9 +103,9 @@ def test_it_is_the_sum_of_its_parts(metric: Metric, draw: Any) -> None:
     values = [part.share * part.target.of(part.of(x), w) for part in d.parts]
     assert d(x, w) == pytest.approx(sum(values), rel=1e-12)
     assert d.scale == pytest.approx(sum(part.share * part.target.scale for part in d.parts))
-    assert (d.event, d.density_cells) == ((3,), None)
-    overlaps = [part.target.overlap(part.of(x), w) for part in d.parts]
-    assert d.overlap(x, w) == min(overlaps)
+    assert d.event == (3,)
+    overlaps = [overlap(part.target, part.of(x), w) for part in d.parts]
+    assert overlap(d, x, w) == min(overlaps)
     assert d.n_effective == pytest.approx(1 / (u**2).sum())
     (itself,) = d.parts[0].target.parts
     assert (itself.target, itself.share) == (d.parts[0].target, 1.0)
@@ -124,8 +119,8 @@ def test_batches_equal_a_loop_and_a_basis_gives_the_same(metric: Metric, draw: A
     xs, ws = x + rng.normal(0, 0.1, (2, 3, 1, 1)), rng.dirichlet(np.ones(30), (2, 3))
     expected = [[d(xs[i, j], ws[i, j]) for j in range(3)] for i in range(2)]
     np.testing.assert_allclose(d(xs, ws), expected, rtol=1e-9)
-    np.testing.assert_allclose(from_basis(d, ws, d.basis(x)), d(x, ws), rtol=1e-9)
-    assert d.overlap(xs, ws).shape == (2, 3)
+    np.testing.assert_allclose(by_basis(d, ws, d.basis(x)), d(x, ws), rtol=1e-9)
+    assert overlap(d, xs, ws).shape == (2, 3)
 
 
 def test_rows_of_weights_are_as_many_data_sets(metric: Metric, draw: Any) -> None:
@@ -136,7 +131,7 @@ def test_rows_of_weights_are_as_many_data_sets(metric: Metric, draw: Any) -> Non
     several = metric.against(z, u).with_observed(z, sets)
     some = several.rows([3, 1])
     basis = some.basis(x)
-    found = from_basis(some, np.stack([[w], [w[::-1]]]), basis)
+    found = by_basis(some, np.stack([[w], [w[::-1]]]), basis)
     expected = [
         several.with_observed(z, sets[3, 0])(x, w),
         several.with_observed(z, sets[1, 0])(x, w[::-1]),
@@ -172,16 +167,17 @@ def test_other_observed_values_keep_the_slices(metric: Metric, draw: Any) -> Non
 def test_the_graph_has_the_same_value_and_the_exact_gradient(metric: Metric, draw: Any) -> None:
     x, w, z, u = draw
     d = metric.against(z, u)
-    assert d.symbolic
+    assert d.metric.symbolic
     basis = d.basis(x)
-    shared = tuple(pytensor.shared(array) for array in basis)
+    shared = tuple(pytensor.shared(array) for array in basis.arrays)
+    in_graph = replace(basis, arrays=shared)
     symbol = pt.vector()
-    value = d.outer(*d.from_basis(symbol, shared, pt), xp=pt)
+    value = d.outer(*in_graph.features(symbol, pt), xp=pt)
     function = pytensor.function([symbol], [value, pt.grad(value, symbol)], mode=PYTHON)
     found, gradient = function(w)
     np.testing.assert_allclose(found, d(x, w), rtol=1e-10)
     step = 1e-7 * np.random.default_rng(3).standard_normal(30) * w
-    change = from_basis(d, w + step, basis) - from_basis(d, w - step, basis)
+    change = by_basis(d, w + step, basis) - by_basis(d, w - step, basis)
     np.testing.assert_allclose(gradient @ (2 * step), change, rtol=2e-5, atol=1e-15)
 
 
@@ -208,8 +204,9 @@ def test_the_graph_of_many_outputs_is_no_larger_than_that_of_two(inner: str) -> 
         x = np.random.default_rng(4).standard_normal((20, m))
         d = Joint(INNER[inner]).against(x)
         symbol = pt.vector()
-        basis = tuple(pytensor.shared(array) for array in d.basis(x))
-        value = d.outer(*d.from_basis(symbol, basis, pt), xp=pt)
+        basis = d.basis(x)
+        basis = replace(basis, arrays=tuple(map(pytensor.shared, basis.arrays)))
+        value = d.outer(*basis.features(symbol, pt), xp=pt)
         sizes.append(len(list(ancestors([value, pt.grad(value, symbol)]))))
     assert sizes[0] == sizes[1]
 
@@ -225,7 +222,7 @@ def test_a_point_without_a_response_counts_nowhere(metric: Metric, draw: Any) ->
     expected = d.of(x[kept], w[kept])
     if not isinstance(metric.metric, AreaMetric):  # type: ignore[attr-defined]
         np.testing.assert_allclose(d.of(gone, w), expected, rtol=1e-10)
-    np.testing.assert_allclose(from_basis(d, w, d.basis(gone)), expected, rtol=1e-10)
+    np.testing.assert_allclose(by_basis(d, w, d.basis(gone)), expected, rtol=1e-10)
 
 
 def test_a_function_is_called_with_what_each_part_sees(draw: Any) -> None:
@@ -241,12 +238,12 @@ def test_a_function_is_called_with_what_each_part_sees(draw: Any) -> None:
         calls.clear()
         d = lift(FunctionMetric(apart)).against(z)
         equal = np.full((2, 30), 1 / 30)
-        found = from_basis(d, equal, d.basis(x))
-        assert not d.symbolic
+        found = by_basis(d, equal, d.basis(x))
+        assert not d.metric.symbolic
         np.testing.assert_allclose(found, d(x), rtol=1e-12)
         assert calls[:number] == [((2, 30), (17,))] * number
         sets = np.full((2, 1, 17), 1 / 17)
         several = d.with_observed(z, sets)
         np.testing.assert_allclose(
-            from_basis(several, equal[:, None], d.basis(x))[:, 0], d(x), rtol=1e-12
+            by_basis(several, equal[:, None], several.basis(x))[:, 0], d(x), rtol=1e-12
         )

@@ -102,7 +102,7 @@ def test_the_finding_names_step_and_argument() -> None:
     (finding,) = data_findings(y, labels=["length"])
     assert finding.text.startswith("length: got 50 values that are all multiples of a step of 0.5 ")
     assert "expected" in finding.text
-    assert finding.text.endswith("pass rounded=0.5")
+    assert finding.text.endswith("pass rounded=0.5.")
 
 
 # Ends: README 2.7.
@@ -256,7 +256,7 @@ def test_the_finding_names_the_specimens() -> None:
     y = np.random.default_rng(15).standard_normal((20, 2))
     y[17] = y[3]
     (finding,) = data_findings(y)
-    assert finding.text.startswith("got specimens 3 and 17 (counted from 0) with identical values")
+    assert finding.text.startswith("Got specimens 3 and 17 (counted from 0) with identical values")
     (finding,) = data_findings(np.concatenate([y, y]))
     assert "17 groups more" not in finding.text
     assert "groups more" in finding.text

@@ -17,10 +17,10 @@ from prbayes.propagation.importance import LARGEST_CLOUD
 
 def test_what_breaks_down_is_said_by_name_and_only_then() -> None:
     assert breakdown((), ()) == []
-    (line,) = breakdown(("sigma", "tau"), ())
-    assert line.startswith("sigma, tau ran to the edge of the support")
-    (line,) = breakdown((), ("y",))
-    assert line.startswith("y: points lose their response at the optimum")
+    (finding,) = breakdown(("sigma", "tau"), ())
+    assert finding.text.startswith("sigma, tau ran to the edge of the support")
+    (finding,) = breakdown((), ("y",))
+    assert finding.text.startswith("y: points lose their response at the optimum")
     assert len(breakdown(("sigma",), ("y",))) == 2
 
 
@@ -39,9 +39,9 @@ def test_no_larger_design_is_asked_for_where_points_cost_nothing(
         for k, cloud in enumerate(of)
     }
     evaluator: Any = SimpleNamespace(nodes=(), designs=designs)
-    (line,) = caveats(evaluator, None, (), 0.4)
-    assert "by about 0.40 standard errors, expected at most 0.1" in line
-    assert told in line
+    (finding,) = caveats(evaluator, None, (), 0.4)
+    assert "by about 0.40 standard errors, expected at most 0.1" in finding.text
+    assert told in finding.text
     assert caveats(evaluator, None, (), 0.14) == ()
 
 
@@ -59,11 +59,11 @@ def test_a_mirror_is_told_by_standard_deviations_and_correlations() -> None:
     rival = Rival(
         evaluator.hyperparameters.unconstrained(point), 0.1, comparable=True, better=False
     )
-    (line,) = caveats(evaluator, None, (rival,), 0.0)
+    (finding,) = caveats(evaluator, None, (rival,), 0.0)
     assert (
         "come from mean[rod] = 1, mean[pin] = 2, cov_stds[0] = 0.5, cov_stds[1] = 0.5, "
         "cov_corr[0,1] = -0.6: another optimum"
-    ) in line
+    ) in finding.text
 
 
 def edges(model: pm.Model, *theta: float) -> tuple[str, ...]:
@@ -118,13 +118,13 @@ def test_an_area_of_a_population_without_a_mean_is_warned_of() -> None:
     observed = np.abs(np.random.default_rng(1).standard_cauchy(30))
     said = "one or less has no mean"
     area = minimum(prb.AreaMetric(), pm.HalfCauchy.dist, observed)
-    assert said in "".join(area.warnings)
+    assert said in "".join(map(str, area.findings))
     assert said in str(prb.diagnose(area))
     other = minimum(prb.KullbackLeibler(), pm.HalfCauchy.dist, observed)
-    assert said not in "".join(other.warnings)
+    assert said not in "".join(map(str, other.findings))
     observed = np.random.default_rng(1).exponential(1.0, 30)
     short = minimum(prb.AreaMetric(), lambda s: pm.Exponential.dist(scale=s), observed)
-    assert said not in "".join(short.warnings)
+    assert said not in "".join(map(str, short.findings))
 
 
 @pytest.mark.parametrize(("largest", "said"), [(2.2, False), (9.0, True)])
@@ -144,7 +144,7 @@ def test_a_value_between_responses_far_apart_is_told_of(largest: float, said: bo
     found = between_runs(evaluator, np.array([0.0, np.log(0.3)]))
     assert len(found) == said
     if said:
-        assert "1 of 60 observed values (9) lie between responses" in found[0]
+        assert "1 of 60 observed values (9) lie between responses" in found[0].text
     # A metric that smooths both sides takes no value by itself.
     with pm.Model() as model:
         x = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))

@@ -53,7 +53,7 @@ def test_a_refusal_tells_what_the_data_do_not() -> None:
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
     evaluator = Evaluator.of(model)
     short = shortcomings(evaluator, np.array([[30.0]]))
-    told = "the data tell less than the prior about mu"
+    told = "The data tell less than the prior about mu"
     with pytest.raises(DesignError, match=rf"y: .*; narrow the priors, .*\. There {told}"):
         refuse(short, evaluator, [told])
     refuse({}, evaluator, [told])

@@ -46,9 +46,9 @@ def codes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return the codes of findings, as they are reported."""
     reported: list[str] = []
 
-    def recorded(findings: list[Finding]) -> tuple[Finding, ...]:
+    def recorded(*findings: Finding) -> tuple[Finding, ...]:
         reported.extend(finding.code for finding in findings)
-        return report(findings)
+        return report(*findings)
 
     monkeypatch.setattr("prbayes.optimize.maximum_likelihood.report", recorded)
     return reported
@@ -65,7 +65,7 @@ def normal_optimum() -> prb.Optimum:
 def test_the_optimum_of_a_normal_population() -> None:
     optimum = normal_optimum()
     assert optimum.converged
-    assert optimum.warnings == ()
+    assert optimum.findings == ()
     assert optimum.point["mu"] == pytest.approx(X.mean(), abs=1e-3)
     assert optimum.point["sigma"] == pytest.approx(X.std(), abs=1e-3)
 
@@ -120,7 +120,7 @@ def test_a_specimen_beyond_all_draws_of_the_prior() -> None:
 def test_a_folded_response_has_two_modes(codes: list[str]) -> None:
     optimum = fit(folded_model())
     assert codes == ["second-mode"]
-    assert "of the posterior's mass" in optimum.warnings[0]
+    assert "of the posterior's mass" in optimum.findings[0].text
     (rival,) = optimum.rivals
     assert rival["point"]["mu"] == pytest.approx(-optimum.point["mu"], abs=1e-3)
     assert rival["point"]["sigma"] == pytest.approx(optimum.point["sigma"], abs=1e-3)
@@ -217,7 +217,7 @@ def test_hyperparameters_that_are_not_identified(codes: list[str]) -> None:
         prb.Simulator("y", line, pm.Normal.dist(first + second, sigma), observed=line(X))
     optimum = fit(model)
     assert codes == ["not-identified"]
-    assert "do not identify first, second" in optimum.warnings[0]
+    assert "do not identify first, second" in optimum.findings[0].text
     assert optimum.stderr["first"] == optimum.stderr["second"] == np.inf
     assert optimum.stderr["sigma"] == pytest.approx(X.std() / np.sqrt(2 * N), abs=2e-3)
     total = optimum.point["first"] + optimum.point["second"]

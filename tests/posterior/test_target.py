@@ -14,6 +14,7 @@ from normal_posterior import Moments, exact_moments, grid_moments, require_close
 from scipy import stats
 
 import prbayes as prb
+from prbayes._finding import from_json
 from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
 from prbayes.model.random_variable import nodes
@@ -103,13 +104,13 @@ def _vague(mu: Floats, sigma: Floats) -> Floats:
 
 
 def test_a_prior_away_from_the_estimate_is_reported() -> None:
-    model = normal_model(KLD, DATA, mu=lambda: pm.Normal("mu", 0.0, 0.1))
+    model = normal_model(KLD, DATA, mu=lambda: pm.Normal("mu", 0.0, 0.2))
     tree = prb.sample(50, chains=1, model=model, **QUIET)
-    conflicts = [line for line in tree.posterior.attrs["warnings"].splitlines() if "prior" in line]
-    assert len(conflicts) == 1
-    assert "mu" in conflicts[0]
+    findings = from_json(tree.posterior.attrs["findings"])
+    (finding,) = [finding for finding in findings if finding.code == "prior-conflict"]
+    assert "mu" in finding.text
     agreeing = prb.sample(50, chains=1, model=fitted(KLD).model, optimum=fitted(KLD), **QUIET)
-    assert agreeing.posterior.attrs["warnings"] == ""
+    assert from_json(agreeing.posterior.attrs["findings"]) == ()
 
 
 # -- priors that end near the data, or are sharper than these --

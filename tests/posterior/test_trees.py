@@ -217,7 +217,7 @@ def test_an_optimum_shows_its_answer_in_a_few_lines() -> None:
     assert lines[0].endswith("converged")
     told = [line.strip().partition(" = ") for line in lines[1:] if " ± " in line]
     assert [name for name, _, _ in told] == ["mean[north]", "mean[south]", "sigma", "variance"]
-    assert len(lines) == 1 + len(told) + len(found.warnings)
+    assert len(lines) == 1 + len(told) + len(found.findings)
     numbers = np.concatenate([np.ravel(found.point[name]) for name in found.point])
     errors = np.concatenate([np.ravel(found.stderr[name]) for name in found.point])
     for (_, _, text), number, error in zip(told, numbers, errors, strict=True):

@@ -15,6 +15,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._validate import Floats
+from prbayes.metrics.multivariate import CompositeDiscrepancy
 from prbayes.model.coverage import shortcomings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
@@ -445,11 +446,11 @@ def test_the_error_of_a_design_is_measured() -> None:
     found = np.sqrt(2) * np.max(np.std([o.theta for o in small], axis=0, ddof=1) / sd)
     assert said > 0.1
     assert 0.7 < said / found < 4  # what blocks tell is too much rather than too little
-    assert any("another design would differ by about" in line for o in small for line in o.warnings)
+    assert "design-error" in {finding.code for o in small for finding in o.findings}
     large = prb.minimize(product(0), starts=0)
     assert large.design_error <= 0.1
     assert 1024 < large.n_responses <= 32 * 512
-    assert not large.warnings
+    assert not large.findings
     assert np.isnan(prb.minimize(once(), starts=0).design_error)  # one input
 
 
@@ -812,7 +813,7 @@ def test_where_a_basis_would_be_too_large_nothing_else_changes(
     at, many, sizes = found()
     assert max(sizes) > 128 * 100
     monkeypatch.setattr("prbayes.propagation.reweighted._MOST_NUMBERS", 100)
-    monkeypatch.setattr("prbayes.metrics.base.AT_ONCE", 100)
+    monkeypatch.setattr(CompositeDiscrepancy.basis, "__defaults__", (100,))
     compact_at, compact_many, compact_sizes = found()
     assert max(compact_sizes) == 128 * 4
     np.testing.assert_allclose(compact_at[0], at[0], rtol=1e-10)

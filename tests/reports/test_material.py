@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
+from prbayes._finding import Finding
 from prbayes.model.random_variable import nodes
 from prbayes.reports.material import gather
 from prbayes.reports.tables import cells
@@ -135,7 +136,10 @@ def test_a_name_is_given_once(calibrated: Any) -> None:
 
 def test_a_saved_optimum_is_diagnosed_as_in_memory(calibrated: Any) -> None:
     lost = replace(
-        calibrated.optimum, converged=False, message="stopped", warnings=("the data do not see mu",)
+        calibrated.optimum,
+        converged=False,
+        message="stopped",
+        findings=(Finding("not-identified", "The data do not see mu."),),
     )
     given = dict.fromkeys(("model", "posterior", "validity", "comparison"))
     memory = gather(optimum=lost, **given).diagnoses["optimum"]

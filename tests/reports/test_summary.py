@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
+from prbayes._finding import Finding, as_json
 from prbayes.reports.material import gather
 from prbayes.reports.summary import summary, verdict
 
@@ -37,7 +38,8 @@ def test_problems_are_counted_in_the_summary(calibrated: Any, section: Any) -> N
     bad = prb.Report("x", posterior=posterior, pictures=False)
     assert any("R-hat" in p for p in section(bad, "Diagnostics").text)
     assert any("problem" in p and "found no problem" not in p for p in bad.sections[0].text)
-    posterior["posterior"].attrs["warnings"] = "the data do not see mu"
+    finding = Finding("not-identified", "The data do not see mu.")
+    posterior["posterior"].attrs["findings"] = as_json([finding])
     again = prb.Report("x", posterior=posterior, pictures=False)
     assert "Posterior: The data do not see mu." in section(again, "Diagnostics").text
 

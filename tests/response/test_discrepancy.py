@@ -11,7 +11,8 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
-from prbayes.response.discrepancy import caveats_of, corrected
+from prbayes._finding import from_json
+from prbayes.response.discrepancy import corrected, findings_of
 
 TIMES = np.array([1.0, 2.0, 4.0])
 
@@ -97,9 +98,9 @@ def test_a_mapping_is_refused() -> None:
     [(1.0, False), (4.0, False), ([1.0, np.nan, 4.0], False), (0.9, True), ([1.0, 2.0, 5.0], True)],
 )
 def test_it_says_where_it_extrapolates(condition: Any, outside: bool) -> None:
-    found = caveats_of(prb.response.Additive(TIMES).of(curve, condition))
+    found = findings_of(prb.response.Additive(TIMES).of(curve, condition))
     assert bool(found) is outside
-    assert all("extrapolates its inadequacy, seen from 1 to 4" in text for text in found)
+    assert all("extrapolates its inadequacy, seen from 1 to 4" in str(f) for f in found)
 
 
 def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture) -> None:
@@ -115,12 +116,13 @@ def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture)
         optimum = prb.minimize(progressbar=False)
     assert not caplog.records
     inside = prb.predict(optimum, drift.of(line, 2.0), x, b, model=model, n_samples=50)
-    assert inside.attrs["caveats"] == []
+    assert from_json(inside.attrs["findings"]) == ()
     assert not caplog.records
     with caplog.at_level(logging.WARNING, "prbayes"):
         beyond = prb.predict(optimum, drift.of(line, 3.0), x, b, model=model, n_samples=50)
-    said = "line at 3: extrapolates its inadequacy, seen from 0 to 2"
-    assert beyond.attrs["caveats"] == [said]
+    said = "line at 3: extrapolates its inadequacy, seen from 0 to 2."
+    (finding,) = from_json(beyond.attrs["findings"])
+    assert (finding.code, str(finding)) == ("extrapolated-discrepancy", said)
     assert [record.message for record in caplog.records] == [said]
 
 

@@ -452,15 +452,20 @@ def test_numbers_that_json_does_not_know_are_read_and_texts_are_left() -> None:
         prb.umbridge(server.url)(1.0, 2.0)
 
 
-def test_a_machine_that_is_gone_is_noticed_without_a_time_limit() -> None:
+def test_a_machine_that_is_gone_is_noticed_without_a_time_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with telling() as server:
-        prb.umbridge(server.url)(1.0, 2.0)
-        ((_, kept),) = [(k, c) for k, c in um_bridge._own.connections.items() if server.url in k]
-        assert kept.http.sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        response = prb.umbridge(server.url)
+        kept = um_bridge._pool.connection_from_url(server.url).pool
+        assert kept is not None
+        sock = kept.queue[-1].sock
+        assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
 
         # What the system says of a machine that does not answer is a loss, and not a time limit.
         def gone(*_: object) -> Any:
+            monkeypatch.undo()
             raise TimeoutError(110, "Connection timed out")
 
-        kept.exchanged = gone  # type: ignore[method-assign]
-        assert prb.umbridge(server.url)(3.0, 2.0)[1] == 18
+        monkeypatch.setattr("urllib3.connection.HTTPConnection.getresponse", gone)
+        assert response(3.0, 2.0)[1] == 18

@@ -269,7 +269,7 @@ def test_several_outputs_are_scored_by_joint_metrics() -> None:
     names = ["ProbabilityResidual", "KullbackLeibler", "AreaMetric", "LogLikelihood"]
     assert {f"Joint({name})" for name in names} <= set(table.data_vars)
     assert float(table["Joint(AreaMetric)"][0]) == pytest.approx(optimum.discrepancy)
-    prb.plot_comparison(table, backend="none")
+    prb.plot_comparison(table)
 
 
 def test_scores_need_every_hyperparameter(model: pm.Model) -> None:

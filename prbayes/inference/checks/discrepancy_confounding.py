@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.identifiability import named_direction
@@ -26,13 +26,13 @@ _TAKES_PART = 0.001
 _TOLD_APART = 0.95
 
 
-def confounded(evaluator: Evaluator, local: Local) -> list[str]:
+def confounded(evaluator: Evaluator, local: Local) -> list[Finding]:
     """Say where data do not tell an inadequacy's hyperparameters from those of other inputs.
 
     Either a direction of both is not identified, or their estimates, by data and prior together,
     have too large a canonical correlation.
     """
-    lines = []
+    findings = []
     for node in evaluator.nodes:
         own, others = _elements(evaluator, node)
         if not own.size or not others.size:
@@ -40,12 +40,16 @@ def confounded(evaluator: Evaluator, local: Local) -> list[str]:
         names = evaluator.hyperparameters.readable_names
         found = _mixed(local, own, others, names) or _alike(local, own, others, names)
         if found:
-            lines.append(
-                f"{node.name}: the data do not tell the model inadequacy from the inputs: {found}; "
-                "measure under more conditions, state narrower priors, or leave one of them out"
-                f"{more_in('inadequacy.md#can-it-be-told-from-the-scatter-of-the-inputs')}"
+            findings.append(
+                Finding(
+                    "discrepancy-confounded",
+                    f"{node.name}: the data do not tell the model inadequacy from the inputs: "
+                    f"{found}; measure under more conditions, state narrower priors, or leave one "
+                    "of them out.",
+                    "inadequacy.md#can-it-be-told-from-the-scatter-of-the-inputs",
+                )
             )
-    return lines
+    return findings
 
 
 def _mixed(local: Local, own: Places, others: Places, names: list[str]) -> str:

@@ -61,7 +61,7 @@ def failing_region_findings(
             Finding(
                 "failing-region",
                 f"{simulator.name}: got no finite response for {share:.1%} of the population, "
-                f"expected less than {lost / n:.1%}: {meaning}",
+                f"expected less than {lost / n:.1%}: {meaning}.",
                 "likelihood.md#failing-region",
             )
         )

@@ -226,10 +226,10 @@ def population_findings(
     return (
         Finding(
             "population-misfit",
-            f"the family of the population: got p = {test.p_value:.2g} for the inputs of {test.n} "
+            f"The family of the population: got p = {test.p_value:.2g} for the inputs of {test.n} "
             f"specimens, with the smallest p-value for {worst}, expected p > {threshold:g}; "
             "compare skewed families, two-part families, gross_errors=True, and a limit beyond "
-            "which no specimen was measured",
+            "which no specimen was measured.",
             "likelihood.md#population-misfit",
         ),
     )

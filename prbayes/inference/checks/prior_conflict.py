@@ -127,7 +127,7 @@ def conflict_findings(
                 f"{standard_error[j]:.2g} (p = {conflict.adjusted[j]:.1g}); the prior pulls the "
                 f"posterior mean to {posterior_mean[j]:.3g}, {conflict.pulls[j]:.1f} standard "
                 f"errors from the data, expected at most {pull:g}; check the units and the prior, "
-                "or widen it",
+                "or widen it.",
                 "likelihood.md#prior-conflict",
             )
         )

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._finding import Finding
-from prbayes._pages import more_in
 from prbayes._validate import Floats
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator, only_through_prior
@@ -126,20 +125,16 @@ def _pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
     return is_worse(back)
 
 
-def of_prior_ends(ends: list[PriorEnd]) -> list[str]:
-    """Say so."""
-    page = more_in("optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something")
-    return [f"{finding.text}{page}" for finding in prior_end_findings(ends)]
-
-
-def prior_end_findings(ends: list[PriorEnd]) -> list[Finding]:
+def prior_end_findings(
+    ends: list[PriorEnd], page: str = "likelihood.md#end-of-a-prior"
+) -> list[Finding]:
     """Report ends of priors."""
     return [
         Finding(
             "prior-end",
-            f"the data push {end}, and ask for more than it allows: widen the prior, or look at "
-            "units, at the response and at the family of the inputs",
-            "likelihood.md#end-of-a-prior",
+            f"The data push {end}, and ask for more than it allows: widen the prior, or look at "
+            "units, at the response and at the family of the inputs.",
+            page,
         )
         for end in ends
     ]

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes._pages import more_in
+from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.projections import number_parts
+from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import slopes
 from prbayes.numerics.stencils import hessian_of, stencil
@@ -34,7 +35,7 @@ _ONE_STEP = 1.5
 
 def wide_kernels(
     evaluator: Evaluator, theta: Floats, scales: Floats, local: Local | None
-) -> list[str]:
+) -> list[Finding]:
     """Say which likelihood is smoothed by so much that the optimum is where it is because of that.
 
     By a step to the optimum under kernels of half the width; of stored responses only.
@@ -52,7 +53,7 @@ def wide_kernels(
     smoothed = [
         k
         for k, node in enumerate(evaluator.nodes)
-        if node.bound.stored and any(p.target.resolution > 0 for p in number_parts(node.target))
+        if node.bound.stored and any(kernel_width(p.target) > 0 for p in number_parts(node.target))
     ]
     if local is None or not smoothed or not local.covariance.size:
         return []
@@ -60,7 +61,7 @@ def wide_kernels(
     thetas = theta + _DIFFERENCE_STEP * stencil(axes.shape[1]) @ axes.T
     step = np.full(axes.shape[1], _DIFFERENCE_STEP)
     hessian = hessian_of(evaluator.total(thetas, scales), step.size)
-    lines = []
+    findings = []
     for k in smoothed:
         gain = _gain(evaluator, thetas, k) / scales[k]
         # On the way to the other optimum the curvature is the mean of both.
@@ -72,8 +73,8 @@ def wide_kernels(
         stderr = np.sqrt((axes**2).sum(axis=1))
         bias = np.abs(shift) / np.where(stderr > 0, stderr, np.inf) / _OF_BIAS
         if bias.max() > _BIASED:
-            lines.append(_told(evaluator, k, bias))
-    return lines
+            findings.append(_finding(evaluator, k, bias))
+    return findings
 
 
 def _axes(local: Local) -> Floats:
@@ -90,25 +91,27 @@ def _gain(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
     total = np.zeros(len(thetas))
     for part in number_parts(evaluator.nodes[k].target):
         seen = part.of(values)
-        total += part.share * (part.target.narrowed(0.5).of(seen, weights))
+        total += part.share * with_narrower_kernel(part.target, 0.5).of(seen, weights)
         total -= part.share * part.target.of(seen, weights)
     return total
 
 
-def _told(evaluator: Evaluator, k: int, bias: Floats) -> str:
+def _finding(evaluator: Evaluator, k: int, bias: Floats) -> Finding:
     node = evaluator.nodes[k]
     worst = int(bias.argmax())
     name = evaluator.hyperparameters.readable_names[worst]
     kernel = ""
     parts = number_parts(node.target)
     if len(parts) == 1:
-        width = parts[0].target.resolution * np.sqrt(_AIMED / bias[worst])
+        width = kernel_width(parts[0].target) * np.sqrt(_AIMED / bias[worst])
         kernel = f"prb.LogLikelihood(density=prb.GaussianKDE({width:.2g})), or "
     size = f"about {bias[worst]:.1f} standard errors"
     if bias[worst] > _ONE_STEP:
         size = "more than a standard error"
-    return (
+    return Finding(
+        "smoothing-bias",
         f"{node.name}: the kernel of the log-likelihood is wide beside what it smooths, as where "
         f"responses lie in groups or a long tail: {name} is off by {size} for that; use {kernel}"
-        f"prb.KullbackLeibler(){more_in('choosing_metric.md#advice')}"
+        "prb.KullbackLeibler().",
+        "choosing_metric.md#advice",
     )

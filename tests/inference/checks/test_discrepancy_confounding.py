@@ -12,8 +12,6 @@ import prbayes as prb
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.discrepancy_confounding import _alike, _canonical, _mixed, confounded
 
-TOLD = "the data do not tell the model inadequacy from the inputs"
-
 
 def local(identified: Any, variances: Any, size: int) -> Local:
     """Return what data identify along some directions, with variances."""
@@ -109,13 +107,14 @@ def test_one_condition_does_not_tell_them_two_do(
     study: Any, conditions: list[float], prior_sd: float, told: bool
 ) -> None:
     optimum = study(conditions, prior_sd)
-    lines = [line for line in optimum.warnings if TOLD in line]
+    lines = [f.text for f in optimum.findings if f.code == "discrepancy-confounded"]
     assert len(lines) == told
     assert all("lift" in line and "measure under more conditions" in line for line in lines)
 
 
 def test_a_narrow_prior_tells_them(study: Any) -> None:
-    assert not [line for line in study([2.0], 0.02).warnings if TOLD in line]
+    codes = {finding.code for finding in study([2.0], 0.02).findings}
+    assert "discrepancy-confounded" not in codes
 
 
 def test_a_model_without_an_inadequacy_has_nothing_to_tell() -> None:

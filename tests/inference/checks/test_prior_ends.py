@@ -61,9 +61,10 @@ def test_data_beyond_a_prior_are_said_to_push_and_draws_stay_there(
         tree = prb.sample_smc(
             draws=300, chains=2, adjustment=adjustment, random_seed=1, progressbar=False
         )
-    (line,) = (line for line in optimum.warnings if "the data push mu to" in line)
-    assert f"next to the end of its prior at {bound:.4g}" in line
-    assert not any("tell less than the prior about mu" in line for line in optimum.warnings)
+    (finding,) = optimum.findings
+    assert finding.code == "prior-end"
+    assert "The data push mu to" in finding.text
+    assert f"next to the end of its prior at {bound:.4g}" in finding.text
     # They went back to the prior, whose mean is a half, where estimates have no density.
     mean = float(tree.posterior["mu"].mean())
     assert abs(mean - bound) < 0.15

@@ -29,7 +29,7 @@ def optimum(response: Any, metric: prb.Metric) -> prb.Optimum:
 
 
 def told(result: prb.Optimum) -> list[str]:
-    return [line for line in result.warnings if "kernel of the log-likelihood" in line]
+    return [finding.text for finding in result.findings if finding.code == "smoothing-bias"]
 
 
 def test_a_kernel_that_is_wide_beside_a_branch_is_told_of() -> None:
