@@ -76,7 +76,7 @@ def test_all_groups_are_of_one_design() -> None:
     assert calls == before + 512
     assert n_design_runs(evaluator) == evaluator.n_responses == 512
     assert first.same_points(second)
-    assert evaluator.nodes[0].design.n_runs == 512
+    assert evaluator.nodes[0].bound.n_runs == 512
     assert sum(node.bound.responses.computed for node in evaluator.nodes) == 512
 
 

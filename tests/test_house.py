@@ -551,6 +551,7 @@ INNER = {
         "pytensor.graph.replace.graph_replace",
         "pytensor.tensor.variable.TensorVariable",
     },
+    "propagation.design": {"pytensor.tensor.variable.TensorVariable"},
     "propagation.fresh": {"pytensor.tensor.variable.TensorVariable"},
     "propagation.ops": {
         "pytensor.gradient.grad_undefined",

@@ -26,7 +26,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.model.specimen_variable import measurements_of, specimen_likelihoods
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.coordinates import Coordinates
-from prbayes.propagation.new_specimens import new_specimens
+from prbayes.propagation.points import new_specimens
 from prbayes.propagation.specimen_points import Surface
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
@@ -218,7 +218,7 @@ class EmulatedSimulator:
 
     is_emulated: ClassVar[Literal[True]] = True
     # As of a Node: no response is weighted.
-    design: ClassVar[None] = None
+    reweighted: ClassVar[None] = None
     max_lost: ClassVar[float] = MAX_LOST
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.convergence import apart_from_data, areas
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 
 _log = logging.getLogger("prbayes")
 # Batches added before a design is refused: by judgement; half or twice changes no answer
@@ -82,8 +82,8 @@ def _untold(evaluator: Evaluator, names: set[str]) -> set[str]:
     """Return the designs, of those named, whose emulators say little where the last points went."""
     found = set()
     for name in names:
-        emulation = evaluator.designs[name].contents.emulation
-        if emulation is not None and emulation.error > _UNTOLD:
+        emulator = evaluator.reweighted[name].design.emulator
+        if emulator is not None and emulator.error > _UNTOLD:
             found.add(name)
     return found
 
@@ -110,9 +110,9 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         errors.whole,
         AGREE,
     )
-    clouds = {name for name, design in evaluator.designs.items() if design.contents.cloud}
+    clouds = {name for name, bound in evaluator.reweighted.items() if bound.design.is_emulated}
     if _needs_runs(evaluator, errors):
-        names = set(evaluator.designs)
+        names = set(evaluator.reweighted)
         # A cloud is then drawn anew for these populations; whether that is enough is seen next.
         if _add(evaluator, thetas, names, min(_GROWTH, _factor(errors.whole))):
             return True
@@ -127,14 +127,14 @@ def runs_left(evaluator: Evaluator, errors: DesignErrors) -> int:
         return 0
     more = _factor(errors.whole) - 1
     left = 0.0
-    for design in evaluator.designs.values():
-        left += min(more * design.n_runs, max(0, design.max_points - design.n_runs))
+    for bound in evaluator.reweighted.values():
+        left += min(more * bound.n_runs, max(0, bound.config.most - bound.n_runs))
     return round(left)
 
 
 def _needs_runs(evaluator: Evaluator, errors: DesignErrors) -> bool:
     """Return whether more runs make designs' error smaller."""
-    emulated = all(design.contents.cloud for design in evaluator.designs.values())
+    emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     return not emulated or errors.emulators > _OF_EACH * AGREE
 
 
@@ -152,17 +152,17 @@ def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 
     names = siblings(evaluator.nodes, names)
     added: list[str] = []
     for k, node in enumerate(evaluator.nodes):
-        design = node.design
-        if design is None or node.name not in names:
+        bound = node.reweighted
+        if bound is None or node.name not in names:
             continue
-        now = design.n_runs
-        first = design.batch_size
+        now = bound.n_runs
+        first = bound.batch_size
         batches = max(1, round((factor - 1) * now / first))
-        room = design.max_points - now
+        room = bound.config.most - now
         size = min(batches * first, room)
         if size > 0:
-            design.add(_components(evaluator, thetas, k), size)
-            added.append(f"{node.name} from {now} to {design.n_runs}")
+            bound.add(_components(evaluator, thetas, k), size)
+            added.append(f"{node.name} from {now} to {bound.n_runs}")
     if added:
         _log.info("refined: %s runs", ", ".join(added))
     return bool(added)
@@ -203,7 +203,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         # Let the designs reach them.
         thin = _thin(evaluator, best)
         _reach(evaluator, best, thin, on_the_way=True)
-        growing = {name for name in thin if _has_room(evaluator.designs[name])}
+        growing = {name for name in thin if _has_room(evaluator.reweighted[name])}
         _add(evaluator, best, growing)
         # Stop where sampling explains the differences that are left.
         spread = value[order[-1]] - value[order[0]]
@@ -222,15 +222,16 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
     return best
 
 
-def _clouds(evaluator: Evaluator, names: set[str]) -> Iterator[tuple[int, Design]]:
+def _clouds(evaluator: Evaluator, names: set[str]) -> Iterator[tuple[int, ReweightedBound]]:
     """Yield designs with a cloud, by position of their simulators, of those named.
 
     And of those that share their specimens, whose points stay the same ones.
     """
     together = siblings(evaluator.nodes, names)
     for k, node in enumerate(evaluator.nodes):
-        if node.design is not None and node.design.contents.cloud and node.name in together:
-            yield k, node.design
+        bound = node.reweighted
+        if bound is not None and bound.design.is_emulated and node.name in together:
+            yield k, bound
 
 
 def _reach(
@@ -238,8 +239,8 @@ def _reach(
 ) -> bool:
     """Let clouds reach the populations at thetas; return whether there are any."""
     clouds = list(_clouds(evaluator, names))
-    for k, design in clouds:
-        design.reach(_components(evaluator, thetas, k), on_the_way=on_the_way)
+    for k, bound in clouds:
+        bound.reach(_components(evaluator, thetas, k), same_surfaces=on_the_way)
     return bool(clouds)
 
 
@@ -249,8 +250,8 @@ def reached(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
 
     They know the prior alone, and are thin around what was found by another process.
     """
-    designs = evaluator.designs.items()
-    names = {name for name, design in designs if len(design.contents.groups) == 1}
+    bounds = evaluator.reweighted.items()
+    names = {name for name, bound in bounds if len(bound.design.groups) == 1}
     with _reaching(evaluator, thetas, names, on_the_way=False):
         yield
 
@@ -258,7 +259,7 @@ def reached(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
 @contextmanager
 def visited(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
     """Let clouds reach the populations at thetas, inside, with the emulators that they have."""
-    with _reaching(evaluator, thetas, set(evaluator.designs), on_the_way=True):
+    with _reaching(evaluator, thetas, set(evaluator.reweighted), on_the_way=True):
         yield
 
 
@@ -267,9 +268,7 @@ def _reaching(
     evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool
 ) -> Iterator[None]:
     """Let clouds of the designs named reach populations, and bring them back afterwards."""
-    with ExitStack() as stack:
-        for _, design in _clouds(evaluator, names):
-            stack.enter_context(design.undone())
+    with designs_restored([bound for _, bound in _clouds(evaluator, names)]):
         _reach(evaluator, thetas, names, on_the_way=on_the_way)
         yield
 
@@ -279,21 +278,21 @@ def _widened(
 ) -> bool:
     """Draw larger clouds for the populations at thetas; return whether any could be."""
     grown = False
-    for k, design in _clouds(evaluator, names):
-        grown |= design.widen(_components(evaluator, thetas, k), on_the_way=on_the_way)
+    for k, bound in _clouds(evaluator, names):
+        grown |= bound.widen(_components(evaluator, thetas, k), same_surfaces=on_the_way)
     return grown
 
 
-def _has_room(design: Design) -> bool:
+def _has_room(bound: ReweightedBound) -> bool:
     """Return whether runs are added to a design on the way: a cloud needs none."""
-    return design.contents.cloud is None and design.n_batches <= MAX_ROUNDS
+    return not bound.design.is_emulated and len(bound.design.batch_sizes) <= MAX_ROUNDS
 
 
 def _thin(evaluator: Evaluator, thetas: Floats) -> set[str]:
     """Return the designs that reach fewer than half of the populations at thetas."""
     names = set()
     for name, support in evaluator.support(thetas).items():
-        if np.median(support["weight_ess"]) < evaluator.designs[name].required_ess:
+        if np.median(support["weight_ess"]) < evaluator.reweighted[name].required_ess:
             names.add(name)
     return names
 
@@ -316,11 +315,11 @@ def refuse(
     what = "; ".join(
         f"{name}: the design does not support the answer: {s}" for name, s in short.items()
     )
-    design = evaluator.designs[next(iter(short))]
+    bound = evaluator.reweighted[next(iter(short))]
     known = "".join(f". {finding}" for finding in findings)
     raise DesignError(
-        f"{what}; narrow the priors, pass a larger prb.Reweighted(n) (now {design.n_runs} runs "
-        f"in all, of at most {design.max_points}), or use prb.Resimulated(n), which has no design"
+        f"{what}; narrow the priors, pass a larger prb.Reweighted(n) (now {bound.n_runs} runs "
+        f"in all, of at most {bound.config.most}), or use prb.Resimulated(n), which has no design"
         f"{known}"
     )
 
@@ -333,7 +332,7 @@ def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
     for node in evaluator.nodes:
         share = lost.get(node.name, 0.0)
         most = node.bound.max_lost
-        if node.design is None and share > most:
+        if node.reweighted is None and share > most:
             raise DesignError(
                 f"{node.name}: lost mass: got {share:.1%} of the population without a response "
                 f"(NaN) at the answer, expected at most max_lost = {most:.1%}: it would rest on "

@@ -159,7 +159,7 @@ def refine(
                 if not refine_at(evaluator, wanted):
                     break
             refuse(shortcomings(evaluator, wanted), evaluator)
-    return {name: design.n_runs for name, design in evaluator.designs.items()}
+    return {name: bound.n_runs for name, bound in evaluator.reweighted.items()}
 
 
 def _thetas(hyperparameters: Hyperparameters, thetas: Any) -> Floats:
@@ -590,10 +590,10 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
         If they still fall short after the last round.
     """
     evaluator = plan.evaluator
-    if not (plan.refine and evaluator.designs):
+    if not (plan.refine and evaluator.reweighted):
         return state
     near = state.cloud
-    emulated = all(design.contents.cloud for design in evaluator.designs.values())
+    emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if near is None or (emulated and state.local is not None):
         # Points of clouds follow wherever it goes; runs are added where the pilot has led.
         near = spread_around(
@@ -731,8 +731,8 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
         hold=state.hold,
     )
     search = partial(rivals, best, starts=plan.starts, seed=plan.seed)
-    clouds = any(design.contents.cloud for design in evaluator.designs.values())
-    if clouds and plan.refine:
+    emulated = any(bound.design.is_emulated for bound in evaluator.reweighted.values())
+    if emulated and plan.refine:
         found = _visited(best, search())
     else:
         found = _supported(plan, search)
@@ -858,7 +858,8 @@ def _told_by_prior(evaluator: Evaluator) -> str:
 
 def _told_of_designs(evaluator: Evaluator, error: float) -> str:
     """Say how many runs emulators rest on, and how far another design's optimum would be."""
-    told = [d.told for d in evaluator.designs.values() if d.contents.emulation is not None]
+    designs = {name: bound.design for name, bound in evaluator.reweighted.items()}
+    told = [design.summary(name) for name, design in designs.items() if design.is_emulated]
     if not told:
         return ""
     if np.isfinite(error):

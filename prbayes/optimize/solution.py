@@ -175,7 +175,7 @@ def _support(
     for name, support in evaluator.support(theta[None]).items():
         out[name] = {key: float(value[0]) for key, value in support.items()}
     for k, node in enumerate(evaluator.nodes):
-        if node.design is None and affordable:
+        if node.reweighted is None and affordable:
             out[node.name] = missing_mass(evaluator, theta, k)
     return out
 

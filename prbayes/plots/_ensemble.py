@@ -101,8 +101,8 @@ def supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
         return out
     ok = np.ones(indices.size, dtype=bool)
     for name, support in evaluator.support(thetas[indices]).items():
-        design = evaluator.designs[name]
-        ok &= supports_each(support, design.required_ess, design.config.max_lost, VISIBLE)
+        bound = evaluator.reweighted[name]
+        ok &= supports_each(support, bound.required_ess, bound.max_lost, VISIBLE)
     out[indices] = ok
     return out
 

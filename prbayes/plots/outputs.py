@@ -231,7 +231,7 @@ class _Population:
     def of(cls, evaluator: Evaluator, thetas: Floats, k: int) -> _Population:
         """Return the k-th simulator's mixture of populations at thetas."""
         values, weights = evaluator.populations(thetas, k)
-        if evaluator.simulators[k].design is not None:  # all populations have the same points
+        if evaluator.simulators[k].reweighted is not None:  # all populations have the same points
             values = values[0]
             weights = weights.mean(axis=0)
         else:

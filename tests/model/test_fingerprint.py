@@ -183,8 +183,8 @@ def test_clones_that_order_variables_otherwise_are_the_same_problem() -> None:
 def test_a_design_that_has_grown_is_another_run_of_the_same_problem() -> None:
     model = clone_model(base())
     (node,) = nodes(model).values()
-    assert node.design is not None
-    node.design.add([np.array([1.0, 2.0])])
+    assert node.reweighted is not None
+    node.reweighted.add([np.array([1.0, 2.0])])
     grown = identity_of(Evaluator.of(model))
     assert differences(grown, identity(), Level.POSTERIOR) == []
     assert "number of responses of y" in differences(grown, identity(), Level.RUN)[0]

@@ -158,12 +158,12 @@ def test_a_study_takes_outputs_by_name_and_finds_them_in_its_store(
 ) -> None:
     with ThreadPoolExecutor(2) as pool:
         node = model_of(spring(unit), pool, store=tmp_path, version="1")
-    force = node.design.batches.points[0]
+    force = node.reweighted.design.runs.points[0]
     # In the order of what was observed.
     expected = np.stack([2 * force**2, force / 2 * 3.0], axis=1)
-    np.testing.assert_allclose(node.bound.values, expected, rtol=1e-14)
+    np.testing.assert_allclose(node.bound.design.sample.values, expected, rtol=1e-14)
     again = model_of(spring(unit), store=tmp_path, version="1")
-    np.testing.assert_array_equal(again.bound.values, node.bound.values)
+    np.testing.assert_array_equal(again.bound.design.sample.values, node.bound.design.sample.values)
     assert (node.bound.responses.computed, again.bound.responses.computed) == (16, 0)
 
 

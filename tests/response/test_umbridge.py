@@ -199,7 +199,7 @@ def model_of(response: Any, **settings: Any) -> pm.Model:
 
 def responses(response: Any, **settings: Any) -> tuple[np.ndarray[Any, Any], Any]:
     (node,) = nodes(model_of(response, **settings)).values()
-    return node.bound.values, node
+    return node.bound.design.sample.values, node
 
 
 @pytest.mark.long
@@ -256,7 +256,7 @@ def test_a_specimen_that_fails_now_and_then_is_tried_again_by_policy() -> None:
     with telling(evaluate) as server:
         retry = prb.response.Retry(1, then=prb.response.Abort())
         values, node = responses(prb.umbridge(server.url), on_failure=retry)
-    x = node.design.batches.points[0]
+    x = node.reweighted.design.runs.points[0]
     np.testing.assert_array_equal(values, np.stack([x - 4.0, x * x * 2.0], axis=1))
     assert node.bound.responses.computed == 32
 

@@ -242,12 +242,12 @@ def test_scores_of_a_model_that_was_built_again_are_those_of_the_first() -> None
     optimum = prb.minimize(first)
     there = prb.compare({"optimum": optimum}, model=first)
     again = build()
-    design = Evaluator.of(again).designs["y"]
-    before = design.contents
+    bound = Evaluator.of(again).reweighted["y"]
+    before = bound.design
     here = prb.compare({"optimum": optimum.to_datatree()}, model=again)
     for name in ("ProbabilityResidual", "KullbackLeibler", "AreaMetric"):
         np.testing.assert_allclose(here[name], there[name], rtol=0.1)
-    assert design.contents is before
+    assert bound.design is before
     # The compiled graphs read it too.
     assert prb.minimize(again).discrepancy == optimum.discrepancy
 
