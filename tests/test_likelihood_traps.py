@@ -336,9 +336,11 @@ def test_errors_come_before_further_runs() -> None:
         return line(x)
 
     with pytest.raises(DesignError, match="check the units"):
-        _ = likelihood_of(
-            model_of(counted, normal_input, 1000 * line(sample(np.random.default_rng(0))))
-        ).points
+        prepared(
+            likelihood_of(
+                model_of(counted, normal_input, 1000 * line(sample(np.random.default_rng(0))))
+            )
+        )
     assert sum(runs) <= 64 + 2  # two single ones: a specimen by itself has the same response
 
 
@@ -490,7 +492,7 @@ def test_a_start_in_each_basin_finds_nearly_all_roots() -> None:
     _, count = folded_shift(1, 1)
     assert 90 <= count < 100
     straight = model_of(line, normal_input, line(sample(np.random.default_rng(0))))
-    points = with_few_starts(straight, 1).points
+    points = prepared(with_few_starts(straight, 1)).points
     np.testing.assert_array_equal(points.n_roots, 1)
 
 
@@ -832,7 +834,7 @@ def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
     # One model, whose runs serve all data sets.
     base = likelihood_of(model_of(line, normal_input, data[0]))
     _ = prepared(base).points
-    flagged = [bool(base.observing({base.name: y}).findings) for y in data]
+    flagged = [bool(prepared(base.observing({base.name: y})).findings) for y in data]
     assert np.mean(flagged) <= 0.07
 
 

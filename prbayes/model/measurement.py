@@ -263,7 +263,7 @@ class SpecimenLikelihood:
     model: Any = None
     known: Emulation | None = None
     options: PointOptions = field(default_factory=PointOptions)
-    cache: dict[str, Any] = field(default_factory=dict, repr=False)
+    cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Replace the weak reference to the model, which has no pickle, by the model."""
@@ -367,7 +367,7 @@ class SpecimenLikelihood:
             return self
         preparation = self.cache.get("preparation")
         known = self.known if preparation is None else preparation.emulation
-        return replace(self, measurements=changed, known=known, cache={})
+        return replace(self, measurements=changed, known=known)
 
 
 def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> NDArray[np.intp]:
