@@ -29,7 +29,7 @@ from prbayes._validate import (
 )
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.model.first_look import tell_copies
+from prbayes.model.data_checks import warn_duplicates
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
     AnySimulator,
@@ -489,7 +489,7 @@ def _observed_term(
             responses.share(other.responses)
             break
     if term.labels is None:
-        tell_copies(name, target.observed)
+        warn_duplicates(name, target.observed)
     if epsilon is None:
         epsilon = 1 / effective_specimens(target, term.labels) if is_likelihood(target) else np.nan
     specification = Specification(
