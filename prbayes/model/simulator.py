@@ -200,8 +200,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         responses = _responses(name, response, arguments, settings, outputs)
         extras = _measurement_variables(name, model, metric, partners)
         measurement = Measurement(
-            name, cast(LogLikelihood, metric), values, factors, labels, arguments, responses, settings, outputs,
-            groups, extras,
+            name, cast(LogLikelihood, metric), values, factors, labels, arguments, responses,
+            settings, outputs, groups, extras,
         )  # fmt: skip
         return _add_measurement(model, measurement, partners, observed, dims)
     target = _prepared_metric(name, metric, values, weights)
