@@ -42,7 +42,7 @@ from prbayes.response.outputs import ONE, Outputs, lacking
 from prbayes.response.store import Store, StoreError
 
 # A finished chunk, with the rows of its points.
-type Done = tuple[Rows, Chunk]
+type Finished = tuple[Rows, Chunk]
 
 
 @dataclass(frozen=True)
@@ -141,11 +141,11 @@ def respond(
         is_last = attempt == policy.tries - 1
         tolerant = policy.final.goes_on or not is_last
         raised = {}
-        for done in chunks(calling, points, missing, tolerant, tally):
+        for finished in chunks(calling, points, missing, tolerant, tally):
             if on_start is not None:
                 on_start(missing.size, tally.seconds)
                 on_start = None
-            for rows, chunk in done:
+            for rows, chunk in finished:
                 values = assign_rows(values, rows, tally.aligned(chunk))
                 raised.update({int(rows[i]): reason for i, reason in chunk.raised.items()})
                 tally.has_succeeded |= len(chunk.raised) < len(rows)
@@ -153,7 +153,7 @@ def respond(
                 # No run has given a response: the function is another one, whatever the policy.
                 raise _failure_error(calling, points, raised)
             if calling.store is not None:
-                _add_to_store(calling.store, keys, done, is_last=is_last, tolerant=tolerant)
+                _add_to_store(calling.store, keys, finished, is_last=is_last, tolerant=tolerant)
         if raised and not tolerant:
             tally.record_failures(points, raised)
             raise _failure_error(calling, points, raised)
@@ -230,20 +230,20 @@ def _stored(calling: Calling, keys: Floats) -> tuple[Floats, Rows, dict[int, str
 
 
 def _add_to_store(
-    store: Store, keys: Floats, done: Sequence[Done], *, is_last: bool, tolerant: bool
+    store: Store, keys: Floats, finished: Sequence[Finished], *, is_last: bool, tolerant: bool
 ) -> None:
     """Store finished chunks in one transaction, since each waits for the disk.
 
     After the last try NaN is a result, too, except in a chunk that a failure ended.
     """
     parts = []
-    for rows, chunk in done:
+    for rows, chunk in finished:
         is_complete = tolerant or not chunk.raised
-        kept = np.flatnonzero(~lacking(chunk.values) | (is_last and is_complete))
-        if kept.size:
-            kept_rows = enumerate(map(int, kept))
-            reasons = {i: chunk.raised[row] for i, row in kept_rows if row in chunk.raised}
-            parts.append((keys[rows[kept]], chunk.values[kept], reasons))
+        stored = np.flatnonzero(~lacking(chunk.values) | (is_last and is_complete))
+        if stored.size:
+            stored_rows = enumerate(map(int, stored))
+            reasons = {i: chunk.raised[row] for i, row in stored_rows if row in chunk.raised}
+            parts.append((keys[rows[stored]], chunk.values[stored], reasons))
     if parts:
         store.add_all(parts)
 
@@ -276,9 +276,9 @@ def _failure_error(calling: Calling, points: Points, raised: dict[int, str]) -> 
     if isinstance(calling.function, scalar):  # the point of a batch is not known
         (inputs,) = points.at(np.array([row])).keys()
         place = f", the first with inputs {_numbers_text(inputs, 6)}"
-    kept = ""
+    store_text = ""
     if calling.store is not None:
-        kept = f"; {len(calling.store)} responses are kept in {calling.store.folder}"
+        store_text = f"; {len(calling.store)} responses are kept in {calling.store.folder}"
     policies = "on_failure=prb.response.Replace() or prb.response.Retry()"
     advice = (
         "repair it, keep priors and inputs where it has a response, or pass "
@@ -287,32 +287,32 @@ def _failure_error(calling: Calling, points: Points, raised: dict[int, str]) -> 
     if is_wrong_result(reason):
         advice = f"repair it; if this is what a run that failed returns, pass {policies}"
     return ResponseError(
-        f"{calling.name}: the response failed at {len(raised)} point(s){place}: {reason}{kept}; "
-        f"{advice}"
+        f"{calling.name}: the response failed at {len(raised)} point(s){place}: {reason}"
+        f"{store_text}; {advice}"
     )
 
 
 # -- sending chunks --------------------------------------------------------------------------------
 
 
-def chunk_size(calling: Calling, tally: Tally, left: int, workers: int) -> int:
+def chunk_size(calling: Calling, tally: Tally, n_left: int, workers: int) -> int:
     """Return the number of points for the next chunk."""
     is_scalar = isinstance(calling.function, scalar)
     if tally.seconds == 0:
         # The cost is not known yet, and may be minutes for each point.
-        return 1 if is_scalar else min(left, 16)
+        return 1 if is_scalar else min(n_left, 16)
     # From twice the cost of sending a chunk on, no response waits for others to be stored.
     if is_scalar and tally.seconds >= 0.01:
         return 1
     # Smaller chunks towards the end keep all workers busy. Otherwise 0.2 s: long against the 4.5 ms
     # that sending one costs (`python -m benchmarks.scale`), short against the loss of a worker.
-    share = left if calling.executor is None else max(1, left // (2 * workers))
+    share = n_left if calling.executor is None else max(1, n_left // (2 * workers))
     return int(max(1, min(share, 0.2 / tally.seconds)))
 
 
 def chunks(
     calling: Calling, points: Points, rows: Rows, tolerant: bool, tally: Tally
-) -> Iterator[list[Done]]:
+) -> Iterator[list[Finished]]:
     """Compute the responses at some rows of the points, and yield chunks as they are finished.
 
     After a failure that is not tolerated, or a spent budget, no chunk begins; those that have begun
@@ -331,47 +331,47 @@ def chunks(
     suspects: list[Rows] = []  # chunks at work when a worker was lost
     loss: BaseException | None = None
     begun: dict[Future[Chunk], Rows] = {}
-    left = rows
+    waiting = rows
     error: BaseException | None = None
     with progress(f"responses of {calling.name}", rows.size) as report:
-        while left.size or begun or suspects:
+        while waiting.size or begun or suspects:
             if suspects and not begun:
                 for chunk_rows, chunk in _one_at_a_time(pool, work, points, suspects, loss):
                     tally.count(chunk_rows.size, chunk.seconds)
                     report(chunk_rows.size, "")
                     yield [(chunk_rows, chunk)]
                 suspects = []
-            while left.size and not suspects and len(begun) < limits.chunks:
-                size = chunk_size(calling, tally, left.size, limits.workers)
+            while waiting.size and not suspects and len(begun) < limits.chunks:
+                size = chunk_size(calling, tally, waiting.size, limits.workers)
                 try:
                     size = budget().grant(size, least=1)
                 except BudgetError as spent:
                     error = error or spent
-                    left = left[:0]
+                    waiting = waiting[:0]
                     break
-                chunk_rows, left = left[:size], left[size:]
+                chunk_rows, waiting = waiting[:size], waiting[size:]
                 begun[pool.submitted(work, points.at(chunk_rows), tolerant)] = chunk_rows
-            done = []
+            finished = []
             for future in pool.done(begun):
                 chunk_rows = begun.pop(future)
                 failure = failure_of(future)
                 if has_slipped(failure):
-                    left = np.concatenate([chunk_rows, left])
+                    waiting = np.concatenate([chunk_rows, waiting])
                 elif tolerant and is_loss(failure):
                     suspects.append(chunk_rows)
                     loss = failure
                 elif failure is not None:
                     error = error or failure
-                    left = left[:0]
+                    waiting = waiting[:0]
                 else:
                     chunk = future.result()
                     if chunk.raised and not tolerant:
-                        left = left[:0]
+                        waiting = waiting[:0]
                     tally.count(chunk_rows.size, chunk.seconds)
                     report(chunk_rows.size, f"{limits.workers / max(tally.seconds, 1e-9):.3g}/s")
-                    done.append((chunk_rows, chunk))
-            if done:
-                yield done
+                    finished.append((chunk_rows, chunk))
+            if finished:
+                yield finished
     if error is not None:
         pool.renew(error)  # for the next response that is sent to this executor
         _raise_lost(calling.name, error)
@@ -383,13 +383,13 @@ def _one_at_a_time(
     points: Points,
     suspects: list[Rows],
     loss: BaseException | None,
-) -> Iterator[Done]:
+) -> Iterator[Finished]:
     """Compute chunks one by one, and bisect those that end their worker, down to a failed point."""
     pool.renew(loss)
     pool.refuse_dead()
-    left = list(reversed(suspects))
-    while left:
-        rows = left.pop()
+    waiting = list(reversed(suspects))
+    while waiting:
+        rows = waiting.pop()
         future = pool.submitted(work, points.at(rows), True)
         pool.done([future])
         failure = failure_of(future)
@@ -397,14 +397,14 @@ def _one_at_a_time(
         if failure is None:
             yield rows, future.result()
         elif has_slipped(failure):
-            left.append(rows)
+            waiting.append(rows)
         elif not is_loss(failure):
             _raise_lost(pool.name, failure)
         elif rows.size == 1:
             reason = f"it ended its worker ({type(failure).__name__}), or took far too long"
             yield rows, Chunk(np.array([np.nan]), {0: reason}, 0.0)
         else:
-            left += [rows[rows.size // 2 :], rows[: rows.size // 2]]
+            waiting += [rows[rows.size // 2 :], rows[: rows.size // 2]]
 
 
 def _raise_lost(name: str, error: BaseException) -> None:

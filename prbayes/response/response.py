@@ -287,10 +287,10 @@ class Responses:
             If the response raises, or if its result is not real numbers in the batch shape.
         """
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
-        known = self.runs.repeated(values)
-        if known is not None:
-            self.count_reused(known.size)
-            return known
+        responses = self.runs.repeated(values)
+        if responses is not None:
+            self.count_reused(responses.size)
+            return responses
         responses = self._as_batch(values) if self.plain else self._as_points(values)
         self.runs.record(values, responses)
         return responses

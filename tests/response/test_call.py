@@ -55,7 +55,7 @@ def model(response: Any, propagation: Any = None, **keywords: Any) -> pm.Model:
 
 def stored(found: pm.Model) -> Any:
     """Return the design's responses."""
-    return next(iter(nodes(found).values())).bound.values
+    return next(iter(nodes(found).values())).bound.design.sample.values
 
 
 def responses(found: pm.Model) -> Any:
