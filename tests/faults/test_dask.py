@@ -20,7 +20,7 @@ from um_server import Real
 import prbayes as prb
 from prbayes.model.random_variable import nodes
 from prbayes.response.call import Points
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.executors import Capacity, capacity
 from prbayes.response.outputs import Outputs
 from prbayes.response.store import Store
@@ -145,7 +145,7 @@ def study(code: str, folder: Path, executor: Any, n: int) -> Tally:
     making = make(folder)
     response = next(making)
     try:
-        calling = Calling("y", response, executor, store, outputs=outputs)
+        calling = CallSettings("y", response, executor, store, outputs=outputs)
         found = respond(calling, points, tally)
     finally:
         making.close()
