@@ -77,7 +77,9 @@ def test_hostile_responses_cost_their_points(
     told = by_input(tally)
     assert set(told) == set(x) & set(REASONS)
     for point, reason in told.items():
-        assert reason.startswith(REASONS[int(point)]), reason
+        in_thread = where == "dask" and point == 8  # which no alarm interrupts
+        expected_reason = "it ended its worker (" if in_thread else REASONS[int(point)]
+        assert reason.startswith(expected_reason), reason
         assert len(reason) < 1100
     assert store.failed(points.keys()) == {
         row: told[p] for row, p in enumerate(x) if p in told and p != 2
