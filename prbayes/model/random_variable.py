@@ -254,7 +254,7 @@ def _log_first_runs(
 ) -> None:
     """Log how many runs there are, and how long they take, from the time of one run, or NaN."""
     cost = propagation.cost
-    if cost.each and np.isnan(seconds):
+    if cost.per_theta and np.isnan(seconds):
         return  # known after the first call
     responses.on_start = None
 
@@ -272,7 +272,7 @@ def _log_first_runs(
         "another number in propagation=%s; more: %s",
         responses.name,
         with_duration(runs),
-        with_duration(cost.each),
+        with_duration(cost.per_theta),
         setting,
         cost.growth,
     )
