@@ -105,14 +105,16 @@ def emulated(
     models: Sequence[Any],
     runs: Runs,
     at: Floats,
+    mask: NDArray[np.bool_] | None = None,
     coarse: Floats | None = None,
 ) -> Floats:
     """Return outputs at points, (k, d) -> (k, m), predicted by a model of each output.
 
     Where the nearest run failed, the outputs are those of that run. Predictions are at most one
-    range of the runs' outputs beyond them. ``coarse``, (k, m), is a coarse response at the points.
+    range of the runs' outputs beyond them. ``mask``, (n,), selects the runs of the fit; ``coarse``,
+    (k, m), is a coarse response at the points.
     """
-    mask = np.ones(len(runs.x), dtype=bool)
+    mask = np.ones(len(runs.x), dtype=bool) if mask is None else mask
     rows = runs.among(mask)
     points = runs.scaled(at)
     outputs = [_predicted(model, runs, rows, k, points, coarse) for k, model in enumerate(models)]

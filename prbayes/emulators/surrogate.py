@@ -31,7 +31,7 @@ from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.numerics.points import sobol
 from prbayes.response.call import Points, compute
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
@@ -217,9 +217,11 @@ class Surrogate:
         database = None
         if store is not None:
             database = Store(store, name, columns=design.shape[1], version=version)
-        calling = Calling(name, response, executor, database, policy, retry_failed, outputs=None)
+        settings = CallSettings(
+            name, response, executor, database, policy, retry_failed, outputs=None
+        )
         with shown(progressbar):
-            responses, tally = _computed(calling, Points(domain.arguments(design), domain.varying))
+            responses, tally = _computed(settings, Points(domain.arguments(design), domain.varying))
         usable = _usable(responses)
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
@@ -529,13 +531,13 @@ def _surfaces(model: Any, x: Floats, y: Floats) -> Predict:
     return _OutputSurfaces(tuple(fitted(model, x, output) for output in y.T))
 
 
-def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
+def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
     """Learn the names of several stored outputs before any other run.
 
     A store contains numbers only: with a version, one of its runs is computed again, and refused if
     its outputs have changed places.
     """
-    store = calling.store
+    store = settings.store
     if store is None or store.version is None:
         return
     keys, values = store.known()
@@ -544,21 +546,21 @@ def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
     usable = np.flatnonzero(_usable(values) & points.have_same_constants(keys))[:1]
     if not usable.size:
         return
-    (again,) = respond(replace(calling, store=None), points.from_keys(keys[usable]), tally)
+    (again,) = respond(replace(settings, store=None), points.from_keys(keys[usable]), tally)
     (stored,) = values[usable]
     moved = np.allclose(np.sort(again), np.sort(stored)) and not np.allclose(again, stored)
     if tally.named is not None and moved:
         raise StoreError(
-            f"{calling.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
+            f"{settings.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
             "numbers are stored in another order, expected the same one; pass another version="
         )
 
 
-def _computed(calling: Calling, points: Points) -> tuple[Floats, Tally]:
+def _computed(settings: CallSettings, points: Points) -> tuple[Floats, Tally]:
     """Return the responses at points, and the count of runs."""
     tally = Tally()
-    _learn_names(calling, points, tally)
-    return respond(calling, points, tally), tally
+    _learn_names(settings, points, tally)
+    return respond(settings, points, tally), tally
 
 
 def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool) -> None:
