@@ -72,7 +72,7 @@ def _first(results: Mapping[str, Any]) -> Any:
 
 def _computes_responses(model: pm.Model) -> bool:
     """Return whether a draw of the model's simulators computes responses: a report spends none."""
-    return any(simulator.runs_per_theta for simulator in population_simulators(model))
+    return any(not simulator.has_specimens for simulator in population_simulators(model))
 
 
 def _model_labels(m: Material) -> dict[str, Any]:
