@@ -9,11 +9,10 @@ import numpy as np
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function, quantile
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local
+from prbayes.inference.asymptotics import Local, number_parts, one_dimensional
 from prbayes.inference.checks.discrepancy_confounding import confounded
 from prbayes.inference.checks.prior_ends import at_prior_ends, prior_end_findings
 from prbayes.inference.identifiability import unidentified_directions, without
-from prbayes.inference.projections import number_parts, one_dimensional
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import dependent
 from prbayes.metrics.base import Minimum, is_likelihood

@@ -27,7 +27,12 @@ from prbayes._validate import (
 )
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.checks.smoothing_bias import wide_kernels
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.design_error import design_error
+from prbayes.inference.refits import (
+    SamplingDistribution,
+    jumping_simulators,
+    sampling_of_functions,
+)
 from prbayes.inference.requirements import sampling_obstacle
 from prbayes.inference.resampling import SETS
 from prbayes.model.budgets import explained, kept
@@ -616,7 +621,7 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
             return state
         if state.sampling is None:
             return state
-        errors = state.sampling.design_error()
+        errors = design_error(state.sampling)
         state = replace(state, design_error=errors.whole)
         if not errors.whole > AGREE:
             return state
@@ -792,7 +797,7 @@ def _settled(plan: _Plan, state: _State) -> _State:
     known = not np.isnan(state.design_error) and not away.any()
     if known or state.sampling is None:
         return state
-    return replace(state, design_error=state.sampling.design_error().whole)
+    return replace(state, design_error=design_error(state.sampling).whole)
 
 
 # -- after -----------------------------------------------------------------------------------------
@@ -808,7 +813,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         plan.search,
         state.run,
         covariance=_covariance(state),
-        functions=None if state.sampling is None else state.sampling.of_functions,
+        functions=None if state.sampling is None else sampling_of_functions(state.sampling),
         remark=begun.led.remark,
         screened=begun.screened,
         responses_before=plan.responses_before,
@@ -873,7 +878,7 @@ def _stopped(plan: _Plan, begun: _Beginning, state: _State, reason: str) -> Opti
         plan.search,
         state.run,
         covariance=_covariance(state),
-        functions=None if state.sampling is None else state.sampling.of_functions,
+        functions=None if state.sampling is None else sampling_of_functions(state.sampling),
         remark=f"{begun.led.remark} {reason} before the minimisation was finished.",
         screened=begun.screened,
         responses_before=plan.responses_before,
@@ -903,7 +908,7 @@ def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, 
         tolerance=plan.search.tolerance,
         seed=plan.seed,
     )
-    jump = tuple(evaluator.nodes[k].name for k in state.sampling.unsettled())
+    jump = tuple(evaluator.nodes[k].name for k in jumping_simulators(state.sampling))
     return edge, jump
 
 

@@ -10,6 +10,7 @@ import xarray as xr
 from prbayes._progress import shown
 from prbayes._validate import Seed, flag, positive_integer, seed_number
 from prbayes.inference.identifiability import unidentified_directions
+from prbayes.inference.refits import is_prepared_by_data, refit, refit_prepared
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_refits
@@ -103,9 +104,9 @@ def bootstrap(
     else:
         data = reweighted_sets(evaluator, draws, seed)
     with shown(progressbar):
-        x, converged = sampling.refit(data)
-        if sampling.prepares:
-            x, converged = sampling.refit_prepared(data, x)
+        x, converged = refit(sampling, data)
+        if is_prepared_by_data(sampling.evaluator):
+            x, converged = refit_prepared(sampling, data, x)
     return bootstrap_tree(
         evaluator,
         sampling.thetas(x)[None],

@@ -11,8 +11,7 @@ import numpy as np
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local
-from prbayes.inference.projections import number_parts
+from prbayes.inference.asymptotics import Local, number_parts
 from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import slopes
