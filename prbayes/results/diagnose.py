@@ -14,6 +14,7 @@ import xarray as xr
 from prbayes._display import view
 from prbayes._finding import Finding, from_json
 from prbayes._validate import Floats
+from prbayes.inference.checks.metric_suitability import small_simulators
 from prbayes.inference.goodness_of_fit import (
     UNLIKELY,
     FittedSets,
@@ -34,7 +35,6 @@ from prbayes.model.elements import (
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
-from prbayes.optimize.caveats import small_simulators
 from prbayes.optimize.optimum import NO_RESPONSE, TOLD_SHARE, Optimum, compared_in, require_of_model
 from prbayes.response.inputs import model_on_context
 from prbayes.results.likelihood_checks import Checked, check_draws, check_optimum, separate_modes
