@@ -546,7 +546,7 @@ INNER = {
         "pymc.smc.kernels.SMC_KERNEL",
         "pymc.smc.kernels.systematic_resampling",
     },
-    "posterior.trees": {"arviz_stats.ecdf_utils.ecdf_pit"},
+    "posterior.sbc": {"arviz_stats.ecdf_utils.ecdf_pit"},
     "propagation.base": {
         "pytensor.graph.replace.graph_replace",
         "pytensor.tensor.variable.TensorVariable",

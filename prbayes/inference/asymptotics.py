@@ -29,8 +29,7 @@ from prbayes.metrics.base import Discrepancy, Minimum, Part, is_additive
 from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
-from prbayes.numerics.derivatives import slopes
-from prbayes.numerics.stencils import hessian_of, stencil
+from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
 # Step of differences in prior standard deviations, for densities that are twice differentiable.
 _NARROW_STEP = 1e-3
@@ -71,7 +70,7 @@ class LinearArea:
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
-    """Populations around theta, in the order of `numerics.stencils.stencil`."""
+    """Populations around theta, in the order of `numerics.derivatives.stencil`."""
 
     share: float  # the nominal step, in prior standard deviations
     step: Floats  # (d,): the step, shorter where the prior is wide beside the population

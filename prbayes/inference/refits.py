@@ -25,7 +25,7 @@ from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, 
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.batched_bfgs import Descent
 from prbayes.numerics.batched_simplex import descend_by_simplex
-from prbayes.numerics.stencils import second_differences
+from prbayes.numerics.derivatives import second_differences
 
 # Smallest share of refits that converge. Without the outermost tenth at one end, a normal sampling
 # distribution is too narrow by 16 %.

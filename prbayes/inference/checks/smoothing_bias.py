@@ -13,8 +13,7 @@ from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local, number_parts
 from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
 from prbayes.model.evaluator import Evaluator
-from prbayes.numerics.derivatives import slopes
-from prbayes.numerics.stencils import hessian_of, stencil
+from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
 
 def smoothing_bias(
