@@ -31,7 +31,7 @@ from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.numerics.points import sobol
 from prbayes.response.call import Points, compute
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
@@ -220,12 +220,14 @@ class Surrogate:
         database = None
         if store is not None:
             database = Store(store, name, columns=design.shape[1], version=version)
-        calling = Calling(name, response, executor, database, policy, retry_failed, outputs=None)
+        settings = CallSettings(
+            name, response, executor, database, policy, retry_failed, outputs=None
+        )
         tally = Tally()
         rows = Points(domain.arguments(design), domain.varying)
         with shown(progressbar):
-            _learn_names(calling, rows, tally)
-            responses = respond(calling, rows, tally)
+            _learn_names(settings, rows, tally)
+            responses = respond(settings, rows, tally)
         usable = _usable(responses)
         if usable.sum() < n_needed:
             raise ResponseError(
@@ -570,13 +572,13 @@ def _surfaces(model: Any, x: Floats, y: Floats) -> Predict:
     return _OutputSurfaces(tuple(fitted(model, x, output) for output in y.T))
 
 
-def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
+def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
     """Learn the names of several stored outputs before any other run.
 
     A store contains numbers only: with a version, one of its runs is computed again, and refused if
     its outputs have changed places.
     """
-    store = calling.store
+    store = settings.store
     if store is None or store.version is None:
         return
     keys, values = store.known()
@@ -585,12 +587,12 @@ def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
     usable = np.flatnonzero(_usable(values) & points.have_same_constants(keys))[:1]
     if not usable.size:
         return
-    (again,) = respond(replace(calling, store=None), points.from_keys(keys[usable]), tally)
+    (again,) = respond(replace(settings, store=None), points.from_keys(keys[usable]), tally)
     (stored,) = values[usable]
     moved = np.allclose(np.sort(again), np.sort(stored)) and not np.allclose(again, stored)
     if tally.named is not None and moved:
         raise StoreError(
-            f"{calling.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
+            f"{settings.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
             "numbers are stored in another order, expected the same one; pass another version="
         )
 

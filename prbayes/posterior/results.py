@@ -240,7 +240,7 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) ->
     values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     names = [m.name for m in measurements]
     discrepancies = np.stack([-values[name].sum(axis=1) for name in names], axis=-1)
-    n_runs = [len(likelihood.emulation.z) for likelihood in likelihoods]
+    n_runs = [len(prepared(likelihood).emulation.z) for likelihood in likelihoods]
     variables: dict[str, Any] = {
         "discrepancy": (_BY_DRAW, discrepancies.reshape(chains, draws, -1)),
         "epsilon": ("simulator", np.ones(len(names))),
@@ -248,7 +248,10 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) ->
         "metric": ("simulator", [without_addresses(m.metric) for m in measurements]),
         "compared": ("simulator", [""] * len(names)),
         "propagation": ("simulator", [f"emulator of {n} runs" for n in n_runs]),
-        "n_points": ("simulator", [likelihood.points.log_a.size for likelihood in likelihoods]),
+        "n_points": (
+            "simulator",
+            [prepared(likelihood).points.log_a.size for likelihood in likelihoods],
+        ),
         "n_runs": ("simulator", n_runs),
         "is_likelihood": ("simulator", np.ones(len(names), dtype=int)),
     }
