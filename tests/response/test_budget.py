@@ -154,7 +154,7 @@ def test_refine_goes_on_with_the_design_that_has_grown() -> None:
         prb.refine(parts, thetas=FAR, max_runs=20, **QUIET)
     assert other.bound.n_points == 32 < node.bound.n_points
     prb.refine(parts, thetas=FAR, **QUIET)
-    assert np.array_equal(other.bound.known_responses, node.bound.known_responses)
+    assert np.array_equal(other.bound.design.runs.values, node.bound.design.runs.values)
 
 
 def test_refinement_around_the_optimum_has_a_budget_too() -> None:
