@@ -60,16 +60,16 @@ def test_a_budget_that_was_spent_stays_spent() -> None:
         with pytest.raises(BudgetError):
             budget().grant(11, least=11)
         with pytest.raises(BudgetError):
-            budget().go_on()
+            budget().check()
         with unlimited():
-            budget().go_on()
+            budget().check()
 
 
 def test_time_runs_out() -> None:
     with limited(0.001, None):
         time.sleep(0.002)
         with pytest.raises(BudgetError, match=r"max_seconds = 0\.001 was reached"):
-            budget().go_on()
+            budget().check()
 
 
 def test_a_budget_holds_in_its_own_thread() -> None:
