@@ -18,7 +18,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.metrics.readings import Readings, Repeats, averaged
+from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
 from prbayes.model.parameters import Hyperparameters
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
@@ -166,9 +166,9 @@ class StackedReadings:
             logs = np.where(np.isnan(measurement.rows), 0.0, logs).sum(axis=1)
             np.subtract.at(log_gross, index, logs)
         return cls(
-            Readings.beside(readings),
+            side_by_side(readings),
             np.concatenate(scales, axis=1),
-            Repeats.beside(repeats) if any(part.count.any() for part in repeats) else None,
+            side_by_side(repeats) if any(part.count.any() for part in repeats) else None,
             tuple(numbers),
             _specimen_groups(measurements, numbers, size),
             log_gross,

@@ -14,11 +14,6 @@ import pymc as pm
 from prbayes._finding import Finding, report
 from prbayes.model.elements import variable_of
 from prbayes.model.emulated import population_simulators
-<<<<<<< HEAD:prbayes/reports/illustrations.py
-from prbayes.model.random_variable import nodes
-from prbayes.model.specimen_variable import measurements_of
-=======
->>>>>>> main:prbayes/reports/figures.py
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.landscape import plot_landscape
 from prbayes.plots.optimizer import plot_optimizer
