@@ -132,20 +132,20 @@ class _Document:
 
 
 class Report(_Document):
-    """A calibration as a document: what was calibrated, the answer, whether it may be trusted.
+    """A calibration as a document: the problem, the answer, whether it may be trusted.
 
-    What is not given is left out. Pictures are made when the report is; after that it is data,
-    and a writer gives the same bytes each time.
+    The report has sections for the results that are given. It is data: pictures are made once, and
+    a writer gives the same bytes each time.
 
     Parameters
     ----------
     title : str
     sections : tuple of Section
-        By default those of the results. With them given, results are not looked at.
+        By default those of the results; with sections, results are not read.
     author, date : str
         Below the title. No date is made up.
     model : pymc.Model, optional
-        What needs it are distributions of populations, and the graph; the rest is in the results.
+        Needed for distributions of populations and for the graph; the rest is in the results.
     optimum : Optimum or xarray.DataTree, or a mapping of such, optional
         From `minimize`, or its ``to_datatree()``; several by name.
     posterior : xarray.DataTree, or a mapping of such, optional
@@ -153,23 +153,22 @@ class Report(_Document):
     validity : ValidityTest, or a mapping of such, optional
         From `area_test`; several by name.
     comparison : xarray.Dataset, optional
-        From `compare`; that of the optima and posteriors by default, where there are two or more.
+        From `compare`; that of the optima and posteriors by default, if there are two or more.
     decision : xarray.Dataset, or a mapping of such, optional
         From `exceedance`, `sensitivity` or `plan`; several by name.
     pictures : bool
-        Whether pictures are made of the results.
+        Whether pictures of the results are made.
     validation : mapping, optional
-        What validity was tested on, by condition: a pair of what was measured on other specimens
-        and what `predict` says of it. It becomes a table and a picture.
+        Data of the validity tests, by condition: a pair of measured responses of other specimens
+        and their prediction by `predict`. They become a table and a picture.
     labels : mapping, optional
-        What a reader calls hyperparameters, inputs, simulators and outputs, by their names, with
-        units: ``{"mu": "mean of log C", "crack": "crack length / notch length"}``.
+        Labels of hyperparameters, inputs, simulators and outputs by name, with units: ``{"mu":
+        "mean of log C", "crack": "crack length / notch length"}``.
 
     Attributes
     ----------
     sections : tuple of Section
-        For a report of your own: ``report.with_section``, or
-        ``dataclasses.replace(report, sections=...)``.
+        Other sections: ``report.with_section``, or ``dataclasses.replace(report, sections=...)``.
 
     Raises
     ------

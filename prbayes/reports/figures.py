@@ -91,7 +91,7 @@ def _labels_of(m: Material, names: Iterable[Any]) -> dict[str, Any]:
 def _population(m: Material) -> Request:
     """Request the population of the first posterior, or else of the first optimum."""
     # An optimum from a file has no evaluator, hence no population.
-    result = _first(m.posteriors | m.found)
+    result = _first(m.posteriors | m.live_optima)
     if m.model is None or result is None:
         return None
     return Call((result,), {"model": m.model, **_model_labels(m)})
@@ -118,7 +118,7 @@ def _posterior(m: Material) -> Request:
     labels = _model_labels(m)
     if m.model is None:
         labels = _labels_of(m, posterior["posterior"].data_vars)
-    return Call((posterior,), {"optimum": _first(m.found), "model": m.model, **labels})
+    return Call((posterior,), {"optimum": _first(m.live_optima), "model": m.model, **labels})
 
 
 def _stages(m: Material) -> Request:
@@ -129,13 +129,17 @@ def _stages(m: Material) -> Request:
 
 
 def _optimizer(m: Material) -> Request:
-    return Call((_first(m.found),), {"col_wrap": 2, **_model_labels(m)}) if m.found else None
+    return (
+        Call((_first(m.live_optima),), {"col_wrap": 2, **_model_labels(m)})
+        if m.live_optima
+        else None
+    )
 
 
 def _landscape(m: Material) -> Request:
-    if m.model is None or not m.found:
+    if m.model is None or not m.live_optima:
         return None
-    return Call((_first(m.found),), {"model": m.model, **_model_labels(m)})
+    return Call((_first(m.live_optima),), {"model": m.model, **_model_labels(m)})
 
 
 def _comparison(m: Material) -> Request:

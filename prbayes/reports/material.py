@@ -40,7 +40,7 @@ class Material:
     model: pm.Model | None
     description: dict[str, Any] | None  # of the model; from a file where there is no model
     optima: dict[str, xr.DataTree]
-    found: dict[str, Optimum]  # the optima that are not from a file
+    live_optima: dict[str, Optimum]  # the optima that are not from a file
     posteriors: dict[str, xr.DataTree]
     tests: dict[str, ValidityTest]
     comparison: xr.Dataset | None
@@ -121,8 +121,8 @@ def gather(
     decisions = _by_label(decision, "decision")
     validation = {} if validation is None else validation
     _require_kinds(model, optima, posteriors, tests, comparison, decisions, validation, labels)
-    found = {label: o for label, o in optima.items() if isinstance(o, Optimum)}
-    optima |= {label: o.to_datatree() for label, o in found.items()}
+    live_optima = {label: o for label, o in optima.items() if isinstance(o, Optimum)}
+    optima |= {label: o.to_datatree() for label, o in live_optima.items()}
     for label, tree in optima.items():
         _require_group(label, tree, "optimum", (), "prb.minimize")
         if "stderr" not in tree:
@@ -132,7 +132,7 @@ def gather(
             )
 
     results = optima | posteriors
-    identities = {label: identity_in(result) for label, result in (results | found).items()}
+    identities = {label: identity_in(result) for label, result in (results | live_optima).items()}
     identities |= {label: test.identity for label, test in tests.items()}
     identities |= {label: identity_in(table) for label, table in decisions.items()}
     for label, (_, predicted) in validation.items():
@@ -144,20 +144,22 @@ def gather(
 
     description = _stored_description(results) if model is None else describe(model)
     if comparison is None and len(results) > 1:
-        comparison = compare(results | found, model=model)
+        comparison = compare(results | live_optima, model=model)
     observed, outputs = _observed(model, results)
     _require_labels(labels, model, description, outputs, validation)
     return Material(
         model=model,
         description=description,
         optima=optima,
-        found=found,
+        live_optima=live_optima,
         posteriors=posteriors,
         tests=tests,
         comparison=comparison,
         observed=observed,
         outputs=outputs,
-        diagnoses={label: _diagnosis(result, model) for label, result in (results | found).items()},
+        diagnoses={
+            label: _diagnosis(result, model) for label, result in (results | live_optima).items()
+        },
         decisions=decisions,
         validation=dict(validation),
         labels=dict(labels or {}),

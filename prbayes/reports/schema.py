@@ -103,8 +103,8 @@ def _of_test(test: xr.Dataset) -> Iterator[str]:
 
 def _of_decision(table: xr.Dataset) -> Iterator[str]:
     kind = kind_of_decision(table) or ""
-    known = {*table.variables, *table.attrs}
-    lacking = [name for name in _OF_DECISION[kind] if name not in known]
+    present = {*table.variables, *table.attrs}
+    lacking = [name for name in _OF_DECISION[kind] if name not in present]
     if lacking:
         yield f"got no {lacking}, expected a table of prb.{CALLED[kind]}"
         return

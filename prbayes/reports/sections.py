@@ -306,9 +306,9 @@ def optima(m: Material) -> list[Section]:
     for label, tree in m.optima.items():
         names = read_elements(told_of(tree["optimum"].data_vars, tree["stderr"].data_vars))
         text = [_how_it_ended(tree["optimum"].attrs)]
-        if label in m.found:
-            evaluator = m.found[label].evaluator
-            for rival in m.found[label].rivals:
+        if label in m.live_optima:
+            evaluator = m.live_optima[label].evaluator
+            for rival in m.live_optima[label].rivals:
                 place = labelled(evaluator, rival["point"], {}).data_vars
                 text.append(_other_optimum(rival, place, names))
         text.append(
