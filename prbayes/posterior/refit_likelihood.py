@@ -25,7 +25,7 @@ from scipy.special import logsumexp, ndtri
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.inference.batched_objective import BatchObjective
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import (
     DataSets,
     groups,
@@ -384,7 +384,7 @@ def _draw(
     points = points_along(evaluator, thetas, rng)
     sets = sets_at(evaluator, stored_populations(evaluator, thetas), points)
     starts = x if len(centers) == 1 else _best_starts(centers, sets, options)
-    estimates, converged = sampling.refit(sets, starts, roughly=True)
+    estimates, converged = refit(sampling, sets, starts, is_rough=True)
     if converged.mean() < options.converged:
         raise ValueError(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
@@ -511,7 +511,7 @@ def _at_minimiser(
 
 def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
     """Return the sampling distribution with the minimiser for the observed responses as theta."""
-    (x,), _ = sampling.refit(observed_set(sampling.evaluator))
+    (x,), _ = refit(sampling, observed_set(sampling.evaluator))
     return replace(sampling, theta=sampling.thetas(x))
 
 
