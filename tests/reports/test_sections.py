@@ -157,7 +157,7 @@ def test_of_a_curve_some_outputs_have_a_row(calibrated: Any) -> None:
     rows = cells(about.table).rows
     assert len(rows) == len(cells(correlations.table).rows) == 12
     assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
-    assert "y: 12 of 40 outputs are told." in about.text
+    assert "y: 12 of 40 outputs are shown." in about.text
     assert len(values.text) == 41  # of few specimens all outputs are listed
 
 
