@@ -264,8 +264,8 @@ def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
         "the data could as well come from there."
     )
     assert text[2].endswith(
-        "at mu = 3.000, with discrepancy 0.2500: the data fit it less well; a posterior tells how "
-        "much it counts."
+        "at mu = 3.000, with discrepancy 0.2500: the data fit it less well; a posterior gives "
+        "its weight."
     )
     vector = ({"point": {"w": np.array([1.0, 2.0])}, "discrepancy": 0.25, "comparable": True},)
     of_it = {"w": np.array([3.0, 4.0])}
