@@ -19,6 +19,7 @@ from prbayes.reports.numbers import (
     percentage,
     plus_minus,
     probability,
+    rows_table,
     sample_sd,
     shown,
     span,
@@ -27,7 +28,6 @@ from prbayes.reports.numbers import (
 from prbayes.reports.schema import CALLED, kind_of_decision
 from prbayes.reports.section import Section
 from prbayes.reports.summary import verdict
-from prbayes.reports.tables import rows_table
 from prbayes.results.diagnose import Diagnosis
 from prbayes.validation.area_test import ValidityTest, u_values
 from prbayes.validation.conditions import DIRECTION, Comparable, comparables

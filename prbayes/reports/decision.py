@@ -10,10 +10,9 @@ import xarray as xr
 
 from prbayes.plots._labels import named
 from prbayes.reports.material import Material
-from prbayes.reports.numbers import number, percentage, plus_minus
+from prbayes.reports.numbers import number, percentage, plus_minus, rows_table
 from prbayes.reports.schema import kind_of_decision
 from prbayes.reports.section import Section
-from prbayes.reports.tables import rows_table
 
 
 def decision(m: Material) -> list[Section]:

@@ -34,12 +34,12 @@ from prbayes.reports.numbers import (
     described,
     number,
     places,
+    rows_table,
     sample_sd,
     with_zeros,
 )
 from prbayes.reports.section import Section
 from prbayes.reports.summary import answers, next_steps, summary
-from prbayes.reports.tables import rows_table
 from prbayes.response.outputs import ONE
 
 

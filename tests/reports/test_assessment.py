@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.reports.tables import cells
+from prbayes.reports.numbers import cells
 
 
 def test_comparison(calibrated: Any, page: Any, row: Any) -> None:

@@ -12,9 +12,8 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.reports.material import gather
-from prbayes.reports.numbers import NOTHING
+from prbayes.reports.numbers import NOTHING, cells
 from prbayes.reports.sections import _other_optimum, data, metric
-from prbayes.reports.tables import cells
 from prbayes.response.outputs import Outputs
 
 
