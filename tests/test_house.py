@@ -529,13 +529,16 @@ INNER = {
     },
     "model.simulator": {"pytensor.graph.basic.Variable", "pytensor.tensor.variable.TensorVariable"},
     "model.specimen_likelihood": {
+        "pytensor.graph.replace.graph_replace",
+        "pytensor.graph.replace.vectorize_graph",
+        "pytensor.tensor.variable.TensorVariable",
+    },
+    "model.specimen_variable": {
         "pymc.logprob.abstract.ValuedRV",
         "pymc.logprob.abstract._logprob",
-        "pymc.logprob.utils.CheckParameterValue",
         "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Constant",
         "pytensor.graph.replace.graph_replace",
-        "pytensor.graph.replace.vectorize_graph",
         "pytensor.graph.traversal.ancestors",
         "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",

@@ -44,8 +44,8 @@ class MarginalCorrelation(LiftedMetric):
     Notes
     -----
     A specimen that failed (+inf) counts as the largest observed value of that output plus the
-    range. Missing outputs (NaN): each marginal has the specimens that have the
-    output, each correlation those that have both.
+    range. Missing outputs (NaN): each marginal has the specimens with the output, each correlation
+    those with both.
 
     References
     ----------
@@ -58,8 +58,8 @@ class MarginalCorrelation(LiftedMetric):
     >>> import numpy as np
     >>> from prbayes import ProbabilityResidual
     >>> x = np.random.default_rng(0).normal(size=(50, 2))
-    >>> found = MarginalCorrelation(ProbabilityResidual()).against(x)
-    >>> found(x) < 1e-20 < found(x @ [[1.0, 0.5], [0.5, 1.0]])
+    >>> residual = MarginalCorrelation(ProbabilityResidual()).against(x)
+    >>> residual(x) < 1e-20 < residual(x @ [[1.0, 0.5], [0.5, 1.0]])
     True
     """
 
@@ -78,7 +78,7 @@ class MarginalCorrelation(LiftedMetric):
 
     @property
     def minimum(self) -> Minimum:  # type: ignore[override]
-        """Quadratic if the metric's is, or else nothing is known: correlations have squares."""
+        """Quadratic if the metric's is, else unknown: correlations have squares."""
         quadratic = self.metric.minimum is Minimum.QUADRATIC
         return Minimum.QUADRATIC if quadratic else Minimum.UNKNOWN
 

@@ -336,8 +336,8 @@ def count(
 def smooth(values: Floats, kernel: Floats, first_at: int, out: Floats) -> None:
     """Add the convolution of rows, zero beyond their ends, with a kernel to ``out``.
 
-    The rows have shape (rows, g), ``out`` (rows, m); the first of g stands at ``first_at`` among
-    the m, which may be before or behind them all.
+    The rows have shape (rows, g), ``out`` (rows, m); the first of g is at place ``first_at``
+    of the m, which may be outside them.
     """
     rows, g = values.shape
     m = out.shape[1]

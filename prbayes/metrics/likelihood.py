@@ -52,7 +52,7 @@ class LogLikelihood(Metric):
         each output. True adds the variable ``{name}_gross_errors`` with a Beta(1, 9) prior.
     censored : tuple of (lower, upper), optional
         Limits of the readings, numbers or arrays as for ``error``, None for no limit: a value at or
-        beyond a limit says only that the output lies there.
+        beyond a limit means only that the output is there.
     rounded : float or array_like, optional
         Width to which values were rounded, as for ``error``. Also the width of an interval whose
         middle is the reading.

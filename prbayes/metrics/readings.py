@@ -15,28 +15,14 @@ from prbayes._validate import Floats
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Readings of m outputs of N specimens.
+    """Readings of m outputs of N specimens; all arrays have the shape (N, m)."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (N, m)
-        NaN where an output was not measured, or is censored.
-    error : ndarray, shape (N, m)
-        Standard deviation of the reading's normal error; zero if it is exact.
-    step : ndarray, shape (N, m)
-        Width to which the reading was rounded; zero if it was not.
-    lower, upper : ndarray, shape (N, m)
-        Bounds of a censored reading, perhaps infinite; NaN where the reading is not censored.
-    is_relative : ndarray of bool, shape (N, m)
-        Where the error is a share of the output.
-    """
-
-    values: Floats
-    error: Floats
-    step: Floats
-    lower: Floats
+    values: Floats  # NaN where an output was not measured, or is censored
+    error: Floats  # standard deviation of the normal error; zero if the reading is exact
+    step: Floats  # width to which the reading was rounded; zero if it was not
+    lower: Floats  # bound of a censored reading, perhaps infinite; NaN if not censored
     upper: Floats
-    is_relative: NDArray[np.bool_]
+    is_relative: NDArray[np.bool_]  # whether the error is a share of the output
 
     @classmethod
     def exact(cls, values: Floats) -> Readings:
@@ -156,19 +142,11 @@ class Repeats:
     .. math:: \prod_r N(y_r;\, f,\, e^2 c_r^2) = N(\bar y;\, f,\, e^2 c^2)\,
         \frac{c}{(2 \pi e^2)^{(R-1)/2} \prod_r c_r}
         \exp\Bigl(-\frac{1}{2 e^2} \sum_r \frac{(y_r - \bar y)^2}{c_r^2}\Bigr).
-
-    Attributes
-    ----------
-    count : ndarray, shape (N, m)
-        Number of readings less one.
-    within : ndarray, shape (N, m)
-        Sum of squares around the mean.
-    constant : ndarray, shape (N, m)
     """
 
-    count: Floats
-    within: Floats
-    constant: Floats
+    count: Floats  # (N, m): number of readings less one
+    within: Floats  # (N, m): sum of squares around the mean
+    constant: Floats  # (N, m)
 
     def log_density(self, error: Any, xp: Any) -> Any:
         """Return the sum over outputs, (N,), as an array or a graph of the error e, (m,)."""

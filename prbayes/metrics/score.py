@@ -48,19 +48,11 @@ class ScoreOptions:
 
 @dataclass(frozen=True, eq=False)
 class WeightSlopes:
-    """Stored responses with their weights at one theta, and the derivatives of the weights.
+    """Stored responses with their weights at one theta, and the derivatives of the weights."""
 
-    Attributes
-    ----------
-    responses : ndarray, shape (M,) or (M, m)
-    weights : ndarray, shape (M,)
-    slopes : ndarray, shape (d, M)
-        Derivatives with respect to the elements of theta.
-    """
-
-    responses: Floats
-    weights: Floats
-    slopes: Floats
+    responses: Floats  # (M,) or (M, m)
+    weights: Floats  # (M,)
+    slopes: Floats  # (d, M): derivatives with respect to the elements of theta
 
     @property
     def spread(self) -> Floats:
@@ -89,21 +81,12 @@ class WeightSlopes:
 
 @dataclass(frozen=True, eq=False)
 class ShiftedResponses:
-    """Responses at theta plus and minus a step along each element, from common random numbers.
+    """Responses at theta plus and minus a step along each element, from common random numbers."""
 
-    Attributes
-    ----------
-    responses : ndarray, shape (M,) or (M, m)
-        At theta itself.
-    upper, lower : ndarray, shape (d, M) or (d, M, m)
-    lengths : ndarray, shape (d,)
-        The steps.
-    """
-
-    responses: Floats
-    upper: Floats
+    responses: Floats  # (M,) or (M, m): at theta itself
+    upper: Floats  # (d, M) or (d, M, m)
     lower: Floats
-    lengths: Floats
+    lengths: Floats  # (d,): the steps
 
     @property
     def weights(self) -> Floats:
@@ -127,15 +110,8 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
 
     The whitening by few data depends on them, and the minimiser with it. That of the population at
     an estimate is about the same for all data sets with this estimate. The bandwidth is that of as
-    many specimens as are observed. Data with gaps keep their whitening.
-
-    Parameters
-    ----------
-    target : Discrepancy
-        Of several outputs.
-    responses : ndarray, shape (M, m)
-        Rows that lack a number are left out.
-    weights : ndarray, shape (M,)
+    many specimens as are observed. Data with gaps keep their whitening. Responses, (M, m), that
+    lack a number are left out.
     """
     if np.isnan(target.observed).any():
         # Outputs that no specimen has together may depend on each other linearly.

@@ -32,18 +32,9 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     scatter are maximum likelihood of a t distribution [1]_, axes and signs are those of another
     scatter and of a third moment relative to it [2]_. All of them are robust to gross outliers.
 
-    Parameters
-    ----------
-    sample, weights : ndarray, shapes (n, m), (n,)
-        All finite.
-    outputs : ndarray of int, shape (m,)
-        Numbers of the outputs for messages.
-
-    Raises
-    ------
-    ValueError
-        If an output has equal values, outputs depend on each other linearly, or the specimens are
-        fewer than m + 2.
+    The sample, (n, m), and weights are finite; messages use the numbers of the outputs, (m,).
+    Raises ValueError if an output has equal values, outputs depend on each other linearly, or the
+    specimens are fewer than m + 2.
 
     References
     ----------

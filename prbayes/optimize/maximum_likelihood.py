@@ -20,6 +20,7 @@ from prbayes.inference.checks.prior_ends import PriorEnd, end_of_range, prior_en
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.parameters import THETAS
+from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.optimum import Optimum, plain
 
@@ -67,12 +68,14 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         if objective.count > options.max_evaluations:
             break
     # Points of specimens have a Monte Carlo error, with which a ridge has ripples.
-    errors = [max(x.points.difference, x.options.half_difference) for x in evaluator.likelihoods]
+    errors = [
+        max(prepared(x).points.difference, x.options.half_difference) for x in evaluator.likelihoods
+    ]
     modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
     best = modes[0]
     point, stderr = _in_units(evaluator, best.theta, best.covariance)
     ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
-    findings = [f for likelihood in evaluator.likelihoods for f in likelihood.findings]
+    findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
     weights = _posterior_weights(evaluator, modes, with_prior=options.prior)
     findings += report(*_findings(evaluator, modes, weights, ends))
     rivals = tuple(

@@ -36,7 +36,7 @@ from prbayes.model.evaluator import Evaluator, has_other_terms, n_design_runs, o
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.optimize.caveats import (
     between_runs,
     breakdown,

@@ -29,6 +29,7 @@ from prbayes.model.fingerprint import (
 )
 from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
 from prbayes.model.locking import locked
+from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.caveats import breakdown
 
 # What is less is written as 0.0%.
@@ -410,7 +411,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     is_likelihood = [0] * len(nodes) + [1] * len(measurements)
     variables["is_likelihood"] = ("simulator", is_likelihood)
     runs = [node.bound.n_runs for node in nodes]
-    runs += [len(likelihood_of(evaluator, m).emulation.z) for m in measurements]
+    runs += [len(prepared(likelihood_of(evaluator, m)).emulation.z) for m in measurements]
     variables["n_runs"] = ("simulator", runs)
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.Dataset(variables, coords={"simulator": names, **elements})

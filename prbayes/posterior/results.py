@@ -30,6 +30,9 @@ from prbayes.model.labels import (
     observed_dataset,
     versions,
 )
+from prbayes.model.measurement import specimen_labels
+from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import MAX_LOST
 from prbayes.response.outputs import lacking
 
@@ -240,7 +243,7 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) ->
     values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     names = [m.name for m in measurements]
     discrepancies = np.stack([-values[name].sum(axis=1) for name in names], axis=-1)
-    n_runs = [len(likelihood.emulation.z) for likelihood in likelihoods]
+    n_runs = [len(prepared(likelihood).emulation.z) for likelihood in likelihoods]
     variables: dict[str, Any] = {
         "discrepancy": (_BY_DRAW, discrepancies.reshape(chains, draws, -1)),
         "epsilon": ("simulator", np.ones(len(names))),
@@ -248,7 +251,10 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) ->
         "metric": ("simulator", [without_addresses(m.metric) for m in measurements]),
         "compared": ("simulator", [""] * len(names)),
         "propagation": ("simulator", [f"emulator of {n} runs" for n in n_runs]),
-        "n_points": ("simulator", [likelihood.points.log_a.size for likelihood in likelihoods]),
+        "n_points": (
+            "simulator",
+            [prepared(likelihood).points.log_a.size for likelihood in likelihoods],
+        ),
         "n_runs": ("simulator", n_runs),
         "is_likelihood": ("simulator", np.ones(len(names), dtype=int)),
     }
@@ -373,9 +379,10 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, thetas: Floats) -> xr.Data
     for likelihood in evaluator.likelihoods:
         name = likelihood.measurements[-1].name
         dim = str(observed[name].dims[0])
-        if likelihood.labels is not None:  # by specimen, not by reading
+        labels = specimen_labels(likelihood)
+        if labels is not None:  # by specimen, not by reading
             dim = f"{name}_specimen"
-            coords[dim] = likelihood.labels
+            coords[dim] = labels
         variables[name] = (["chain", "draw", dim], values[name].reshape(chains, draws, -1))
     return xr.Dataset(variables, coords=coords)
 
@@ -389,7 +396,7 @@ def _emulated_responses(
     for k, likelihood in enumerate(evaluator.likelihoods):
         params = specimen_params(evaluator, thetas.reshape(-1, d), k)
         for measurement in likelihood.measurements:
-            values = likelihood.draws(rng, params, len(measurement.observed), measurement)
+            values = draw_readings(likelihood, rng, params, len(measurement.observed), measurement)
             responses[measurement.name] = values.reshape(chains, draws, *values.shape[1:])
     return labelled_responses(evaluator, responses, (chains, draws))
 

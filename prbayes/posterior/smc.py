@@ -34,6 +34,7 @@ from prbayes.model.fingerprint import identity_of, require_same
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import log_kernel
+from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
 from prbayes.optimize.optimum import Optimum, require_sampling
@@ -358,7 +359,9 @@ def result_of(
         )
         findings = [*budget, *_lost_findings(evaluator, lost)]
         if optimum is None:
-            findings += [f for likelihood in evaluator.likelihoods for f in likelihood.findings]
+            findings += [
+                f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings
+            ]
         else:
             conflicts = prior_conflicts(optimum, evaluator, thetas) if evaluator.nodes else ()
             findings += [*optimum.findings, *conflicts]

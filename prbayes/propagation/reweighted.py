@@ -49,9 +49,9 @@ from prbayes.response.distributions import prior_draws, refuse_without_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import lacking
 from prbayes.response.response import (
-    Known,
+    KnownPoints,
     Responses,
-    once_each,
+    deduplicated_responses,
     refuse_coarse,
     refuse_other_number,
 )
@@ -493,7 +493,7 @@ class ReweightedBound(Bound):
         if len(values) < len(runs):
             points = self.points_of(responses.inputs, runs.points)
             missing = [x[len(values) :] for x in points]
-            more = once_each(responses, missing, Known(points, values))
+            more = deduplicated_responses(responses, missing, KnownPoints(points, values))
             values = np.concatenate([values.reshape(-1, *more.shape[1:]), more])
             if pairs:
                 self._other_responses.remove(pairs[0])
