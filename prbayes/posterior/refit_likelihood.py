@@ -58,11 +58,9 @@ class RefitLikelihoodOptions:
     """Options of the likelihood given an estimate, from refits."""
 
     n_sets: int = 1024  # synthetic data sets
-    n_starts: int = (
-        64  # points around the estimate, the best of which begins a refit of local optima
-    )
-    # Rounds that share the data sets. Those of the first are drawn around the estimate, in a ball of
-    # ``radius`` standard errors; later ones around the posterior before, ``inflation`` times as wide.
+    n_starts: int = 64  # points around the estimate as starts of refits, with local optima
+    # Rounds that share the data sets. The first ones are drawn in a ball of ``radius`` standard
+    # errors around the estimate, later ones from the previous posterior, ``inflation`` times wider.
     rounds: int = 2
     radius: float = 4.0
     inflation: float = 1.5
