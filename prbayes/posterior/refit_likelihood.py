@@ -25,7 +25,7 @@ from scipy.special import logsumexp, ndtri
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.inference.batched_objective import BatchObjective
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import (
     DataSets,
     groups,
@@ -315,7 +315,7 @@ def _draw(
     points = points_along(evaluator, thetas, rng)
     data = sets_at(evaluator, stored_populations(evaluator, thetas), points)
     starts = x if len(centers) == 1 else _best_starts(centers, data, options)
-    estimates, converged = sampling.refit(data, starts, roughly=True)
+    estimates, converged = refit(sampling, data, starts, is_rough=True)
     if converged.mean() < options.converged:
         raise ValueError(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
@@ -403,7 +403,7 @@ def _at_minimiser(
 
 def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
     """Return the sampling distribution with the minimiser for the observed responses as theta."""
-    (x,), _ = sampling.refit(observed_set(sampling.evaluator))
+    (x,), _ = refit(sampling, observed_set(sampling.evaluator))
     return replace(sampling, theta=sampling.thetas(x))
 
 
