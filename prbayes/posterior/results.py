@@ -30,8 +30,11 @@ from prbayes.model.labels import (
     observed_dataset,
     versions,
 )
+from prbayes.model.measurement import specimen_labels
+from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import MAX_LOST
-from prbayes.response.outputs import lacking
+from prbayes.response.outputs import is_missing
 
 Stages = dict[str, list[float]]  # statistics of a chain by name, a value for each stage
 
@@ -376,9 +379,10 @@ def _log_likelihood_by_specimen(evaluator: Evaluator, thetas: Floats) -> xr.Data
     for likelihood in evaluator.likelihoods:
         name = likelihood.measurements[-1].name
         dim = str(observed[name].dims[0])
-        if likelihood.labels is not None:  # by specimen, not by reading
+        labels = specimen_labels(likelihood)
+        if labels is not None:  # by specimen, not by reading
             dim = f"{name}_specimen"
-            coords[dim] = likelihood.labels
+            coords[dim] = labels
         variables[name] = (["chain", "draw", dim], values[name].reshape(chains, draws, -1))
     return xr.Dataset(variables, coords=coords)
 
@@ -392,7 +396,7 @@ def _emulated_responses(
     for k, likelihood in enumerate(evaluator.likelihoods):
         params = specimen_params(evaluator, thetas.reshape(-1, d), k)
         for measurement in likelihood.measurements:
-            values = likelihood.draws(rng, params, len(measurement.observed), measurement)
+            values = draw_readings(likelihood, rng, params, len(measurement.observed), measurement)
             responses[measurement.name] = values.reshape(chains, draws, *values.shape[1:])
     return labelled_responses(evaluator, responses, (chains, draws))
 
@@ -433,7 +437,7 @@ def _stored_specimens(
             continue
         values, weights = node.bound.populations([root[valid] for root in roots])
         responses = values[0]  # of all populations
-        cumulative = np.cumsum(np.where(lacking(responses), 0.0, weights), axis=1)
+        cumulative = np.cumsum(np.where(is_missing(responses), 0.0, weights), axis=1)
         for place, row in zip(first + valid, cumulative, strict=True):
             if row[-1] > 0:
                 uniform = rng.random(size) * row[-1]
