@@ -105,8 +105,6 @@ class Surrogate:
     _joined: bool = field(repr=False, default=False)
     _predict: Predict = field(repr=False, default=cast(Predict, None))
     _multifidelity: MultifidelitySurface | None = field(repr=False, default=None)
-        repr=False, default=cast(MultifidelitySurface, None)
-    )
     # Not empty after the first warning of points outside.
     _warned: list[bool] = field(repr=False, default_factory=list)
     # Names of the outputs in the response's mapping; None without names.
