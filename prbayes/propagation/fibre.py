@@ -67,16 +67,10 @@ class FibrePoints:
     """K importance points on the fibre of each of N specimens.
 
     log L_i(theta) = logsumexp_k(log p(x_ik | theta) + log_a_ik).
-
-    Attributes
-    ----------
-    x : ndarray, shape (N, K, d)
-        Inputs; the mean of the reference population for points of weight zero.
-    log_a : ndarray, shape (N, K)
-        Logarithms of the importance numbers, minus log K; -inf for points of weight zero.
     """
 
-    x: Floats
+    x: Floats  # (N, K, d): inputs; the mean of the reference population for points of weight zero
+    # (N, K): logarithms of the importance numbers, minus log K; -inf for points of weight zero
     log_a: Floats
 
     def without_errors(self, outputs: int) -> FibrePoints:
@@ -92,20 +86,11 @@ class FibrePoints:
 
 @dataclass(frozen=True, eq=False)
 class FibreProposal:
-    """Proposal distribution on the fibres of N specimens: a mixture over charts for each.
+    """Proposal distribution on the fibres of N specimens: a mixture over charts for each."""
 
-    Attributes
-    ----------
-    fibres : Fibres
-        Response, reference population and measured outputs.
-    charts : Charts
-    numbers : ndarray of int, shape (N,)
-        Numbers of the specimens, from which their random numbers follow.
-    """
-
-    fibres: Fibres
+    fibres: Fibres  # response, reference population and measured outputs
     charts: Charts
-    numbers: Indices
+    numbers: Indices  # (N,): numbers of the specimens, from which their random numbers follow
 
     def draw(self, points: int, seed: int, after: int = 0) -> FibrePoints:
         """Draw points on all fibres.

@@ -79,33 +79,17 @@ class EmulatedPoints:
 
 @dataclass(frozen=True, eq=False)
 class DesignEmulator:
-    """An emulator of one response, fitted to the runs of a design.
-
-    Attributes
-    ----------
-    runs : Runs
-    surfaces : tuple
-        By output.
-    left_out : ndarray, shape (n, m)
-        Predictions of runs that were left out.
-    weights : ndarray, shape (T, n)
-        Of the runs in the populations that matter.
-    run_share : float
-        Mixing weight of the runs among the points of a population.
-    error : float
-        Root mean square error of the worst output at runs that were left out, in units of its
-        spread in the populations that matter.
-    event : tuple of int
-        Shape of one response: () or (m,).
-    """
+    """An emulator of one response, fitted to the runs of a design."""
 
     runs: Runs
-    surfaces: tuple[Any, ...]
-    left_out: Floats
-    weights: Floats
-    run_share: float
+    surfaces: tuple[Any, ...]  # by output
+    left_out: Floats  # (n, m): predictions of runs that were left out
+    weights: Floats  # (T, n): of the runs in the populations that matter
+    run_share: float  # mixing weight of the runs among the points of a population
+    # Root mean square error of the worst output at runs that were left out, in units of its spread
+    # in the populations that matter.
     error: float
-    event: tuple[int, ...]
+    event: tuple[int, ...]  # shape of one response: () or (m,)
 
     def for_populations(self, weights: Floats) -> DesignEmulator | None:
         """Return the same surfaces for other populations; None where runs alone are as good."""
