@@ -127,7 +127,7 @@ class Design:
             return text
         following, outputs = self.emulator.n_following, len(self.emulator.surfaces)
         if not following:
-            return f"{text} It does not follow the coarse response, which tells nothing more."
+            return f"{text} It does not follow the coarse response, which adds no information."
         share = f" in {following} of {outputs} outputs" if following < outputs else ""
         return f"{text} It follows the coarse response{share}."
 
