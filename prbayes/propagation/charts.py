@@ -48,7 +48,7 @@ class ReferencePopulation:
         covariance = (centred.T * weights) @ centred
         sd = np.sqrt(np.diagonal(covariance))
         if np.all(sd > 0):
-            # Scaled, so that units of the inputs do not decide what counts as singular.
+            # Scaled: units of the inputs do not decide whether the matrix is singular.
             correlation = covariance / np.outer(sd, sd)
             if np.linalg.eigvalsh(correlation)[0] > 1e-10:
                 return cls(mean, sd[:, None] * np.linalg.cholesky(correlation))

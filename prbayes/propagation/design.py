@@ -254,8 +254,8 @@ def _responses_at(points: Sequence[Floats], responses: Responses, design: Design
     if values is not None:
         responses.count_reused(len(values))
         return values
-    known = None if design is None else KnownPoints(design.runs.points, design.runs.values)
-    values = deduplicated_responses(responses, points, known)
+    runs = None if design is None else KnownPoints(design.runs.points, design.runs.values)
+    values = deduplicated_responses(responses, points, runs)
     responses.runs.stored.append((list(points), values))
     return values
 
@@ -303,8 +303,8 @@ class WeightFunction:
 
 def is_line(inputs: Inputs) -> bool:
     """Return whether a specimen is one continuous number."""
-    x, *others = inputs.aleatory
-    return not others and x.type.ndim == 0 and x.dtype.startswith("float")
+    x = inputs.aleatory[0]
+    return len(inputs.aleatory) == 1 and x.type.ndim == 0 and x.dtype.startswith("float")
 
 
 def common_rows(first: Sequence[Floats], second: Sequence[Floats]) -> int:

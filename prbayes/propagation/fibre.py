@@ -242,7 +242,7 @@ def _draw(
         t = normal / np.sqrt(chi_square / Charts.degrees)
     scaled = charts.scale[specimen, slot] @ t[..., None]
     u = charts.location[specimen, slot] + scaled[..., 0]
-    # Specimens without charts have arrays of zeros, so that all their solves fail.
+    # Specimens without charts have arrays of zeros: all their solves fail.
     z, jacobian, converged = charts.points(fibres, specimen, slot, u)
 
     rows = np.flatnonzero(converged)
@@ -319,7 +319,7 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
 def _shifted_sobol(points: int, dimensions: int, key: tuple[int, int], numbers: Indices) -> Floats:
     """Return Sobol points with a digital shift of the specimen, (n, points, dimensions).
 
-    Errors of specimens are independent, so that they average out in the log-likelihood.
+    Errors of specimens are independent: they average out in the log-likelihood.
     """
     bits = 30  # of SciPy's points, which are multiples of 2^-30
     net = (sobol(points, dimensions, key[1]) * 2**bits).astype(np.int64)

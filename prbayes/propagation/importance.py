@@ -30,8 +30,8 @@ from prbayes.response.response import Responses
 class EmulatedSizes:
     """Sizes of emulated samples, whose points cost no run.
 
-    The mixture that a sample is drawn from has few populations beside the prior, so that each fills
-    its space evenly.
+    The mixture that a sample is drawn from has few populations beside the prior: each fills its
+    space evenly.
     """
 
     first: int = 8192  # points
@@ -242,13 +242,13 @@ def mixture_of(groups: Sequence[Sequence[Floats]], size: int) -> tuple[list[Floa
 
     The first group is the prior; groups have one array of roots, (k, *shape), by root.
     """
-    prior, *others = groups
-    if not others:
+    prior, *posteriors = groups
+    if not posteriors:
         count = 384  # more cost time and change nothing
         return spread_over(prior, count), np.full(count, 1 / count)
     near = SIZES.near * size // SIZES.first
-    parts = [spread_over(prior, SIZES.from_prior), *(spread_over(g, near) for g in others)]
-    each = (1 - SIZES.prior_share) / (near * len(others))
-    shares = np.full(SIZES.from_prior + near * len(others), each)
+    parts = [spread_over(prior, SIZES.from_prior), *(spread_over(g, near) for g in posteriors)]
+    share = (1 - SIZES.prior_share) / (near * len(posteriors))
+    shares = np.full(SIZES.from_prior + near * len(posteriors), share)
     shares[: SIZES.from_prior] = SIZES.prior_share / SIZES.from_prior
     return [np.concatenate(same) for same in zip(*parts, strict=True)], shares

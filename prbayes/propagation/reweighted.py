@@ -86,7 +86,7 @@ class Reweighted(Propagation):
         at runs that were left out, mixed with the weighted runs as far as these errors require;
         not with one input, discrete ones, or an n above 2000, where runs alone are as good. Or a
         surface of ``prb.surrogate``, or any regressor with ``fit(X, y)`` and ``predict(X)``. With
-        None the runs stand alone.
+        None the runs are used alone.
     coarse : callable, optional
         A cheap response of the same inputs and outputs that approximates the expensive one, such as
         that of a coarser mesh. The emulator then models the difference of the two, for each output

@@ -1,8 +1,8 @@
 """All roots of f(x) = y: the inputs with which a response reproduces each measured specimen.
 
 Levenberg-Marquardt runs for all specimens and starts at once. A root is kept if its misfit is at
-most `gap` nats above the specimen's best, so that a mirror root is kept as long as the error of the
-comparison cannot tell it from the true one.
+most `gap` nats above the specimen's best: a mirror root that the error of the comparison does not
+exclude is kept.
 """
 
 from __future__ import annotations
