@@ -15,16 +15,17 @@ from prbayes.model.evaluator import Evaluator
 class Requirement:
     """How well a design has to support populations."""
 
-    ess: float  # weight effective sample size at the median, as a share of the design's required size
+    ess: float  # median weight effective sample size, as a share of the design's required one
     lowest_ess: float  # the same at the 5% quantile
     # Bounds of the mean raw weight, which is one if the design covers the population.
     mass: tuple[float, float]
     tails: bool  # whether 5% and 95% quantiles of the mean raw weight are bounded, or the median
 
 
-# Of the optimiser and the samplers, whose designs grow until they meet it. A mean weight of 0.8 to 1.25
-# is a fifth of the population's mass either way. Half the effective sample size moves an optimum by
-# .05 standard errors; twice is more than 1024 points give with two inputs (docs/constants.md).
+# Of the optimiser and the samplers, whose designs grow until they meet it. A mean weight of 0.8 to
+# 1.25 is a fifth of the population's mass either way. Half the effective sample size moves an
+# optimum by .05 standard errors; twice is more than 1024 points give with two inputs
+# (docs/constants.md).
 ENOUGH = Requirement(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
 # Of predictions, whose designs do not grow. Laxer: draws at the edge of a posterior are less well
 # supported than its centre, and resampling needs no derivative.
