@@ -96,9 +96,7 @@ def rank(
         folds = positive_integer(folds, "folds", minimum=2)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
-    n_folds = [
-        table.sizes["fold"] for table in candidates.values() if isinstance(table, xr.Dataset)
-    ]
+    passed = [table for table in candidates.values() if isinstance(table, xr.Dataset)]
     number = folds or (passed[0].sizes["fold"] if passed else None)
     tables = {}
     for label, candidate in candidates.items():
