@@ -83,7 +83,7 @@ class JointNull(Null):
     random_seed: int = 0
 
     def __post_init__(self) -> None:
-        advice = ", so that the model cannot be calibrated anew; use prb.validation.PosteriorNull()"
+        advice = "; the model cannot be calibrated anew: use prb.validation.PosteriorNull()"
         require_refits(self.optimum, "JointNull", advice)
         _require_responses(self.responses)
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
