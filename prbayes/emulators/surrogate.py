@@ -206,15 +206,7 @@ class Surrogate:
         refuse_misfit(name, response, lambda: [r.size for r in domain.inputs], None)
         n_needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=n_needed)
-        unit = sobol(n, domain.dimensions, seed)
-        if points == "predictive":
-            if predictive is None:
-                raise ValueError(
-                    f"{name}: points: got 'predictive' for inputs that are ranges, expected a "
-                    "`.dist()` among them; leave points= out"
-                )
-            unit = domain.like(predictive, unit)
-        design = domain.at(unit)
+        design = _design(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
 
         # Compute the responses; the coarse ones first, as an error in them then costs no run.
         coarse_values = None if coarse is None else _first_coarse(name, coarse, domain, design)
@@ -505,6 +497,20 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
         h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         h = h ^ (h >> np.uint64(31))
     return h
+
+
+def _design(
+    name: str, points: str, domain: Ranges, predictive: Floats | None, unit: Floats
+) -> Floats:
+    """Return the design's rows for points of the unit cube: even, or as the prior predictive."""
+    if points == "even":
+        return domain.at(unit)
+    if predictive is None:
+        raise ValueError(
+            f"{name}: points: got 'predictive' for inputs that are ranges, expected a `.dist()` "
+            "among them; leave points= out"
+        )
+    return domain.at(domain.like(predictive, unit))
 
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:
