@@ -19,7 +19,7 @@ from prbayes.inference.resampling import dependent
 from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.metrics.likelihood import kernel_width
 from prbayes.metrics.multivariate import components_missed
-from prbayes.model.elements import read_variables, split_elements, told_elements
+from prbayes.model.elements import readable_variables, split_elements, table_elements
 from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.labels import labelled
 from prbayes.model.parameters import THETAS
@@ -372,10 +372,10 @@ def _of_rival(evaluator: Evaluator, rival: Rival) -> Finding:
     points = evaluator.hyperparameters.constrained(
         np.stack([rival.theta, evaluator.hyperparameters.initial])
     )
-    read = read_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
+    read = readable_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
     values = labelled(evaluator, {name: points[name] for name in read}, {"point": 2}).data_vars
     elements = split_elements(values)
-    place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in told_elements(values))
+    place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in table_elements(values))
     return Finding(
         "second-mode",
         f"The data could as well come from {place}: another optimum, or mirror "

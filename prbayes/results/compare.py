@@ -26,12 +26,12 @@ from prbayes.model.coverage import shortcomings
 from prbayes.model.elements import (
     coordinates,
     element_names,
-    read_elements,
+    optimum_elements,
+    readable_elements,
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
-    told_of,
+    table_elements,
     variable_of,
     with_coordinates,
 )
@@ -126,7 +126,7 @@ def compare(
     columns = {label: _column(label, result, naming) for label, result in results.items()}
     every = _shared(list(columns.values()), model)
     told = set.intersection(*(column.told for column in columns.values()))
-    names = read_elements(name for name in every if name in told)
+    names = readable_elements(name for name in every if name in told)
     if not names:
         raise ValueError(
             f"compare: got results {list(results)} that share no hyperparameter, "
@@ -246,7 +246,7 @@ def _column(label: str, result: Any, naming: pm.Model | None) -> _Column:
         draws = stacked_draws(posterior)
         if naming is not None:
             draws = with_coordinates(draws, naming)
-        told = told_elements(draws)
+        told = table_elements(draws)
         return _Column(_of_draws(draws), set(told), *_cost(posterior.attrs))
     if isinstance(result, xr.DataTree) and "optimum" in result.children:
         optimum = result["optimum"]
@@ -270,7 +270,7 @@ def _of_draws(draws: Mapping[str, xr.DataArray]) -> dict[str, _Estimate]:
 def _of_optimum(
     point: Mapping[Any, Any], stderr: Mapping[Any, Any], cost: tuple[float, float]
 ) -> _Column:
-    return _Column(_normal(point, stderr), set(told_of(point, stderr)), *cost)
+    return _Column(_normal(point, stderr), set(optimum_elements(point, stderr)), *cost)
 
 
 def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, _Estimate]:
