@@ -14,8 +14,7 @@ from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
 from prbayes.decision.populations import Populations, ResponseSample
 from prbayes.decision.quantities import Quantity, refuse_quantity
-from prbayes.inference.measured import drawn_in
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
 from prbayes.model.elements import split_elements, table_elements

@@ -33,8 +33,8 @@ from prbayes.numerics.points import sobol
 from prbayes.response.call import Points, compute
 from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
-from prbayes.response.outputs import Outputs, lacking
-from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
+from prbayes.response.outputs import Outputs, is_missing
+from prbayes.response.response import check_call_settings, refuse_coarse, refuse_misfit
 from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
@@ -194,7 +194,7 @@ class Surrogate:
         outside = Replace() if outside is None else outside
         policy = Abort() if on_failure is None else on_failure
         _refuse_wrong(name, response, model, outside, points)
-        refuse_calling(executor, store, version, policy)
+        check_call_settings(executor, store, version, policy)
         flag(retry_failed, f"{name}: retry_failed")
         share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
@@ -505,7 +505,7 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:
     """Return which runs have only finite outputs, (n,)."""
-    return ~lacking(np.where(np.isfinite(responses), responses, np.nan))
+    return ~is_missing(np.where(np.isfinite(responses), responses, np.nan))
 
 
 def _spread(values: Floats) -> Any:

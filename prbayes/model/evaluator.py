@@ -168,7 +168,7 @@ class Evaluator:
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
-        budget().go_on()
+        budget().check()
         node = self.nodes[k]
         return node.bound.discrepancies(self.roots(thetas, k), target or node.target)
 
@@ -235,7 +235,7 @@ class Evaluator:
         symbolic = [node.bound for node in self.nodes if node.bound.symbolic]
 
         def counted(theta: Floats, scales: Floats) -> Any:
-            budget().go_on()
+            budget().check()
             for bound in symbolic:
                 bound.responses.count_symbolic(bound.n_per_theta)
             return function(theta, scales)

@@ -49,7 +49,7 @@ def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, in
         array = np.asarray(value)
         unnamed = [None] * (array.ndim - len(leading))
         dims = model.named_vars_to_dims.get(name) or unnamed
-        for dim in dims:
+        for dim in filter(None, dims):
             if model.coords.get(dim) is not None:
                 coords[dim] = np.asarray(model.coords[dim])
         names = [dim or f"{name}_dim_{i}" for i, dim in enumerate(dims)]

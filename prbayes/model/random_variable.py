@@ -46,7 +46,7 @@ from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
 from prbayes.response.budget import duration
 from prbayes.response.compile import PLAIN
 from prbayes.response.inputs import Inputs
-from prbayes.response.outputs import ONE, Outputs
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
@@ -64,7 +64,7 @@ class Node:
     specimens: NDArray[Any] | None  # (N,): labels of the specimens
     # Names of the simulators before it in the model that have a ``.dist()`` of its inputs.
     same_inputs: tuple[str, ...] = ()
-    outputs: Outputs = ONE  # of a run
+    outputs: Outputs = SINGLE_OUTPUT  # of a run
     group: str = ""  # name of the group of its specimens
 
     is_emulated: ClassVar[Literal[False]] = False
@@ -183,7 +183,7 @@ class Specification:
     epsilon: Any  # shared scalar; NaN while it is not set
     specimens: NDArray[Any] | None  # (N,): labels
     same_inputs: tuple[str, ...] = ()
-    outputs: Outputs = ONE
+    outputs: Outputs = SINGLE_OUTPUT
     group: str = ""
     progressbar: bool = True
     original: Specification | None = None  # of a clone, which takes the runs of the original

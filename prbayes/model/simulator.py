@@ -51,9 +51,9 @@ from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compile import PLAIN
 from prbayes.response.distributions import refuse_without_density
-from prbayes.response.groups import Groups, is_group, places_of
+from prbayes.response.groups import Groups, group_indices, is_group
 from prbayes.response.inputs import Inputs, is_labelled, model_on_context, read_inputs
-from prbayes.response.outputs import ONE, Outputs, read_observed
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
 
@@ -183,7 +183,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         refuse_single_precision(f"{name}: {root.name}", root.dtype)
     groups, measured = None, observed
     if arguments.groups is not None:
-        groups, measured = places_of(name, observed, arguments.groups)
+        groups, measured = group_indices(name, observed, arguments.groups)
     values, outputs = read_observed(name, _numbers(name, measured))
     metric = LogLikelihood() if metric is None else metric
     if isinstance(metric, Metric) and metric.by_specimen:
@@ -478,7 +478,7 @@ def _add_term(
             if simulator.group == term.group
             and not aleatory.isdisjoint(simulator.responses.inputs.aleatory)
         ),
-        responses.outputs or ONE,
+        responses.outputs or SINGLE_OUTPUT,
         term.group,
         progressbar,
     )

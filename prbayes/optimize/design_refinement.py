@@ -10,11 +10,10 @@ import numpy as np
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local
+from prbayes.inference.asymptotics import Information, Local
+from prbayes.inference.design_error import DesignErrors
 from prbayes.inference.identifiability import oriented
-from prbayes.inference.refits import DesignErrors
 from prbayes.inference.resampling import families, siblings
-from prbayes.inference.sandwich import Information
 from prbayes.model.coverage import Shortcoming, shortcomings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS

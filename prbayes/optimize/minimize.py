@@ -26,8 +26,16 @@ from prbayes._validate import (
     seed_number,
 )
 from prbayes.inference.asymptotics import Local
-from prbayes.inference.checks.smoothing_bias import wide_kernels
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.checks.flat_edge import breakdown_findings, elements_at_edge
+from prbayes.inference.checks.identification import unidentified_findings
+from prbayes.inference.checks.metric_suitability import data_between_runs, heavy_tails
+from prbayes.inference.checks.smoothing_bias import smoothing_bias
+from prbayes.inference.design_error import design_error
+from prbayes.inference.refits import (
+    SamplingDistribution,
+    jumping_simulators,
+    sampling_of_functions,
+)
 from prbayes.inference.requirements import sampling_obstacle
 from prbayes.inference.resampling import SETS
 from prbayes.model.budgets import explained, kept
@@ -37,14 +45,6 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_variable import specimen_likelihoods
-from prbayes.optimize.caveats import (
-    between_runs,
-    breakdown,
-    caveats,
-    elements_at_edge,
-    heavy_tails,
-    not_identified,
-)
 from prbayes.optimize.convergence import (
     OVERLAP,
     OVERLAP_ENOUGH,
@@ -73,6 +73,7 @@ from prbayes.optimize.design_refinement import (
     spread_along,
     spread_around,
 )
+from prbayes.optimize.findings import optimum_findings
 from prbayes.optimize.local_optima import Best, Rival, excluded, rivals, standing, visit
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
 from prbayes.optimize.methods import Method
@@ -616,7 +617,7 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
             return state
         if state.sampling is None:
             return state
-        errors = state.sampling.design_error()
+        errors = design_error(state.sampling)
         state = replace(state, design_error=errors.whole)
         if not errors.whole > AGREE:
             return state
@@ -629,7 +630,7 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
         plan.advance(n_design_runs(evaluator) - before, note)
     elif rounds == MAX_ROUNDS:
         # A search follows what is not identified until no design supports it.
-        known = [] if state.local is None else not_identified(evaluator, state.local)
+        known = [] if state.local is None else unidentified_findings(evaluator, state.local)
         refuse(short, evaluator, known)
     elif state.cloud is None:
         near = pilot(evaluator, state.scales, seed=plan.seed)
@@ -792,7 +793,7 @@ def _settled(plan: _Plan, state: _State) -> _State:
     known = not np.isnan(state.design_error) and not away.any()
     if known or state.sampling is None:
         return state
-    return replace(state, design_error=state.sampling.design_error().whole)
+    return replace(state, design_error=design_error(state.sampling).whole)
 
 
 # -- after -----------------------------------------------------------------------------------------
@@ -808,18 +809,18 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         plan.search,
         state.run,
         covariance=_covariance(state),
-        functions=None if state.sampling is None else state.sampling.of_functions,
+        functions=None if state.sampling is None else sampling_of_functions(state.sampling),
         remark=begun.led.remark,
         screened=begun.screened,
         responses_before=plan.responses_before,
     )
     refuse_lost(evaluator, {name: each["lost_mass"] for name, each in found.support.items()})
     findings = report(
-        *breakdown(edge, jump),
+        *breakdown_findings(edge, jump),
         *heavy_tails(evaluator, state.theta),
-        *between_runs(evaluator, state.theta),
-        *wide_kernels(evaluator, state.theta, state.scales, state.local),
-        *caveats(evaluator, state.sampling, state.others, state.design_error),
+        *data_between_runs(evaluator, state.theta),
+        *smoothing_bias(evaluator, state.theta, state.scales, state.local),
+        *optimum_findings(evaluator, state.sampling, state.others, state.design_error),
     )
     ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
     told = _told_of_designs(evaluator, state.design_error)
@@ -873,7 +874,7 @@ def _stopped(plan: _Plan, begun: _Beginning, state: _State, reason: str) -> Opti
         plan.search,
         state.run,
         covariance=_covariance(state),
-        functions=None if state.sampling is None else state.sampling.of_functions,
+        functions=None if state.sampling is None else sampling_of_functions(state.sampling),
         remark=f"{begun.led.remark} {reason} before the minimisation was finished.",
         screened=begun.screened,
         responses_before=plan.responses_before,
@@ -903,7 +904,7 @@ def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, 
         tolerance=plan.search.tolerance,
         seed=plan.seed,
     )
-    jump = tuple(evaluator.nodes[k].name for k in state.sampling.unsettled())
+    jump = tuple(evaluator.nodes[k].name for k in jumping_simulators(state.sampling))
     return edge, jump
 
 

@@ -12,6 +12,7 @@ import xarray as xr
 from prbayes._display import view
 from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
+from prbayes.inference.checks.flat_edge import breakdown_findings
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
 from prbayes.metrics.multivariate import components_summary
@@ -30,7 +31,6 @@ from prbayes.model.fingerprint import (
 from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
 from prbayes.model.locking import locked
 from prbayes.model.specimen_preparation import prepared
-from prbayes.optimize.caveats import breakdown
 
 # What is less is written as 0.0%.
 TOLD_SHARE = 5e-4
@@ -267,7 +267,7 @@ def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     ValueError
         If it is at the edge of a support, or at a jump.
     """
-    findings = breakdown(optimum.at_edge, optimum.at_jump)
+    findings = breakdown_findings(optimum.at_edge, optimum.at_jump)
     if findings:
         reasons = " ".join(map(str, findings))
         raise ValueError(

@@ -8,11 +8,11 @@ import numpy as np
 
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
+from prbayes.inference.checks.flat_edge import no_information
 from prbayes.model.evaluator import Evaluator, has_other_terms, missing_mass
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.caveats import no_information
 from prbayes.optimize.convergence import Run, Search, apart_from_data
 from prbayes.optimize.local_optima import Rival
 from prbayes.optimize.optimum import Optimum, plain

@@ -18,7 +18,7 @@ from prbayes.model.labels import (
 )
 from prbayes.model.measurement import specimen_labels
 from prbayes.model.specimen_likelihood import draw_readings
-from prbayes.response.outputs import lacking
+from prbayes.response.outputs import is_missing
 
 # The names that ArviZ's functions which want a number for each observation show when they refuse.
 _LIKELIHOOD = ("one_number_for_all_specimens", "other_terms")
@@ -205,7 +205,7 @@ def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Gene
         values, weights = node.bound.populations([root[where] for root in roots])
         # The same responses carry all populations.
         points = values[0]
-        edges = np.cumsum(np.where(lacking(points), 0.0, weights), axis=1)
+        edges = np.cumsum(np.where(is_missing(points), 0.0, weights), axis=1)
         for place, row in zip(first + where, edges, strict=True):
             total = row[-1]
             if total > 0:

@@ -10,12 +10,17 @@ import numpy as np
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import first_order_shifts, local_sampling
-from prbayes.inference.identifiability import identified_by_area, identified_by_curvature
-from prbayes.inference.measured import Refits
+from prbayes.inference.asymptotics import (
+    Information,
+    LinearArea,
+    first_order_shifts,
+    identified_by_area,
+    local_sampling,
+)
+from prbayes.inference.identifiability import identified_by_curvature
+from prbayes.inference.refits import simplex_refits
 from prbayes.inference.requirements import simulator_obstacle
-from prbayes.inference.resampling import SETS, DataSets, groups
-from prbayes.inference.sandwich import Information, LinearArea
+from prbayes.inference.resampling import DataSets, groups
 from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.model.epsilon import Epsilon, refuse_without_epsilon
 from prbayes.model.locking import locked
@@ -105,7 +110,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     require_minimiser(optimum, "calibrate_epsilon")
     found = {}
     for k, node in enumerate(evaluator.nodes):
-        information = Information(evaluator, k, optimum.theta, n_sets=SETS)
+        information = Information(evaluator, k, optimum.theta)
         found[node.name] = _epsilon(information)
     for group in groups(evaluator.nodes):
         names = [evaluator.nodes[k].name for k in group]
@@ -122,7 +127,7 @@ def _dependence(optimum: Optimum, group: list[int], epsilon: Floats) -> float:
     exchanged, averaged over the directions identified.
     """
     evaluator = optimum.evaluator
-    information = [Information(evaluator, k, optimum.theta, n_sets=SETS) for k in group]
+    information = [Information(evaluator, k, optimum.theta) for k in group]
     if len(group) < 2 or any(one.node.metric.minimum is Minimum.UNKNOWN for one in information):
         return 1.0
     basis = local_sampling(information, epsilon).identified
@@ -191,7 +196,7 @@ def _by_refits(information: Information) -> float:
     the discrepancy grows like a square or like an absolute value.
     """
     scales = np.ones(len(information.evaluator.nodes))
-    refits = Refits.at(
+    refits = simplex_refits(
         information.evaluator,
         information.theta,
         scales,
@@ -201,7 +206,7 @@ def _by_refits(information: Information) -> float:
     p = local.identified.shape[1]
     _refuse_unidentified(information, p)
     # One delta for each data set, and its opposite; steps in units of the prior's spread.
-    rng = np.random.default_rng(information.seed)
+    rng = np.random.default_rng(0)
     z = rng.standard_normal((len(refits.shifts), p))
     root = np.linalg.cholesky(local.covariance)
     delta = z @ root.T @ local.identified.T
@@ -276,7 +281,7 @@ def _by_coverage(information: Information) -> float:
     errors = np.sqrt(np.maximum(variances, 0))
     axes = basis @ (vectors * errors)
     directions = axes * information.prior_sd[:, None]
-    cloud = _Cloud.around(areas, directions, information.seed)
+    cloud = _Cloud.around(areas, directions, 0)
     # Coverage grows with epsilon.
     low, high = (information.noise_floor * factor for factor in (1e-3, 10.0))
     # To rounding.

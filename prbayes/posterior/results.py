@@ -34,7 +34,7 @@ from prbayes.model.measurement import specimen_labels
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import MAX_LOST
-from prbayes.response.outputs import lacking
+from prbayes.response.outputs import is_missing
 
 Stages = dict[str, list[float]]  # statistics of a chain by name, a value for each stage
 
@@ -437,7 +437,7 @@ def _stored_specimens(
             continue
         values, weights = node.bound.populations([root[valid] for root in roots])
         responses = values[0]  # of all populations
-        cumulative = np.cumsum(np.where(lacking(responses), 0.0, weights), axis=1)
+        cumulative = np.cumsum(np.where(is_missing(responses), 0.0, weights), axis=1)
         for place, row in zip(first + valid, cumulative, strict=True):
             if row[-1] > 0:
                 uniform = rng.random(size) * row[-1]

@@ -26,7 +26,7 @@ from prbayes.model.fingerprint import from_attributes as identity_of_attributes
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.plots._labels import refuse_labels
 from prbayes.reports.schema import kind_of_decision
-from prbayes.response.outputs import ONE, Outputs, read_observed
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.results.compare import compare
 from prbayes.results.diagnose import Diagnosis, diagnose
 from prbayes.validation.area_test import ValidityTest, u_values
@@ -347,7 +347,7 @@ def _stored_observed(name: str, values: xr.DataArray) -> tuple[Floats, Outputs]:
     """Return the measured responses of a simulator, and their columns, from a result."""
     units = values.attrs.get("units")
     if values.ndim != 2:
-        outputs = Outputs(units=(units,)) if isinstance(units, str) and units else ONE
+        outputs = Outputs(units=(units,)) if isinstance(units, str) and units else SINGLE_OUTPUT
         return np.ravel(values.values), outputs
     if units is not None and not isinstance(units, str):  # of each output
         values = values.assign_coords(units=(values.dims[1], np.asarray(units)))

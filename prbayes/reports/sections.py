@@ -40,7 +40,7 @@ from prbayes.reports.numbers import (
 from prbayes.reports.section import Section
 from prbayes.reports.summary import answers, next_steps, summary
 from prbayes.reports.tables import rows_table
-from prbayes.response.outputs import ONE
+from prbayes.response.outputs import SINGLE_OUTPUT
 
 
 def sections_of(*, pictures: bool, **results: Any) -> tuple[Section, ...]:
@@ -138,7 +138,7 @@ def data(m: Material) -> list[Section]:
 def _output_rows(name: str, m: Material) -> list[dict[str, Any]]:
     """Return a row for each output of a simulator."""
     y = m.observed[name]
-    outputs = m.outputs.get(name, ONE)
+    outputs = m.outputs.get(name, SINGLE_OUTPUT)
     if y.ndim == 1:
         units = outputs.units[0] if outputs.units else ""
         meaning = m.labels.get(name, "")

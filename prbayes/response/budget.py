@@ -29,7 +29,7 @@ class Budget:
     computed: int = 0  # responses; those found in a store cost nothing
     spent: str = ""  # why the budget is spent, as a clause; final once it is set
 
-    def go_on(self) -> None:
+    def check(self) -> None:
         """Raise if the budget is spent."""
         seconds = time.perf_counter() - self.start
         if not self.spent and self.max_seconds is not None and seconds > self.max_seconds:
@@ -39,7 +39,7 @@ class Budget:
 
     def grant(self, runs: int, least: int) -> int:
         """Return how many of the runs may be computed, and count them; raise below ``least``."""
-        self.go_on()
+        self.check()
         if self.max_runs is None:
             return runs
         granted = min(runs, self.max_runs - self.computed)

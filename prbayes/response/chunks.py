@@ -38,7 +38,7 @@ from prbayes.response.executors import (
     is_loss,
 )
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
-from prbayes.response.outputs import ONE, Outputs, lacking
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing
 from prbayes.response.store import Store, StoreError
 
 # A finished chunk, with the rows of its points.
@@ -56,7 +56,7 @@ class CallSettings:
     on_failure: OnFailure = field(default_factory=Abort)
     retry_failed: bool = False  # whether points that are stored as failed are computed again
     timeout: float | None = None  # seconds for one response
-    outputs: Outputs | None = ONE  # None takes them from the first run
+    outputs: Outputs | None = SINGLE_OUTPUT  # None takes them from the first run
 
     @property
     def accepts_stored_failures(self) -> bool:
@@ -157,7 +157,7 @@ def respond(
         if raised and not tolerant:
             tally.record_failures(points, raised)
             raise _failure_error(settings, points, raised)
-        missing = missing[lacking(values[missing])]
+        missing = missing[is_missing(values[missing])]
         if not missing.size:
             break
     return _apply_policy(settings, points, values, failed | raised, tally)
@@ -239,7 +239,7 @@ def _add_to_store(
     parts = []
     for rows, chunk in finished:
         is_complete = tolerant or not chunk.raised
-        stored = np.flatnonzero(~lacking(chunk.values) | (is_last and is_complete))
+        stored = np.flatnonzero(~is_missing(chunk.values) | (is_last and is_complete))
         if stored.size:
             stored_rows = enumerate(map(int, stored))
             reasons = {i: chunk.raised[row] for i, row in stored_rows if row in chunk.raised}
@@ -253,7 +253,7 @@ def _apply_policy(
 ) -> Floats:
     """Return responses with the policy's replacement of NaN, or raise if it refuses NaN."""
     tally.record_failures(points, raised)
-    is_nan = lacking(values)
+    is_nan = is_missing(values)
     policy = settings.on_failure.final
     if not is_nan.any():
         return values

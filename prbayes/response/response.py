@@ -25,7 +25,7 @@ from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs, batch_shape, broadcast_batch
-from prbayes.response.outputs import ONE, Outputs, outputs_of_result
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, outputs_of_result
 from prbayes.response.store import Store
 
 
@@ -58,7 +58,7 @@ def refuse_misfit(
         refuse(name, sizes(), outputs)
 
 
-def refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
+def refuse_wrong_arity(name: str, function: object, inputs: Inputs) -> None:
     """Raise if the signature of a function has more or fewer arguments than there are inputs."""
     inner: Any = function.function if isinstance(function, scalar) else function
     try:
@@ -76,7 +76,9 @@ def refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
         ) from None
 
 
-def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
+def check_call_settings(
+    executor: object, store: object, version: object, on_failure: object
+) -> None:
     """Raise if an argument that says how a response is called has the wrong type."""
     executes(executor, "executor")
     if store is not None:
@@ -176,10 +178,10 @@ class Responses:
         on_failure: OnFailure | None = None,
         retry_failed: bool = False,
         timeout: float | None = None,
-        outputs: Outputs | None = ONE,
+        outputs: Outputs | None = SINGLE_OUTPUT,
     ) -> None:
         refuse_uncallable(name, function)
-        refuse_other_number(name, function, inputs)
+        refuse_wrong_arity(name, function, inputs)
         refuse_misfit(name, function, partial(_sizes, inputs), outputs)
         report(*findings_of(function))
         policy = Abort() if on_failure is None else on_failure

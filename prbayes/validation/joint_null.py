@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats, called, positive_integer
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
 from prbayes.model.coverage import shortcomings
 from prbayes.model.fingerprint import Level, require_same
@@ -138,7 +138,7 @@ class JointNull(Null):
         points = simulated_points(
             evaluator, populations, self.replicates, self.random_seed, more=n_new
         )
-        x, converged = sampling.refit(sets_at(evaluator, populations, points))
+        x, converged = refit(sampling, sets_at(evaluator, populations, points))
         # With fewer the replicates would be those of unusual data sets.
         if converged.mean() < 0.5:
             raise ValueError(

@@ -10,7 +10,8 @@ import pytest
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference.refits import DesignErrors, SamplingDistribution
+from prbayes.inference.design_error import DesignErrors, design_error
+from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import aligned
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
@@ -179,7 +180,7 @@ def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
         model = build(response, known=True)
         optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
         sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
-        errors[kind] = sampling.design_error()
+        errors[kind] = design_error(sampling)
     assert 0.01 < errors["kink"].emulators < np.inf
     assert errors["smooth"].emulators < 0.1 * errors["kink"].emulators
     assert 0.02 < errors["smooth"].points < 0.1
