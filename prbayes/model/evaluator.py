@@ -11,12 +11,13 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, roots_of
+from prbayes.model.parameters import Hyperparameters, roots_of, variable_names
 from prbayes.model.random_variable import (
     Node,
     SimulatorRV,
@@ -387,8 +388,18 @@ def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
 
     Such as the spread between groups, or the mean of a group that was not measured.
     """
+    model = evaluator.model
+    free = set(model.free_RVs)
     params = [p for group in _simulator_params(evaluator) for p in group]
-    return evaluator.hyperparameters.only_through_others(params)
+    direct = {v for v in ancestors(params, blockers=free) if v in free}
+    joined = free & set(ancestors(list(direct)))
+    # A variable comes after those that it depends on.
+    for rv in model.free_RVs:
+        if joined.intersection(ancestors([rv])):
+            joined.add(rv)
+    indirect = {str(rv.name) for rv in joined - direct}
+    sizes = [int(np.prod(s, dtype=int)) for s in evaluator.hyperparameters.shapes.values()]
+    return np.repeat([name in indirect for name in variable_names(model)], sizes)
 
 
 def likelihood_of(evaluator: Evaluator, measurement: Measurement) -> SpecimenLikelihood:

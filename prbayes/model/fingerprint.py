@@ -27,6 +27,7 @@ from prbayes.model.description import (
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement
+from prbayes.model.parameters import fixed_points, plain_names
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_variable import measurements_of, specimen_likelihoods
 from prbayes.response.compile import interpreted
@@ -94,7 +95,7 @@ class Identity:
 def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) -> Identity:
     """Return the identity of an evaluator's problem, with numbers; computes no response."""
     names = evaluator.hyperparameters
-    thetas = names.fixed_points(4)  # a power of two: Sobol points are balanced then
+    thetas = fixed_points(names, 4)  # a power of two: Sobol points are balanced then
     simulators = []
     for k, node in enumerate(evaluator.nodes):
         values = evaluator.discrepancies(thetas, k) if node.bound.stored else np.empty(0)
@@ -105,7 +106,7 @@ def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) ->
         simulators,
         shapes=names.shapes,
         prior_minimised=prior_minimised,
-        thetas=_tuples(thetas[:, np.argsort(names.plain_names)]),
+        thetas=_tuples(thetas[:, np.argsort(plain_names(names))]),
         log_prior=_tuples(names.log_prior(thetas)),
         log_other=_tuples(evaluator.log_other(thetas)),
     )
