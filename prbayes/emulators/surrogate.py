@@ -26,7 +26,11 @@ from prbayes._validate import (
 )
 from prbayes.emulators.cross_validation import CrossValidation, cross_validated, points_needed
 from prbayes.emulators.io import read, write
-from prbayes.emulators.multifidelity import Followed, Following, followed
+from prbayes.emulators.multifidelity import (
+    MultifidelityModel,
+    MultifidelitySurface,
+    fit_multifidelity,
+)
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.numerics.points import sobol
@@ -100,7 +104,7 @@ class Surrogate:
     # Whether the coarse response is among the inputs of the surface, too.
     _joined: bool = field(repr=False, default=False)
     _predict: Predict = field(repr=False, default=cast(Predict, None))
-    _followed: Followed = field(repr=False, default=cast(Followed, None))
+    _multifidelity: MultifidelitySurface | None = field(repr=False, default=None)
     # Not empty after the first warning of points outside.
     _warned: list[bool] = field(repr=False, default_factory=list)
     # Names of the outputs in the response's mapping; None without names.
@@ -424,8 +428,8 @@ class Surrogate:
         coarse = _coarse_at("surrogate", self.coarse, self.domain, self.points)
         usable &= np.isfinite(coarse)
         x, y = unit[usable], self.responses[usable]
-        surface_beside = followed(self.model, x, y, coarse[usable], joined=self._joined)
-        return replace(surrogate, _followed=surface_beside)
+        multifidelity = fit_multifidelity(self.model, x, y, coarse[usable], joined=self._joined)
+        return replace(surrogate, _multifidelity=multifidelity)
 
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
@@ -445,12 +449,12 @@ class Surrogate:
 
     def _surface(self, columns: Floats, unit: Floats) -> Floats:
         """Return values of the surface at rows, and at the same rows in the unit cube."""
-        if self.coarse is None:
+        if self.coarse is None or self._multifidelity is None:
             return self._predict(unit)
         coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
         has_coarse = np.isfinite(coarse)
         values = np.empty(len(unit))
-        values[has_coarse] = self._followed(unit[has_coarse], coarse[has_coarse])
+        values[has_coarse] = self._multifidelity(unit[has_coarse], coarse[has_coarse])
         if not has_coarse.all():
             values[~has_coarse] = self._predict(unit[~has_coarse])
             n_lost = (~has_coarse).sum()
@@ -614,7 +618,7 @@ def _best(
     for joined in (False, True):
         if n < points_needed(model, x.shape[1] + joined):
             continue
-        residuals = cross_validated(Following(model, model, joined), x, y, seed, coarse)
+        residuals = cross_validated(MultifidelityModel(model, model, joined), x, y, seed, coarse)
         if (residuals**2).sum() < (least**2).sum():
             least, choice = residuals, joined
     return least, choice

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from prbayes.inference.refits import (
 from prbayes.inference.resampling import DataSets, observed_set
 from prbayes.numerics.batched_bfgs import Descent
 from prbayes.propagation.base import N_BLOCKS
-from prbayes.propagation.reweighted import designs_restored
 
 
 @dataclass(frozen=True)
@@ -106,16 +105,18 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
 def _spread_of_parts(sampling: SamplingDistribution, observed: DataSets) -> Floats:
     """Return the spread of the minima of an eighth of the points each, (r,)."""
     evaluator = sampling.evaluator
-    designs = [(bound, bound.design) for bound in evaluator.reweighted.values()]
+    bounds = evaluator.reweighted
     minima = []
     descent = None
     for b in range(N_BLOCKS):
-        with designs_restored(bound for bound, _ in designs):
-            for bound, design in designs:
-                bound.design = design.rows(design.sample.blocks == b)
-            objective = BatchObjective.of(evaluator, sampling.scales, observed)
-            descent = descent or descent_of(sampling, objective, is_rough=True)
-            minima.append(_minimum(sampling, objective, descent))
+        parts = {
+            k: bound.copied(bound.design.rows(bound.blocks == b)) for k, bound in bounds.items()
+        }
+        nodes = tuple(replace(node, bound=parts[node.name]) for node in evaluator.nodes)
+        part = replace(evaluator, nodes=nodes, has_graph=False)
+        objective = BatchObjective.of(part, sampling.scales, observed)
+        descent = descent or descent_of(sampling, objective, is_rough=True)
+        minima.append(_minimum(sampling, objective, descent))
     finite = np.array([x for x in minima if np.isfinite(x).all()])
     if len(finite) < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)

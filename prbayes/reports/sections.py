@@ -34,12 +34,12 @@ from prbayes.reports.numbers import (
     described,
     number,
     places,
+    rows_table,
     sample_sd,
     with_zeros,
 )
 from prbayes.reports.section import Section
 from prbayes.reports.summary import answers, next_steps, summary
-from prbayes.reports.tables import rows_table
 from prbayes.response.outputs import SINGLE_OUTPUT
 
 
@@ -128,7 +128,7 @@ def data(m: Material) -> list[Section]:
             continue
         n = len(_shown_columns(y))
         if n < y.shape[1]:
-            text.append(f"{name}: {n} of {y.shape[1]} outputs are told.")
+            text.append(f"{name}: {n} of {y.shape[1]} outputs are shown.")
         if y.shape[1] > 1:
             correlations.append(_correlations(name, m))
     table = rows_table(with_zeros(rows))
@@ -357,7 +357,7 @@ def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any], names: Se
     if rival["comparable"]:
         judged = "the data could as well come from there"
     else:
-        judged = "the data fit it less well; a posterior tells how much it counts"
+        judged = "the data fit it less well; a posterior gives its weight"
     return f"Another optimum is at {at}, with discrepancy {discrepancy}: {judged}."
 
 
@@ -385,7 +385,7 @@ def posteriors(m: Material) -> list[Section]:
         sections.append(Section(title, text, table))
         rows = _correlation_rows({name: values[name] for name in names})
         if rows:
-            about = "Correlations of the draws: what is 1 or -1 the data hardly tell apart."
+            about = "Correlations of the draws: the data hardly distinguish a pair near 1 or -1."
             title = _titled("Correlations of the hyperparameters", label, m.posteriors)
             sections.append(Section(title, about, rows_table(rows), level=3))
     return sections
@@ -482,7 +482,7 @@ def comparison(m: Material) -> list[Section]:
     if scores:
         about = (
             "Discrepancy of the population at each estimate, under each metric, "
-            "whatever it was calibrated with."
+            "whichever metric it was calibrated with."
         )
         sections.append(Section("Scores under each metric", about, rows_table(scores), level=3))
     return sections

@@ -202,17 +202,7 @@ class Program:
                     ) from None
 
     def __call__(self, *values: float) -> float | Floats | dict[str, float | Floats]:
-        """Run the program for one specimen, and read the response.
-
-        Raises
-        ------
-        RuntimeError
-            If the program ends with another code than zero, or its results cannot be read.
-        TimeoutError
-            If it takes too long; it is ended then, with all that it started.
-        ValueError
-            If there are more or fewer inputs than names.
-        """
+        """Run the program for one specimen, and read the response."""
         if len(values) != len(self.inputs):
             hint = ""
             if len(values) == 1 and np.size(values[0]) == len(self.inputs):

@@ -272,12 +272,9 @@ class Pool:
         return future
 
     def done(self, futures: Iterable[Future[Any]]) -> set[Future[Any]]:
-        """Wait until a future is finished, and return those that are; log a long silence.
+        """Return the finished futures, at least one of them; log a long silence.
 
-        Raises
-        ------
-        ResponseError
-            If there has been no worker for ten minutes.
+        Ten minutes without any worker are an error.
         """
         waiting = list(futures)
         silent, absences = 0.0, 0

@@ -475,17 +475,7 @@ class Simulation:
         return self.unit.name
 
     def __call__(self, *values: float) -> float | Floats | dict[str, Any]:
-        """Simulate one specimen: a number, a curve, or a mapping of these.
-
-        Raises
-        ------
-        RuntimeError
-            If the unit reports a failure, or ends too early.
-        TimeoutError
-            If it takes too long.
-        ValueError
-            If there are more or fewer inputs than variables, or they are of another kind.
-        """
+        """Simulate one specimen: a number, a curve, or a mapping of these."""
         if len(values) != len(self.inputs):
             self._refuse_inputs(self.unit.name, [1] * len(values))
         start_values = [*self.parameters]

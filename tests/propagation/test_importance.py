@@ -17,9 +17,9 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
 from prbayes.optimize.design_refinement import _reach, _widened, grow, refine_at
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.exponential_families import PointDensity
 from prbayes.propagation.importance import SIZES, columns, mixture_of, spread_over
 from prbayes.propagation.points import MixtureSampler
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.budget import BudgetError
 from prbayes.response.compile import PLAIN
@@ -438,7 +438,7 @@ def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
     evaluator, bound = design_of(build())
     thetas = evaluator.hyperparameters.prior_thetas(2, 0)
     shares = np.array([0.125, 0.875])
-    sampler = MixtureSampler("y", bound.inputs, PointDensity(bound.inputs))
+    sampler = MixtureSampler("y", bound.inputs, PopulationDensity(bound.inputs))
     _, mixture = sampler.draw(evaluator.roots(thetas, 0), 1024, 3, shares)
     np.testing.assert_array_equal(mixture.counts, [128, 896])
 
