@@ -36,22 +36,24 @@ def describe(model: pm.Model) -> dict[str, Any]:
         ``variables``: name, role and distribution of each; ``simulators``: name, response, inputs,
         metric, propagation, the number of its points, and specimens.
     """
-    known = known_variables(model)
+    variables = known_variables(model)
     by_metric = nodes(model)
     likelihoods = specimen_likelihoods(model)
-    described = [(rv, "hyperparameter", _distribution(rv, known)) for rv in model.free_RVs]
+    described = [(rv, "hyperparameter", _distribution(rv, variables)) for rv in model.free_RVs]
     for variable in model.deterministics:
-        described.append((variable, "deterministic", f"computed from {_parents(variable, known)}"))
+        described.append(
+            (variable, "deterministic", f"computed from {_parents(variable, variables)}")
+        )
     for rv in model.observed_RVs:
         if rv not in by_metric and rv not in likelihoods:
-            described.append((rv, "observed", _distribution(rv, known)))
+            described.append((rv, "observed", _distribution(rv, variables)))
     simulators = []
     for node in by_metric.values():
         propagation = without_addresses(node.propagation)
-        simulators.append(_simulator(node, known, propagation, node.bound.n_points))
+        simulators.append(_simulator(node, variables, propagation, node.bound.n_points))
     for rv, measurement in measurements_of(model).items():
         n_runs = len(prepared(likelihoods[rv]).emulation.z)
-        simulators.append(_simulator(measurement, known, f"emulator of {n_runs} runs", n_runs))
+        simulators.append(_simulator(measurement, variables, f"emulator of {n_runs} runs", n_runs))
     return {
         "variables": [
             {"name": str(variable.name), "role": role, "distribution": text}

@@ -452,8 +452,8 @@ def is_current(evaluator: Evaluator) -> bool:
     model = evaluator.model
     likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
     now: list[object] = [*nodes(model).values(), *likelihoods]
-    before: list[object] = [*evaluator.nodes, *evaluator.likelihoods]
-    return len(now) == len(before) and all(a is b for a, b in zip(now, before, strict=True))
+    previous: list[object] = [*evaluator.nodes, *evaluator.likelihoods]
+    return len(now) == len(previous) and all(a is b for a, b in zip(now, previous, strict=True))
 
 
 def _sum_over_runs(evaluator: Evaluator, counts: list[int]) -> int:

@@ -278,15 +278,15 @@ def require_same_responses(got: Identity | None, model: pm.Model, caller: str) -
     """
     stored = {} if got is None else {simulator.name: simulator for simulator in got.simulators}
     for node in nodes(model).values():
-        before = stored.get(node.name)
-        if before is None or not before.points or before.points == _points(node):
+        saved = stored.get(node.name)
+        if saved is None or not saved.points or saved.points == _points(node):
             continue
         shapes = node.inputs.event_shapes
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-        columns = np.split(np.array(before.points), ends[:-1], axis=1)
+        columns = np.split(np.array(saved.points), ends[:-1], axis=1)
         aleatory = [x.reshape(-1, *shape) for x, shape in zip(columns, shapes, strict=True)]
         values = node.responses(aleatory, []).ravel()
-        if not _close(values, before.responses[: values.size]):
+        if not _close(values, saved.responses[: values.size]):
             raise ValueError(
                 f"{caller}: got a result of another problem: the response of {node.name} has other "
                 f"values at the same points; {_REMEDIES[Level.POPULATIONS]}"
@@ -305,8 +305,8 @@ def require_together(
     Raise a ValueError if one of the results, by label, is of another problem. A model without a
     simulator is not compared.
     """
-    known = [identity for identity in identities.values() if identity is not None]
-    expected = known[0] if known else None
+    with_identity = [i for i in identities.values() if i is not None]
+    expected = with_identity[0] if with_identity else None
     if model is not None and (nodes(model) or specimen_likelihoods(model)):
         expected = identity_of_model(model)
     for label, identity in identities.items():

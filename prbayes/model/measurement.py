@@ -252,7 +252,7 @@ class SpecimenLikelihood:
     measurements : tuple of Measurement
         Of simulators with the same inputs, in the order of the model.
     model : weak reference to a pymc.Model
-    known : Emulation or None
+    shared_emulation : Emulation or None
         Of the same responses, for other data.
     options : PointOptions
     cache : dict
@@ -261,7 +261,7 @@ class SpecimenLikelihood:
 
     measurements: tuple[Measurement, ...]
     model: Any = None
-    known: Emulation | None = None
+    shared_emulation: Emulation | None = None
     options: PointOptions = field(default_factory=PointOptions)
     cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
@@ -366,8 +366,8 @@ class SpecimenLikelihood:
         if all(a is b for a, b in zip(changed, self.measurements, strict=True)):
             return self
         preparation = self.cache.get("preparation")
-        known = self.known if preparation is None else preparation.emulation
-        return replace(self, measurements=changed, known=known)
+        emulation = self.shared_emulation if preparation is None else preparation.emulation
+        return replace(self, measurements=changed, shared_emulation=emulation)
 
 
 def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> NDArray[np.intp]:
