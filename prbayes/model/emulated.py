@@ -61,32 +61,15 @@ _SIZES = EmulatedSizes()
 
 @dataclass(frozen=True, eq=False)
 class EmulatedResponse:
-    """A response between its runs, as a function of the inputs.
-
-    Attributes
-    ----------
-    coordinates : Coordinates
-    z : ndarray, shape (n, d)
-        Coordinates of the runs.
-    y : ndarray, shape (n, m)
-        Their outputs; +inf is a specimen that failed, NaN a run without response.
-    surface : Surface
-        Through the finite runs.
-    columns : slice
-        The outputs of the surface that are those of the response.
-    event : tuple
-        Shape of a specimen's outputs, () or (m,).
-    error : ndarray, shape (m,)
-        Root mean square error of runs that are left out, near the specimens.
-    """
+    """A response between its runs, as a function of the inputs."""
 
     coordinates: Coordinates
-    z: Floats
-    y: Floats
-    surface: Surface
-    columns: slice
-    event: tuple[int, ...]
-    error: Floats
+    z: Floats  # (n, d): coordinates of the runs
+    y: Floats  # (n, m): their outputs; +inf is a failed specimen, NaN a run without response
+    surface: Surface  # through the finite runs
+    columns: slice  # the outputs of the surface that are those of the response
+    event: tuple[int, ...]  # shape of a specimen's outputs, () or (m,)
+    error: Floats  # (m,): root mean square error of left-out runs, near the specimens
 
     def __call__(self, inputs: Sequence[Floats]) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
@@ -156,20 +139,11 @@ def values_of(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[
 
 @dataclass(frozen=True, eq=False)
 class EmulatedSimulator:
-    """The specimens of a simulator, or of one of its groups, whose responses are emulated.
-
-    Attributes
-    ----------
-    likelihood : SpecimenLikelihood
-    measurement : Measurement
-        The arguments of the simulator.
-    place : int or None
-        Index of the group; None without groups.
-    """
+    """The specimens of a simulator, or of one of its groups, whose responses are emulated."""
 
     likelihood: SpecimenLikelihood
     measurement: Measurement
-    place: int | None = None
+    place: int | None = None  # index of the group; None without groups
 
     is_emulated: ClassVar[Literal[True]] = True
     # As of a Node: no response is weighted.
@@ -310,21 +284,12 @@ class EmulatedSample:
 
     Specimens are drawn from a mixture of populations. A population of the mixture's range is the
     specimens with importance weights.
-
-    Attributes
-    ----------
-    simulator : EmulatedSimulator
-    points : list of ndarray, shapes (n, *event)
-    log_mixture : ndarray, shape (n,)
-        Log-density of the specimens in the mixture.
-    blocks : ndarray of int, shape (n,)
-        Eight parts, each of which represents the mixture.
     """
 
     simulator: EmulatedSimulator
-    points: list[Floats]
-    log_mixture: Floats
-    blocks: NDArray[np.intp]
+    points: list[Floats]  # (n, *event) by input
+    log_mixture: Floats  # (n,): log-density of the specimens in the mixture
+    blocks: NDArray[np.intp]  # (n,): eight parts, each of which represents the mixture
 
     has_runs: ClassVar[Literal[False]] = False  # a design has runs as points
 

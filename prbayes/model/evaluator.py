@@ -60,36 +60,17 @@ class Evaluation:
 
 @dataclass(frozen=True, eq=False)
 class Evaluator:
-    """The simulators, likelihoods and hyperparameters of a model, compiled for batches of thetas.
-
-    Attributes
-    ----------
-    model : pymc.Model
-    hyperparameters : Hyperparameters
-        Names, transforms and prior of theta.
-    nodes : tuple of Node
-        The simulators with a metric of distributions.
-    likelihoods : tuple of SpecimenLikelihood
-        The log-likelihoods by specimen, one for simulators with common specimens.
-    measurements : tuple of Measurement
-        The simulators with a log-likelihood by specimen.
-    emulated : tuple of EmulatedSimulator
-        The populations of these, by group.
-    has_graph : bool
-        Whether the nodes have the data and designs of the model, so that its graph is the
-        objective.
-    functions : dict
-        Compiled functions, which evaluators of other data share.
-    """
+    """Simulators, likelihoods and hyperparameters of a model, compiled for batches of thetas."""
 
     model: pm.Model
-    hyperparameters: Hyperparameters
-    nodes: tuple[Node, ...]
-    likelihoods: tuple[SpecimenLikelihood, ...]
-    measurements: tuple[Measurement, ...]
-    emulated: tuple[EmulatedSimulator, ...]
+    hyperparameters: Hyperparameters  # names, transforms and prior of theta
+    nodes: tuple[Node, ...]  # simulators with a metric of distributions
+    likelihoods: tuple[SpecimenLikelihood, ...]  # one for simulators with common specimens
+    measurements: tuple[Measurement, ...]  # simulators with a log-likelihood by specimen
+    emulated: tuple[EmulatedSimulator, ...]  # the populations of these, by group
+    # Whether the nodes have the data and designs of the model, whose graph is the objective then.
     has_graph: bool = True
-    functions: dict[Any, Any] = field(default_factory=dict, repr=False)
+    functions: dict[Any, Any] = field(default_factory=dict, repr=False)  # compiled and shared
 
     @classmethod
     def of(cls, model: pm.Model) -> Evaluator:
@@ -217,13 +198,8 @@ class Evaluator:
 
         (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, gradient].
 
-        The prior's density is that of the user's own units, as in `pymc.find_MAP`: without
-        Jacobian.
-
-        Raises
-        ------
-        NotImplementedError, TypeError
-            If the objective has no gradient.
+        The prior's density is in the user's own units, as in `pymc.find_MAP`: without Jacobian.
+        Raise NotImplementedError or TypeError if the objective has no gradient.
         """
         if not self.has_graph:
             if prior or gradient:
@@ -255,18 +231,10 @@ class Evaluator:
         metric: Metric | None = None,
         weights: dict[str, Floats] | None = None,
     ) -> Evaluator:
-        """Return an evaluator of the same model with other observed responses.
+        """Return an evaluator of the same model with other observed responses, by simulator.
 
         Metrics choose bandwidths and cells again; designs and epsilons are the same objects.
-
-        Parameters
-        ----------
-        data : dict
-            Observed responses by the names of simulators.
-        metric : Metric, optional
-            Of all simulators; by default each has its own.
-        weights : dict, optional
-            Weights of the responses; by default those of the model for as many responses.
+        Weights are by default those of the model for as many responses.
         """
         targets = []
         for node in self.nodes:

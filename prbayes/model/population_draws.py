@@ -109,16 +109,8 @@ class Populations:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
 
         Weights are tempered until their effective sample size is ten times the number of
-        hyperparameters, so that a few draws do not decide the next proposal.
-
-        Parameters
-        ----------
-        z, log_a : ndarray, shapes (N, K, d) and (N, K)
-        smoothing : ndarray, shape (d, d), optional
-            As in `log_likelihoods`.
-        share : ResponseShare, optional
-            Points of the share of a population that has a response.
-        seed : int
+        hyperparameters, so that a few draws do not decide the next proposal. Points and smoothing
+        are those of `log_likelihoods`; the share is that of a population with a response.
         """
         names = self.hyperparameters
         d = names.size

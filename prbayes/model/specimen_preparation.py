@@ -41,31 +41,18 @@ _log = logging.getLogger("prbayes")
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """Emulator and importance points of measured specimens.
-
-    Attributes
-    ----------
-    emulation : Emulation
-    points : SpecimenPoints
-    findings : tuple of Finding
-        Warnings about the data and the runs, before the fit.
-    share : ResponseShare or None
-        Points from which the share of a population with a response follows, if it matters.
-    """
+    """Emulator and importance points of measured specimens."""
 
     emulation: Emulation
     points: SpecimenPoints
-    findings: tuple[Finding, ...]
-    share: ResponseShare | None
+    findings: tuple[Finding, ...]  # about the data and the runs, before the fit
+    share: ResponseShare | None  # of a population with a response, if it matters
 
 
 def prepared(likelihood: SpecimenLikelihood) -> Preparation:
     """Return the emulator and the points of a likelihood; the first call computes the runs.
 
-    Raises
-    ------
-    DesignError, ResponseError
-        If the runs are not sufficient, or the response does not allow the likelihood.
+    Raise DesignError or ResponseError if the response does not allow the likelihood.
     """
     preparation: Preparation = likelihood.cached("preparation", lambda: _prepare(likelihood))
     return preparation
