@@ -247,7 +247,7 @@ class Information:
         return float(np.mean(distances))
 
     def gradients(self, observed: Floats, weights: Floats) -> Floats:
-        """Return gradients at theta for data sets, (n,) values, (n_sets, n) weights: (n_sets, d)."""
+        """Return gradients at theta, (n_sets, d), for data sets of values (n,)."""
         across = self._along_stencil(observed, weights[:, None], slice(self.stencil.n_cross))
         return slopes(across.T, self.stencil.step)
 

@@ -54,9 +54,9 @@ def zhang_statistic(z: Floats, weights: Floats, draws: int = 8, seed: int = 0) -
 def mixture_ratio(z: Floats, weights: Floats, width: float = 0.5, steps: int = 100) -> Floats:
     """Return log-likelihood ratios of a mixture to the fitted population, (d,).
 
-    Large values reject. The mixture replaces the population of one input at a time. Its 25 centers are fixed between
-    -3.5 and 3.5, its mixing weights follow from EM. The width of its normals bounds the likelihood:
-    without it, exact data would put a point mass on each root.
+    Large values reject. The mixture replaces the population of one input at a time. Its 25 centers
+    are fixed between -3.5 and 3.5, its mixing weights follow from EM. The width of its normals
+    bounds the likelihood: without it, exact data would put a point mass on each root.
     """
     centers = np.linspace(-3.5, 3.5, 25)
     ratios = []
