@@ -30,7 +30,7 @@ from prbayes.model.elements import (
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
+    table_elements,
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
@@ -482,7 +482,7 @@ def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
     with np.errstate(all="ignore"):  # a variable that never moves
         values = getattr(stats, statistic)(posterior)
     elements = single_elements(values.data_vars)
-    return {name: elements[name] for name in told_elements(stacked_draws(posterior))}
+    return {name: elements[name] for name in table_elements(stacked_draws(posterior))}
 
 
 def _repeated_draws(draws: xr.Dataset) -> list[Finding]:
