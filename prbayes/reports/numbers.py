@@ -188,7 +188,9 @@ def cells(table: Any) -> Cells:
 
 
 def rows_table(rows: list[dict[str, Any]]) -> Any:
-    """Return a table without columns that are empty in every row; NaN is not empty."""
+    """Return a table without columns that are empty in every row, or None; NaN is not empty."""
+    if not rows:
+        return None
     pandas: Any = import_module("pandas")
     columns = {key: [row[key] for row in rows] for key in rows[0]}
     return pandas.DataFrame(
@@ -198,6 +200,16 @@ def rows_table(rows: list[dict[str, Any]]) -> Any:
             if any(value not in (None, "") for value in column)
         }
     )
+
+
+def correlation_table(names: Sequence[str], r: Any, digits: int) -> Any:
+    """Return a matrix of correlations, (m, m), as a table; None for a single variable."""
+    rows = []
+    for i, name in enumerate(names if len(names) > 1 else ()):
+        texts = [NOTHING if math.isnan(x) else f"{x + 0.0:.{digits}f}" for x in r[i]]
+        texts[i] = "1"
+        rows.append({"": name} | dict(zip(names, texts, strict=True)))
+    return rows_table(rows)
 
 
 def _frame(table: Any) -> Any:

@@ -13,12 +13,12 @@ import xarray as xr
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats
 from prbayes.model.elements import (
-    read_elements,
+    optimum_elements,
+    readable_elements,
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
-    told_of,
+    table_elements,
 )
 from prbayes.model.labels import labelled
 from prbayes.optimize.optimum import compared_in
@@ -30,6 +30,7 @@ from prbayes.reports.material import Material, gather
 from prbayes.reports.numbers import (
     NOTHING,
     alike,
+    correlation_table,
     counted,
     described,
     number,
@@ -71,8 +72,7 @@ def sections_of(*, pictures: bool, **results: Any) -> tuple[Section, ...]:
 def _summary(m: Material) -> list[Section]:
     if not (m.results or m.tests or m.description):
         return []
-    rows = answers(m)
-    sections = [Section("Summary", summary(m), rows_table(rows) if rows else None)]
+    sections = [Section("Summary", summary(m), rows_table(answers(m)))]
     steps = next_steps(m)
     if steps:
         sections.append(Section("What to do next", steps, level=3))
@@ -161,25 +161,20 @@ def _shown_columns(y: Floats) -> list[int]:
 
 
 def _correlations(name: str, m: Material) -> Section:
-    """Return the correlations of outputs."""
-    y = m.observed[name]
-    names = m.outputs[name].names
-    columns = _shown_columns(y)
-    rows = []
-    for i in columns:
-        row = {"": names[i]}
-        for j in columns:
-            pairs = y[:, [i, j]]
-            pairs = pairs[np.isfinite(pairs).all(axis=1)]
-            r = correlation(pairs, np.ones(len(pairs))) if len(pairs) > 2 else math.nan
-            text = NOTHING if math.isnan(r) else f"{r + 0.0:.3f}"
-            row[names[j]] = "1" if i == j else text
-        rows.append(row)
+    """Return the correlations of outputs, each of the specimens that have both."""
+    y = m.observed[name][:, _shown_columns(m.observed[name])]
+    r = np.full((y.shape[1], y.shape[1]), np.nan)
+    for i, j in np.ndindex(r.shape):
+        pairs = y[:, [i, j]]
+        pairs = pairs[np.isfinite(pairs).all(axis=1)]
+        if len(pairs) > 2:
+            r[i, j] = correlation(pairs, np.ones(len(pairs)))
+    names = [m.outputs[name].names[j] for j in _shown_columns(m.observed[name])]
     about = (
         f"Correlations of the measured outputs of {name}, each of the specimens that have both; "
         "those that failed are in none."
     )
-    return Section(f"Correlations of {name}", about, rows_table(rows), level=3)
+    return Section(f"Correlations of {name}", about, correlation_table(names, r, 3), level=3)
 
 
 def _values(m: Material) -> Section:
@@ -228,7 +223,7 @@ def metric(m: Material) -> list[Section]:
     lines = [f"{name}: {metric}." for name, metric in metrics.items()]
     compared = [line for table in m.calibrations.values() for line in compared_in(table)]
     text = (about, *lines, *dict.fromkeys(compared))
-    return [Section("Metric and epsilon", text, rows_table(rows) if rows else None)]
+    return [Section("Metric and epsilon", text, rows_table(rows))]
 
 
 def _log_likelihood(rows: list[dict[str, Any]]) -> Section:
@@ -304,7 +299,9 @@ def optima(m: Material) -> list[Section]:
     """Return a section for each optimum."""
     sections = []
     for label, tree in m.optima.items():
-        names = read_elements(told_of(tree["optimum"].data_vars, tree["stderr"].data_vars))
+        names = readable_elements(
+            optimum_elements(tree["optimum"].data_vars, tree["stderr"].data_vars)
+        )
         text = [_how_it_ended(tree["optimum"].attrs)]
         if label in m.live_optima:
             evaluator = m.live_optima[label].evaluator
@@ -377,15 +374,16 @@ def posteriors(m: Material) -> list[Section]:
             text += _width(tree)
         draws = stacked_draws(posterior)
         values = split_elements(draws)
-        names = read_elements(told_elements(draws))
+        names = readable_elements(table_elements(draws))
         title = _titled("Posterior", label, m.posteriors)
         table = rows_table(_posterior_rows(tree, list(values), names))
         sections.append(Section(title, text, table))
-        rows = _correlation_rows({name: values[name] for name in names})
-        if rows:
+        varying = [name for name in names if np.ptp(values[name]) > 0]
+        if 2 <= len(varying) <= 8:  # more do not fit on a page
+            r = np.corrcoef([values[name] for name in varying])
             about = "Correlations of the draws: the data hardly distinguish a pair near 1 or -1."
             title = _titled("Correlations of the hyperparameters", label, m.posteriors)
-            sections.append(Section(title, about, rows_table(rows), level=3))
+            sections.append(Section(title, about, correlation_table(varying, r, 2), level=3))
     return sections
 
 
@@ -435,21 +433,6 @@ def _posterior_rows(
                 "error of mean": number(mcse) if decimals is None else f"{mcse:.{decimals}f}",
             }
         )
-    return rows
-
-
-def _correlation_rows(draws: dict[str, Floats]) -> list[dict[str, str]]:
-    """Return the correlations of draws; none of one variable, or of more than fit on a page."""
-    names = [name for name, values in draws.items() if np.ptp(values) > 0]
-    if not 2 <= len(names) <= 8:
-        return []
-    r = np.corrcoef([draws[name] for name in names])
-    rows = []
-    for i, name in enumerate(names):
-        row = {"": name}
-        for j, column in enumerate(names):
-            row[column] = "1" if i == j else f"{r[i, j] + 0.0:.2f}"
-        rows.append(row)
     return rows
 
 

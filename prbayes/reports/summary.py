@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes.model.elements import (
-    read_variables,
+    optimum_elements,
+    readable_variables,
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
-    told_of,
+    table_elements,
     variable_of,
 )
 from prbayes.plots._labels import metric_label, named
@@ -176,15 +176,17 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
         draws = split_elements(stacked)
         estimates = {
             name: (float(draws[name].mean()), float(draws[name].std(ddof=1)))
-            for name in told_elements(stacked)
+            for name in table_elements(stacked)
         }
     else:
         optimum = m.optima[label]["optimum"].data_vars
         stderr = m.optima[label]["stderr"].data_vars
         points = single_elements(optimum)
         errors = single_elements(stderr)
-        estimates = {name: (points[name], errors[name]) for name in told_of(optimum, stderr)}
-    variables = read_variables(m.hyperparameters, {variable_of(name) for name in estimates})
+        estimates = {
+            name: (points[name], errors[name]) for name in optimum_elements(optimum, stderr)
+        }
+    variables = readable_variables(m.hyperparameters, {variable_of(name) for name in estimates})
     return {name: pair for name, pair in estimates.items() if variable_of(name) in variables}
 
 

@@ -43,7 +43,7 @@ def command(
         The program and its arguments. A program without a folder is looked up on the path, once.
     inputs : sequence of str
         Names of the simulator's inputs, in their order. ``{name}`` or ``{name:.6e}`` in an argument
-        or a template stands for the value; other braces are left alone.
+        or a template is replaced by the value; other braces are left alone.
     read : callable
         ``read(folder)`` returns the response, in the unit of the observed values, from the files in
         the folder: a number, or for several outputs an array, shape (m,), or a mapping of numbers

@@ -1,4 +1,4 @@
-"""Groups of specimens, such as suppliers or batches, with hyperparameters of their own."""
+"""Groups of specimens, such as suppliers or batches, with their hyperparameters."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def refuse_wrong_arity(name: str, function: object, inputs: Inputs) -> None:
 def check_call_settings(
     executor: object, store: object, version: object, on_failure: object
 ) -> None:
-    """Raise if an argument that says how a response is called has the wrong type."""
+    """Raise if a setting of the calls of a response has the wrong type."""
     executes(executor, "executor")
     if store is not None:
         folder_path(store, "store")
@@ -368,7 +368,7 @@ class Responses:
             # or another order over specimens by about one.
             if not (np.abs(rows[first] - single) > 0.01 * rows[finite].std(axis=0)).any():
                 return
-            # A response with scatter of its own is no mixing.
+            # A random response does not mix its specimens.
             if (np.abs(alone() - single) > 1e-6 * np.abs(single)).any():
                 return
         except ResponseError:  # it takes no batch of one
@@ -418,7 +418,7 @@ def deduplicated_responses(
     """Return the responses at points (n, *event), (n,) or (n, m), each different point once.
 
     Discrete inputs have few values, and a censored input repeats its bounds. If four points that
-    are computed again differ, the response has scatter of its own and is computed at all points.
+    are computed again differ, the response is random and is computed at all points.
     """
     n = len(points[0])
     known_values = np.empty(0) if known is None else known.values
