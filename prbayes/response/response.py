@@ -132,9 +132,9 @@ class Runs:
 class Responses:
     """The user's response: a function of inputs, and how it is called.
 
-    A function of whole batches without other settings is called once for each batch (``is_batched``).
-    Every other one goes through `respond`: on an executor, in chunks, with a store (a folder) and a
-    failure policy. ``outputs`` of None are those of the first run.
+    A function of whole batches without other settings is called once for each batch. Every other
+    one goes through `respond`: on an executor, in chunks, with a store (a folder) and a failure
+    policy. ``outputs`` of None are those of the first run.
     """
 
     def __init__(
