@@ -83,9 +83,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         in a last axis, or a mapping of arrays with the keys of ``observed``. NaN is a point without
         response, +inf a specimen that failed. The response of a specimen depends on the inputs of
         that specimen alone: one of them is also computed by itself, and a difference is refused.
-        Where inputs repeat, as discrete ones do, a design computes the response once. Model random
-        scatter of the response as an input, such as ``pm.Normal.dist(0, 1)``. Simulators with the
-        same response object, inputs and propagation, and metrics of distributions, share runs.
+        Where inputs repeat, as discrete ones do, a design computes the response once, unless four
+        of them differ when they are computed again. Model random scatter of the response as an
+        input, such as ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs
+        and propagation, and metrics of distributions, share runs.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
