@@ -368,7 +368,7 @@ def posteriors(m: Material) -> list[Section]:
         by = f" by {posterior.attrs['sampler']}" if "sampler" in posterior.attrs else ""
         text = [
             f"{chains} of {posterior.sizes['draw']} draws{by}. "
-            f"Intervals hold {INTERVAL:.0%} of the draws, with equal tails."
+            f"Intervals contain {INTERVAL:.0%} of the draws, with equal tails."
         ]
         if not m.is_by_specimen:
             text += _width(tree)

@@ -72,15 +72,12 @@ def _whole_verdict(m: Material) -> str:
     if not m.results:
         return ""
     if m.rejected:
-        return "Verdict: the calibrated model is rejected by data that it has not seen."
+        return "Verdict: the calibrated model is rejected by new data."
     if _has_problems(m):
         return "Verdict: not to be used before the problems under Diagnostics are removed."
     if not m.tests:
-        return "Verdict: calibrated, and not tested on data that it has not seen."
-    return (
-        "Verdict: calibrated, and not rejected by data that it has not seen, which does not prove "
-        "it right."
-    )
+        return "Verdict: calibrated, and not tested on new data."
+    return "Verdict: calibrated, and not rejected by new data, which does not prove it right."
 
 
 def _has_problems(m: Material) -> bool:
@@ -95,7 +92,7 @@ def verdict(label: str, test: ValidityTest, m: Material) -> str:
     directions = len(in_directions(test))
     values = counted(test.u_values.size, "value")
     if directions:
-        values = f"several outputs, seen in {counted(directions, 'direction')}"
+        values = f"several outputs in {counted(directions, 'direction')}"
     conditions = test.of_conditions
     # A single condition may only have the name of a function.
     is_named = len(conditions) > 1 or conditions[0] in {*m.validation, *m.labels}
