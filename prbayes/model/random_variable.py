@@ -126,28 +126,24 @@ class Node:
     def observing(self, data: Any) -> Node:
         """Return the same simulator with other observed responses; it computes no response.
 
-        It is the same object where the values are the same.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the metric does not take them, or weights or labels go with as many as before.
+        It is the same object where the values are the same. Raise TypeError or ValueError if the
+        metric does not take them, or weights or labels go with as many as before.
         """
-        before = self.target
+        target = self.target
         data = np.asarray(data)
-        if np.array_equal(data, before.observed.astype(data.dtype), equal_nan=True):
+        if np.array_equal(data, target.observed.astype(data.dtype), equal_nan=True):
             return self
         values = np.asarray(data, dtype=np.float64)
-        if values.shape[1:] != before.event or values.ndim != before.observed.ndim:
+        if values.shape[1:] != target.event or values.ndim != target.observed.ndim:
             raise ValueError(
                 f"{self.name}: observed: got shape {values.shape}, expected "
-                f"{('N', *before.event)}, as when the simulator was made"
+                f"{('N', *target.event)}, as when the simulator was made"
             )
-        weights: Floats | None = before.weights
-        n = len(before.weights)
+        weights: Floats | None = target.weights
+        n = len(target.weights)
         if len(values) != n:
             # Weights and labels belong to the values before.
-            if self.specimens is not None or np.ptp(before.weights) > 0:
+            if self.specimens is not None or np.ptp(target.weights) > 0:
                 raise ValueError(
                     f"{self.name}: observed: got {len(values)} specimens, expected "
                     f"{n}, as many as there are specimens= or weights=; build the "
@@ -193,13 +189,6 @@ class Specification:
         """The simulator, with its first responses: the first access computes them.
 
         After an error, or an interruption, the next access tries again.
-
-        Raises
-        ------
-        BudgetError, ResponseError, StoreError
-            If the first responses cannot be computed.
-        TypeError, ValueError
-            If the propagation does not take the inputs or their priors.
         """
         with lock(self):
             return self._node
@@ -308,10 +297,7 @@ def shared_epsilon(name: str, value: float) -> Any:
 
 
 def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
-    """Return the log-density of an observed node.
-
-    The only place where the sign of a discrepancy changes.
-    """
+    """Return the log-density of an observed node; the sign of a discrepancy changes only here."""
     return -discrepancy / epsilon
 
 
@@ -327,13 +313,6 @@ class SimulatorRV(RandomVariable):
     PyTensor's rewriters keep every operation that they have met. The simulator with all stored
     responses is therefore referenced by applications of the operation, which live as long as a
     model or a compiled function, and weakly by the operation itself.
-
-    Attributes
-    ----------
-    simulator : Specification or Node
-        A specification until `nodes` computes its first responses.
-    node : Node
-        The first access computes its first responses.
     """
 
     __props__ = ("name", "signature", "dtype", "inplace", "simulator")
@@ -356,7 +335,7 @@ class SimulatorRV(RandomVariable):
 
     @property
     def simulator(self) -> AnySimulator:
-        """The simulator, with its first responses once these are computed."""
+        """The simulator: a specification until `nodes` computes its first responses."""
         simulator = self._simulator()
         if simulator is None:
             raise RuntimeError(f"{self}: got an operation of a model that is gone")
@@ -364,7 +343,7 @@ class SimulatorRV(RandomVariable):
 
     @property
     def node(self) -> Node:
-        """The simulator with its first responses."""
+        """The simulator with its first responses, which the first access computes."""
         simulator = self.simulator
         return simulator if isinstance(simulator, Node) else simulator.node
 
@@ -428,11 +407,11 @@ class SimulatorRV(RandomVariable):
         """Draw responses of specimens; their shape is the last of the arguments."""
         if self.simulator.same_inputs and not self._warned:
             self._warned = True
-            others = ", ".join(self.simulator.same_inputs)
+            names = ", ".join(self.simulator.same_inputs)
             report(
                 Finding(
                     "independent-draws",
-                    f"{self.simulator.name} has inputs that {others} has too, the same "
+                    f"{self.simulator.name} has inputs that {names} has too, the same "
                     "specimens; PyMC's predictive sampling draws each variable by itself, and so "
                     "as independent of the others: use prb.predict for responses of the same "
                     "specimens.",
@@ -625,11 +604,6 @@ def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
     """Return the simulators of a model as far as they are computed, by their observed variables.
 
     In a clone they are copies, which the first call makes.
-
-    Raises
-    ------
-    TypeError
-        If it is no model.
     """
     if not isinstance(model, pm.Model):
         raise TypeError(f"model: got {called(model)}, expected a pm.Model")
@@ -642,14 +616,8 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
 
     The first call computes their first responses. In a clone it makes copies, which compiled
     functions of the clone follow. Where `pymc.set_data` or `pymc.observe` changed the data, the
-    metric is prepared again, and the responses are the same.
-
-    Raises
-    ------
-    BudgetError, ResponseError, StoreError
-        If the first responses cannot be computed; the next call tries again.
-    TypeError, ValueError
-        If it is no model, or a metric does not take the data that it has now.
+    metric is prepared again, and the responses are the same. If the first responses cannot be
+    computed, the next call tries again.
     """
     computed = {}
     for rv, simulator in simulators(model).items():

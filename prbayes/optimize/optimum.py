@@ -17,7 +17,7 @@ from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
-from prbayes.model.elements import read_variables, single_elements, told_of
+from prbayes.model.elements import optimum_elements, readable_variables, single_elements
 from prbayes.model.evaluator import Evaluator, likelihood_of, specimen_log_likelihoods
 from prbayes.model.fingerprint import (
     Identity,
@@ -156,14 +156,14 @@ class Optimum:
         stderr = labelled(self.evaluator, self.stderr, {}).data_vars
         rows = []
         names = [str(name) for name in point]
-        for name in read_variables(names, names):
+        for name in readable_variables(names, names):
             value, error = point[name], stderr[name]
             alone = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
             if not alone or value.size > _ONE_BY_ONE:
                 rows.append((name, _short(value), _short(error)))
                 continue
             values, errors = single_elements({name: value}), single_elements({name: error})
-            for element in told_of({name: value}, {name: error}):
+            for element in optimum_elements({name: value}, {name: error}):
                 rows.append((element, _short(values[element]), _short(errors[element])))
         return rows
 

@@ -67,16 +67,10 @@ class FibrePoints:
     """K importance points on the fibre of each of N specimens.
 
     log L_i(theta) = logsumexp_k(log p(x_ik | theta) + log_a_ik).
-
-    Attributes
-    ----------
-    x : ndarray, shape (N, K, d)
-        Inputs; the mean of the reference population for points of weight zero.
-    log_a : ndarray, shape (N, K)
-        Logarithms of the importance numbers, minus log K; -inf for points of weight zero.
     """
 
-    x: Floats
+    x: Floats  # (N, K, d): inputs; the mean of the reference population for points of weight zero
+    # (N, K): logarithms of the importance numbers, minus log K; -inf for points of weight zero
     log_a: Floats
 
     def without_errors(self, outputs: int) -> FibrePoints:
@@ -92,31 +86,17 @@ class FibrePoints:
 
 @dataclass(frozen=True, eq=False)
 class FibreProposal:
-    """Proposal distribution on the fibres of N specimens: a mixture over charts for each.
+    """Proposal distribution on the fibres of N specimens: a mixture over charts for each."""
 
-    Attributes
-    ----------
-    fibres : Fibres
-        Response, reference population and measured outputs.
-    charts : Charts
-    numbers : ndarray of int, shape (N,)
-        Numbers of the specimens, from which their random numbers follow.
-    """
-
-    fibres: Fibres
+    fibres: Fibres  # response, reference population and measured outputs
     charts: Charts
-    numbers: Indices
+    numbers: Indices  # (N,): numbers of the specimens, from which their random numbers follow
 
     def draw(self, points: int, seed: int, after: int = 0) -> FibrePoints:
         """Draw points on all fibres.
 
-        Parameters
-        ----------
-        points : int
-            K, for each specimen. A power of two fills the fibre most evenly.
-        seed : int
-        after : int
-            Points of the same seed that are left out, as they were drawn before.
+        K = ``points`` for each specimen: a power of two fills the fibre most evenly. The first
+        ``after`` points of the same seed are left out, as they were drawn before.
         """
         n, d = len(self.fibres.y), len(self.fibres.population.mean)
         x = np.empty((n, points, d))
@@ -148,26 +128,11 @@ def fit_fibres(
     outputs lacked up to .35 in log L. Numbers of a specimen depend on the other specimens only by
     rounding.
 
-    Parameters
-    ----------
-    response : Response
-        Called with many inputs (n, d); NaN where it has no value.
-    y : ndarray, shape (N, m)
-        Measured outputs, m < d.
-    population : ReferencePopulation
-        Population that the proposals are fitted to; it should cover the plausible populations.
-    starts : int
-        Searches for modes, for each specimen.
-    tries : int
-        Random points of the fibre that decide whether charts are missing.
-    most_charts : int
-        Of a specimen.
-    rounds : int
-        Of adaptation. With one round charts do not turn.
-    seed : int
-    numbers : ndarray of int, shape (N,), optional
-        Numbers of the specimens, by default 0 to N - 1. A specimen has the same points alone as in
-        a batch if its number is the same.
+    The response is called with many inputs (n, d), and is NaN where it has no value; y are the
+    measured outputs, (N, m) with m < d. The proposals are fitted to ``population``, which should
+    cover the plausible populations. Modes are searched from ``starts`` points, and ``tries`` random
+    points of the fibre show whether charts are missing. A specimen has the same points alone as in
+    a batch if its number is the same.
 
     Examples
     --------
@@ -257,7 +222,7 @@ def _draw(
         t = normal / np.sqrt(chi_square / Charts.degrees)
     scaled = charts.scale[specimen, slot] @ t[..., None]
     u = charts.location[specimen, slot] + scaled[..., 0]
-    # Specimens without charts have arrays of zeros, so that all their solves fail.
+    # Specimens without charts have arrays of zeros: all their solves fail.
     z, jacobian, converged = charts.points(fibres, specimen, slot, u)
 
     rows = np.flatnonzero(converged)
@@ -334,7 +299,7 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
 def _shifted_sobol(points: int, dimensions: int, key: tuple[int, int], numbers: Indices) -> Floats:
     """Return Sobol points with a digital shift of the specimen, (n, points, dimensions).
 
-    Errors of specimens are independent, so that they average out in the log-likelihood.
+    Errors of specimens are independent: they average out in the log-likelihood.
     """
     bits = 30  # of SciPy's points, which are multiples of 2^-30
     net = (sobol(points, dimensions, key[1]) * 2**bits).astype(np.int64)
