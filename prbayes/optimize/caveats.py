@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,9 +25,11 @@ from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.labels import labelled
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross
-from prbayes.optimize.design_refinement import AGREE
-from prbayes.optimize.local_optima import Rival
+from prbayes.optimize.convergence import AGREE
 from prbayes.propagation.importance import LARGEST_CLOUD
+
+if TYPE_CHECKING:
+    from prbayes.optimize.local_optima import Rival
 
 # Design error of which is warned, in standard errors: half as much again as is asked for, since an
 # estimate from eight blocks is itself uncertain by a quarter.

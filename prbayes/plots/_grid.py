@@ -81,7 +81,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     plane = _plane(optimum, evaluator, names)
 
     # What is marked, by element
-    path = free_elements(evaluator, optimum.trace["theta"])
+    path = free_elements(evaluator, optimum.search.trace["theta"])
     others = np.array([rival["theta"] for rival in optimum.rivals])
     others = others.reshape(-1, optimum.theta.size)
     rivals = free_elements(evaluator, others)

@@ -42,7 +42,7 @@ def check_optimum(optimum: Any, caller: str) -> None:
     if not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"{caller}: got {got}, expected an Optimum; call prb.minimize() first")
-    if not len(optimum.trace.get("theta", ())):
+    if not len(optimum.search.trace.get("theta", ())):
         raise ValueError(
             f"{caller}: got an optimum without a trace, expected one as prb.minimize returns it"
         )

@@ -73,13 +73,13 @@ def plot_optimizer(
     """
     refuse_look(labels, backend, pc_kwargs)
     check_optimum(optimum, "plot_optimizer")
-    path = free_elements(optimum.evaluator, optimum.trace["theta"])
+    path = free_elements(optimum.evaluator, optimum.search.trace["theta"])
     final = free_elements(optimum.evaluator, optimum.theta[None])
     hyperparameters = free_names(optimum)
     names = ["discrepancy", *hyperparameters]
     refuse_labels(labels, hyperparameters, evaluator=optimum.evaluator)
     canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
-    evaluations = optimum.trace["evaluations"].astype(np.float64)
+    evaluations = optimum.search.trace["evaluations"].astype(np.float64)
     _draw_objective(canvas.panel("discrepancy"), optimum, evaluations)
     ends = evaluations[[0, -1]]
     for name in hyperparameters:
@@ -98,9 +98,9 @@ def _draw_objective(panel: Panel, optimum: Optimum, evaluations: Floats) -> None
     # Anew with the final design and scales, where that costs no response
     free = not optimum.evaluator.responses_per_theta
     if free:
-        values = objective(optimum, optimum.evaluator, optimum.trace["theta"])
+        values = objective(optimum, optimum.evaluator, optimum.search.trace["theta"])
     else:
-        values = optimum.trace["discrepancy"]
+        values = optimum.search.trace["discrepancy"]
     shown = np.where(np.isfinite(values), values, np.nan)
     best = np.fmin.accumulate(shown)
 

@@ -42,7 +42,7 @@ from prbayes.model.labels import labelled
 from prbayes.model.locking import locked
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
-from prbayes.optimize.design_refinement import reached
+from prbayes.optimize.design_refinement import temporary_first_samples
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.response.inputs import event_shape
 
@@ -236,7 +236,7 @@ def _model_among(results: Mapping[str, Any]) -> pm.Model | None:
 def _column(label: str, result: Any, naming: pm.Model | None) -> _Column:
     """Read a result of any kind; draws without coordinates have those of a model."""
     if isinstance(result, Optimum):
-        cost = float(result.n_responses), result.seconds
+        cost = float(result.n_responses), result.search.seconds
         evaluator = result.evaluator
         point = labelled(evaluator, result.point, {})
         stderr = labelled(evaluator, result.stderr, {})
@@ -318,7 +318,7 @@ def _scores(
     thetas = _thetas(evaluator, names, estimates)
     if thetas is None:
         return {}
-    with reached(evaluator, thetas) if reach else nullcontext():
+    with temporary_first_samples(evaluator, thetas) if reach else nullcontext():
         return _scored(evaluator, thetas, metrics)
 
 
