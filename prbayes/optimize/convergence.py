@@ -47,21 +47,18 @@ AGREE = 0.1
 class Result(Enum):
     """How a minimisation ended, with its message."""
 
-    CONVERGED = "Converged."
-    SETTLED_BY_GRADIENTS = "Converged: gradients around the end of the line search promise no gain."
-    SETTLED_BY_SIMPLEX = "Converged: a simplex around the end of the line search gains nothing."
-    STALLED = "Not converged: the line search stalled."
-    FAILED = "Not converged: the minimiser failed."
-    MAX_EVALUATIONS = "Not converged: the largest number of evaluations is reached."
-    STOPPED = "Not finished: a budget is spent."
-    AT_EDGE = "Not converged: hyperparameters ran to the edge of the support."
+    CONVERGED = "The minimiser converged."
+    SETTLED_BY_GRADIENTS = "Gradients around the end of the line search promise no further gain."
+    SETTLED_BY_SIMPLEX = "A simplex around the end of the line search gains nothing."
+    STALLED = "The line search stalled before convergence."
+    FAILED = "The minimiser failed."
+    MAX_EVALUATIONS = "The largest number of evaluations was reached before convergence."
+    STOPPED = "A budget was spent."
+    AT_EDGE = "The minimum is at the edge of a support."
     NO_INFORMATION = (
-        "Not converged: no hyperparameter changes the discrepancy here, far from the data; try "
-        "another start."
+        "No hyperparameter changes the discrepancy here, far from the data: try another start."
     )
-    NO_OVERLAP = (
-        "Not converged: the population here hardly overlaps with the data; try another start."
-    )
+    NO_OVERLAP = "The population here hardly overlaps with the data: try another start."
 
     @property
     def converged(self) -> bool:

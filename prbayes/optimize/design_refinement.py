@@ -40,6 +40,8 @@ _log = logging.getLogger("prbayes")
 MAX_ROUNDS = 8
 # Share of it for points and for emulators: together they then have it all.
 _SHARE = np.sqrt(0.5)
+# Error of an emulator, in the response's spread, that makes it another response.
+_POOR_EMULATOR = 0.25
 # Data sets for noise floors that only end a pilot or compare optima.
 FEW_SETS = 50
 
@@ -185,11 +187,10 @@ def refine_at(
     while is_drawn and names:
         names &= set(shortcomings(evaluator, thetas))
         is_drawn = _enlarge_samples(evaluator, nearby, names, on_the_way=True)
-    # Runs, where samples do not suffice or the emulator is poor: an error of a quarter of the
-    # response's spread makes it another response.
+    # Runs, where samples do not suffice or the emulator is poor.
     for name in short:
         emulation = evaluator.designs[name].contents.emulation
-        if emulation is not None and emulation.error > 0.25:
+        if emulation is not None and emulation.error > _POOR_EMULATOR:
             names.add(name)
     _add_runs(evaluator, nearby, names)
     return short

@@ -57,7 +57,7 @@ from prbayes.optimize.local_optima import Rival, find_rivals
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
 from prbayes.optimize.methods import Method
 from prbayes.optimize.objective import Ridge
-from prbayes.optimize.optimum import Optimum, optimum_of, point_at
+from prbayes.optimize.optimum import Optimum, n_computed, optimum_of, point_at
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -360,8 +360,12 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
                 raise
             with unlimited():
                 optimum = _report_stopped(problem, start, problem.fits[-1], str(spent))
-    seconds = time.perf_counter() - clock
-    return replace(optimum, search=replace(optimum.search, seconds=seconds))
+    record = replace(
+        optimum.search,
+        seconds=time.perf_counter() - clock,
+        n_computed=n_computed(evaluator),
+    )
+    return replace(optimum, search=record)
 
 
 def require_finished(optimum: Optimum) -> Optimum:

@@ -364,7 +364,6 @@ def optimum_of(
             details=f"{run.details}{details}".strip(),
             n_evaluations=run.trace.count,
             n_screened=n_screened,
-            n_computed=n_computed(evaluator),
             trace=trace_arrays(run.trace, theta.size),
             stopped=stopped,
             at_edge=at_edge,

@@ -31,7 +31,13 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
 from prbayes.optimize.caveats import small_simulators
-from prbayes.optimize.optimum import NO_RESPONSE, SMALLEST_SHARE, Optimum, compared_in, require_of_model
+from prbayes.optimize.optimum import (
+    NO_RESPONSE,
+    SMALLEST_SHARE,
+    Optimum,
+    compared_in,
+    require_of_model,
+)
 from prbayes.response.inputs import model_on_context
 from prbayes.results.likelihood_checks import Checked, check_draws, check_optimum, separate_modes
 
