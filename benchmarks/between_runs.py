@@ -113,8 +113,8 @@ def cell(name: str, n: int, seeds: int) -> dict[str, float]:
         for key, emulator in zip(("alone", "emulated"), EMULATORS, strict=True):
             evaluator = design_of(response, n, seed, emulator)
             found[key].append(off(evaluator, response, known))
-        emulation = evaluator.designs["y"].contents.emulation
-        found["share"].append(1.0 if emulation is None else emulation.share)
+        emulation = evaluator.reweighted["y"].design.emulator
+        found["share"].append(1.0 if emulation is None else emulation.run_share)
     alone, emulated = (float(np.sqrt(np.mean(found[key]))) for key in ("alone", "emulated"))
     return {
         "inputs": response.d,

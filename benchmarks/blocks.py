@@ -39,7 +39,7 @@ def main():
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--out", type=Path, default=record.RESULTS / "blocks.json")
     arguments = parser.parse_args()
-    in_use = reweighted._BLOCK, reweighted._AT_LEAST
+    in_use = reweighted._BLOCK, reweighted._MIN_POPULATIONS
     blocks = {"in use": in_use} | {str(number): (1, number) for number in BLOCKS}
     rows = []
     for name, metric in METRICS.items():
@@ -49,7 +49,7 @@ def main():
             seconds: dict[str, list[float]] = {block: [] for block in blocks}
             for _ in range(arguments.repeats):
                 for block, setting in blocks.items():
-                    reweighted._BLOCK, reweighted._AT_LEAST = setting
+                    reweighted._BLOCK, reweighted._MIN_POPULATIONS = setting
                     start = time.perf_counter()
                     evaluator.discrepancies(thetas, 0)
                     seconds[block].append(time.perf_counter() - start)
@@ -58,7 +58,7 @@ def main():
             ratios = {block: round(found / used, 2) for block, found in medians.items()}
             rows.append({"metric": name, "points": points, "seconds": used, "ratios": ratios})
             print(f"{name:6s} {points:6d} {used:8.4f} s", *(f"{k}: {v}" for k, v in ratios.items()))
-    reweighted._BLOCK, reweighted._AT_LEAST = in_use
+    reweighted._BLOCK, reweighted._MIN_POPULATIONS = in_use
     record.save(arguments.out, rows)
 
 

@@ -35,16 +35,16 @@ def scatter(name: str, seeds: int) -> dict[str, Any]:
     stored = prb.Reweighted(n, emulator="auto", random_seed=1)
     model = few_runs.build(name, few_runs.observed_of(name, 1), stored)
     first = prb.minimize(model, starts=0, progressbar=False)
-    design = first.evaluator.designs["y"]
-    contents = design.contents
+    bound = first.evaluator.reweighted["y"]
+    design = bound.design
     unit = np.sqrt(np.diag(first.covariance))
-    found: dict[str, Any] = {"inputs": RESPONSES[name].d, "runs": design.n_runs}
+    found: dict[str, Any] = {"inputs": RESPONSES[name].d, "runs": bound.n_runs}
     for size in SIZES:
         optima, claimed = [], []
         for seed in range(seeds):
-            clouds = contents.clouds + 17 * (seed + 1)
-            design._contents = replace(contents, clouds=clouds, size=size)
-            design.reach(contents.groups[-1])
+            number = design.n_emulated_samples + 17 * (seed + 1)
+            bound.design = replace(design, n_emulated_samples=number, emulated_size=size)
+            bound.reach(design.groups[-1])
             asked = Minimisation(start=first.point, refine=False, starts=0)
             optimum = find_optimum(first.evaluator, asked)
             optima.append(optimum.theta / unit)

@@ -86,7 +86,7 @@ def compared(optimum: Any) -> dict[str, Any]:
     off = (middles["eighth"].mean(axis=0) - middles["whole"].mean(axis=0)) / half
     seeds = np.ptp(middles["whole"], axis=0) / half
     return {
-        "points": max(design.n_points for design in optimum.evaluator.designs.values()),
+        "points": max(design.n_points for design in optimum.evaluator.reweighted.values()),
         "seconds": seconds,
         "times less": float(np.median(np.divide(seconds["whole"], seconds["eighth"]))),
         "medians off": float(np.abs(off).max()),

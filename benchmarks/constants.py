@@ -412,7 +412,7 @@ def result_of_first(found: Any) -> list[Any]:
         units,
         *(rival["theta"] for rival in optimum.rivals),
     ]
-    for design in optimum.evaluator.designs.values():
+    for design in optimum.evaluator.reweighted.values():
         parts += [design.values, design.required_ess]
     digits = [np.asarray(part).tobytes() for part in parts]
     return [*digits, optimum.scales, optimum.converged, optimum.findings]

@@ -29,24 +29,25 @@ REPEATS = 3
 
 def row(n: int) -> dict[str, float]:
     """Return the least seconds of a few repetitions, and MiB."""
-    from prbayes.propagation.importance import Cloud, Emulation
+    from prbayes.propagation.importance import EmulatedPoints, Sample, fit_emulator
 
     response = RESPONSES["eight inputs"]
     rng = np.random.default_rng(n)
     x = response.mean + 1.4 * response.sd * rng.standard_normal((n, response.d))
     at = response.mean + response.sd * rng.standard_normal((POINTS, response.d))
-    y, cloud = response(x), Cloud(tuple(at.T), np.zeros(POINTS))
+    points = EmulatedPoints(tuple(at.T))
     weights, blocks = np.full((POPULATIONS, n), 1 / n), np.arange(n) * 8 // n
+    runs = Sample(tuple(x.T), response(x), np.zeros(n), blocks)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     least = np.full(3, np.inf)
     for _ in range(REPEATS):
         clock = [time.process_time()]
-        emulation = Emulation.of("auto", tuple(x.T), y, weights, blocks)
+        emulator = fit_emulator("auto", runs, weights)
         clock.append(time.process_time())
-        assert emulation is not None
-        emulation.at(cloud)
+        assert emulator is not None
+        emulator.at(points)
         clock.append(time.process_time())
-        emulation.without_each_block(cloud)
+        emulator.without_each_block(points)
         clock.append(time.process_time())
         least = np.minimum(least, np.diff(clock))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before

@@ -228,8 +228,8 @@ class Cell:
                     "y", p.response, *inputs, metric=metric, observed=some, propagation=stored
                 )
         evaluator = Evaluator.of(model)
-        for design in evaluator.designs.values():
-            design.add([self.near[root.name] for root in design.inputs.roots], n)
+        for bound in evaluator.reweighted.values():
+            bound.add([self.near[root.name] for root in bound.inputs.roots], n)
         return evaluator
 
     def _thetas(self, values: dict[str, Any]) -> Any:

@@ -134,8 +134,8 @@ def memory(metric: str, outputs: int, points: int) -> dict[str, Any]:
             propagation=prb.Reweighted(16, max_points=points, emulator=None),
         )  # fmt: skip
     evaluator = Evaluator.of(model)
-    (design,) = evaluator.designs.values()
-    design.add([np.zeros((1, outputs))], points - 16)
+    (bound,) = evaluator.reweighted.values()
+    bound.add([np.zeros((1, outputs))], points - 16)
     with_points = peak()
     thetas = np.random.default_rng(1).normal(0, 0.1, (8, outputs))
     objective = evaluator.objective(prior=False, gradient=True)

@@ -263,9 +263,8 @@ def rows_of(cell: Cell) -> list[dict[str, Any]]:
 
 def continue_cell(cell: Cell, until: int) -> None:
     """Analyse the data sets of a cell that are missing, up to a number."""
-    from contextlib import ExitStack
-
     from prbayes._progress import shown
+    from prbayes.propagation.reweighted import designs_restored
 
     done = {row["data set"] for row in rows_of(cell)}
     missing = [i for i in range(until) if i not in done]
@@ -279,10 +278,7 @@ def continue_cell(cell: Cell, until: int) -> None:
     for i in missing:
         row: dict[str, Any]
         try:
-            with ExitStack() as stack:
-                stack.enter_context(shown(False))
-                for design in evaluator.designs.values():
-                    stack.enter_context(design.undone())
+            with shown(False), designs_restored(evaluator.reweighted.values()):
                 row = analyse(evaluator, problem, [2028, i, of_cell])
         except Exception as error:  # a failure is a result
             row = {"error": f"{type(error).__name__}: {error}"[:300]}

@@ -9,6 +9,7 @@ are left out by the marker ``exact``.
 import gc
 import logging
 import os
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -38,6 +39,15 @@ def pytest_configure(config: pytest.Config) -> None:
         return np.where(np.isfinite(digits), found * (1 + 1e-12 * digits), found)
 
     Responses.__call__ = perturbed  # type: ignore[method-assign, assignment]
+
+
+@pytest.fixture(autouse=True)
+def _close_figures() -> Iterator[None]:
+    """Close what a test has drawn: Matplotlib warns of many open figures."""
+    yield
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    if pyplot is not None:
+        pyplot.close("all")
 
 
 @pytest.fixture(autouse=True)

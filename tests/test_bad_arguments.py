@@ -223,7 +223,6 @@ PROPAGATION: dict[str, Sequence[Any]] = {
     "timeout": (0, -1.0, np.nan, "a", True, 5.0),
 }
 PICTURE: dict[str, Sequence[Any]] = {
-    "backend": ("gnuplot", 3, ""),
     "labels": ("mu", 3, ["mu"], {"mu": 3}, {3: "mu"}, {"no such name": "mean"}),
     "figsize": (3, "wide", (3,), (0, 4), (np.inf, 4), ("a", 4)),
     "model": (3, "model"),
@@ -787,7 +786,7 @@ TABLE: dict[str, Row] = {
     "plots.plot_prediction": Row(
         prb.plots.plot_prediction,
         {
-            **{k: PICTURE[k] for k in ("backend", "labels", "figsize")},
+            **{k: PICTURE[k] for k in ("labels", "figsize")},
             "observed": ("a", None, [], np.ones((3, 2)), {"a": [1.0]}),
             "predicted": (3, None, np.ones((2, 3)), {"a": 3}),
             "prob": SHARE,
@@ -797,7 +796,7 @@ TABLE: dict[str, Row] = {
     "plots.plot_sensitivity": Row(
         prb.plots.plot_sensitivity,
         {
-            **{k: PICTURE[k] for k in ("backend", "labels", "figsize")},
+            **{k: PICTURE[k] for k in ("labels", "figsize")},
             "table": (
                 *(None, 3, xr.Dataset(), xr.Dataset({"first": 1.0, "total": 1.0})),
                 *(Name("comparison"), Name("posterior")),
@@ -1012,14 +1011,14 @@ TABLE: dict[str, Row] = {
                 prb.plot_landscape,
                 "optimum",
                 "optimum",
-                ("backend", "labels", "model"),
+                ("labels", "model"),
                 {
                     "pair": (("mu", "zz"), ("mu", "mu"), (), 3, {3}),
                     "points": (0, -1, 1.5, "a", True),
                     "responses": (-1, 1.5, "a", True, None),
                 },
             ),
-            (prb.plot_optimizer, "optimum", "optimum", ("backend", "labels"), {}),
+            (prb.plot_optimizer, "optimum", "optimum", ("labels",), {}),
         )
     },
     "plot_outputs": Row(
@@ -1069,13 +1068,13 @@ TABLE: dict[str, Row] = {
     ),
     "plot_stages": Row(
         prb.plot_stages,
-        {**{k: PICTURE[k] for k in ("backend", "labels")}, "posterior": NO_RESULT},
+        {"labels": PICTURE["labels"], "posterior": NO_RESULT},
         {"posterior": Name("posterior")},
     ),
     "plot_comparison": Row(
         prb.plot_comparison,
         {
-            **{k: PICTURE[k] for k in ("backend", "labels")},
+            "labels": PICTURE["labels"],
             "comparison": (None, 3, "a", xr.Dataset(), Name("optimum"), Name("posterior")),
             "scores": FLAG,
         },
@@ -1083,7 +1082,7 @@ TABLE: dict[str, Row] = {
     ),
     "plot_validity": Row(
         prb.plot_validity,
-        {"backend": PICTURE["backend"], "tests": (None, 3, {}, {"a": 3}, Name("comparison"))},
+        {"tests": (None, 3, {}, {"a": 3}, Name("comparison"))},
         {"tests": Name("validity")},
     ),
 }

@@ -19,7 +19,7 @@ from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.random_variable import nodes
 from prbayes.optimize.design_refinement import _add_runs
-from prbayes.plots._margins import chosen, margins
+from prbayes.plots._margins import margins, select_margins
 from prbayes.response.compile import PLAIN
 
 NAMES = ["Adler", "Busch"]
@@ -76,7 +76,7 @@ def test_all_groups_are_of_one_design() -> None:
     assert calls == before + 512
     assert n_design_runs(evaluator) == evaluator.n_responses == 512
     assert first.same_points(second)
-    assert evaluator.nodes[0].design.n_runs == 512
+    assert evaluator.nodes[0].bound.n_runs == 512
     assert sum(node.bound.responses.computed for node in evaluator.nodes) == 512
 
 
@@ -181,8 +181,8 @@ def test_populations_of_inputs_are_called_by_their_groups() -> None:
     every = margins(Evaluator.of(model))
     assert [margin.name for margin in every] == ["x[Adler]", "x[Busch]"]
     assert [margin.node for margin in every] == [0, 1]
-    assert chosen(every, ["x[Busch]"]) == every[1:]
-    assert chosen(every, ["x"]) == every
+    assert select_margins(every, ["x[Busch]"]) == every[1:]
+    assert select_margins(every, ["x"]) == every
 
 
 @pytest.mark.parametrize("propagation", [prb.Resimulated(256), prb.Fresh(256)])

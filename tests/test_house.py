@@ -225,7 +225,6 @@ def test_no_module_at_the_top_has_the_name_of_a_public_function() -> None:
 # How work is done, by keyword, after what is done; in this order.
 TAIL = (
     "labels",
-    "backend",
     "executor",
     "store",
     "version",
@@ -552,6 +551,7 @@ INNER = {
         "pytensor.graph.replace.graph_replace",
         "pytensor.tensor.variable.TensorVariable",
     },
+    "propagation.design": {"pytensor.tensor.variable.TensorVariable"},
     "propagation.fresh": {"pytensor.tensor.variable.TensorVariable"},
     "propagation.ops": {
         "pytensor.gradient.grad_undefined",

@@ -96,13 +96,13 @@ def test_a_design_goes_with_its_model_and_stays_with_what_was_compiled() -> None
     prb.minimize(model, progressbar=False)
     drawn = pm.compile([model["mu"], model["sigma"]], model["y"])
     (node,) = nodes(model).values()
-    design = weakref.ref(node.bound)
+    bound = weakref.ref(node.bound)
     del model, node
     gc.collect()
     assert drawn(2.0, 1.0).shape == OBSERVED.shape
     del drawn
     gc.collect()
-    assert design() is None
+    assert bound() is None
 
 
 @linux
@@ -128,14 +128,14 @@ def test_the_support_of_many_populations_is_looked_at_in_parts(
     monkeypatch.setattr("prbayes.model.evaluator.IN_CACHE", 1024)
     parts = evaluator.support(thetas)["y"]
     assert all(np.array_equal(whole[key], parts[key]) for key in whole)
-    design = evaluator.designs["y"]
+    bound = evaluator.reweighted["y"]
     sizes = []
-    support = design.support
+    support = bound.support
     monkeypatch.setattr(
-        design, "support", lambda params: sizes.append(len(params[0])) or support(params)
+        bound, "support", lambda params: sizes.append(len(params[0])) or support(params)
     )
     evaluator.support(thetas)
-    assert max(sizes) == 1024 // design.n_points
+    assert max(sizes) == 1024 // bound.n_points
 
 
 @pytest.mark.parametrize("density", [prb.GaussianKDE(twice_silverman), prb.Histogram()])

@@ -93,17 +93,17 @@ NAMED = {"sum": observed()[:, 0], "difference": observed()[:, 1]}
 )
 @pytest.mark.parametrize("way", ["here", pytest.param("stored", marks=pytest.mark.slow), "threads"])
 def test_every_way_to_give_outputs_is_the_same_run(response, data, way, tmp_path):
-    expected = node_of(model_of(propagation=prb.Reweighted(64))).design.values
+    expected = node_of(model_of(propagation=prb.Reweighted(64))).reweighted.design.sample.values
     with ThreadPoolExecutor(2) as pool:
         ways = {"here": {}, "stored": {"store": tmp_path}, "threads": {"executor": pool}}
         node = node_of(model_of(response, data, propagation=prb.Reweighted(64, **ways[way])))
-    np.testing.assert_allclose(node.design.values, expected, rtol=1e-12)
+    np.testing.assert_allclose(node.reweighted.design.sample.values, expected, rtol=1e-12)
     assert node.bound.responses.count == 64
 
 
 def test_a_run_with_two_outputs_is_one_entry_of_the_store(tmp_path):
     propagation = prb.Reweighted(64, store=tmp_path, version="1")
-    first = node_of(model_of(propagation=propagation)).design.values
+    first = node_of(model_of(propagation=propagation)).reweighted.design.sample.values
     store = prb.response.Store(tmp_path, "y", version="1")
     assert len(store) == 64
     assert store.to_dataset()["response"].dims == ("point", "output")
@@ -111,7 +111,7 @@ def test_a_run_with_two_outputs_is_one_entry_of_the_store(tmp_path):
     def never(a, b):
         raise AssertionError("computed again")
 
-    again = node_of(model_of(never, propagation=propagation)).design.values
+    again = node_of(model_of(never, propagation=propagation)).reweighted.design.sample.values
     np.testing.assert_array_equal(again, first)
 
 
@@ -156,15 +156,19 @@ def test_simulators_that_observe_a_mapping_in_another_order_do_not_share_its_col
             prb.Simulator(
                 name, as_mapping, a, b, metric=JOINT, observed=data, propagation=propagation
             )
-    first, second = (node.design.values for node in Evaluator.of(model).nodes)
+    first, second = (node.reweighted.design.sample.values for node in Evaluator.of(model).nodes)
     np.testing.assert_array_equal(second, first[:, ::-1])
 
 
 def test_a_version_keeps_runs_of_another_order_of_outputs_apart(tmp_path):
     swapped = {"difference": NAMED["difference"], "sum": NAMED["sum"]}
     propagation = prb.Reweighted(64, store=tmp_path, version="1")
-    first = node_of(model_of(as_mapping, NAMED, propagation=propagation)).design.values
-    second = node_of(model_of(as_mapping, swapped, propagation=propagation)).design.values
+    first = node_of(
+        model_of(as_mapping, NAMED, propagation=propagation)
+    ).reweighted.design.sample.values
+    second = node_of(
+        model_of(as_mapping, swapped, propagation=propagation)
+    ).reweighted.design.sample.values
     np.testing.assert_array_equal(second, first[:, ::-1])
 
 
@@ -175,7 +179,7 @@ def test_an_output_that_is_nan_costs_the_point_all_of_them():
         return values
 
     node = node_of(model_of(partly, propagation=prb.Reweighted(256)))
-    lost = np.isnan(node.design.values)
+    lost = np.isnan(node.reweighted.design.sample.values)
     assert 0 < lost[:, 0].mean() < 0.25
     np.testing.assert_array_equal(lost[:, 0], lost[:, 1])
 

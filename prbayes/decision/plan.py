@@ -310,9 +310,8 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     # At least 50 specimens: smaller samples have other bandwidths.
     n = max(round(node.n_specimens), 50)
     target = (metric or node.metric).against(_ideal_sample(sample, n))
-    bound = design.telling(
-        sample.outputs, target.metric.beside(target, sample.outputs, design.dimensions)
-    )
+    bound = design.copied(design.design.with_values(sample.outputs))
+    bound.target = target.metric.beside(target, sample.outputs, design.inputs.dimensions)
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
     # Directions with a standard error of up to ten spreads of the prior: fainter ones have less
     # than a hundredth of the prior's information.

@@ -24,8 +24,8 @@ from prbayes.model.labels import versions
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.new_specimens import through_inverses
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.points import through_inverses
+from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.groups import refuse_groups
@@ -132,9 +132,9 @@ class Populations:
             values = emulator(design.points_of(responses.inputs))
             sample = ResponseSample(self, k, design, responses, values, None, emulator)
         else:
-            assert simulator.design is not None
-            values = simulator.design.values_of(responses)
-            sample = ResponseSample(self, k, simulator.design, responses, values, None)
+            bound = simulator.reweighted
+            assert bound is not None
+            sample = ResponseSample(self, k, bound, responses, bound.values_of(responses), None)
         sample.refuse_unsupported()
         return sample
 
@@ -145,7 +145,7 @@ class ResponseSample:
 
     populations: Populations
     k: int  # the simulator with the design
-    design: Design | EmulatedSample
+    design: ReweightedBound | EmulatedSample
     responses: Responses
     outputs: Floats  # (n,) or (n, m): at the design's points
     column: int | None  # of the output; None for a response with one number
@@ -158,8 +158,7 @@ class ResponseSample:
     @property
     def points(self) -> list[Floats]:
         """The specimens, shapes (n, *event), by input."""
-        design = self.design
-        return list(design.contents.table.points if design.has_runs else design.points)
+        return list(self.design.points_of(self.design.inputs))
 
     def emulated(self, points: Sequence[Floats]) -> list[Floats]:
         """Return the output of emulators at specimens, (n,) each: the best estimate first.

@@ -11,9 +11,7 @@ from prbayes._validate import Floats
 from prbayes.emulators.multifidelity import predicted
 from prbayes.emulators.surfaces import Surface
 
-# Tenfold: Kohavi (1995), A study of cross-validation and bootstrap for accuracy estimation and
-# model selection, IJCAI. More folds are nearer to the surface through all points, and cost as many
-# more fits.
+# Tenfold: Kohavi (1995), A study of cross-validation and bootstrap, IJCAI.
 FOLDS = 10
 
 
@@ -24,8 +22,8 @@ class CrossValidation:
     Attributes
     ----------
     residuals : ndarray, shape (n,) or (n, m)
-        Response less surrogate at each design point, fitted without a tenth of the points that this
-        one belongs to; in units of the response, NaN where the response failed.
+        Response less surrogate at each design point, fitted without the tenth of the points that
+        includes it; in units of the response, NaN where the response failed.
     population_sd : float or ndarray, shape (m,)
         Standard deviation of the response, of each output where there are several: over the prior
         predictive distribution where an input is a ``.dist()``, and else over the ranges.
@@ -46,22 +44,22 @@ class CrossValidation:
 
     @property
     def relative(self) -> Any:
-        """Root mean square in units of the population's standard deviation; of a constant too.
+        """Root mean square in units of the population's standard deviation.
 
-        Shape (m,) of several outputs.
+        Shape (m,) of several outputs; of a constant output, zero or infinite.
         """
         sd = np.asarray(self.population_sd)
-        constant = sd == 0
+        is_constant = sd == 0
         of_constant = np.where(np.asarray(self.rms) > 0, np.inf, 0.0)
-        return _number(np.where(constant, of_constant, self.rms / np.where(constant, 1.0, sd)))
+        ratio = self.rms / np.where(is_constant, 1.0, sd)
+        return _number(np.where(is_constant, of_constant, ratio))
 
     def __str__(self) -> str:
-        each = zip(*map(np.atleast_1d, (self.rms, self.relative, self.largest)), strict=True)
-        told = [
+        numbers = zip(*map(np.atleast_1d, (self.rms, self.relative, self.largest)), strict=True)
+        return "; ".join(
             f"rms {rms:.3g} ({relative:.2%} of the population's sd), largest {largest:.3g}"
-            for rms, relative, largest in each
-        ]
-        return "; ".join(told)
+            for rms, relative, largest in numbers
+        )
 
 
 def _number(values: Any) -> Any:
@@ -72,7 +70,7 @@ def _number(values: Any) -> Any:
 def cross_validated(
     model: Any, x: Floats, y: Floats, random_seed: int, coarse: Floats | None = None
 ) -> Floats:
-    """Return responses less what a surface says that was fitted without their tenth of the points.
+    """Return responses less predictions of surfaces without their tenth of the points, as y.
 
     Parameters
     ----------
@@ -80,40 +78,28 @@ def cross_validated(
     x : ndarray, shape (n, d)
         In the unit cube.
     y : ndarray, shape (n,) or (n, m)
-        Each output has a surface of its own.
+        Each output has a surface.
     random_seed : int
-        Of the order in which points are dealt out to folds.
+        Of the assignment of points to folds.
     coarse : ndarray, shape (n,), optional
         A coarse response, for a model that follows one.
-
-    Returns
-    -------
-    ndarray
-        Of the shape of y.
     """
     if y.ndim > 1:
-        each = [cross_validated(model, x, own, random_seed) for own in y.T]
-        return np.stack(each, axis=1)
+        return np.stack([cross_validated(model, x, output, random_seed) for output in y.T], axis=1)
     order = np.random.default_rng(random_seed).permutation(len(y))
     residuals = np.empty(len(y))
     for fold in np.array_split(order, min(FOLDS, len(y))):
-        kept = np.setdiff1d(order, fold)
-        pair = (None, None) if coarse is None else (coarse[kept], coarse[fold])
-        residuals[fold] = y[fold] - predicted(model, x[kept], y[kept], x[fold], *pair)
+        fitted = np.setdiff1d(order, fold)
+        pair = (None, None) if coarse is None else (coarse[fitted], coarse[fold])
+        residuals[fold] = y[fold] - predicted(model, x[fitted], y[fitted], x[fold], *pair)
     return residuals
 
 
 def points_needed(model: Any, dimensions: int) -> int:
-    """Return how many design points a surface needs, so that nine tenths of them determine it."""
-    # Nothing is known of a regressor: a constant is the least that it fits.
+    """Return the number of design points of which nine tenths determine a surface."""
+    # The least model of an unknown regressor is a constant.
     terms = model.terms(dimensions) if isinstance(model, Surface) else 1
     n = terms + 2
-    while n - _largest_fold(n) < terms + 1:
+    while n - -(-n // min(FOLDS, n)) < terms + 1:  # without the largest fold
         n += 1
     return n
-
-
-def _largest_fold(n: int) -> int:
-    """Return the size of the largest fold of n points."""
-    folds = min(FOLDS, n)
-    return -(-n // folds)

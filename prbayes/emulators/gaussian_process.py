@@ -13,20 +13,9 @@ from prbayes._validate import Floats, positive_number
 from prbayes.emulators.surfaces import Predict, Surface
 from prbayes.numerics.threads import one_thread
 
-# Points on which lengths are found: half leaves errors six times as large on eight inputs, twice
-# gains a third and takes eight times as long (benchmarks/emulators.py).
+# Points for the lengths: with half as many, errors on eight inputs are six times as large; twice as
+# many gain a third and take eight times as long (benchmarks/emulators.py).
 MOST_TUNED = 256
-# Where the likelihood is climbed from: lengths in roots of the number of inputs, and the nugget.
-# Long ones alone miss a resonance, short ones alone a response that is nearly a polynomial.
-_CLIMBS = ((0.7, 1e-2), (2.0, 1e-6))
-# Up to how many points both starts are tried; with more one finds the same.
-_BOTH = 128
-# Relative gain of the log-likelihood at which the climb ends: some hundredths of one unit, which
-# changes no prediction by a hundredth of its error.
-_CLIMBED = 1e-5
-# Points that are predicted at a time: they stay in the cache, which is three times as fast.
-_AT_A_TIME = 1024
-
 
 # From squared distances to the correlation, and minus twice its slope.
 Kernel = Callable[[Floats], tuple[Floats, Floats]]
@@ -39,32 +28,29 @@ def squared_exponential(square: Floats) -> tuple[Floats, Floats]:
 
 
 def matern(square: Floats) -> tuple[Floats, Floats]:
-    """Return the same of a Matern correlation, 5/2."""
+    """Return the same of a Matern correlation of smoothness 5/2."""
     r = np.sqrt(5 * square)
     decay = np.exp(-r)
     return (1 + r + r**2 / 3) * decay, 5 / 3 * (1 + r) * decay
 
 
-KERNELS: dict[str, Kernel] = {
-    "squared_exponential": squared_exponential,
-    "matern": matern,
-}
+KERNELS: dict[str, Kernel] = {"squared_exponential": squared_exponential, "matern": matern}
 
 
 @dataclass(frozen=True)
 class GaussianProcess(Surface):
     """A Gaussian process around a constant, with a length for each input and a nugget.
 
-    Lengths and nugget are the likeliest ones, with the variance at its best for each of them.
+    Lengths and nugget maximise the likelihood, profiled over the variance.
 
     Parameters
     ----------
     kernel : str
         "squared_exponential", for responses without corners, or "matern", of smoothness 5/2.
     lengths : tuple of float, optional
-        In the units of the points; found where none are given.
+        In the units of the points; estimated by default.
     nugget : float, optional
-        Variance of what does not depend on the inputs, in that of the response.
+        Variance of the part that does not depend on the inputs, in that of the response.
 
     Raises
     ------
@@ -105,7 +91,7 @@ class GaussianProcess(Surface):
             positive_number(self.nugget, "GaussianProcess: nugget")
 
     def terms(self, dimensions: int) -> int:
-        """Return how many points it needs at least."""
+        """Return the least number of points."""
         return 2
 
     @one_thread()
@@ -113,25 +99,26 @@ class GaussianProcess(Surface):
         """Return the same with the likeliest lengths and nugget."""
         from scipy.optimize import minimize
 
-        few = np.linspace(0, len(x) - 1, min(MOST_TUNED, len(x))).astype(int)
-        likelihood = Likelihood(KERNELS[self.kernel], x[few], y[few] - y[few].mean())
+        rows = np.linspace(0, len(x) - 1, min(MOST_TUNED, len(x))).astype(int)
+        likelihood = Likelihood(KERNELS[self.kernel], x[rows], y[rows] - y[rows].mean())
         d = x.shape[1]
         # Far shorter, a process is noise; far longer, a plane.
         bounds = [(np.log(0.05), np.log(1e3))] * d + [(np.log(1e-10), 0.0)]
-        best = None
-        for length, nugget in _CLIMBS if len(few) <= _BOTH else _CLIMBS[:1]:
-            start = np.log([*[length * np.sqrt(d)] * d, nugget])
-            found = minimize(
+        # Lengths in roots of the number of inputs, and nuggets: long ones alone miss a resonance,
+        # short ones alone a near-polynomial. With many points both give the same.
+        starts = [(0.7, 1e-2), (2.0, 1e-6)] if len(rows) <= 128 else [(0.7, 1e-2)]
+        fits = [
+            minimize(
                 likelihood,
-                start,
+                np.log([*[length * np.sqrt(d)] * d, nugget]),
                 jac=True,
                 bounds=bounds,
                 method="L-BFGS-B",
-                options={"ftol": _CLIMBED},
+                options={"ftol": 1e-5},  # some hundredths of a unit of the log-likelihood
             )
-            if best is None or found.fun < best.fun:
-                best = found
-        assert best is not None
+            for length, nugget in starts
+        ]
+        best = min(fits, key=lambda fit: fit.fun)
         *lengths, nugget = np.exp(best.x).tolist()
         return GaussianProcess(self.kernel, lengths=tuple(lengths), nugget=nugget)
 
@@ -153,8 +140,8 @@ class GaussianProcess(Surface):
         kernel = KERNELS[self.kernel]
         lengths = np.array(self.lengths)
         scaled = x / lengths
-        own, _ = kernel(_squares(scaled, scaled))
-        inverse = _inverse(_root(own, self.nugget))
+        correlation, _ = kernel(_squares(scaled, scaled))
+        inverse = _inverse(_root(correlation, self.nugget))
         mean = y.mean()
         of_ones = inverse.sum(axis=1)
         of_y = inverse @ (y - mean)
@@ -162,21 +149,14 @@ class GaussianProcess(Surface):
         centers = []
         for row in lacking:
             center = float(y[~row].mean())
-            whole = of_y - (center - mean) * of_ones
-            # Conditioned on what is left: nothing hangs on the others any more.
+            all_points = of_y - (center - mean) * of_ones
+            # The coefficients given the remaining points, by a block inverse.
             columns = inverse[:, row]
-            taken = np.linalg.solve(columns[row], whole[row])
-            found = whole - columns @ taken
-            found[row] = 0.0
-            coefficients.append(found)
+            reduced = all_points - columns @ np.linalg.solve(columns[row], all_points[row])
+            reduced[row] = 0.0
+            coefficients.append(reduced)
             centers.append(center)
-        return _Mean(
-            kernel=kernel,
-            scaled=scaled,
-            lengths=lengths,
-            center=np.array(centers),
-            coefficients=np.stack(coefficients, axis=1),
-        )
+        return _Mean(kernel, scaled, lengths, np.array(centers), np.stack(coefficients, axis=1))
 
     def slope(self, x: Floats, y: Floats, along: Floats) -> float:
         """Return the likeliest slope with these lengths, that of generalised least squares."""
@@ -185,29 +165,22 @@ class GaussianProcess(Surface):
         if self.lengths is None or self.nugget is None:
             return self.tuned(x, y).slope(x, y, along)
         scaled = x / np.array(self.lengths)
-        own, _ = KERNELS[self.kernel](_squares(scaled, scaled))
-        known = np.column_stack([np.ones(len(x)), along])
-        weighted = cho_solve((_root(own, self.nugget), True), known)
-        _, slope = np.linalg.lstsq(weighted.T @ known, weighted.T @ y, rcond=None)[0]
+        correlation, _ = KERNELS[self.kernel](_squares(scaled, scaled))
+        terms = np.column_stack([np.ones(len(x)), along])
+        weighted = cho_solve((_root(correlation, self.nugget), True), terms)
+        _, slope = np.linalg.lstsq(weighted.T @ terms, weighted.T @ y, rcond=None)[0]
         return float(slope)
 
 
 def mean_through(kernel: Kernel, lengths: Floats, nugget: float, x: Floats, y: Floats) -> Predict:
-    """Return the mean of a process given points, with lengths and a nugget that are known."""
+    """Return the mean of a process given points, lengths and a nugget."""
     from scipy.linalg import cho_solve
 
     scaled = x / lengths
-    own, _ = kernel(_squares(scaled, scaled))
-    root = _root(own, nugget)
+    correlation, _ = kernel(_squares(scaled, scaled))
     center = float(y.mean())
-    coefficients = cho_solve((root, True), y - center)
-    return _Mean(
-        kernel=kernel,
-        scaled=scaled,
-        lengths=lengths,
-        center=center,
-        coefficients=coefficients,
-    )
+    coefficients = cho_solve((_root(correlation, nugget), True), y - center)
+    return _Mean(kernel, scaled, lengths, center, coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,13 +194,13 @@ class _Mean:
     coefficients: Floats  # (n,) or (n, B)
 
     def __call__(self, at: Floats) -> Floats:
-        found = np.empty((len(at), *self.coefficients.shape[1:]))
-        for start in range(0, len(at), _AT_A_TIME):
-            some = slice(start, start + _AT_A_TIME)
-            square = _squares(at[some] / self.lengths, self.scaled)
-            correlation, _ = self.kernel(square)
-            found[some] = correlation @ self.coefficients
-        return np.asarray(self.center + found)
+        deviations = np.empty((len(at), *self.coefficients.shape[1:]))
+        step = 1024  # so many points stay in the cache
+        for start in range(0, len(at), step):
+            rows = slice(start, start + step)
+            correlation, _ = self.kernel(_squares(at[rows] / self.lengths, self.scaled))
+            deviations[rows] = correlation @ self.coefficients
+        return np.asarray(self.center + deviations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +239,7 @@ class Likelihood:
 
 
 def _root(correlation: Floats, nugget: float) -> Any:
-    """Return the lower root of a correlation with a nugget, larger if rounding asks for it."""
+    """Return the lower root of a correlation with a nugget, enlarged if rounding needs it."""
     from scipy.linalg import cholesky
 
     unit = np.eye(len(correlation))

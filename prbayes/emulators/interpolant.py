@@ -112,7 +112,7 @@ class Interpolant:
 
     @cached_property
     def _pieces(self) -> tuple[Floats, Floats, Floats]:
-        """Of one input: sorted runs, middles of the pieces between them, and their polynomials.
+        """Sorted runs of one input, middles of the pieces between them, and their polynomials.
 
         Between two runs the radial functions are a polynomial of degree five. Its coefficients,
         (6, pieces, m), are those of powers of the distance from the middle of the piece.
@@ -150,7 +150,7 @@ class Interpolant:
 
     @cached_property
     def _legendre_series(self) -> tuple[Floats, Floats]:
-        """Of one input: coefficients of the polynomial and of its derivative, (terms, m)."""
+        """Coefficients of the polynomial of one input and of its derivative, (terms, m)."""
         series = np.zeros_like(self.coefficients)
         series[self.powers[:, 0]] = self.coefficients
         return series, legder(series) / self.half_width
@@ -160,9 +160,9 @@ class Interpolant:
         return np.ascontiguousarray(((z - self.center) / self.half_width).T)
 
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
-        """Return points in blocks: their rows, squared distances to the runs (n, k), and a spare.
+        """Yield the rows of a block of points, squared distances to the runs (n, k), and a spare.
 
-        The two arrays are the same for all blocks, so that they stay in the processor's cache.
+        The two arrays are reused, so that they stay in the processor's cache.
         """
         n = len(self.z)
         step = min(max(1, IN_CACHE // 2 // n), len(z))
@@ -244,8 +244,8 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
             solution += dsytrs(factors, pivots, target - matrix @ solution, lower=True)[0]
             unsolved = np.abs((target - matrix @ solution)[:n] / spread).max()
             left_out = solution[:n] / np.diag(inverse)[:n, None]
-            # Left-out errors look small where the matrix is singular to rounding, so that a
-            # surface that misses its own runs counts with the miss.
+            # Left-out errors are too small where the matrix is singular to rounding; the error at
+            # the runs is added.
             error = float(np.sqrt(((left_out[rows] / spread) ** 2).mean()) + unsolved)
             if error < least:
                 least = error
@@ -266,7 +266,7 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
 
 
 def _degrees(n: int, d: int) -> list[int]:
-    """Return degrees of polynomials with at most a third as many terms as there are points."""
+    """Return degrees of polynomials with at most a third as many terms as points."""
     return [2, *(p for p in range(3, 17) if 3 * comb(d + p, d) <= n)]
 
 
@@ -277,7 +277,7 @@ def _powers(d: int, degree: int) -> NDArray[np.intp]:
 
 
 def _sparse_powers(d: int, degree: int) -> list[tuple[int, ...]]:
-    """Return the same without the many combinations whose total is too high."""
+    """Return the powers up to a total degree without trying all combinations."""
     if d == 1:
         return [(p,) for p in range(degree + 1)]
     return [(p, *rest) for p in range(degree + 1) for rest in _sparse_powers(d - 1, degree - p)]
@@ -311,7 +311,7 @@ def _squared_differences(a: Floats, b: Floats, out: Floats, spare: Floats) -> No
     """
     np.subtract(a[0][:, None], b[0], out=out)
     out *= out
-    for column, other in zip(a[1:], b[1:], strict=True):
-        np.subtract(column[:, None], other, out=spare)
+    for column, row in zip(a[1:], b[1:], strict=True):
+        np.subtract(column[:, None], row, out=spare)
         spare *= spare
         out += spare

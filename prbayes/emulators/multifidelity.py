@@ -1,4 +1,12 @@
-"""Surfaces beside a coarse response: y is about rho times that, and a surface of what is left."""
+"""Two-fidelity surfaces: a multiple of a coarse response, and a surface through the remainder.
+
+References
+----------
+.. [1] Kennedy, M. C. and A. O'Hagan (2000), Predicting the output from a complex computer code when
+   fast approximations are available, Biometrika 87, doi:10.1093/biomet/87.1.1.
+.. [2] Perdikaris, P. et al. (2017), Nonlinear information fusion algorithms for data-efficient
+   multi-fidelity modelling, Proc. R. Soc. A 473, doi:10.1098/rspa.2016.0751.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +21,16 @@ from prbayes.emulators.surfaces import Predict, Surface, fitted, least_squares
 
 @dataclass(frozen=True)
 class Following:
-    """The choice of an output that follows a coarse response.
+    """The model of an output that follows a coarse response.
 
     Attributes
     ----------
     model : Surface or regressor
-        Of what is beside the coarse response.
+        Of the remainder beside the coarse response.
     otherwise : Surface or regressor
         Of the response itself, where there is no coarse one.
     joined : bool
-        Whether what is beside depends on the coarse response, as on another input.
+        Whether the coarse response is also an input of the remainder.
     """
 
     model: Any
@@ -32,16 +40,16 @@ class Following:
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A response as a multiple of a coarse one and a surface; a class, so that it can be pickled.
+    """A response as rho times a coarse one and a surface; a class, so that it can be pickled.
 
     Attributes
     ----------
     rho : float
-        How much of the coarse response there is in this one.
+        Factor of the coarse response.
     scaling : tuple of float, optional
-        What is taken from a coarse response that is among the inputs, and by what it is divided.
+        Center and unit of a coarse response that is also an input.
     rest : callable
-        What is beside it, from points to responses, shape (k,).
+        Surface of the remainder, from points to responses, shape (k,).
     """
 
     rho: float
@@ -54,24 +62,9 @@ class Followed:
 
 
 def followed(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool) -> Followed:
-    """Return a response on top of a coarse one.
+    """Return a response (n,) at points (n, d) as a multiple of a finite coarse one, and a surface.
 
-    Parameters
-    ----------
-    model : Surface or regressor
-        Of what is beside the coarse response. A surface finds rho.
-    x : ndarray, shape (n, d)
-    y, coarse : ndarray, shape (n,)
-        Finite.
-    joined : bool
-        Whether the coarse response is among the inputs, too.
-
-    References
-    ----------
-    .. [1] Kennedy, M. C. and A. O'Hagan (2000), Predicting the output from a complex computer code
-       when fast approximations are available, Biometrika 87, doi:10.1093/biomet/87.1.1.
-    .. [2] Perdikaris, P. et al. (2017), Nonlinear information fusion algorithms for data-efficient
-       multi-fidelity modelling, Proc. R. Soc. A 473, doi:10.1098/rspa.2016.0751.
+    A `Surface` estimates rho; ``joined`` makes the coarse response an input of the surface.
     """
     scaling = _scaling(x, coarse) if joined else None
     points = _points(x, coarse, scaling)
@@ -80,12 +73,12 @@ def followed(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool) 
 
 
 def tuned_beside(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool) -> Any:
-    """Return a model that was tuned to a response with settings for what a coarse one leaves."""
+    """Return a model of a response with settings for the remainder beside a coarse one."""
     if not isinstance(model, Surface):
         return model
     points = _points(x, coarse, _scaling(x, coarse) if joined else None)
-    # With settings for the response rho is told by what changes over short distances; one with
-    # another input has none yet.
+    # Settings for the response estimate rho from changes over short distances; a model with another
+    # input has no settings yet.
     rho = _rho(None if joined else model, points, y, coarse)
     rest = y - rho * coarse
     return model.tuned(points, (rest - rest.mean()) / (rest.std() or 1.0))
@@ -99,47 +92,43 @@ def predicted(
     coarse: Floats | None = None,
     coarse_at: Floats | None = None,
 ) -> Floats:
-    """Return what a surface, or a choice that follows a coarse response, says at points, (k,).
+    """Return predictions at points, (k,), of a surface through runs (n, d), (n,).
 
-    Parameters
-    ----------
-    model : Following, Surface or regressor
-    x : ndarray, shape (n, d)
-    y : ndarray, shape (n,)
-    at : ndarray, shape (k, d)
-    coarse, coarse_at : ndarray, shapes (n,) and (k,), optional
-        The coarse response at both; not finite where there is none.
+    A model that is `Following` needs the coarse response at the runs, (n,), and the points, (k,);
+    it is not finite where there is none.
     """
     if not isinstance(model, Following):
         return fitted(model, x, y)(at)
     assert coarse is not None
     assert coarse_at is not None
-    known = np.isfinite(coarse)
-    there = np.isfinite(coarse_at)
-    surface = followed(model.model, x[known], y[known], coarse[known], joined=model.joined)
-    found = np.empty(len(at))
-    found[there] = surface(at[there], coarse_at[there])
-    if not there.all():
-        found[~there] = fitted(model.otherwise, x, y)(at[~there])
-    return found
+    has_coarse = np.isfinite(coarse)
+    follows = np.isfinite(coarse_at)
+    surface = followed(
+        model.model, x[has_coarse], y[has_coarse], coarse[has_coarse], joined=model.joined
+    )
+    values = np.empty(len(at))
+    values[follows] = surface(at[follows], coarse_at[follows])
+    if not follows.all():
+        values[~follows] = fitted(model.otherwise, x, y)(at[~follows])
+    return values
 
 
 def _rho(model: Any, x: Floats, y: Floats, coarse: Floats) -> float:
-    """Return how much of a coarse response there is in another one."""
+    """Return the factor of a coarse response in another one."""
     slope = model.slope if isinstance(model, Surface) else least_squares
     spread = coarse.std() or 1.0
     return float(slope(x, y, (coarse - coarse.mean()) / spread) / spread)
 
 
 def _scaling(x: Floats, coarse: Floats) -> tuple[float, float]:
-    """Return what gives a coarse response the place and spread of the inputs."""
+    """Return center and unit that give a coarse response the place and spread of the inputs."""
     spread = float(coarse.std() / x.std(axis=0).mean()) or 1.0
     return float(coarse.mean() - x.mean() * spread), spread
 
 
 def _points(x: Floats, coarse: Floats, scaling: tuple[float, float] | None) -> Floats:
-    """Return points that a surface is over."""
+    """Return the inputs of a surface, with the coarse response if it is scaled."""
     if scaling is None:
         return x
-    center, spread = scaling
-    return np.column_stack([x, (coarse - center) / spread])
+    center, unit = scaling
+    return np.column_stack([x, (coarse - center) / unit])

@@ -1,4 +1,4 @@
-"""Where a surrogate holds: a range for each input of a response."""
+"""Ranges of a surrogate's inputs, given or from their prior predictive distributions."""
 
 from __future__ import annotations
 
@@ -12,8 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 
 from prbayes._validate import Floats, real_array
-from prbayes.emulators.prior_predictive import POPULATIONS, SPECIMENS, predictive_inputs
 from prbayes.numerics.points import sobol
+from prbayes.response.compile import compile_batched
+from prbayes.response.distributions import PopulationSampler, prior_draws, valid
+from prbayes.response.inputs import model_on_context, read_inputs
+
+# Ranges are quantiles of these 2^15 draws: with a coverage of .999 some 16 draws are beyond either
+# end, and the share left out is known to a quarter.
+POPULATIONS, SPECIMENS = 512, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,15 +33,8 @@ class Range:
     constant: bool = False  # whether it is one value only
 
     @property
-    def proper(self) -> bool:
-        """Whether it is finite, and not empty unless it is to be constant."""
-        finite = np.isfinite(self.low) & np.isfinite(self.high)
-        wide = self.low < self.high
-        return bool((finite & (wide | self.constant)).all())
-
-    @property
     def size(self) -> int:
-        """Of how many numbers the input is made."""
+        """The number of elements of the input."""
         return self.low.size
 
     @property
@@ -53,25 +52,22 @@ class Ranges:
     @cached_property
     def low(self) -> Floats:
         """Lowest values, shape (columns,)."""
-        return np.concatenate([one.low.ravel() for one in self.inputs])
+        return np.concatenate([r.low.ravel() for r in self.inputs])
 
     @cached_property
     def high(self) -> Floats:
         """Highest values, shape (columns,)."""
-        return np.concatenate([one.high.ravel() for one in self.inputs])
+        return np.concatenate([r.high.ravel() for r in self.inputs])
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
         """Which columns are not constant."""
-        return np.repeat(
-            [not one.constant for one in self.inputs],
-            [one.size for one in self.inputs],
-        )
+        return np.repeat(self.varying, [r.size for r in self.inputs])
 
     @property
     def varying(self) -> list[bool]:
         """Which inputs are not constant."""
-        return [not one.constant for one in self.inputs]
+        return [not r.constant for r in self.inputs]
 
     @property
     def dimensions(self) -> int:
@@ -91,45 +87,37 @@ class Ranges:
         return columns
 
     def like(self, rows: Floats, unit: Floats) -> Floats:
-        """Return points of the unit cube whose coordinates are distributed as those of rows are."""
-        known = self.scaled(rows)
-        each = [np.quantile(own, u) for own, u in zip(known.T, unit.T, strict=True)]
-        return np.stack(each, axis=1)
+        """Map points of the unit cube so that each coordinate has the distribution of the rows."""
+        scaled = self.scaled(rows)
+        return np.stack([np.quantile(x, u) for x, u in zip(scaled.T, unit.T, strict=True)], axis=1)
 
     def outside(self, columns: Floats) -> NDArray[np.bool_]:
         """Return which numbers are outside of their range, NaN included, shape (n, columns)."""
-        # For a bound that was computed in another way: far above rounding, and far below any
-        # distance at which a surface would go astray.
+        # For a bound that was computed in another way: far above rounding.
         slack = 1e-9 * (self.high - self.low)
-        above_low = columns >= self.low - slack
-        below_high = columns <= self.high + slack
         # Comparisons with NaN are false.
-        return np.asarray(~(above_low & below_high))
+        inside = (columns >= self.low - slack) & (columns <= self.high + slack)
+        return np.asarray(~inside)
 
-    def complaint(self, columns: Floats, out: NDArray[np.bool_]) -> str:
-        """Say which inputs of rows are outside, given what `outside` returned."""
-        said = []
-        for one, where in self._by_input():
-            wrong = columns[:, where][out[:, where]]
-            if not wrong.size:
-                continue
-            got = f"{wrong.min():.6g} to {wrong.max():.6g}"
-            lowest = np.min(one.low)
-            highest = np.max(one.high)
-            expected = f"{lowest:.6g} to {highest:.6g}"
-            said.append(f"{one.name} from {got}, expected {expected}")
-        bad = out.any(axis=1).sum()
-        return f"got {bad} of {len(columns)} points outside its design: {'; '.join(said)}"
+    def complaint(self, columns: Floats, is_outside: NDArray[np.bool_]) -> str:
+        """Return a sentence about the inputs of rows that are `outside`."""
+        inputs = []
+        for r, place in self._places():
+            wrong = columns[:, place][is_outside[:, place]]
+            if wrong.size:
+                inputs.append(
+                    f"{r.name} from {wrong.min():.6g} to {wrong.max():.6g}, expected "
+                    f"{np.min(r.low):.6g} to {np.max(r.high):.6g}"
+                )
+        n_outside = is_outside.any(axis=1).sum()
+        return f"got {n_outside} of {len(columns)} points outside its design: {'; '.join(inputs)}"
 
     def arguments(self, columns: Floats) -> list[Any]:
         """Return the response's arguments for rows: arrays (n, *event), and numbers."""
-        found: list[Any] = []
-        for one, where in self._by_input():
-            if one.constant:
-                found.append(float(one.low))
-            else:
-                found.append(columns[:, where].reshape(-1, *one.event))
-        return found
+        return [
+            float(r.low) if r.constant else columns[:, place].reshape(-1, *r.event)
+            for r, place in self._places()
+        ]
 
     def columns(self, values: Sequence[ArrayLike]) -> tuple[Floats, tuple[int, ...]]:
         """Return inputs as rows, and their leading shape.
@@ -145,38 +133,31 @@ class Ranges:
             If there are too few or many inputs, or one has the wrong shape.
         """
         if len(values) != len(self.inputs):
-            names = ", ".join(one.name for one in self.inputs)
+            names = ", ".join(r.name for r in self.inputs)
             raise TypeError(
                 f"surrogate: got {len(values)} inputs, expected {len(self.inputs)}: {names}"
             )
-        arrays = []
+        arrays = [real_array(x, r.name) for r, x in zip(self.inputs, values, strict=True)]
         leading = []
-        for one, value in zip(self.inputs, values, strict=True):
-            array = real_array(value, one.name)
-            arrays.append(array)
-            leading.append(_leading_shape(one, array))
+        for r, array in zip(self.inputs, arrays, strict=True):
+            n_leading = array.ndim - len(r.event)
+            if r.event and array.shape[-len(r.event) :] != r.event:
+                event = ", ".join(map(str, r.event))
+                raise ValueError(f"{r.name}: got shape {array.shape}, expected (..., {event})")
+            leading.append(array.shape[:n_leading])
         batch = np.broadcast_shapes(*leading)
-        rows = []
-        for one, array in zip(self.inputs, arrays, strict=True):
-            full = np.broadcast_to(array, batch + one.event)
-            rows.append(full.reshape(-1, one.size))
+        rows = [
+            np.broadcast_to(array, batch + r.event).reshape(-1, r.size)
+            for r, array in zip(self.inputs, arrays, strict=True)
+        ]
         return np.concatenate(rows, axis=1), batch
 
-    def _by_input(self) -> Iterator[tuple[Range, slice]]:
+    def _places(self) -> Iterator[tuple[Range, slice]]:
         """Yield inputs with their columns."""
         start = 0
-        for one in self.inputs:
-            yield one, slice(start, start + one.size)
-            start += one.size
-
-
-def _leading_shape(one: Range, array: Floats) -> tuple[int, ...]:
-    """Return the shape of an input without its event axes."""
-    axes = len(one.event)
-    if axes and array.shape[-axes:] != one.event:
-        event = ", ".join(map(str, one.event))
-        raise ValueError(f"{one.name}: got shape {array.shape}, expected (..., {event})")
-    return array.shape[: array.ndim - axes]
+        for r in self.inputs:
+            yield r, slice(start, start + r.size)
+            start += r.size
 
 
 def read_ranges(
@@ -205,95 +186,91 @@ def read_ranges(
     TypeError, ValueError
         If an input is no range, distribution or number, a range is empty, or all are constants.
     """
-    is_list = isinstance(inputs, Mapping | Sequence) and not isinstance(inputs, str)
-    if not is_list or not len(inputs):
+    is_collection = isinstance(inputs, Mapping | Sequence) and not isinstance(inputs, str)
+    if not is_collection or not len(inputs):
         raise TypeError(
             f"{name}: inputs: got {inputs!r:.60}, expected a dict such as {{'k': (200, 300)}}, "
             "or a list"
         )
     if isinstance(inputs, Mapping) and not all(isinstance(key, str) for key in inputs):
         raise TypeError(f"{name}: inputs: got {list(inputs)} as names, expected texts")
-    named = dict(inputs) if isinstance(inputs, Mapping) else dict(enumerate(inputs, 1))
-    drawn = _drawn(name, named, random_seed)
-    ranges = _ranges(name, named, drawn, coverage)
-    if not drawn:
-        return ranges, None
-    rows = _predictive_rows(ranges, list(named), drawn, random_seed)
-    inside = ~ranges.outside(rows).any(axis=1)
-    return ranges, rows[inside]
-
-
-def _drawn(name: str, named: dict[Any, Any], random_seed: int) -> dict[Any, Floats]:
-    """Return prior predictive draws of the inputs that are random."""
-    random = {key: x for key, x in named.items() if isinstance(x, Variable)}
-    if not random:
-        return {}
-    draws = predictive_inputs(name, list(random.values()), random_seed)
-    return dict(zip(random, draws, strict=True))
-
-
-def _ranges(name: str, named: dict[Any, Any], drawn: dict[Any, Floats], coverage: float) -> Ranges:
-    """Return the ranges, given or from draws, each checked."""
-    found = []
-    for key, x in named.items():
-        label = _label(key, x)
-        draws = drawn.get(key)
-        one = _given(name, label, x) if draws is None else _covering(label, draws, coverage)
-        if not one.proper:
-            raise ValueError(
-                f"{name}: inputs: {label}: got {one.low} to {one.high}, expected a range (low, "
-                "high) with low < high"
-            )
-        found.append(one)
-    ranges = Ranges(tuple(found))
+    entries: dict[Any, Any] = dict(inputs if isinstance(inputs, Mapping) else enumerate(inputs, 1))
+    random = {key: x for key, x in entries.items() if isinstance(x, Variable)}
+    draws: dict[Any, Floats] = {}
+    if random:
+        samples = predictive_inputs(name, list(random.values()), random_seed)
+        draws = dict(zip(random, samples, strict=True))
+    ranges = Ranges(tuple(_range(name, k, x, draws.get(k), coverage) for k, x in entries.items()))
     if not ranges.dimensions:
         raise ValueError(
             f"{name}: inputs: got constants only, expected at least one range or distribution"
         )
-    return ranges
-
-
-def _label(key: str | int, x: Any) -> str:
-    """Return what messages call an input."""
-    if isinstance(key, str):
-        return key
-    return str(getattr(x, "name", None) or f"input {key}")
-
-
-def _given(name: str, label: str, x: Any) -> Range:
-    """Return the range that was given, or a constant."""
-    # A list of a number and True is one of numbers to NumPy.
-    if isinstance(x, list | tuple) and any(isinstance(one, bool) for one in x):
-        x = np.asarray(x, dtype=object)
-    array = real_array(x, f"{name}: inputs: {label}")
-    if array.shape == ():
-        return Range(label, array, array, constant=True)
-    if array.shape != (2,):
-        raise ValueError(
-            f"{name}: inputs: {label}: got shape {array.shape}, expected a range (low, high), a "
-            "`.dist()`, a variable of the model or a number"
-        )
-    return Range(label, array[0, ...], array[1, ...])
-
-
-def _covering(label: str, draws: Floats, coverage: float) -> Range:
-    """Return the range that covers the central share of draws, (populations, specimens, *event)."""
-    tail = (1 - coverage) / 2
-    low, high = np.quantile(draws, [tail, 1 - tail], axis=(0, 1))
-    return Range(label, np.asarray(low), np.asarray(high))
-
-
-def _predictive_rows(
-    ranges: Ranges, keys: list[Any], drawn: dict[Any, Floats], random_seed: int
-) -> Floats:
-    """Return rows of the prior predictive distribution; inputs with a range are uniform."""
+    if not draws:
+        return ranges, None
+    # Inputs with a range are uniform.
     unit = sobol(POPULATIONS * SPECIMENS, ranges.dimensions, random_seed)
-    uniform = ranges.arguments(ranges.at(unit))
-    values: list[Any] = []
-    for key, one, otherwise in zip(keys, ranges.inputs, uniform, strict=True):
-        if key in drawn:
-            values.append(drawn[key].reshape(-1, *one.event))
-        else:
-            values.append(otherwise)
+    values = ranges.arguments(ranges.at(unit))
+    for i, (key, r) in enumerate(zip(entries, ranges.inputs, strict=True)):
+        if key in draws:
+            values[i] = draws[key].reshape(-1, *r.event)
     rows, _ = ranges.columns(values)
-    return rows
+    return ranges, rows[~ranges.outside(rows).any(axis=1)]
+
+
+def _range(name: str, key: str | int, entry: Any, draws: Floats | None, coverage: float) -> Range:
+    """Return the range of an input: given, or of the central share of draws; or a constant."""
+    label = key if isinstance(key, str) else str(getattr(entry, "name", None) or f"input {key}")
+    if draws is not None:  # (populations, specimens, *event)
+        tail = (1 - coverage) / 2
+        low, high = np.quantile(draws, [tail, 1 - tail], axis=(0, 1))
+        is_constant = False
+    else:
+        # A list of a number and True is one of numbers to NumPy.
+        if isinstance(entry, list | tuple) and any(isinstance(x, bool) for x in entry):
+            entry = np.asarray(entry, dtype=object)
+        array = real_array(entry, f"{name}: inputs: {label}")
+        is_constant = array.shape == ()
+        if not is_constant and array.shape != (2,):
+            raise ValueError(
+                f"{name}: inputs: {label}: got shape {array.shape}, expected a range (low, high), "
+                "a `.dist()`, a variable of the model or a number"
+            )
+        low, high = (array, array) if is_constant else (array[0, ...], array[1, ...])
+    low, high = np.asarray(low), np.asarray(high)
+    is_proper = np.isfinite(low) & np.isfinite(high) & ((low < high) | is_constant)
+    if not is_proper.all():
+        raise ValueError(
+            f"{name}: inputs: {label}: got {low} to {high}, expected a range (low, high) with low "
+            "< high"
+        )
+    return Range(label, low, high, is_constant)
+
+
+def predictive_inputs(name: str, variables: list[Any], random_seed: int) -> list[Floats]:
+    """Return prior predictive draws of variables, shapes (populations, specimens, *event).
+
+    The variables are ``.dist()`` objects and variables of the model on the context. Raises
+    TypeError if there is no model on the context, ValueError if the parameters of the inputs are
+    invalid at all draws of the priors.
+    """
+    model = model_on_context(None, f"{name}: inputs that are distributions")
+    inputs = read_inputs(name, variables, model)
+    roots = prior_draws(inputs.roots, POPULATIONS, random_seed)
+    symbols = inputs.placeholders()
+    (is_valid,) = compile_batched(symbols, [valid(inputs, inputs.rebuilt(symbols)[0])])(*roots)
+    usable = np.flatnonzero(np.broadcast_to(is_valid, POPULATIONS))
+    if not usable.size:
+        raise ValueError(
+            f"{name}: got invalid parameters of the inputs at all draws of the priors, "
+            "expected valid ones"
+        )
+    # Other draws replace those with invalid parameters, such as a negative standard deviation.
+    places = usable[np.arange(POPULATIONS) % usable.size]
+    valid_roots = [values[places] for values in roots]
+    rng = np.random.default_rng(random_seed)
+    aleatory, epistemic = PopulationSampler(inputs)(valid_roots, SPECIMENS, rng)
+    # An epistemic value is the same for all specimens.
+    return [
+        np.broadcast_to(values, (POPULATIONS, SPECIMENS, *values.shape[2:])).astype(np.float64)
+        for values in inputs.fill(aleatory, epistemic)
+    ]

@@ -1,4 +1,4 @@
-"""Responses between the runs: a surface through them, chosen by what it says of runs left out."""
+"""Selection of emulators by cross-validation, and their mixing weight beside the runs."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import MOST_TUNED, GaussianProcess
 from prbayes.emulators.multifidelity import Following, predicted, tuned_beside
 from prbayes.emulators.surfaces import RadialBasis, Surface
 
-# Runs that a surface goes through at most: its cost grows with their cube. More are left to the
-# weights, which are then good enough.
+# Most runs of a surface, whose cost grows with their cube; with more runs their weights suffice.
 MOST_RUNS = 2000
 
 
@@ -33,9 +33,9 @@ class Runs:
     y : ndarray, shape (n, m)
         Outputs; a run that is not finite in one of them has none.
     importance : ndarray, shape (n,)
-        How much weight each run has in the populations that matter; they sum to one.
+        Mean weight of each run in the relevant populations; they sum to one.
     blocks : ndarray, shape (n,)
-        Which of a few parts, each spread over all of them, a run belongs to.
+        Block of each run; each block is spread over all runs.
     coarse : ndarray, shape (n, m), optional
         The same outputs by a coarse response; a run without one of them has none.
     """
@@ -53,26 +53,25 @@ class Runs:
 
     @cached_property
     def center(self) -> Floats:
-        """The mean of the inputs in the populations that matter, (d,)."""
+        """The mean of the inputs in the relevant populations, (d,)."""
         return self.importance @ self.x
 
     @cached_property
     def spread(self) -> Floats:
         """Their standard deviation, (d,)."""
-        away = self.x - self.center
-        found = np.sqrt(self.importance @ away**2)
-        return np.where(found > 0, found, 1.0)
+        sd = np.sqrt(self.importance @ (self.x - self.center) ** 2)
+        return np.where(sd > 0, sd, 1.0)
 
     def scaled(self, x: Floats) -> Floats:
         """Return inputs in units of their spread."""
         return np.asarray((x - self.center) / self.spread)
 
-    def among(self, kept: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return which of the runs kept a surface goes through: different, good, and not too many.
+    def among(self, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return the runs in a mask that a surface is fitted on: different, good, and not too many.
 
-        Of too many, half are those that matter most, and half some of the others.
+        Of too many, half are the most important ones, and half are spread over the others.
         """
-        rows = np.flatnonzero(kept & self.good)
+        rows = np.flatnonzero(mask & self.good)
         _, first = np.unique(self.x[rows], axis=0, return_index=True)
         rows = rows[np.sort(first)]
         if rows.size > MOST_RUNS:
@@ -82,33 +81,37 @@ class Runs:
             rows = np.sort(rows[np.concatenate([first, order[rest]])])
         return rows
 
+    def most_important(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the most important runs of some rows, on which models are tuned."""
+        order = np.argsort(-self.importance[rows], kind="stable")
+        return np.sort(rows[order[:MOST_TUNED]])
 
-# Runs up to which a spline is tried. With more it is better than processes for one of twelve
-# responses, by a hundredth of the sampling noise of 50 data (benchmarks/emulators.py), and takes
-# most of the time.
-_SPLINED = 256
+    @cached_property
+    def block_masks(self) -> NDArray[np.bool_]:
+        """The runs of each block, (B, n)."""
+        return np.asarray(self.blocks == np.unique(self.blocks)[:, None])
 
 
 def candidates(n: int, dimensions: int) -> list[Surface]:
-    """Return the surfaces that are tried on so many runs.
+    """Return the surfaces that are tried on n runs.
 
     Processes with a length for each input are best on nearly all responses, and with few runs a
-    spline around a polynomial on what is almost a polynomial (`python -m benchmarks.emulators`).
+    spline around a polynomial on near-polynomial ones (`python -m benchmarks.emulators`). With more
+    than 256 runs the spline is best for one of twelve responses, and takes most of the time.
     """
     processes: list[Surface] = [GaussianProcess("squared_exponential"), GaussianProcess("matern")]
-    if n > _SPLINED:
+    if n > 256:
         return processes
     degree = 2
-    # A third as many terms as there are runs.
+    # At most a third as many terms as runs.
     while degree < 8 and 3 * comb(dimensions + degree + 1, dimensions) <= n:
         degree += 1
     return [*processes, RadialBasis("quintic", degree=degree)]
 
 
-def enough(model: Any, n: int, dimensions: int) -> bool:
-    """Return whether so many runs determine a surface, and leave some to tell its error."""
+def has_enough_runs(model: Any, n: int, dimensions: int) -> bool:
+    """Return whether n runs determine a surface, and leave some to estimate its error."""
     terms = model.terms(dimensions) if isinstance(model, Surface) else 1
-    # Else its polynomial takes up what tells the error.
     return 2 * n >= 3 * terms
 
 
@@ -116,13 +119,13 @@ def emulated(
     models: Sequence[Any],
     runs: Runs,
     at: Floats,
-    kept: NDArray[np.bool_] | None = None,
+    mask: NDArray[np.bool_] | None = None,
     coarse: Floats | None = None,
 ) -> Floats:
-    """Return what the outputs are about at points.
+    """Return predicted outputs at points, (k, m).
 
-    Where the nearest run failed, the outputs are those of that run. Nothing is said to be further
-    from the runs' outputs than these are from each other.
+    Where the nearest run failed, the outputs are those of that run. Predictions are at most one
+    range of the runs' outputs beyond them.
 
     Parameters
     ----------
@@ -130,56 +133,54 @@ def emulated(
         Of each output.
     runs : Runs
     at : ndarray, shape (k, d)
-    kept : ndarray of bool, shape (n,), optional
-        The runs that it is fitted on; all by default.
+    mask : ndarray of bool, shape (n,), optional
+        The runs of the fit; all by default.
     coarse : ndarray, shape (k, m), optional
         The coarse response at the points, where there is one.
-
-    Returns
-    -------
-    ndarray, shape (k, m)
     """
-    kept = np.ones(len(runs.x), dtype=bool) if kept is None else kept
-    rows = runs.among(kept)
+    mask = np.ones(len(runs.x), dtype=bool) if mask is None else mask
+    rows = runs.among(mask)
     points = runs.scaled(at)
-    each = [_said(model, runs, rows, k, points, coarse) for k, model in enumerate(models)]
-    return _bounded(np.stack(each, axis=1), runs, rows, kept, at)
+    outputs = [_predicted(model, runs, rows, k, points, coarse) for k, model in enumerate(models)]
+    return _bounded(np.stack(outputs, axis=1), runs, rows, mask, at)
 
 
 def emulated_without_each(
     models: Sequence[Any], runs: Runs, at: Floats, coarse: Floats | None = None
 ) -> Iterator[Floats]:
-    """Yield the same, (k, m), from surfaces that lack a block of the runs each."""
-    every = runs.among(np.ones(len(runs.x), dtype=bool))
-    x = runs.scaled(runs.x[every])
+    """Yield the predictions, (k, m), of surfaces without each block of the runs."""
+    fitted = runs.among(np.ones(len(runs.x), dtype=bool))
+    x = runs.scaled(runs.x[fitted])
     points = runs.scaled(at)
-    blocks = np.array(list(each_block(runs)))
-    known = {}  # by output, (k, B)
+    by_output = {}  # (k, B), where a surface has a short way
     for k, model in enumerate(models):
         if isinstance(model, Surface):
-            predict = model.without_each(x, runs.y[every, k], blocks[:, every])
+            predict = model.without_each(x, runs.y[fitted, k], runs.block_masks[:, fitted])
             if predict is not None:
-                known[k] = predict(points)
-    for b, block in enumerate(blocks):
+                by_output[k] = predict(points)
+    for b, block in enumerate(runs.block_masks):
         rows = runs.among(~block)
-        each = [
-            known[k][:, b] if k in known else _said(model, runs, rows, k, points, coarse)
+        outputs = [
+            by_output[k][:, b]
+            if k in by_output
+            else _predicted(model, runs, rows, k, points, coarse)
             for k, model in enumerate(models)
         ]
-        yield _bounded(np.stack(each, axis=1), runs, rows, ~block, at)
+        yield _bounded(np.stack(outputs, axis=1), runs, rows, ~block, at)
 
 
-def _said(
+def _predicted(
     model: Any, runs: Runs, rows: NDArray[np.intp], k: int, points: Floats, coarse: Floats | None
 ) -> Floats:
-    """Return what a surface through some of the runs says of output k at scaled points, (k,)."""
-    here = None if runs.coarse is None else runs.coarse[rows, k]
-    there = None if coarse is None else coarse[:, k]
-    return predicted(model, runs.scaled(runs.x[rows]), runs.y[rows, k], points, here, there)
+    """Return output k at scaled points, (k,), by a surface through some of the runs."""
+    coarse_runs = None if runs.coarse is None else runs.coarse[rows, k]
+    coarse_points = None if coarse is None else coarse[:, k]
+    x = runs.scaled(runs.x[rows])
+    return predicted(model, x, runs.y[rows, k], points, coarse_runs, coarse_points)
 
 
 def _bounded(
-    values: Floats, runs: Runs, rows: NDArray[np.intp], kept: NDArray[np.bool_], at: Floats
+    values: Floats, runs: Runs, rows: NDArray[np.intp], mask: NDArray[np.bool_], at: Floats
 ) -> Floats:
     """Return values, (k, m), not far beyond those of the runs; failed where the nearest did."""
     y = runs.y[rows]
@@ -187,50 +188,63 @@ def _bounded(
     highest = y.max(axis=0)
     reach = highest - lowest
     values = np.clip(values, lowest - reach, highest + reach)
-    if not runs.good[kept].all():
-        nearest = _nearest(runs, kept, at)
+    if not runs.good[mask].all():
+        from scipy.spatial import cKDTree
+
+        places = np.flatnonzero(mask)
+        _, index = cKDTree(runs.scaled(runs.x[places])).query(runs.scaled(at))
+        nearest = places[index]
         failed = ~runs.good[nearest]
         values[failed] = runs.y[nearest[failed]]
     return values
 
 
-def _nearest(runs: Runs, kept: NDArray[np.bool_], at: Floats) -> NDArray[np.intp]:
-    """Return the run that is nearest to each point."""
-    from scipy.spatial import cKDTree
-
-    rows = np.flatnonzero(kept)
-    tree = cKDTree(runs.scaled(runs.x[rows]))
-    _, which = tree.query(runs.scaled(at))
-    return np.asarray(rows[which])
-
-
 def left_out(models: Sequence[Any], runs: Runs) -> Floats:
-    """Return what surfaces say at the runs that were fitted without the block of each, (n, m)."""
-    found = np.empty_like(runs.y)
-    said = emulated_without_each(models, runs, runs.x, runs.coarse)
-    for block, values in zip(each_block(runs), said, strict=True):
-        found[block] = values[block]
-    return found
+    """Return the predictions at the runs, (n, m), of surfaces without the block of each run."""
+    values = np.empty_like(runs.y)
+    predictions = emulated_without_each(models, runs, runs.x, runs.coarse)
+    for block, at_runs in zip(runs.block_masks, predictions, strict=True):
+        values[block] = at_runs[block]
+    return values
 
 
-def each_block(runs: Runs) -> Iterator[NDArray[np.bool_]]:
-    """Yield which runs are in each block."""
-    for number in np.unique(runs.blocks).tolist():
-        yield runs.blocks == number
+@dataclass(frozen=True, eq=False)
+class _Selection:
+    """The best models so far, for each output."""
+
+    models: tuple[Any, ...]
+    predictions: Floats  # (n, m): at runs that were left out
+    errors: Floats  # (m,)
+
+    def improved(self, models: Sequence[Any], runs: Runs, rows: NDArray[np.intp]) -> _Selection:
+        """Return the selection with other models of the outputs that they predict better."""
+        predictions = left_out(models, runs)
+        # Part of the importance is uniform: the errors of a few runs alone would be noise.
+        importance = runs.importance[rows] + 0.1 / len(runs.y)
+        # A failure predicted by a neighbour has an error of the spread.
+        y, y_left_out = runs.y[rows], predictions[rows]
+        residuals = np.where(np.isfinite(y_left_out), y_left_out - y, y.std(axis=0))
+        errors = importance @ residuals**2
+        is_better = errors < self.errors
+        pairs = zip(is_better, models, self.models, strict=True)
+        return _Selection(
+            models=tuple(model if better else best for better, model, best in pairs),
+            predictions=np.where(is_better, predictions, self.predictions),
+            errors=np.where(is_better, errors, self.errors),
+        )
 
 
 def chosen(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
-    """Return for each output the surface whose left-out errors are smallest, and what it says.
+    """Return the surface with the smallest left-out errors for each output, and its predictions.
 
-    Errors are squared, and count where the populations that matter live. Where there is a coarse
-    response, following it is another choice.
+    Errors are squared, and weighted by importance. A coarse response adds surfaces that follow it.
 
     Returns
     -------
     models : tuple of Following, Surface or regressor
         Of each output.
-    said : ndarray, shape (n, m)
-        What they say of runs that were left out.
+    predictions : ndarray, shape (n, m)
+        At runs that were left out.
 
     Raises
     ------
@@ -238,120 +252,133 @@ def chosen(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
         If none can be fitted.
     """
     rows = runs.among(np.ones(len(runs.y), dtype=bool))
-    best = _Best.of_none(runs, rows)
-    smallest = rows.size - rows.size // np.unique(runs.blocks).size - 1
+    m = runs.y.shape[1]
+    best = _Selection((None,) * m, np.empty_like(runs.y), np.full(m, np.inf))
+    smallest = rows.size - rows.size // len(runs.block_masks) - 1
     tuned = []
     for model in tried:
-        if not enough(model, smallest, runs.x.shape[1]):
+        if not has_enough_runs(model, smallest, runs.x.shape[1]):
             continue
         try:
-            own = _tuned(model, runs, rows)
-            best.take(own)
+            models = _tuned(model, runs, rows)
+            best = best.improved(models, runs, rows)
         except np.linalg.LinAlgError:
             continue
-        tuned.append(own)
+        tuned.append(models)
     if None in best.models:
         raise np.linalg.LinAlgError("no surface goes through the runs")
     if runs.coarse is not None:
-        otherwise = tuple(best.models)
-        _try_following(best, otherwise, otherwise, joined=False)
-        for own in tuned:
-            _try_following(best, own, otherwise, joined=True)
-    return tuple(best.models), best.said
-
-
-@dataclass(eq=False)
-class _Best:
-    """The best of what was tried so far, for each output."""
-
-    runs: Runs
-    rows: NDArray[np.intp]  # that surfaces go through
-    least: Floats  # (m,): their errors
-    models: list[Any]
-    said: Floats  # (n, m): what they say of runs that were left out
-
-    @classmethod
-    def of_none(cls, runs: Runs, rows: NDArray[np.intp]) -> _Best:
-        """Return what there is before anything was tried."""
-        m = runs.y.shape[1]
-        return cls(
-            runs=runs,
-            rows=rows,
-            least=np.full(m, np.inf),
-            models=[None] * m,
-            said=np.empty_like(runs.y),
-        )
-
-    def take(self, models: Sequence[Any]) -> None:
-        """Take models of the outputs for which they are better."""
-        runs = self.runs
-        rows = self.rows
-        said = left_out(models, runs)
-        # Some of the importance is the same for all: that of a few would be luck.
-        importance = runs.importance[rows] + 0.1 / len(runs.y)
-        # A run that failed by its neighbour is off by the spread.
-        own = runs.y[rows]
-        spread = own.std(axis=0)
-        found = said[rows]
-        off = np.where(np.isfinite(found), found - own, spread)
-        error = importance @ off**2
-        better = np.flatnonzero(error < self.least)
-        for k in better.tolist():
-            self.least[k] = error[k]
-            self.models[k] = models[k]
-            self.said[:, k] = said[:, k]
-
-
-def _try_following(
-    best: _Best, models: Sequence[Any], otherwise: Sequence[Any], *, joined: bool
-) -> None:
-    """Take choices that follow the coarse response where they are better.
-
-    Parameters
-    ----------
-    best : _Best
-    models : sequence
-        Of each output, which were tuned without the coarse response.
-    otherwise : sequence
-        Of each output, where there is no coarse response.
-    joined : bool
-        Whether the coarse response is among the inputs.
-    """
-    runs = best.runs
-    assert runs.coarse is not None
-    known = best.rows[np.isfinite(runs.coarse[best.rows]).all(axis=1)]
-    in_a_block = max(int(block[known].sum()) for block in each_block(runs))
-    fewest = known.size - in_a_block
-    dimensions = runs.x.shape[1] + joined
-    if not all(enough(model, fewest, dimensions) for model in models):
-        return
-    some = _most_important(runs, known)
-    x = runs.scaled(runs.x[some])
-    found = []
-    for k, model in enumerate(models):
-        y = runs.y[some, k]
-        coarse = runs.coarse[some, k]
-        tuned = tuned_beside(model, x, y, coarse, joined=joined)
-        found.append(Following(tuned, otherwise[k], joined))
-    with suppress(np.linalg.LinAlgError):
-        best.take(found)
-
-
-def _most_important(runs: Runs, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return those of the runs on which models are tuned."""
-    # Those that matter most, should it take only some.
-    order = np.argsort(-runs.importance[rows], kind="stable")
-    return np.sort(rows[order[:MOST_TUNED]])
+        otherwise = best.models
+        best = _with_following(best, otherwise, otherwise, runs, rows, joined=False)
+        for models in tuned:
+            best = _with_following(best, models, otherwise, runs, rows, joined=True)
+    return best.models, best.predictions
 
 
 def _tuned(model: Any, runs: Runs, rows: NDArray[np.intp]) -> list[Any]:
-    """Return a model with settings of its own for each output."""
+    """Return a model tuned to each output."""
     if not isinstance(model, Surface):
         return [model] * runs.y.shape[1]
-    some = _most_important(runs, rows)
-    x = runs.scaled(runs.x[some])
-    found = []
-    for own in runs.y[some].T:
-        spread = own.std() or 1.0
-        found.append(model.tuned(x, (own - own.mean()) / spread))
-    return found
+    rows = runs.most_important(rows)
+    x = runs.scaled(runs.x[rows])
+    return [model.tuned(x, (y - y.mean()) / (y.std() or 1.0)) for y in runs.y[rows].T]
+
+
+def _with_following(
+    best: _Selection,
+    models: Sequence[Any],
+    otherwise: Sequence[Any],
+    runs: Runs,
+    rows: NDArray[np.intp],
+    *,
+    joined: bool,
+) -> _Selection:
+    """Return the selection with models that follow the coarse response where they are better.
+
+    ``models`` are of each output, tuned without the coarse response; ``otherwise`` where there is
+    none; ``joined`` makes the coarse response an input.
+    """
+    assert runs.coarse is not None
+    rows_with_coarse = rows[np.isfinite(runs.coarse[rows]).all(axis=1)]
+    largest_block = max(int(block[rows_with_coarse].sum()) for block in runs.block_masks)
+    smallest = rows_with_coarse.size - largest_block
+    dimensions = runs.x.shape[1] + joined
+    if not all(has_enough_runs(model, smallest, dimensions) for model in models):
+        return best
+    tuning = runs.most_important(rows_with_coarse)
+    x, y, coarse = runs.scaled(runs.x[tuning]), runs.y[tuning], runs.coarse[tuning]
+    following = []
+    for k, model in enumerate(models):
+        tuned = tuned_beside(model, x, y[:, k], coarse[:, k], joined=joined)
+        following.append(Following(tuned, otherwise[k], joined))
+    with suppress(np.linalg.LinAlgError):
+        return best.improved(following, runs, rows)
+    return best
+
+
+def share_of_runs(
+    weights: Floats, y: Floats, predictions: Floats, blocks: NDArray[np.intp]
+) -> float:
+    """Return the share of a population that the runs have, from 0 (the emulator alone) to 1.
+
+    The emulator's distribution functions have a bias, estimated from runs that were left out; those
+    of weighted runs have a variance. A mixture has the least squared error where the runs' share is
+    bias^2 / (bias^2 + variance). The bias is estimated without its variance.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (T, n)
+        Of the runs in the relevant populations; each row sums to one.
+    y : ndarray, shape (n, m)
+        Outputs of the runs; not finite where they failed.
+    predictions : ndarray, shape (n, m)
+        Of an emulator without the block of each run.
+    blocks : ndarray, shape (n,)
+    """
+
+    def variance_of_sum(parts: Floats) -> Floats:  # over independent blocks, (T, B, L) -> (T, L)
+        return np.asarray(parts.shape[1] * parts.var(axis=1, ddof=1))
+
+    bias, variance = 0.0, 0.0
+    member = (blocks == np.unique(blocks)[:, None]).astype(float)
+    importance = weights.mean(axis=0)
+    for output, prediction in zip(y.T, predictions.T, strict=True):
+        levels, width = _levels(output, importance)
+        below = _below(output, levels, width)
+        # Error of the emulator's distribution functions: by block, (T, B, L).
+        error = _below(prediction, levels, width) - below
+        errors = np.einsum("tn,bn,nl->tbl", weights, member, error)
+        total = errors.sum(axis=1)
+        scatter = variance_of_sum(errors)
+        bias += float(np.maximum(total**2 - scatter, 0.0).sum(axis=-1).mean())
+        # Weighted runs around their distribution function.
+        function = np.einsum("tn,nl->tl", weights, below)
+        deviations = below - function[:, None, :]
+        by_block = np.einsum("tn,bn,tnl->tbl", weights, member, deviations)
+        variance += float(variance_of_sum(by_block).sum(axis=-1).mean())
+    return bias / (bias + variance) if bias > 0 else 0.0
+
+
+def _levels(values: Floats, importance: Floats) -> tuple[Floats, float]:
+    """Return 32 quantiles of finite weighted values, and the width of smoothed steps there.
+
+    The width, .2 standard deviations, is a bandwidth of a thousand data. Without it a response with
+    one value for many specimens would be wrong at all of them where an emulator errs by a rounding.
+    """
+    is_finite = np.isfinite(values)
+    values, weights = values[is_finite], importance[is_finite]
+    order = np.argsort(values)
+    values, weights = values[order], weights[order]
+    total = weights.sum()
+    cumulated = np.cumsum(weights) - 0.5 * weights
+    levels = np.interp((np.arange(32) + 0.5) / 32 * total, cumulated, values)
+    low, high = np.interp(ndtr([-1.0, 1.0]) * total, cumulated, values)
+    return levels, 0.2 * (high - low) / 2
+
+
+def _below(values: Floats, levels: Floats, width: float) -> Floats:
+    """Return a smoothed indicator of values below levels, (n, L); NaN and +inf never are."""
+    if not width > 0:
+        return (values[:, None] <= levels).astype(float)
+    ramp = (levels - values[:, None]) / width + 0.5
+    return np.asarray(np.clip(np.nan_to_num(ramp, nan=0.0), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Response surfaces: radial basis functions, polynomials, and what users bring along."""
+"""Response surfaces: radial basis functions, polynomials, and regressors of users."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from prbayes._validate import Floats, positive_integer
 
-# The lowest degree with which each kernel is conditionally positive definite, so that the
-# interpolant is unique: Wendland (2005), Scattered Data Approximation, ch. 8;
-# scipy.interpolate.RBFInterpolator warns below it.
+# The lowest degree with which a kernel is conditionally positive definite, and the interpolant
+# unique: Wendland (2005), Scattered Data Approximation, ch. 8.
 _LOWEST_DEGREE = {"linear": 0, "thin_plate_spline": 1, "cubic": 1, "quintic": 2}
 
 Predict = Callable[[Floats], Floats]
@@ -26,8 +25,7 @@ Predict = Callable[[Floats], Floats]
 class Surface(ABC):
     """A kind of response surface: `RadialBasis`, `Polynomial`, or one of your own.
 
-    A surface of your own derives from it and says how many points it needs, and what passes through
-    them.
+    A surface of your own derives from it and defines ``terms`` and ``through``.
 
     Examples
     --------
@@ -45,11 +43,11 @@ class Surface(ABC):
 
     @abstractmethod
     def terms(self, dimensions: int) -> int:
-        """Return how many points it needs at least, for inputs of so many dimensions."""
+        """Return the least number of points for inputs of so many dimensions."""
 
     @abstractmethod
     def through(self, x: Floats, y: Floats) -> Predict:
-        """Return the surface through points, or, by least squares, along them.
+        """Return the surface through points, or the least-squares surface.
 
         Parameters
         ----------
@@ -65,15 +63,15 @@ class Surface(ABC):
         """
 
     def tuned(self, x: Floats, y: Floats) -> Surface:
-        """Return the surface with settings that fit the points, which keeps them with fewer."""
+        """Return the surface with settings that are estimated from the points."""
         return self
 
     def slope(self, x: Floats, y: Floats, along: Floats) -> float:
-        """Return how steeply responses follow another one, of spread 1, beside such a surface."""
+        """Return the slope of responses along another one, of spread 1, beside such a surface."""
         return least_squares(x, y, along)
 
     def without_each(self, x: Floats, y: Floats, lacking: NDArray[np.bool_]) -> Predict | None:
-        """Return surfaces that each lack some of the points, if there is a short way to them.
+        """Return surfaces that each lack some of the points; None without a short way to them.
 
         Parameters
         ----------
@@ -135,22 +133,20 @@ class RadialBasis(Surface):
 
     def terms(self, dimensions: int) -> int:
         """Return the number of terms of the polynomial."""
-        degree = self._degree()
-        return comb(dimensions + degree, degree)
+        return comb(dimensions + self._degree, self._degree)
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the interpolant."""
         from scipy.interpolate import RBFInterpolator as Interpolator  # takes long to import
 
         surface: Predict = Interpolator(
-            x, y, smoothing=self.smoothing, kernel=self.kernel, degree=self._degree()
+            x, y, smoothing=self.smoothing, kernel=self.kernel, degree=self._degree
         )
         return surface
 
+    @property
     def _degree(self) -> int:
-        if self.degree is None:
-            return _LOWEST_DEGREE[self.kernel]
-        return self.degree
+        return _LOWEST_DEGREE[self.kernel] if self.degree is None else self.degree
 
 
 @dataclass(frozen=True)
@@ -189,26 +185,17 @@ class Polynomial(Surface):
 
     def basis(self, x: Floats) -> Floats:
         """Return products of Legendre polynomials at points of the unit cube, shape (n, terms)."""
-        dimensions = x.shape[1]
-        # One input at a time, and points last, so that what is multiplied lies in a row:
-        # (d, degree + 1, n).
+        # Points last, so that the factors are contiguous: (d, degree + 1, n).
         single = np.polynomial.legendre.legvander(2 * x - 1, self.degree)
-        rows = np.ascontiguousarray(np.moveaxis(single, 0, -1))
-        degrees = [
-            each
-            for each in product(range(self.degree + 1), repeat=dimensions)
-            if sum(each) <= self.degree
-        ]
-        terms = np.ones((len(degrees), len(x)))
-        for term, each in zip(terms, degrees, strict=True):
-            for own, k in zip(rows, each, strict=True):
-                if k:  # the first one is one
-                    term *= own[k]
+        single = np.ascontiguousarray(np.moveaxis(single, 0, -1))
+        powers = product(range(self.degree + 1), repeat=x.shape[1])
+        powers_of_terms = [p for p in powers if sum(p) <= self.degree]
+        terms = np.ones((len(powers_of_terms), len(x)))
+        for term, powers_of_term in zip(terms, powers_of_terms, strict=True):
+            for polynomials, k in zip(single, powers_of_term, strict=True):
+                if k:  # the polynomial of degree zero is one
+                    term *= polynomials[k]
         return terms.T
-
-
-# Points whose terms are made at a time: they stay in the cache.
-_POINTS_OF_A_BASIS = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,14 +207,15 @@ class _LeastSquares:
 
     def __call__(self, at: Floats) -> Floats:
         values = np.empty(len(at))
-        for first in range(0, len(at), _POINTS_OF_A_BASIS):
-            some = slice(first, first + _POINTS_OF_A_BASIS)
-            values[some] = self.polynomial.basis(at[some]) @ self.coefficients
+        step = 4096  # the terms of so many points stay in the cache
+        for start in range(0, len(at), step):
+            rows = slice(start, start + step)
+            values[rows] = self.polynomial.basis(at[rows]) @ self.coefficients
         return values
 
 
 def least_squares(x: Floats, y: Floats, along: Floats) -> float:
-    """Return how steeply responses follow another one beside a plane, which any surface tells."""
+    """Return the slope of responses along another one, beside a plane."""
     columns = np.column_stack([np.ones(len(x)), x, along])
     return float(np.linalg.lstsq(columns, y, rcond=None)[0][-1])
 
@@ -250,21 +238,13 @@ def fitted(model: Any, x: Floats, y: Floats) -> Predict:
         From points, shape (k, d), to responses, shape (k,).
     """
     center = y.mean()
-    # A response that is constant has no spread to divide by.
-    spread = y.std() or 1.0
+    spread = y.std() or 1.0  # one for a constant response
     z = (y - center) / spread
-    predict = _through(model, x, z)
-    return _InUnits(predict, center, spread)
-
-
-def _through(model: Any, x: Floats, z: Floats) -> Predict:
-    """Return a surface, or what a regressor that was fitted predicts."""
     if isinstance(model, Surface):
-        return model.through(x, z)
+        return _InUnits(model.through(x, z), center, spread)
     regressor = copy.deepcopy(model)
     regressor.fit(x, z)
-    predict: Predict = regressor.predict
-    return predict
+    return _InUnits(regressor.predict, center, spread)
 
 
 @dataclass(frozen=True, eq=False)

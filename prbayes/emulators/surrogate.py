@@ -1,4 +1,4 @@
-"""`Surrogate`: a surface through a few runs of a response, that knows its error and limits."""
+"""`Surrogate`: a surface through a few runs of a response, with its error and ranges."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from prbayes._validate import (
     share,
 )
 from prbayes.emulators.cross_validation import CrossValidation, cross_validated, points_needed
-from prbayes.emulators.hashed_noise import hashed_rows
-from prbayes.emulators.io import Kept, read, settings_of, shipped, write
+from prbayes.emulators.io import SavedSurrogate, read, settings_of, shipped, write
 from prbayes.emulators.multifidelity import Followed, Following, followed
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
@@ -40,23 +39,16 @@ from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
 
-# Times d + 1 is how many residuals are nearby: 8 or more of them tell an rms to a quarter or
-# better, 1 / sqrt(2 k), and more of them are less near.
-_NEIGHBOURS = 4
-_DESIGNS = ("even", "predictive")
-
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
     """A surface through runs of an expensive response, to be called in its place.
 
-    It is made by ``fit`` or ``load``.
-
-    Called with arrays of any leading shape, like the response; can be given to `Simulator` and
-    `predict`. Of several outputs each has a surface of its own, all through the same runs; they
-    come back in the last axis, or as a mapping where the response returns one. Inside its ranges
-    only: outside, and where the nearest design point failed, it gives what ``outside`` says, and
-    says so.
+    ``fit`` and ``load`` construct it. Like the response it takes arrays of any leading shape;
+    `Simulator` and `predict` accept it. Each of several outputs has a surface, all through the same
+    runs; they are the last axis of the result, or a mapping where the response returns one. Outside
+    its ranges, and where the nearest design point failed, it returns what ``outside`` specifies,
+    and logs a warning.
 
     Attributes
     ----------
@@ -110,9 +102,9 @@ class Surrogate:
     _joined: bool = field(repr=False, default=False)
     _predict: Predict = field(repr=False, default=cast(Predict, None))
     _followed: Followed = field(repr=False, default=cast(Followed, None))
-    # Whether points outside were told of.
+    # Not empty after the first warning of points outside.
     _warned: list[bool] = field(repr=False, default_factory=list)
-    # What the response's mapping calls its outputs; None where they have no names.
+    # Names of the outputs in the response's mapping; None without names.
     _named: Outputs | None = field(repr=False, default=None)
     # Search trees of all points, and of those that did not fail.
     _trees: tuple[Any, Any] = field(repr=False, default=(None, None))
@@ -210,67 +202,85 @@ class Surrogate:
         share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
         domain, predictive = read_ranges(name, inputs, prob, seed)
-        refuse_misfit(name, response, lambda: [one.size for one in domain.inputs], None)
-        needed = points_needed(model, domain.dimensions)
-        positive_integer(n, f"{name}: n", minimum=needed)
+        refuse_misfit(name, response, lambda: [r.size for r in domain.inputs], None)
+        n_needed = points_needed(model, domain.dimensions)
+        positive_integer(n, f"{name}: n", minimum=n_needed)
+        unit = sobol(n, domain.dimensions, seed)
+        if points == "predictive":
+            if predictive is None:
+                raise ValueError(
+                    f"{name}: points: got 'predictive' for inputs that are ranges, expected a "
+                    "`.dist()` among them; leave points= out"
+                )
+            unit = domain.like(predictive, unit)
+        design = domain.at(unit)
 
-        # Compute the responses.
-        design = _designed(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
-        # First, as what is wrong with it then costs no run.
-        beside = None if coarse is None else _first_coarse(name, coarse, domain, design)
-        kept = (
-            None if store is None else Store(store, name, columns=design.shape[1], version=version)
-        )
-        calling = Calling(name, response, executor, kept, policy, retry_failed, outputs=None)
+        # Compute the responses; the coarse ones first, as an error in them then costs no run.
+        coarse_values = None if coarse is None else _first_coarse(name, coarse, domain, design)
+        database = None
+        if store is not None:
+            database = Store(store, name, columns=design.shape[1], version=version)
+        calling = Calling(name, response, executor, database, policy, retry_failed, outputs=None)
         tally = Tally()
-        at = Points(domain.arguments(design), domain.varying)
+        rows = Points(domain.arguments(design), domain.varying)
         with shown(progressbar):
-            _learn_names(calling, at, tally)
-            responses = respond(calling, at, tally)
-        good = _usable(responses)
-        _refuse_unfit(name, responses, needed, followed=coarse is not None)
+            _learn_names(calling, rows, tally)
+            responses = respond(calling, rows, tally)
+        usable = _usable(responses)
+        if usable.sum() < n_needed:
+            raise ResponseError(
+                f"{name}: got {usable.sum()} numbers from {len(responses)} responses, too few for "
+                "a surface"
+            )
+        if coarse is not None and responses.ndim > 1:
+            raise ResponseError(
+                f"{name}: coarse: got one number a point beside a response of "
+                f"{responses.shape[1]} outputs, expected a response of one; leave coarse= out, or "
+                "use prb.Reweighted(n, coarse=)"
+            )
 
-        # Tell the error.
-        unit = domain.scaled(design)
+        # Estimate the error, then fit the surface.
+        x, y = domain.scaled(design)[usable], responses[usable]
+        coarse_values = None if coarse_values is None else coarse_values[usable]
         residuals = np.full(responses.shape, np.nan)
-        beside = None if beside is None else beside[good]
-        residuals[good], joined = _best(model, unit[good], responses[good], beside, seed)
+        residuals[usable], joined = _best(model, x, y, coarse_values, seed)
         if coarse is not None and joined is None:
             coarse = None
-            _log.info("%s: the coarse response tells nothing more, and is not followed", name)
-        error = CrossValidation(residuals, _spread(responses[good]))
-
-        # Fit the surface; only then is the spread over the prior predictive distribution known.
-        unfitted = cls(
+            _log.info("%s: the coarse response does not improve the fit, and is not followed", name)
+        surrogate = cls(
             domain,
             design,
             responses,
             model,
             outside,
             tally.computed,
-            error,
+            CrossValidation(residuals, _spread(y)),
             coarse=coarse,
             _joined=bool(joined),
             _named=tally.named,
-        )
-        found = unfitted._completed()._over(predictive)
+        )._completed()
+        if predictive is not None:
+            values = surrogate._at(predictive)
+            error = CrossValidation(residuals, _spread(values[_usable(values)]))
+            surrogate = replace(surrogate, error=error)
+        computed = tally.computed
         _log.info(
-            "%s: %d responses computed; cross-validated error %s", name, tally.computed, found.error
+            "%s: %d responses computed; cross-validated error %s", name, computed, surrogate.error
         )
-        return found
+        return surrogate
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the inputs."""
-        return tuple(one.name for one in self.domain.inputs)
+        return tuple(r.name for r in self.domain.inputs)
 
     @property
     def ranges(self) -> dict[str, tuple[Any, Any]]:
         """Lowest and highest value of each input."""
-        return {one.name: (one.low.tolist(), one.high.tolist()) for one in self.domain.inputs}
+        return {r.name: (r.low.tolist(), r.high.tolist()) for r in self.domain.inputs}
 
     def __call__(self, *inputs: ArrayLike) -> Any:
-        """Return what the response would be about, (...) or (..., m), or a mapping of such.
+        """Return predictions of the response, (...) or (..., m), or a mapping of them.
 
         Parameters
         ----------
@@ -278,35 +288,30 @@ class Surrogate:
             One per input.
         """
         columns, batch = self.domain.columns(inputs)
-        out = self.domain.outside(columns)
-        bad = out.any(axis=1)
-        values = np.full((len(columns), *self._event), np.nan)
+        is_outside = self.domain.outside(columns)
+        bad = is_outside.any(axis=1)
+        event = self.responses.shape[1:]
+        values = np.full((len(columns), *event), np.nan)
         values[~bad] = self._at(columns[~bad])
         if bad.any():
-            values[bad] = self._outside_value(columns, out)
-        found = values.reshape((*batch, *self._event))
-        return found if self._named is None else self._named.by_key(found)
+            values[bad] = self._outside_value(columns, is_outside)
+        values = values.reshape((*batch, *event))
+        return values if self._named is None else self._named.by_key(values)
 
-    @property
-    def _event(self) -> tuple[int, ...]:
-        """Shape of one response: () or (m,)."""
-        return self.responses.shape[1:]
-
-    def _outside_value(self, columns: Floats, out: NDArray[np.bool_]) -> float:
-        """Return what stands for the response outside the ranges, and say so, or raise."""
-        text = f"surrogate: {self.domain.complaint(columns, out)}"
+    def _outside_value(self, columns: Floats, is_outside: NDArray[np.bool_]) -> float:
+        """Return the replacement outside the ranges with a warning, or raise."""
+        text = f"surrogate: {self.domain.complaint(columns, is_outside)}"
         if isinstance(self.outside, Abort):
             raise ValueError(
                 f"{text}; fit it on wider ranges, or with outside=prb.response.Replace(), which "
                 "gives NaN there"
             )
         value = cast(Replace, self.outside).value
-        # Once: a sampler asks thousands of times, and a simulator tells of the mass it loses.
+        # Once: a sampler calls thousands of times, and a simulator reports the mass it loses.
         level = logging.DEBUG if self._warned else logging.WARNING
         once = f"{text}; they give {value}; this is told once."
         report(Finding("outside-ranges", once), level=level)
-        self._warned.append(True)
-        del self._warned[1:]
+        self._warned[:] = [True]
         return value
 
     def local_error(self, *inputs: ArrayLike) -> Floats:
@@ -323,19 +328,18 @@ class Surrogate:
             In units of the response.
         """
         columns, batch = self.domain.columns(inputs)
-        near = self._nearby(self.domain.scaled(columns))
-        rms = np.sqrt((near**2).mean(axis=1))
-        return np.asarray(rms.reshape((*batch, *self._event)))
+        residuals = self._nearby(self.domain.scaled(columns))
+        rms = np.sqrt((residuals**2).mean(axis=1))
+        return np.asarray(rms.reshape((*batch, *self.responses.shape[1:])))
 
     def with_error(self, random_seed: Seed = 0) -> Surrogate:
-        """Return the surrogate with its own error added.
+        """Return the surrogate with its error added.
 
-        That is a cross-validation residual from nearby, with either sign. Which one is chosen as if
-        at random, but is always the same for the same input, so that the answer does not change
-        from call to call. Populations become wider by the surrogate's error where they live: for
-        predictions that are not to be more certain than the surrogate, and for calibrations with
-        `Reweighted`. The noise jumps from input to input, so that the discrepancy is no longer
-        smooth under `Resimulated`.
+        The error is a cross-validation residual from nearby, with either sign, selected by a hash
+        of the input, so that the same input has the same error in every call. Populations become
+        wider by the surrogate's error: for predictions that are not to be more certain than the
+        surrogate, and for calibrations with `Reweighted`. The noise jumps from input to input, so
+        that the discrepancy is no longer smooth under `Resimulated`.
 
         Parameters
         ----------
@@ -348,8 +352,7 @@ class Surrogate:
         >>> bool(surrogate(1.0) == surrogate(1.0))
         True
         """
-        noise = seed_number(random_seed, "with_error: random_seed")
-        return replace(self, noise=noise)
+        return replace(self, noise=seed_number(random_seed, "with_error: random_seed"))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write design, responses and configuration as netCDF.
@@ -363,7 +366,7 @@ class Surrogate:
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        kept = Kept(
+        record = SavedSurrogate(
             ranges=self.domain,
             points=self.points,
             responses=self.responses,
@@ -377,7 +380,7 @@ class Surrogate:
             joined=None if self.coarse is None else self._joined,
             outputs=self._named,
         )
-        write(path, kept)
+        write(path, record)
 
     @classmethod
     def load(
@@ -387,7 +390,7 @@ class Surrogate:
         model: Any = None,
         coarse: Callable[..., Any] | None = None,
     ) -> Surrogate:
-        """Read what `save` wrote, and fit the surface anew.
+        """Read what `save` wrote, and fit the surface again.
 
         No response is computed, and nothing is unpickled.
 
@@ -395,8 +398,8 @@ class Surrogate:
         ----------
         path : path-like
         model : object, optional
-            The surface or regressor, where it is not one that ships with prbayes: a file keeps its
-            design, not its code.
+            The surface or regressor, where it is not one that ships with prbayes: a file contains
+            its design, not its code.
         coarse : callable, optional
             The coarse response, where the surrogate follows one: for the same reason. It is called
             at the design. A surrogate that follows none needs none.
@@ -408,201 +411,170 @@ class Surrogate:
         TypeError, ValueError
             If a regressor is needed, or the surface is not that which was saved.
         """
-        kept = read(file_path(path, "path"))
+        record = read(file_path(path, "path"))
         if model is None:
-            model = shipped(kept.kind, kept.settings)
+            model = shipped(record.kind, record.settings)
         if model is None:
             raise TypeError(
-                f"Surrogate.load: got no model, expected the {kept.kind} it was fitted with; "
+                f"Surrogate.load: got no model, expected the {record.kind} it was fitted with; "
                 "pass model="
             )
-        if kept.joined is not None and coarse is None:
+        if record.joined is not None and coarse is None:
             raise TypeError(
                 "Surrogate.load: got no coarse response, expected the one that the surrogate "
                 "follows: a file does not keep it; pass coarse="
             )
-        unfitted = cls(
-            domain=kept.ranges,
-            points=kept.points,
-            responses=kept.responses,
+        surrogate = cls(
+            domain=record.ranges,
+            points=record.points,
+            responses=record.responses,
             model=model,
-            outside=kept.outside,
-            n_runs=kept.n_runs,
-            error=kept.error,
-            noise=kept.noise,
-            coarse=None if kept.joined is None else coarse,
-            _joined=bool(kept.joined),
-            _named=kept.outputs,
-        )
-        found = unfitted._completed()
-        spread = np.asarray(_spread(kept.responses[_usable(kept.responses)]))
-        # Above what the linear algebra of another processor leaves, below what another setting
-        # changes.
+            outside=record.outside,
+            n_runs=record.n_runs,
+            error=record.error,
+            noise=record.noise,
+            coarse=None if record.joined is None else coarse,
+            _joined=bool(record.joined),
+            _named=record.outputs,
+        )._completed()
+        spread = np.asarray(_spread(record.responses[_usable(record.responses)]))
         size = np.where(spread > 0, spread, 1.0)
-        now, then = found._probes() / size, kept.probes / size
-        if not np.allclose(now, then, rtol=0, atol=1e-6, equal_nan=True):
-            beside = "" if kept.joined is None else ", and the same coarse response"
+        probes, saved = surrogate._probes() / size, record.probes / size
+        # The tolerance is above rounding on another processor, below the effect of a setting.
+        if not np.allclose(probes, saved, rtol=0, atol=1e-6, equal_nan=True):
+            and_coarse = "" if record.joined is None else ", and the same coarse response"
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
-                f"{kept.kind} that was saved in this file, expected the same one with the same "
-                f"settings (and a fixed seed of its own){beside}"
+                f"{record.kind} that was saved in this file, expected the same one with the same "
+                f"settings (and a fixed seed of its own){and_coarse}"
             )
-        return found
+        return surrogate
 
     def _completed(self) -> Surrogate:
-        """Return this one with its surface and its search trees."""
+        """Return the surrogate with its surface and its search trees."""
         from scipy.spatial import cKDTree
 
         unit = self.domain.scaled(self.points)
-        good = _usable(self.responses)
-        surface = _surfaces(self.model, unit[good], self.responses[good])
-        trees = cKDTree(unit), cKDTree(unit[good])
-        found = replace(self, _predict=surface, _trees=trees)
+        usable = _usable(self.responses)
+        surface = _surfaces(self.model, unit[usable], self.responses[usable])
+        surrogate = replace(self, _predict=surface, _trees=(cKDTree(unit), cKDTree(unit[usable])))
         if self.coarse is None:
-            return found
+            return surrogate
         coarse = _coarse_at("surrogate", self.coarse, self.domain, self.points)
-        good &= np.isfinite(coarse)
-        y = self.responses[good]
-        beside = followed(self.model, unit[good], y, coarse[good], joined=self._joined)
-        return replace(found, _followed=beside)
-
-    def _over(self, predictive: Floats | None) -> Surrogate:
-        """Return this one with the spread over the prior predictive distribution, if there is."""
-        if predictive is None:
-            return self
-        values = self._at(predictive)
-        spread = _spread(values[_usable(values)])
-        return replace(self, error=CrossValidation(self.error.residuals, spread))
+        usable &= np.isfinite(coarse)
+        x, y = unit[usable], self.responses[usable]
+        surface_beside = followed(self.model, x, y, coarse[usable], joined=self._joined)
+        return replace(surrogate, _followed=surface_beside)
 
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
         if not len(columns):
-            return np.empty((0, *self._event))
-        # What lies outside by its rounding only is on the edge.
+            return np.empty((0, *self.responses.shape[1:]))
+        # Rounding may put a point on the edge outside.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
         values = self._surface(columns, unit)
         if self.noise is not None:
             values = values + self._noise_at(columns, unit, self.noise)
         failed = ~_usable(self.responses)
         if failed.any():
-            # Nothing is known near a run that failed.
-            all_points, _ = self._trees
-            _, which = all_points.query(unit)
-            near = failed[which]
-            values[near] = self.responses[which[near]]
+            _, nearest = self._trees[0].query(unit)
+            is_failed = failed[nearest]
+            values[is_failed] = self.responses[nearest[is_failed]]
         return values
 
     def _surface(self, columns: Floats, unit: Floats) -> Floats:
-        """Return values of the surface at rows, which are also given in the unit cube."""
+        """Return values of the surface at rows, and at the same rows in the unit cube."""
         if self.coarse is None:
             return self._predict(unit)
         coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
-        known = np.isfinite(coarse)
+        has_coarse = np.isfinite(coarse)
         values = np.empty(len(unit))
-        values[known] = self._followed(unit[known], coarse[known])
-        if not known.all():
-            values[~known] = self._predict(unit[~known])
-            lost = (~known).sum()
+        values[has_coarse] = self._followed(unit[has_coarse], coarse[has_coarse])
+        if not has_coarse.all():
+            values[~has_coarse] = self._predict(unit[~has_coarse])
+            n_lost = (~has_coarse).sum()
             report(
                 Finding(
                     "coarse-without-number",
-                    f"surrogate: coarse: got no number at {lost} of {known.size} points, where "
+                    f"surrogate: coarse: got no number at {n_lost} of {len(unit)} points, where "
                     "the surface goes on without it.",
                 )
             )
         return values
 
     def _noise_at(self, columns: Floats, unit: Floats, random_seed: int) -> Floats:
-        """Return for each row residuals of one run nearby, with either sign, (n,) or (n, m)."""
-        near = self._nearby(unit)
-        n, k = near.shape[:2]
+        """Return residuals of a run nearby for each row, with either sign, (n,) or (n, m)."""
+        residuals = self._nearby(unit)
+        n, k = residuals.shape[:2]
         number, sign = np.divmod(hashed_rows(columns, random_seed), np.uint64(2))
-        which = (number % np.uint64(k)).astype(np.intp)
-        chosen = near[np.arange(n), which]
-        turned = np.where(sign == 0, 1.0, -1.0)
-        return chosen * turned.reshape((n, *(1 for _ in self._event)))
+        place = (number % np.uint64(k)).astype(np.intp)
+        signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
+        return residuals[np.arange(n), place] * signs
 
     def _nearby(self, unit: Floats) -> Floats:
         """Return the residuals at the nearest design points that did not fail, (n, k, ...)."""
         residuals = self.error.residuals[_usable(self.responses)]
-        dimensions = unit.shape[1]
-        k = min(len(residuals), _NEIGHBOURS * (dimensions + 1))
-        _, good_points = self._trees
-        # What is not finite is outside, and has no neighbours: any will do.
-        known = np.where(np.isfinite(unit), unit, 0.5)
-        _, which = good_points.query(known, k=k)
-        return np.asarray(residuals[which])
+        # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
+        k = min(len(residuals), 4 * (unit.shape[1] + 1))
+        # Points that are not finite are outside: any neighbours will do.
+        _, nearest = self._trees[1].query(np.where(np.isfinite(unit), unit, 0.5), k=k)
+        return np.asarray(residuals[nearest])
 
     def _probes(self) -> Floats:
-        """Return values of the surface, without noise, at a few fixed points."""
-        # More than surfaces that ship have coefficients, in few dimensions, so that another one
-        # cannot agree at all of them.
+        """Return values of the surface, without noise, at 64 fixed points, which identify it."""
         unit = sobol(64, self.domain.dimensions, 0)
         return self._surface(self.domain.at(unit), unit)
 
 
-def _designed(
-    name: str, points: str, domain: Ranges, predictive: Floats | None, unit: Floats
-) -> Floats:
-    """Return the design's rows for points of the unit cube: evenly, or as the prior has them."""
-    if points == "even":
-        return domain.at(unit)
-    if predictive is None:
-        raise ValueError(
-            f"{name}: points: got 'predictive' for inputs that are ranges, expected a `.dist()` "
-            "among them; leave points= out"
-        )
-    return domain.at(domain.like(predictive, unit))
+def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
+    """Return a pseudo-random number for each row of x, (n, d) -> (n,), equal for equal rows.
+
+    The bits of the rows go through the finalizer of splitmix64: Steele, Lea and Flood (2014), Fast
+    splittable pseudorandom number generators, doi:10.1145/2660193.2660195.
+    """
+    h = np.full(len(x), random_seed, dtype=np.uint64)
+    # Adding 0.0 makes -0.0 the number that it equals.
+    for column in np.ascontiguousarray(x.T + 0.0):
+        h = (h ^ column.view(np.uint64)) + np.uint64(0x9E3779B97F4A7C15)
+        h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        h = h ^ (h >> np.uint64(31))
+    return h
 
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:
-    """Return which runs have finite outputs, all of them, (n,)."""
+    """Return which runs have only finite outputs, (n,)."""
     return ~lacking(np.where(np.isfinite(responses), responses, np.nan))
-
-
-def _refuse_unfit(name: str, responses: Floats, needed: int, *, followed: bool) -> None:
-    """Raise if too few runs have a response, or several outputs were to follow a coarse one."""
-    good = _usable(responses).sum()
-    if good < needed:
-        raise ResponseError(
-            f"{name}: got {good} numbers from {len(responses)} responses, too few for a surface"
-        )
-    if followed and responses.ndim > 1:
-        raise ResponseError(
-            f"{name}: coarse: got one number a point beside a response of {responses.shape[1]} "
-            "outputs, expected a response of one; leave coarse= out, or use "
-            "prb.Reweighted(n, coarse=)"
-        )
 
 
 def _spread(values: Floats) -> Any:
     """Return the standard deviation of responses, a number or one for each output."""
-    found = values.std(axis=0)
-    return float(found) if found.ndim == 0 else found
+    sd = values.std(axis=0)
+    return float(sd) if sd.ndim == 0 else sd
 
 
 @dataclass(frozen=True, eq=False)
-class _Together:
+class _OutputSurfaces:
     """Surfaces of several outputs; a class, so that it can be pickled."""
 
-    each: tuple[Predict, ...]
+    surfaces: tuple[Predict, ...]
 
     def __call__(self, at: Floats) -> Floats:
-        return np.stack([predict(at) for predict in self.each], axis=-1)
+        return np.stack([predict(at) for predict in self.surfaces], axis=-1)
 
 
 def _surfaces(model: Any, x: Floats, y: Floats) -> Predict:
     """Return a surface through responses, or one through each of several outputs."""
     if y.ndim == 1:
         return fitted(model, x, y)
-    return _Together(tuple(fitted(model, x, own) for own in y.T))
+    return _OutputSurfaces(tuple(fitted(model, x, output) for output in y.T))
 
 
 def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
-    """Learn what a mapping calls several outputs that are stored, before any other run.
+    """Learn the names of several stored outputs before any other run.
 
-    A store keeps numbers only: where a version is believed, one of its runs is computed again, and
-    refused if its outputs have changed places.
+    A store contains numbers only: with a version, one of its runs is computed again, and refused if
+    its outputs have changed places.
     """
     store = calling.store
     if store is None or store.version is None:
@@ -633,15 +605,15 @@ def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: F
 
 
 def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
-    """Return the same at the design, or raise if it is no response of the inputs."""
+    """Return a coarse response at the design, or raise if it is no response of the inputs."""
     refuse_coarse(f"{name}: coarse", coarse)
-    found = _coarse_at(name, coarse, domain, columns)
-    if not np.isfinite(found).any():
+    values = _coarse_at(name, coarse, domain, columns)
+    if not np.isfinite(values).any():
         raise ResponseError(
             f"{name}: coarse: got no number at any of {len(columns)} points, expected a response "
             "of the same inputs; repair it, or leave coarse= out"
         )
-    return found
+    return values
 
 
 def _best(
@@ -649,15 +621,15 @@ def _best(
 ) -> tuple[Floats, bool | None]:
     """Return the least cross-validated residuals, and how a coarse response is followed for them.
 
-    None if it is not; else whether it is among the inputs of the surface, too.
+    None if it is not followed; else whether it is also an input of the surface.
     """
     least = cross_validated(model, x, y, seed)
     choice = None
     if coarse is None:
         return least, choice
-    known = int(np.isfinite(coarse).sum())
+    n = int(np.isfinite(coarse).sum())
     for joined in (False, True):
-        if known < points_needed(model, x.shape[1] + joined):
+        if n < points_needed(model, x.shape[1] + joined):
             continue
         residuals = cross_validated(Following(model, model, joined), x, y, seed, coarse)
         if (residuals**2).sum() < (least**2).sum():
@@ -684,5 +656,6 @@ def _refuse_wrong(name: str, response: object, model: Any, outside: object, poin
             f"{name}: outside: got {outside!r:.60}, expected prb.response.Replace() or "
             "prb.response.Abort()"
         )
-    if points not in _DESIGNS:
-        raise ValueError(f"{name}: points: got {points!r:.60}, expected one of {_DESIGNS}")
+    designs = ("even", "predictive")
+    if points not in designs:
+        raise ValueError(f"{name}: points: got {points!r:.60}, expected one of {designs}")

@@ -57,12 +57,12 @@ class BatchObjective:
         bases = []
         for k in chosen:
             node = evaluator.nodes[k]
-            design = evaluator.designs[node.name]
+            design = evaluator.reweighted[node.name].design
             weights = sets.weights[k][rows, None]
             values = sets.values[k]
             target = node.target.with_observed(values, weights)
             other = stored[k] if stored else None
-            own = design.values if other is None else other
+            own = design.sample.values if other is None else other
             targets.append(target)
             responses.append(own)
             bases.append(target.basis(own))

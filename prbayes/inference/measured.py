@@ -89,8 +89,8 @@ class Refits:
         # Minimisers depend on the ratios of scales only; of one simulator they do not at all.
         ratios = scales / scales[chosen[0]]
         fingerprints = []
-        for design in evaluator.designs.values():
-            content = design.values.tobytes()
+        for bound in evaluator.reweighted.values():
+            content = bound.design.sample.values.tobytes()
             fingerprints.append(hash(content))
         return _refits(
             evaluator,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +23,7 @@ from prbayes.numerics.batched_bfgs import Descent
 from prbayes.numerics.batched_simplex import descend_by_simplex
 from prbayes.numerics.stencils import second_differences
 from prbayes.propagation.base import N_BLOCKS
+from prbayes.propagation.reweighted import designs_restored
 
 # Step of differences, in standard errors.
 _REFIT_STEP = 0.02
@@ -247,7 +247,10 @@ class SamplingDistribution:
         The minimum of each emulator that lacks a block of the runs is found, and how far it is from
         that of the whole: where a descent ends differs from the optimum for other reasons, too.
         """
-        each = [node.design.left_out() if node.design else [] for node in self.evaluator.nodes]
+        each = [
+            node.reweighted.design.without_each_block() if node.reweighted else []
+            for node in self.evaluator.nodes
+        ]
         number = max(map(len, each))
         if not number:
             return np.full(self.stderr.size, np.nan)
@@ -291,13 +294,13 @@ class SamplingDistribution:
 
     def _spread_of_parts(self, observed: DataSets) -> Floats:
         """Return by how much the minima of an eighth of the points each scatter, (r,)."""
-        designs = list(self.evaluator.designs.values())
+        designs = [(bound, bound.design) for bound in self.evaluator.reweighted.values()]
         found = []
         descent = None
         for b in range(N_BLOCKS):
-            with ExitStack() as parts:
-                for design in designs:
-                    parts.enter_context(design.part(design.blocks == b))
+            with designs_restored(bound for bound, _ in designs):
+                for bound, design in designs:
+                    bound.design = design.rows(design.sample.blocks == b)
                 objective = BatchObjective.of(self.evaluator, self.scales, observed)
                 descent = descent or self._descent(objective, roughly=True)
                 found.append(self._only(objective, descent))
@@ -319,14 +322,14 @@ class SamplingDistribution:
         .. [1] He, Z. and A. B. Owen (2016), Extensible grids: uniform sampling on a space filling
            curve, J. R. Stat. Soc. B 78, 917-931, doi:10.1111/rssb.12132.
         """
-        dimensions = max(node.bound.dimensions for node in self.evaluator.nodes)
+        dimensions = max(node.bound.inputs.dimensions for node in self.evaluator.nodes)
         return 0.5 + 0.5 / dimensions
 
     @property
     def _of_clouds(self) -> bool:
         """Whether all responses are those of clouds."""
-        designs = [node.design for node in self.evaluator.nodes]
-        return all(design is not None and design.contents.cloud for design in designs)
+        bounds = [node.reweighted for node in self.evaluator.nodes]
+        return all(bound is not None and bound.design.is_emulated for bound in bounds)
 
     @property
     def _stored(self) -> bool:

@@ -19,11 +19,11 @@ def designs_as_before(evaluator: Evaluator) -> Iterator[Callable[[], None]]:
     The same call then begins where this one began, and finds the responses. The function that is
     yielded does the same, for work that a budget ended with a part of its result.
     """
-    before = [(design, design.mark()) for design in evaluator.designs.values()]
+    designs = [(bound, bound.design) for bound in evaluator.reweighted.values()]
 
     def restore() -> None:
-        for design, mark in before:
-            design.go_back(mark, remember=True)
+        for bound, design in designs:
+            bound.design = design
 
     try:
         yield restore
@@ -55,7 +55,7 @@ def kept(model: pm.Model, *also: str) -> str:
     parts = list(also)
     if folders:
         parts.append(f"all responses ({', '.join(sorted(folders))})")
-    elif any(s.is_computed and s.node.design is not None for s in used):
+    elif any(s.is_computed and s.node.reweighted is not None for s in used):
         parts.append("the responses of the model's designs")
     if not parts:
         return "nothing is kept: give the propagation a store="

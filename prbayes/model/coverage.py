@@ -85,10 +85,8 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]
     """Return, by simulator, in what its design does not support populations at thetas, (P, d)."""
     found = {}
     for name, support in evaluator.support(thetas).items():
-        design = evaluator.designs[name]
-        short = shortcoming(
-            support, design.required_ess, design.config.max_lost, design.n_points, ENOUGH
-        )
+        bound = evaluator.reweighted[name]
+        short = shortcoming(support, bound.required_ess, bound.max_lost, bound.n_points, ENOUGH)
         if short:
             found[name] = short
     return found

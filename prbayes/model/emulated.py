@@ -29,7 +29,7 @@ from prbayes.model.specimen_likelihood import (
 )
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.coordinates import Coordinates
-from prbayes.propagation.new_specimens import new_specimens
+from prbayes.propagation.points import new_specimens
 from prbayes.propagation.specimen_points import Surface
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
@@ -221,7 +221,7 @@ class EmulatedSimulator:
 
     is_emulated: ClassVar[Literal[True]] = True
     # As of a Node: no response is weighted.
-    design: ClassVar[None] = None
+    reweighted: ClassVar[None] = None
     max_lost: ClassVar[float] = MAX_LOST
 
     @property

@@ -31,14 +31,14 @@ from prbayes.model.specimen_likelihood import (
     specimen_likelihoods,
 )
 from prbayes.propagation.base import Bound
-from prbayes.propagation.importance import CLOUD
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.importance import SIZES
+from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
 from prbayes.response.groups import is_group
 
 # Points of a design from which on samplers start with an eighth of them.
-_LARGE = CLOUD
+_LARGE = SIZES.first
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,9 @@ class Evaluator:
         return [*self.nodes, *self.emulated]
 
     @property
-    def designs(self) -> dict[str, Design]:
-        """The designs of the simulators that reweight stored responses, by name."""
-        return {n.name: n.design for n in self.nodes if n.design is not None}
+    def reweighted(self) -> dict[str, ReweightedBound]:
+        """The simulators that reweight the stored responses of a design, by name."""
+        return {n.name: n.reweighted for n in self.nodes if n.reweighted is not None}
 
     @property
     def epsilon(self) -> Floats:
@@ -279,7 +279,8 @@ class Evaluator:
                 counted = node.target.weights if same_size else None
             target = (metric or node.metric).against(observed, counted)
             bound = node.bound
-            targets.append(target.metric.beside(target, bound.first_responses, bound.dimensions))
+            dimensions = bound.inputs.dimensions
+            targets.append(target.metric.beside(target, bound.first_responses, dimensions))
         return self.with_targets(targets)
 
     def roots(self, thetas: Floats, k: int) -> list[Floats]:
@@ -300,15 +301,15 @@ class Evaluator:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
         by_name = {}
         for k, node in enumerate(self.nodes):
-            design = node.design
-            if design is None:
+            bound = node.reweighted
+            if bound is None:
                 continue
             # Some populations at a time: their weights at all points take memory.
-            step = max(1, IN_CACHE // design.n_points)
+            step = max(1, IN_CACHE // bound.n_points)
             parts = []
             for first in range(0, max(1, len(thetas)), step):
                 roots = self.roots(thetas[first : first + step], k)
-                parts.append(design.support(roots))
+                parts.append(bound.support(roots))
             by_name[node.name] = {
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]
             }
@@ -457,8 +458,8 @@ def _sum_over_runs(evaluator: Evaluator, counts: list[int]) -> int:
 
 def n_design_runs(evaluator: Evaluator) -> int:
     """Return the number of runs of all designs; shared runs count once."""
-    designs = [node.design for node in evaluator.nodes]
-    return _sum_over_runs(evaluator, [0 if d is None else d.n_runs for d in designs])
+    bounds = [node.reweighted for node in evaluator.nodes]
+    return _sum_over_runs(evaluator, [0 if bound is None else bound.n_runs for bound in bounds])
 
 
 def missing_mass(evaluator: Evaluator, theta: Floats, k: int) -> dict[str, float]:
@@ -474,9 +475,11 @@ def coarser_evaluator(evaluator: Evaluator) -> Evaluator | None:
     """Return an evaluator with an eighth of the points of large designs; None if none is large."""
     bounds: list[Bound] = []
     for node in evaluator.nodes:
-        design = node.design
-        is_large = design is not None and design.n_points >= _LARGE
-        bounds.append(design.coarser() if design is not None and is_large else node.bound)
+        bound = node.reweighted
+        if bound is not None and bound.n_points >= _LARGE:
+            bounds.append(bound.copied(bound.design.rows(bound.blocks == 0)))
+        else:
+            bounds.append(node.bound)
     pairs = list(zip(evaluator.nodes, bounds, strict=True))
     if all(node.bound is bound for node, bound in pairs):
         return None
@@ -491,7 +494,7 @@ def coarse_where_sufficient(evaluator: Evaluator, theta: Floats) -> Evaluator:
         return evaluator
     support = coarse.support(theta[None])
     is_sufficient = [
-        support[name]["weight_ess"][0] >= design.required_ess
-        for name, design in coarse.designs.items()
+        support[name]["weight_ess"][0] >= bound.required_ess
+        for name, bound in coarse.reweighted.items()
     ]
     return coarse if all(is_sufficient) else evaluator

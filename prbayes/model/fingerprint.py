@@ -221,9 +221,9 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         metric=without_addresses(node.metric),
         propagation=without_addresses(node.propagation),
         n_points=node.bound.n_runs,
-        batches=1 if node.design is None else node.design.n_drawn,
+        batches=1 if node.reweighted is None else node.reweighted.design.n_drawn,
         epsilon=node.epsilon_value,
-        responses=_numbers(node.bound.known_responses[:8].ravel()),
+        responses=_numbers(node.bound.first_responses[:8].ravel()),
         discrepancies=_numbers(discrepancies),
         points=_points(node),
     )
@@ -257,9 +257,9 @@ _POINTS = 2
 def _points(node: Node) -> tuple[tuple[float, ...], ...]:
     """Return the aleatory inputs of the first known responses, a row for each."""
     # A propagation of a user's own may know none.
-    if node.bound.inputs.epistemic or not len(node.bound.known_points):
+    if node.bound.inputs.epistemic or not len(node.bound.first_points):
         return ()
-    columns = [x[:_POINTS].reshape(min(_POINTS, len(x)), -1) for x in node.bound.known_points]
+    columns = [x[:_POINTS].reshape(min(_POINTS, len(x)), -1) for x in node.bound.first_points]
     return tuple(map(_numbers, np.concatenate(columns, axis=1)))
 
 

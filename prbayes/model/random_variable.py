@@ -45,7 +45,7 @@ from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.model.first_look import tell_far_data
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
-from prbayes.propagation.reweighted import Design, design_of
+from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
 from prbayes.response.budget import duration
 from prbayes.response.compile import PLAIN
 from prbayes.response.inputs import Inputs
@@ -128,9 +128,9 @@ class Node:
         return self.bound.populations(list(roots))
 
     @property
-    def design(self) -> Design | None:
-        """The stored responses, None where the propagation stores none."""
-        return design_of(self.bound)
+    def reweighted(self) -> ReweightedBound | None:
+        """The propagation with its design, None where it stores no responses."""
+        return reweighted_of(self.bound)
 
     @property
     def epsilon_value(self) -> float:
@@ -178,7 +178,8 @@ class Node:
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
         bound = self.bound.copied()
-        bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
+        dimensions = bound.inputs.dimensions
+        bound.target = target.metric.beside(target, bound.first_responses, dimensions)
         other = replace(self, target=bound.target, bound=bound)
         if self.epsilon_is_default:
             other.epsilon.set_value(np.asarray(1 / other.n_specimens))
@@ -237,8 +238,9 @@ class Specification:
         responses.on_start = partial(_log_first_runs, self.propagation, responses)
         with shown(self.progressbar):
             bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
-            target = self.target
-            bound.aim(target.metric.beside(target, bound.first_responses, bound.dimensions))
+            dimensions = bound.inputs.dimensions
+            metric = self.target.metric
+            bound.target = metric.beside(self.target, bound.first_responses, dimensions)
         responses.on_start = None
         tell_far_data(self.name, self.target.observed, bound.first_responses, self.outputs.names)
         return Node(

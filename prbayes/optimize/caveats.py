@@ -26,7 +26,7 @@ from prbayes.model.labels import labelled
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross
 from prbayes.optimize.convergence import AGREE
-from prbayes.propagation.importance import LARGEST_CLOUD
+from prbayes.propagation.importance import SIZES
 
 if TYPE_CHECKING:
     from prbayes.optimize.local_optima import Rival
@@ -355,15 +355,15 @@ def not_identified(evaluator: Evaluator, local: Local, told: Sequence[str] = ())
 
 
 def _of_design(evaluator: Evaluator, error: float) -> Finding:
-    designs = evaluator.designs.values()
+    designs = [bound.design for bound in evaluator.reweighted.values()]
     runs = max(design.n_runs for design in designs)
     apart = f"The optimum of another design would differ by about {error:.2f} standard errors, "
     apart += f"expected at most {AGREE}; "
-    if min(len(design.contents.cloud or ()) for design in designs) < LARGEST_CLOUD:
+    if min(len(design.emulated or ()) for design in designs) < SIZES.largest:
         advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
     else:
         advice = (
-            f"between its {runs} runs are {LARGEST_CLOUD} emulated points, the most there are: "
+            f"between its {runs} runs are {SIZES.largest} emulated points, the most there are: "
             "more runs help as far as the emulator is off, which the message says, and the rest "
             "counts as another error of the optimum"
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +33,7 @@ from prbayes.optimize.convergence import (
 )
 from prbayes.optimize.objective import Ridge
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 
 _log = logging.getLogger("prbayes")
 # Batches after which a design is refused; half or twice changes no answer (docs/constants.md).
@@ -65,7 +65,7 @@ def refine_designs(
     the fit after the last round.
     """
     evaluator = search.evaluator
-    if not evaluator.designs:
+    if not evaluator.reweighted:
         return fit, None
     nearby = _neighbourhood(evaluator, fit, seed)
     short = shortcomings(evaluator, nearby) or shortcomings(evaluator, fit.theta[None])
@@ -102,7 +102,7 @@ def _neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
     """Return thetas around a fit that designs have to support, (m, d)."""
     hyperparameters = evaluator.hyperparameters
     nearby = fit.cloud
-    is_emulated = all(design.contents.cloud for design in evaluator.designs.values())
+    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if nearby is None or (is_emulated and fit.local is not None):
         # Emulated samples follow the fit anywhere; runs are added around the pilot's thetas.
         nearby = spread_around(fit.theta, fit.covariance, hyperparameters.prior_sd, seed=seed)
@@ -186,11 +186,11 @@ def refine_at(
     is_drawn = _redraw_samples(evaluator, nearby, names)
     while is_drawn and names:
         names &= set(shortcomings(evaluator, thetas))
-        is_drawn = _enlarge_samples(evaluator, nearby, names, on_the_way=True)
+        is_drawn = _enlarge_samples(evaluator, nearby, names, same_surfaces=True)
     # Runs, where samples do not suffice or the emulator is poor.
     for name in short:
-        emulation = evaluator.designs[name].contents.emulation
-        if emulation is not None and emulation.error > _POOR_EMULATOR:
+        emulator = evaluator.reweighted[name].design.emulator
+        if emulator is not None and emulator.error > _POOR_EMULATOR:
             names.add(name)
     _add_runs(evaluator, nearby, names)
     return short
@@ -207,13 +207,13 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         errors.whole,
         AGREE,
     )
-    names = set(evaluator.designs)
+    names = set(evaluator.reweighted)
     # At most twice as many runs at a time: the estimate of the error is itself uncertain.
     if _needs_runs(evaluator, errors) and _add_runs(
         evaluator, thetas, names, min(2.0, _growth_factor(errors.whole))
     ):
         return True
-    emulated = {name for name in names if evaluator.designs[name].contents.cloud}
+    emulated = {name for name in names if evaluator.reweighted[name].design.is_emulated}
     if not emulated or not errors.points > _SHARE * AGREE:
         return False
     return _enlarge_samples(evaluator, thetas, emulated)
@@ -224,13 +224,13 @@ def runs_left(evaluator: Evaluator, errors: DesignErrors) -> int:
     if not _needs_runs(evaluator, errors):
         return 0
     more = _growth_factor(errors.whole) - 1
-    designs = evaluator.designs.values()
-    return round(sum(min(more * d.n_runs, max(0, d.max_points - d.n_runs)) for d in designs))
+    bounds = evaluator.reweighted.values()
+    return round(sum(min(more * b.n_runs, max(0, b.config.most - b.n_runs)) for b in bounds))
 
 
 def _needs_runs(evaluator: Evaluator, errors: DesignErrors) -> bool:
     """Return whether more runs reduce the designs' error."""
-    is_emulated = all(design.contents.cloud for design in evaluator.designs.values())
+    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     return not is_emulated or errors.emulators > _SHARE * AGREE
 
 
@@ -252,15 +252,15 @@ def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: flo
     names = siblings(evaluator.nodes, names)
     added = []
     for k, node in enumerate(evaluator.nodes):
-        design = node.design
-        if design is None or node.name not in names:
+        bound = node.reweighted
+        if bound is None or node.name not in names:
             continue
-        before = design.n_runs
-        batches = max(1, round((factor - 1) * before / design.batch_size))
-        size = min(batches * design.batch_size, design.max_points - before)
+        previous = bound.n_runs
+        batches = max(1, round((factor - 1) * previous / bound.batch_size))
+        size = min(batches * bound.batch_size, bound.config.most - previous)
         if size > 0:
-            design.add(_components(evaluator, thetas, k), size)
-            added.append(f"{node.name} from {before} to {design.n_runs}")
+            bound.add(_components(evaluator, thetas, k), size)
+            added.append(f"{node.name} from {previous} to {bound.n_runs}")
     if added:
         _log.info("refined: %s runs", ", ".join(added))
     return bool(added)
@@ -295,8 +295,10 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         best = thetas[order]
         # Extend the designs to them.
         names = _undersampled(evaluator, best)
-        _redraw_samples(evaluator, best, names, on_the_way=True)
-        _add_runs(evaluator, best, {name for name in names if _has_room(evaluator.designs[name])})
+        _redraw_samples(evaluator, best, names, same_surfaces=True)
+        _add_runs(
+            evaluator, best, {name for name in names if _has_room(evaluator.reweighted[name])}
+        )
         # Stop where sampling explains the remaining differences.
         spread = values[order[-1]] - values[order[0]]
         noise = sum(noise_floors(evaluator, best[0], FEW_SETS) / scales)
@@ -312,9 +314,9 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
     return best
 
 
-def _has_room(design: Design) -> bool:
+def _has_room(bound: ReweightedBound) -> bool:
     """Return whether a pilot adds runs to a design: emulated samples need none."""
-    return design.contents.cloud is None and design.n_batches <= MAX_ROUNDS
+    return not bound.design.is_emulated and len(bound.design.batch_sizes) <= MAX_ROUNDS
 
 
 def _undersampled(evaluator: Evaluator, thetas: Floats) -> set[str]:
@@ -322,70 +324,68 @@ def _undersampled(evaluator: Evaluator, thetas: Floats) -> set[str]:
     return {
         name
         for name, support in evaluator.support(thetas).items()
-        if np.median(support["weight_ess"]) < evaluator.designs[name].required_ess
+        if np.median(support["weight_ess"]) < evaluator.reweighted[name].required_ess
     }
 
 
 # -- emulated samples ------------------------------------------------------------------------------
 
 
-def _emulated_designs(evaluator: Evaluator, names: set[str]) -> list[tuple[int, Design]]:
+def _emulated_designs(evaluator: Evaluator, names: set[str]) -> list[tuple[int, ReweightedBound]]:
     """Return designs with emulated samples, by position of their simulators.
 
     Those named, and those of simulators that share their specimens.
     """
     names = siblings(evaluator.nodes, names)
     return [
-        (k, node.design)
+        (k, node.reweighted)
         for k, node in enumerate(evaluator.nodes)
-        if node.design is not None and node.design.contents.cloud and node.name in names
+        if node.reweighted is not None and node.reweighted.design.is_emulated and node.name in names
     ]
 
 
 def _redraw_samples(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool = False
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool = False
 ) -> bool:
     """Redraw emulated samples for the populations at thetas; return whether there are any."""
-    designs = _emulated_designs(evaluator, names)
-    for k, design in designs:
-        design.reach(_components(evaluator, thetas, k), on_the_way=on_the_way)
-    return bool(designs)
+    bounds = _emulated_designs(evaluator, names)
+    for k, bound in bounds:
+        bound.reach(_components(evaluator, thetas, k), same_surfaces=same_surfaces)
+    return bool(bounds)
 
 
 def _enlarge_samples(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool = False
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool = False
 ) -> bool:
     """Draw larger samples for the populations at thetas; return whether any could be."""
     is_larger = False
-    for k, design in _emulated_designs(evaluator, names):
-        is_larger |= design.widen(_components(evaluator, thetas, k), on_the_way=on_the_way)
+    for k, bound in _emulated_designs(evaluator, names):
+        is_larger |= bound.widen(_components(evaluator, thetas, k), same_surfaces=same_surfaces)
     return is_larger
 
 
 @contextmanager
 def temporary_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
     """Redraw emulated samples for the populations at thetas within the context."""
-    with _temporary_samples(evaluator, thetas, set(evaluator.designs), on_the_way=True):
+    with _temporary_samples(evaluator, thetas, set(evaluator.reweighted), same_surfaces=True):
         yield
 
 
 @contextmanager
 def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
     """Do the same in designs of a model that was never calibrated, which cover the prior alone."""
-    designs = evaluator.designs.items()
-    names = {name for name, design in designs if len(design.contents.groups) == 1}
-    with _temporary_samples(evaluator, thetas, names, on_the_way=False):
+    bounds = evaluator.reweighted.items()
+    names = {name for name, bound in bounds if len(bound.design.groups) == 1}
+    with _temporary_samples(evaluator, thetas, names, same_surfaces=False):
         yield
 
 
 @contextmanager
 def _temporary_samples(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool
 ) -> Iterator[None]:
-    with ExitStack() as stack:
-        for _, design in _emulated_designs(evaluator, names):
-            stack.enter_context(design.undone())
-        _redraw_samples(evaluator, thetas, names, on_the_way=on_the_way)
+    with designs_restored([bound for _, bound in _emulated_designs(evaluator, names)]):
+        _redraw_samples(evaluator, thetas, names, same_surfaces=same_surfaces)
         yield
 
 
@@ -407,10 +407,10 @@ def refuse(
     reasons = "; ".join(
         f"{name}: the design does not support the answer: {s}" for name, s in short.items()
     )
-    design = evaluator.designs[next(iter(short))]
+    bound = evaluator.reweighted[next(iter(short))]
     raise DesignError(
-        f"{reasons}; narrow the priors, pass a larger prb.Reweighted(n) (now {design.n_runs} runs "
-        f"in all, of at most {design.max_points}), or use prb.Resimulated(n), which has no design"
+        f"{reasons}; narrow the priors, pass a larger prb.Reweighted(n) (now {bound.n_runs} runs "
+        f"in all, of at most {bound.config.most}), or use prb.Resimulated(n), which has no design"
         + "".join(f". {finding}" for finding in findings)
     )
 
@@ -420,7 +420,7 @@ def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
     for node in evaluator.nodes:
         share = lost.get(node.name, 0.0)
         limit = node.bound.max_lost
-        if node.design is None and share > limit:
+        if node.reweighted is None and share > limit:
             raise DesignError(
                 f"{node.name}: lost mass: got {share:.1%} of the population without a response "
                 f"(NaN) at the answer, expected at most max_lost = {limit:.1%}: it would rest on "

@@ -115,7 +115,7 @@ def find_rivals(
     def search() -> list[Rival]:
         return rivals_from_prior(reference, starts=starts, seed=seed)
 
-    if refine and any(design.contents.cloud for design in evaluator.designs.values()):
+    if refine and any(bound.design.is_emulated for bound in evaluator.reweighted.values()):
         rivals = verified_rivals(reference, search())
     else:
         rivals = _supported_rivals(evaluator, search, refine=refine)

@@ -139,7 +139,7 @@ def refine(
                 if not refine_at(evaluator, thetas):
                     break
             refuse(shortcomings(evaluator, thetas), evaluator)
-    return {name: design.n_runs for name, design in evaluator.designs.items()}
+    return {name: bound.n_runs for name, bound in evaluator.reweighted.items()}
 
 
 def _require_thetas(hyperparameters: Hyperparameters, values: Any) -> Floats:
@@ -607,7 +607,11 @@ def _report(problem: _Problem, start: _Start, fit: Fit, rivals: list[Rival]) -> 
 def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> str:
     """Return sentences about edges, designs and directions that are not identified."""
     evaluator = search.evaluator
-    designs = [d.told for d in evaluator.designs.values() if d.contents.emulation is not None]
+    designs = [
+        bound.design.summary(name)
+        for name, bound in evaluator.reweighted.items()
+        if bound.design.is_emulated
+    ]
     sentences = [f"{', '.join(at_edge)} ran to the edge of the support."] if at_edge else []
     sentences += designs
     if designs and np.isfinite(fit.design_error):

@@ -343,7 +343,7 @@ def optimum_of(
         for name, numbers in evaluator.support(theta[None]).items()
     }
     for k, node in enumerate(evaluator.nodes):
-        if node.design is None and is_affordable:
+        if node.reweighted is None and is_affordable:
             support[node.name] = missing_mass(evaluator, theta, k)
     return Optimum(
         point=point,

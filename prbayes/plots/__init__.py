@@ -1,4 +1,4 @@
-"""Pictures of results, alike on every backend of ArviZ."""
+"""Pictures of results, drawn by Matplotlib in panels of ArviZ."""
 
 from prbayes.plots.prediction import plot_prediction
 from prbayes.plots.sensitivity import plot_sensitivity

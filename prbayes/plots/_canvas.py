@@ -1,251 +1,137 @@
-"""What all pictures are drawn on: panels of an ArviZ `PlotCollection`, alike on each backend.
+"""Panels of an ArviZ `PlotCollection`, drawn by Matplotlib, with one legend below them.
 
 Plotting libraries are imported when a canvas is made.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Floats, texts
-from prbayes.plots._colours import ColourScale, draw_colour_bar
-from prbayes.plots._legends import draw_legend, legend_entry
-from prbayes.plots._ticks import Ticks
+from prbayes._validate import Floats, called, texts
 
-# Colours that colour-blind readers tell apart (Okabe and Ito, Color Universal Design, 2008); line
-# styles tell curves apart in grey.
+# Colours that colour-blind readers distinguish (Okabe and Ito, Color Universal Design, 2008); line
+# styles distinguish curves in grey.
 BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"
 VERMILION, PURPLE = "#D55E00", "#CC79A7"
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE)
-# ArviZ's codes, which each backend translates: against the background, styles, markers.
+# Codes of ArviZ for colours against the background, line styles and markers.
 INK, GREY, PALE = "B1", "B2", "B3"
 SOLID, DASHED, DOTTED, DASHDOT = "C0", "C1", "C2", "C3"
 CIRCLE, CROSS, DIAMOND = "C0", "C3", "C4"
 
-
-# What has no artist of its own to keep.
-_OF_AXES = frozenset({"title", "xlabel", "ylabel", "xlim", "ylim", "xticks", "yticks"})
-
-# Those of ArviZ.
-_BACKENDS = ("matplotlib", "bokeh", "plotly", "none")
-
 Limits = tuple[float, float]
+Ticks = tuple[list[float], list[str]]  # positions and labels
 
 
-def grid_settings(
-    panels: int, size: tuple[float, float], backend: str | None, pc_kwargs: dict[str, Any]
-) -> dict[str, Any]:
-    """Return keywords of `PlotCollection.wrap` for so many panels of a size in inches."""
-    arviz: Any = import_module("arviz")
-    backend = backend or arviz.rcParams["plot.backend"]
-
-    # Three panels a row; four make a square
-    settings = {"cols": ["__variable__"], "col_wrap": 2 if panels == 4 else 3, **pc_kwargs}
-    whole = figure_size(settings.pop("figsize", None))
-    columns = min(panels, settings["col_wrap"])
-    rows = -(-panels // columns)
-
-    width, height = size
-    across, down = whole or (width * columns, height * rows)
-    figure = _figure_settings(backend, across, down, rows)
-    figure |= settings.get("figure_kwargs", {})
-    return settings | {"backend": backend, "figure_kwargs": figure}
+def refuse_look(labels: object, pc_kwargs: Mapping[str, Any]) -> None:
+    """Raise if labels are no texts by name, or the size is none, before anything is computed."""
+    if labels is not None:
+        texts(labels, "labels")
+    if "backend" in pc_kwargs:
+        raise TypeError(
+            f"backend: got {called(pc_kwargs['backend'])}, expected none: pictures are drawn by "
+            "Matplotlib"
+        )
+    _figure_size(pc_kwargs.get("figsize"))
 
 
-def figure_size(given: Any) -> tuple[float, float] | None:
-    """Return width and height in inches, as given, or raise.
-
-    Raises
-    ------
-    ValueError
-        If they are not two positive numbers.
-    """
-    if given is None:
+def _figure_size(figsize: Any) -> tuple[float, float] | None:
+    """Return width and height in inches, or raise if they are not two positive numbers."""
+    if figsize is None:
         return None
     try:
-        width, height = map(float, given)
+        width, height = map(float, figsize)
     except (TypeError, ValueError):
-        width = height = math.nan
-    if not (0 < width < math.inf and 0 < height < math.inf):
+        width = height = np.nan
+    if not (0 < width < np.inf and 0 < height < np.inf):
         raise ValueError(
-            f"figsize: got {given!r:.60}, expected width and height of the picture in inches, such "
-            "as (8, 5)"
+            f"figsize: got {figsize!r:.60}, expected width and height of the picture in inches, "
+            "such as (8, 5)"
         )
     return width, height
 
 
-def _figure_settings(backend: str, width: float, height: float, rows: int) -> dict[str, Any]:
-    """Return the keywords of a figure of so many inches."""
-    if backend == "matplotlib":
-        # Its layout makes room for the legend
-        size = (width, height)
-        return {"figsize": size, "figsize_units": "inches", "layout": "constrained"}
-    # By judgement: 100 pixels an inch, and two or three rows of text below the panels for the
-    # legend; bokeh has one below each panel.
-    legend = 70 * rows if backend == "bokeh" else 60
-    across = 100 * width
-    down = 100 * height + legend
-    return {"figsize": (across, down), "figsize_units": "dots"}
-
-
-def refuse_look(labels: object, backend: object, pc_kwargs: Mapping[str, Any]) -> None:
-    """Raise if labels are no texts by name, a size is none, or there is no such backend.
-
-    Before anything is done.
-
-    Raises
-    ------
-    TypeError, ValueError
-        With what was expected.
-    """
-    if labels is not None:
-        texts(labels, "labels")
-    figure_size(pc_kwargs.get("figsize"))
-    if backend is not None and backend not in _BACKENDS:
-        raise ValueError(f"backend: got {backend!r:.60}, expected one of {', '.join(_BACKENDS)}")
-
-
-@dataclass(frozen=True, eq=False)
-class _Call:
-    """A call of a backend's function, without the panel that it is for."""
-
-    function: str
-    data: tuple[Any, ...]
-    keywords: dict[str, Any]
-
-    def on(self, target: Any, library: Any) -> Any:
-        """Make the call on a panel of the backend; return the artist, if there is one to keep."""
-        function = getattr(library, self.function)
-        artist = function(*self.data, target, **self.keywords)
-        if isinstance(artist, list):
-            return None  # plotly's contours, one for each level
-        return artist
-
-
 class Canvas:
-    """Collects what is to be drawn, by visual and panel, and draws it in `finish`.
+    """A figure with named panels, in order, of a size in inches each.
 
-    Parameters
-    ----------
-    panels : sequence of str
-        Names, in order.
-    size : (float, float)
-        Of a panel, in inches.
-    backend : str or None
-        That of ArviZ's settings by default.
-    pc_kwargs : dict
-        For `PlotCollection.wrap`.
+    ``pc_kwargs`` are keywords of `PlotCollection.wrap`, and ``figsize`` of the whole figure.
     """
 
     def __init__(
-        self,
-        panels: Sequence[str],
-        *,
-        size: tuple[float, float],
-        backend: str | None,
-        pc_kwargs: dict[str, Any],
+        self, panels: Sequence[str], *, size: tuple[float, float], pc_kwargs: dict[str, Any]
     ) -> None:
+        # Three panels a row; four make a square.
+        n = len(panels)
+        settings = {"cols": ["__variable__"], "col_wrap": 2 if n == 4 else 3, **pc_kwargs}
+        columns = min(n, settings["col_wrap"])
+        rows = -(-n // columns)
+        figure = {
+            "figsize": _figure_size(settings.pop("figsize", None))
+            or (size[0] * columns, size[1] * rows),
+            "figsize_units": "inches",
+            "layout": "constrained",  # makes room for the legend
+        }
+        settings["figure_kwargs"] = figure | settings.get("figure_kwargs", {})
         arviz: Any = import_module("arviz")
-        settings = grid_settings(len(panels), size, backend, pc_kwargs)
-        self.backend = str(settings["backend"])
-        self._library: Any = import_module(f"arviz_plots.backend.{self.backend}")
-        # One variable for each panel, of a dimension of its own
-        data = xr.Dataset()
-        for name in panels:
-            data[name] = (f"{name} point", np.zeros(2))
-        self._collection: Any = arviz.PlotCollection.wrap(data, **settings)
-        self._calls: dict[str, dict[str, _Call]] = {}
-        self._legend: set[str] = set()
-        self._empty: list[str] = []
-        self._scales: dict[tuple[str, str], ColourScale] = {}  # by visual and panel
+        data = xr.Dataset({name: (f"{name} point", np.zeros(2)) for name in panels})
+        self._collection = arviz.PlotCollection.wrap(data, backend="matplotlib", **settings)
+        library = import_module("arviz_plots.backend.matplotlib")
+        self._panels = {
+            name: Panel(library, self._collection.get_target(name, {})) for name in panels
+        }
 
     def panel(self, name: str) -> Panel:
         """Return the panel of a name, to draw on."""
-        return Panel(self, name)
-
-    def add(
-        self,
-        panel: str,
-        visual: str,
-        function: str,
-        *data: Any,
-        legend: str = "",
-        **keywords: Any,
-    ) -> None:
-        """Plan a call of the backend's function, which will be ``visual`` of the panel."""
-        if legend:
-            first = legend not in self._legend
-            self._legend.add(legend)
-            keywords |= legend_entry(self.backend, legend, first=first)
-        by_panel = self._calls.setdefault(visual, {})
-        by_panel[panel] = _Call(function, data, keywords)
-
-    def leave_empty(self, panel: str) -> None:
-        """Plan to show nothing of a panel, not even its axes."""
-        self._empty.append(panel)
-
-    def tell_colours(self, panel: str, visual: str, scale: ColourScale) -> None:
-        """Plan a bar that says what the colours of ``visual`` mean."""
-        self._scales[visual, panel] = scale
+        return self._panels[name]
 
     def finish(self) -> Any:
-        """Draw everything, with a legend below the panels, and return the `PlotCollection`."""
-        for visual, by_panel in self._calls.items():
-            self._draw(visual, by_panel)
-        for (visual, name), scale in self._scales.items():
-            figure = self._collection.viz["figure"].item()
-            target = self._collection.get_target(name, {})
-            artist = self._collection.viz[visual][name].item()
-            draw_colour_bar(self.backend, figure, target, artist, scale)
-        for name in self._empty:
-            _hide(self.backend, self._collection.get_target(name, {}))
-        if self._legend and self.backend != "none":
-            variables = self._collection.data.data_vars
-            targets = [self._collection.get_target(name, {}) for name in variables]
-            figure = self._collection.viz["figure"].item()
-            draw_legend(self.backend, figure, targets)
+        """Return the `PlotCollection`, with a legend, and the artists by visual and panel."""
+        visuals: dict[str, dict[str, Any]] = {}
+        for name, panel in self._panels.items():
+            for visual, artist in panel.artists.items():
+                cell = np.empty((), dtype=object)
+                cell[()] = artist
+                visuals.setdefault(visual, {})[name] = cell
+        for visual, by_panel in visuals.items():
+            artists = {name: ((), cell) for name, cell in by_panel.items()}
+            self._collection.viz[visual] = xr.DataTree(xr.Dataset(artists))
+        figure = self._collection.viz["figure"].item()
+        draw_legend(figure, [panel.target for panel in self._panels.values()])
         return self._collection
 
-    def _draw(self, visual: str, by_panel: dict[str, _Call]) -> None:
-        """Draw a visual on the panels that have it."""
 
-        def one(da: Any, target: Any, var_name: str, sel: Any, isel: Any) -> Any:
-            return by_panel[var_name].on(target, self._library)
-
-        self._collection.map(
-            one,
-            visual,
-            data=self._collection.data[list(by_panel)],
-            subset_info=True,
-            store_artist=visual not in _OF_AXES,
-        )
-
-
-def _hide(backend: str, target: Any) -> None:
-    """Take the axes of a panel away; its place stays empty."""
-    if backend == "matplotlib":
-        target.set_axis_off()
-    elif backend == "bokeh":
-        target.visible = False
-    elif backend == "plotly":
-        axes = target.figure.get_subplot(target.row, target.col)
-        for axis in (axes.xaxis, axes.yaxis):
-            target.figure.layout[axis.plotly_name] = None
+def draw_legend(figure: Any, targets: list[Any]) -> None:
+    """Draw one legend below all panels, with as many columns as fit and rows of equal length."""
+    handles: dict[str, Any] = {}
+    for target in targets:
+        for handle, text in zip(*target.get_legend_handles_labels(), strict=True):
+            handles.setdefault(text, handle)
+    n = len(handles)
+    if not n:
+        return
+    # An inch takes 11.5 characters of the default font; a mark with its gaps is as wide as eight.
+    characters = sum(len(text) + 8 for text in handles)
+    fitting = max(1, min(n, int(n * 11.5 * figure.get_figwidth() / characters)))
+    rows = -(-n // fitting)
+    columns = -(-n // rows)
+    figure.legend(
+        handles.values(), handles, loc="outside lower center", ncols=columns, frameon=False
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
     """One panel of a canvas; each visual is drawn once on it."""
 
-    canvas: Canvas
-    name: str
+    library: Any  # ArviZ's drawing functions
+    target: Any  # axes of Matplotlib
+    artists: dict[str, Any] = field(default_factory=dict)  # by visual
 
     def line(
         self,
@@ -258,12 +144,13 @@ class Panel:
         width: float | None = 1.8,
         legend: str = "",
     ) -> None:
-        """Draw a line; without a width, of the backend's."""
-        how: dict[str, Any] = {"color": color, "linestyle": style}
+        """Draw a line; without a width, that of Matplotlib's settings."""
+        look: dict[str, Any] = {"label": legend} if legend else {}
         if width is not None:
-            how["width"] = width
-        data = (np.asarray(x), np.asarray(y))
-        self.canvas.add(self.name, visual, "line", *data, legend=legend, **how)
+            look["width"] = width
+        self.artists[visual] = self.library.line(
+            np.asarray(x), np.asarray(y), self.target, color=color, linestyle=style, **look
+        )
 
     def band(
         self,
@@ -275,16 +162,10 @@ class Panel:
         alpha: float = 0.25,
         legend: str = "",
     ) -> None:
-        """Shade what is between two curves, the lower one first."""
-        self.canvas.add(
-            self.name,
-            visual,
-            "fill_between_y",
-            x,
-            *sides,
-            legend=legend,
-            color=color,
-            alpha=alpha,
+        """Shade the area between two curves, the lower one first."""
+        look = {"label": legend} if legend else {}
+        self.artists[visual] = self.library.fill_between_y(
+            x, *sides, self.target, color=color, alpha=alpha, **look
         )
 
     def points(
@@ -299,17 +180,10 @@ class Panel:
         legend: str = "",
     ) -> None:
         """Draw markers of an area, in square points."""
-        if self.canvas.backend == "bokeh":
-            size = size**0.5  # a diameter there
-        self.canvas.add(
-            self.name,
-            visual,
-            "scatter",
-            *np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y)),
-            legend=legend,
-            color=color,
-            marker=marker,
-            size=size,
+        look = {"label": legend} if legend else {}
+        places = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
+        self.artists[visual] = self.library.scatter(
+            *places, self.target, color=color, marker=marker, size=size, **look
         )
 
     def heights(
@@ -318,37 +192,28 @@ class Panel:
         axes: tuple[Floats, Floats],
         z: Floats,
         levels: Floats,
-        scale: ColourScale,
+        ticks: Ticks,
+        name: str,
     ) -> None:
-        """Draw heights over a plane, z of shape (x, y): colours from dark to light, and contours.
+        """Draw heights, (x, y), as colours from dark to light with contours and a colour bar.
 
-        The levels are even; what is above the last has the colour of the last. A bar says what the
-        colours mean.
+        Heights above the last level have its colour. The bar has the ticks and the name.
         """
-        self.canvas.tell_colours(self.name, visual, scale)
-        how: dict[str, Any] = {"levels": levels, "cmap": "cividis", "alpha": 0.45}
-        if self.canvas.backend == "plotly":  # would choose levels of its own
-            how["contours"] = {
-                "start": levels[0],
-                "end": levels[-1],
-                "size": levels[1] - levels[0],
-            }
-        below = np.minimum(z, levels[-1])
-        self.canvas.add(self.name, visual, "contourf", *axes, below, **how)
-        self.canvas.add(
-            self.name,
-            f"{visual}_lines",
-            "contour",
-            *axes,
-            z,
-            levels=levels[1:-1],
-            color=GREY,
-            alpha=0.6,
+        filled = self.library.contourf(
+            *axes, np.minimum(z, levels[-1]), self.target, levels=levels, cmap="cividis", alpha=0.45
         )
+        lines = self.library.contour(
+            *axes, z, self.target, levels=levels[1:-1], color=GREY, alpha=0.6
+        )
+        self.artists.update({visual: filled, f"{visual}_lines": lines})
+        bar = self.target.figure.colorbar(filled, ax=self.target)
+        places, labels = ticks
+        bar.set_ticks(places, labels=labels)
+        bar.set_label(name)
 
     def blank(self) -> None:
-        """Leave the panel empty, without axes: a place that holds the others apart."""
-        self.canvas.leave_empty(self.name)
+        """Leave the panel empty, without axes."""
+        self.target.set_axis_off()
 
     def axes(
         self,
@@ -361,16 +226,54 @@ class Panel:
         xticks: Ticks | None = None,
         yticks: Ticks | None = None,
     ) -> None:
-        """Name the axes, and say what they cover; what is not given is left to the backend."""
-        given: dict[str, tuple[Any, ...]] = {}
-        for what, text in (("title", title), ("xlabel", x), ("ylabel", y)):
-            if text:
-                given[what] = (text,)
-        for what, limits in (("xlim", xlim), ("ylim", ylim)):
-            if limits is not None:
-                given[what] = (limits,)
-        for what, ticks in (("xticks", xticks), ("yticks", yticks)):
-            if ticks is not None:
-                given[what] = ticks
-        for what, data in given.items():
-            self.canvas.add(self.name, what, what, *data)
+        """Set labels, limits and ticks of the axes; the rest is left to Matplotlib."""
+        settings = {"title": title, "xlabel": x, "ylabel": y, "xlim": xlim, "ylim": ylim}
+        self.target.set(**{key: value for key, value in settings.items() if value})
+        if xticks is not None:
+            self.target.set_xticks(*xticks)
+        if yticks is not None:
+            self.target.set_yticks(*yticks)
+
+
+# -- ticks -----------------------------------------------------------------------------------
+
+
+def round_ticks(low: float, high: float) -> Ticks:
+    """Return up to five round numbers within a range, and their labels."""
+    from matplotlib.ticker import MaxNLocator  # heavy, and only needed for pictures
+
+    places = np.asarray(MaxNLocator(5, steps=[1.0, 2.0, 2.5, 5.0, 10.0]).tick_values(low, high))
+    step = places[1] - places[0]
+    rounding = 1e-9 * step
+    places = places[(places >= low - rounding) & (places <= high + rounding)]
+    return places.tolist(), ["0" if abs(x) < step / 2 else f"{x:.12g}" for x in places]
+
+
+def spans_decades(values: Floats) -> bool:
+    """Return whether logarithms show values better: all are positive, the largest 20 times more."""
+    finite = values[np.isfinite(values)]
+    if not finite.size or finite.min() <= 0:
+        return False
+    return bool(finite.max() > 20 * finite.min())
+
+
+def log_ticks(values: Floats) -> Ticks:
+    """Return ticks of positive values: positions as base-10 logarithms, labels of the values."""
+    finite = values[np.isfinite(values)]
+    logs = np.log10(finite[finite > 0])
+    low = logs.min()
+    high = logs.max()
+    # At most six powers of ten; 1, 2, 5 within two decades.
+    powers = np.arange(np.floor(low), np.ceil(high) + 1)
+    step = -(-powers.size // 6)
+    factors = (1, 2, 5) if high - low < 2 else (1,)
+    margin = 0.05 * (high - low) + 1e-9  # the axis reaches a little beyond the values
+    places: list[float] = []
+    labels: list[str] = []
+    for power in powers[::step]:
+        for factor in factors:
+            place = power + np.log10(factor)
+            if low - margin <= place <= high + margin:
+                places.append(float(place))
+                labels.append(f"{factor * 10.0**power:g}")
+    return places, labels

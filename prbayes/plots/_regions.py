@@ -9,19 +9,6 @@ from scipy.ndimage import gaussian_filter
 
 from prbayes._validate import Floats
 
-# Cells along each axis of the plane; a cell is a fifth of the narrowest kernel that has them all
-# within sight, and an outline looks smooth.
-_CELLS = 160
-# How far the plane reaches, in standard deviations of the points: 1.8e-4 of a normal population are
-# beyond, and those of a longer tail are outside any region that is drawn.
-_PLANE = 4.2
-# Part of the largest spread that the narrowest one is taken for, so that points on a line have a
-# region: thinner than the line it is drawn with.
-_NARROWEST = 1e-3
-# Part of a population, at either end, that does not tell how wide it is: where responses diverge, a
-# few specimens would decide the kernel's width. A normal spread is then known to 3%.
-_FAR_TAIL = 0.01
-
 
 @dataclass(frozen=True, eq=False)
 class White:
@@ -32,8 +19,18 @@ class White:
 
     @classmethod
     def of(cls, points: Floats, weights: Floats) -> White:
-        """Return the coordinates of points, (n, 2), with weights of sum 1; without far tails."""
-        points = _within(points, weights)
+        """Return the coordinates of points, (n, 2), with weights of sum 1.
+
+        The tails beyond 1% at either end are clipped: where responses diverge, a few specimens
+        would decide the width.
+        """
+        clipped = []
+        for column in points.T:
+            order = np.argsort(column, kind="stable")
+            low, high = np.searchsorted(np.cumsum(weights[order]), [0.01, 0.99])
+            ends = column[order[[low, min(high, column.size - 1)]]]
+            clipped.append(np.clip(column, ends[0], ends[1]))
+        points = np.column_stack(clipped)
         center = weights @ points
         deviations = points - center
         spread = np.sqrt(weights @ deviations**2)
@@ -41,10 +38,9 @@ class White:
         scaled = deviations / unit
         covariance = scaled.T @ (weights[:, None] * scaled)
         variances, vectors = np.linalg.eigh(covariance)
-        largest = max(float(variances[-1]), 1e-300)
-        least = largest * _NARROWEST**2
-        steps = np.sqrt(np.maximum(variances, least))
-        return cls(center, unit[:, None] * vectors * steps)
+        # Points on a line have a region too, thinner than its outline.
+        least = max(float(variances[-1]), 1e-300) * 1e-3**2
+        return cls(center, unit[:, None] * vectors * np.sqrt(np.maximum(variances, least)))
 
     def of_points(self, points: Floats) -> Floats:
         """Return coordinates of points, (n, 2)."""
@@ -55,31 +51,19 @@ class White:
         return self.center + coordinates @ self.axes.T
 
 
-def _within(points: Floats, weights: Floats) -> Floats:
-    """Return points with what is far out moved to where few are, in each coordinate."""
-    moved = []
-    for column in points.T:
-        order = np.argsort(column, kind="stable")
-        below = np.cumsum(weights[order])
-        low, high = np.searchsorted(below, [_FAR_TAIL, 1 - _FAR_TAIL])
-        ends = column[order[[low, min(high, column.size - 1)]]]
-        moved.append(np.clip(column, ends[0], ends[1]))
-    return np.column_stack(moved)
+def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[Floats]:
+    """Return for each probability the outline of the smallest region that contains it.
 
-
-def outlines(points: Floats, weights: Floats, shares: tuple[float, ...]) -> list[Floats]:
-    """Return for each share the outline of the smallest region that holds it.
-
-    The density is that of a Gaussian kernel along the points' own principal axes, by Scott's rule
-    for the effective number of points, whose inflation of their spread is taken back: of a normal
-    population the regions are its ellipses.
+    The density is that of a Gaussian kernel along the points' principal axes, by Scott's rule for
+    the effective number of points. The kernel's inflation of the spread is removed: the regions of
+    a normal population are its ellipses.
 
     Parameters
     ----------
     points : ndarray, shape (n, 2)
         Finite.
     weights : ndarray, shape (n,)
-    shares : tuple of float
+    probs : tuple of float
 
     Returns
     -------
@@ -88,41 +72,36 @@ def outlines(points: Floats, weights: Floats, shares: tuple[float, ...]) -> list
     """
     w = weights / weights.sum()
     white = White.of(points, w)
-    coordinates = white.of_points(points)
-
-    # Weights in cells, smoothed
-    edges = np.linspace(-_PLANE, _PLANE, _CELLS + 1)
-    x, y = coordinates.T
+    # Cells on a plane of 4.2 standard deviations: 2e-4 of a normal population are beyond. A cell is
+    # a fifth of the narrowest kernel for which the plane matters.
+    edges = np.linspace(-4.2, 4.2, 161)
+    x, y = white.of_points(points).T
     masses, *_ = np.histogram2d(x, y, bins=[edges, edges], weights=w)
     bandwidth = np.sum(w**2) ** (1 / 6)  # n ** (-1 / 6)
-    step = edges[1] - edges[0]
-    density = gaussian_filter(masses, bandwidth / step, mode="constant")
+    density = gaussian_filter(masses, bandwidth / (edges[1] - edges[0]), mode="constant")
 
-    shrunk = 1 / np.sqrt(1 + bandwidth**2)
+    deflation = 1 / np.sqrt(1 + bandwidth**2)
     middles = (edges[:-1] + edges[1:]) / 2
-    found = []
-    for share in shares:
-        lines = _contour(middles, density, _threshold(density, share))
-        placed = [white.points(shrunk * line) for line in lines]
-        found.append(_joined(placed))
-    return found
+    joined = []
+    for prob in probs:
+        lines = _contour(middles, density, _threshold(density, prob))
+        joined.append(_joined([white.points(deflation * line) for line in lines]))
+    return joined
 
 
-def _threshold(density: Floats, share: float) -> float:
-    """Return the density above which a share is, where all sums to one, or less on the plane."""
-    # What is beyond the plane is thinner than all on it
+def _threshold(density: Floats, prob: float) -> float:
+    """Return the density above which a probability lies, of a density that sums to at most one."""
     descending = np.sort(density.ravel())[::-1]
-    total = np.cumsum(descending)
     last = np.count_nonzero(descending) - 1
-    return float(descending[min(np.searchsorted(total, share), last)])
+    return float(descending[min(np.searchsorted(np.cumsum(descending), prob), last)])
 
 
 def _contour(middles: Floats, density: Floats, level: float) -> list[Floats]:
     """Return lines of one height, (k, 2) each, of a density over (x, y)."""
     from matplotlib.figure import Figure  # heavy, and only needed for pictures
 
-    drawn = Figure().add_subplot().contour(middles, middles, density.T, levels=[level])
-    return [np.asarray(line) for line in drawn.allsegs[0] if len(line) > 1]
+    contours = Figure().add_subplot().contour(middles, middles, density.T, levels=[level])
+    return [np.asarray(line) for line in contours.allsegs[0] if len(line) > 1]
 
 
 def _joined(lines: list[Floats]) -> Floats:

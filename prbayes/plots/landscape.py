@@ -14,15 +14,15 @@ from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel, refuse_look
-from prbayes.plots._colours import ColourScale
-from prbayes.plots._grid import Landscape, landscape, rooted
-from prbayes.plots._names import named, refuse_labels
-from prbayes.plots._objective import check_optimum, free_names, objective_label
-
-# Points along each axis, by the number of hyperparameters: contours of 41 look smooth, and as many
-# evaluations are drawn in about a second; a curve can have more. By judgement.
-_ALONG_AXIS = {1: 161, 2: 41}
-_PATH = "path of the optimiser"
+from prbayes.plots._labels import named, refuse_labels
+from prbayes.plots._landscape_data import (
+    Landscape,
+    check_optimum,
+    free_names,
+    landscape,
+    objective_label,
+    rooted,
+)
 
 
 @locked
@@ -34,7 +34,6 @@ def plot_landscape(
     points: int | None = None,
     responses: int = 0,
     labels: Mapping[str, str] | None = None,
-    backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
     """Draw the objective around the optimum over two hyperparameters, with the optimiser's path.
@@ -62,8 +61,6 @@ def plot_landscape(
         `Resimulated` and `Fresh` every point of the picture costs n for each simulator.
     labels : mapping, optional
         What a reader calls a hyperparameter, by its name, with units.
-    backend : {"matplotlib", "bokeh", "plotly"}, optional
-        That of ArviZ's settings by default.
     **pc_kwargs
         ``figsize=(8, 5)``, in inches, of the whole picture; others go to
         ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
@@ -88,53 +85,46 @@ def plot_landscape(
     ...     y = prb.Simulator(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> prb.plot_landscape(prb.minimize(model), backend="none").viz["optimum"].name
+    >>> prb.plot_landscape(prb.minimize(model)).viz["optimum"].name
     'optimum'
     """
-    refuse_look(labels, backend, pc_kwargs)
+    refuse_look(labels, pc_kwargs)
     positive_integer(responses, "responses", minimum=0)
     check_optimum(optimum, "plot_landscape")
     evaluator = _evaluator_of(optimum, model)
-    known = free_names(optimum)
-    names = _chosen(pair, known)
-    refuse_labels(labels, known, evaluator=evaluator)
+    hyperparameters = free_names(optimum)
+    names = _axis_names(pair, hyperparameters)
+    refuse_labels(labels, hyperparameters, evaluator=evaluator)
     if points is None:
-        points = _ALONG_AXIS[len(names)]
+        points = 161 if len(names) == 1 else 41  # contours look smooth, in about a second
     else:
         points = positive_integer(points, "points", minimum=5)  # fewer show no bowl
     _check_cost(evaluator, points ** len(names), responses)
 
-    found = landscape(optimum, evaluator, names, points)
-    if not np.isfinite(found.heights).any():
+    surface = landscape(optimum, evaluator, names, points)
+    if not np.isfinite(surface.heights).any():
         raise ValueError(
             "plot_landscape: got no finite objective, expected some around the optimum; look at "
             "its message"
         )
-    others = [name for name in known if name not in names]
-    listed = ", ".join(named(name, labels) for name in others)
-    held = f"{listed} held at the optimum" if others else ""
-
-    canvas = Canvas(["landscape"], size=(6.4, 5.4), backend=backend, pc_kwargs=pc_kwargs)
+    fixed = [named(name, labels) for name in hyperparameters if name not in names]
+    title = f"{', '.join(fixed)} held at the optimum" if fixed else ""
+    objective = objective_label(optimum)
+    canvas = Canvas(["landscape"], size=(6.4, 5.4), pc_kwargs=pc_kwargs)
     panel = canvas.panel("landscape")
-    height = objective_label(optimum)
     x = named(names[0], labels)
+    xlim, *ylim = [(float(axis[0]), float(axis[-1])) for axis in surface.axes]
     if len(names) == 1:
-        _draw_curve(panel, found, alone=not others)
-        panel.axes(x=x, y=height, title=held, xlim=_ends(found.axes[0]))
+        _draw_curve(panel, surface, alone=not fixed)
+        panel.axes(x=x, y=objective, title=title, xlim=xlim)
     else:
-        _draw_plane(panel, found, height)
-        panel.axes(
-            x=x,
-            y=named(names[1], labels),
-            title=held,
-            xlim=_ends(found.axes[0]),
-            ylim=_ends(found.axes[1]),
-        )
+        _draw_plane(panel, surface, objective)
+        panel.axes(x=x, y=named(names[1], labels), title=title, xlim=xlim, ylim=ylim[0])
     return canvas.finish()
 
 
 def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
-    """Return the optimum's own evaluator, or one of another model with the same hyperparameters."""
+    """Return the optimum's evaluator, or that of another model with the same hyperparameters."""
     if model is None or model is optimum.model:
         return optimum.evaluator
     require_of_model(optimum, model, "plot_landscape", Level.POPULATIONS)
@@ -149,90 +139,80 @@ def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
     return evaluator
 
 
-def _chosen(pair: Sequence[str] | None, known: list[str]) -> list[str]:
-    """Return the one or two hyperparameters that are asked for, of those known."""
+def _axis_names(pair: Sequence[str] | None, hyperparameters: list[str]) -> list[str]:
+    """Return the one or two hyperparameters along the axes."""
     if pair is None:
-        return known[:2]
+        return hyperparameters[:2]
     if not isinstance(pair, str | Sequence):
-        raise TypeError(f"pair: got {called(pair)}, expected one or two of {known}")
+        raise TypeError(f"pair: got {called(pair)}, expected one or two of {hyperparameters}")
     names = [pair] if isinstance(pair, str) else list(pair)
-    different = set(names)
-    allowed = different <= set(known) and len(different) == len(names)
-    if not allowed or len(names) not in _ALONG_AXIS:
-        raise KeyError(f"pair: got {pair}, expected one or two of {known}")
+    are_different = len(set(names)) == len(names)
+    if len(names) not in (1, 2) or not are_different or not set(names) <= set(hyperparameters):
+        raise KeyError(f"pair: got {pair}, expected one or two of {hyperparameters}")
     return names
 
 
-def _check_cost(evaluator: Evaluator, points: int, responses: int) -> None:
-    """Refuse to compute more responses than allowed."""
-    each = evaluator.responses_per_theta
-    cost = points * each
+def _check_cost(evaluator: Evaluator, n_points: int, responses: int) -> None:
+    """Raise if the picture would compute more responses than allowed."""
+    cost = n_points * evaluator.responses_per_theta
     if cost > responses:
         raise ValueError(
-            f"plot_landscape: got responses={responses}, expected at least {cost}: {points} points "
-            f"with {each} responses each; pass responses={cost}, fewer points, or use "
-            "prb.Reweighted(), whose pictures cost none"
+            f"plot_landscape: got responses={responses}, expected at least {cost}: {n_points} "
+            f"points with {evaluator.responses_per_theta} responses each; pass responses={cost}, "
+            "fewer points, or use prb.Reweighted(), whose pictures cost none"
         )
 
 
-def _ends(axis: Floats) -> tuple[float, float]:
-    return float(axis[0]), float(axis[-1])
+def _draw_plane(panel: Panel, surface: Landscape, objective: str) -> None:
+    """Draw the objective over two hyperparameters, with the path and a colour bar."""
+    roots, low, high = rooted(surface.heights)
+    first, second = surface.axes
+    levels = np.linspace(0, 1, 11)
+    places = levels[::2]
+    ticks = (places.tolist(), distinct_texts(low + places**2 * (high - low)))
+    panel.heights("landscape", (first, second), roots, levels, ticks, objective)
+    x, y = surface.path.T
+    panel.line("path", x, y, INK, width=1.0)
+    _draw_marks(panel, (x, y), surface.optimum.T, surface.local_optima.T)
 
 
-def told_apart(values: Floats) -> tuple[str, ...]:
-    """Return numbers with three digits, or as many more, up to eight, as tell them apart."""
+def distinct_texts(values: Floats) -> list[str]:
+    """Return numbers with three digits, or up to eight until they differ."""
     for digits in range(3, 9):
-        texts = tuple(f"{value:.{digits}g}" for value in values)
+        texts = [f"{value:.{digits}g}" for value in values]
         if len(set(texts)) == len(texts):
             break
     return texts
 
 
-def _draw_plane(panel: Panel, found: Landscape, height: str) -> None:
-    """Draw the objective over two hyperparameters, with a bar of its values by its name."""
-    roots, low, high = rooted(found.heights)
-    first, second = found.axes
-    levels = np.linspace(0, 1, 11)
-    told = levels[::2]
-    values = low + told**2 * (high - low)
-    texts = told_apart(values)
-    scale = ColourScale(tuple(told.tolist()), texts, height)
-    panel.heights("landscape", (first, second), roots, levels, scale)
-    x, y = found.path.T
-    panel.line("path", x, y, INK, width=1.0)
-    panel.points("asked", x, y, INK, size=14, legend=_PATH)
-    _draw_optima(panel, found.optimum.T, found.rivals.T)
-
-
-def _draw_curve(panel: Panel, found: Landscape, *, alone: bool) -> None:
+def _draw_curve(panel: Panel, surface: Landscape, *, alone: bool) -> None:
     """Draw the objective over one hyperparameter.
 
     Path and other optima lie on the curve only if there are no other hyperparameters.
     """
-    known = np.isfinite(found.heights)
-    (axis,) = found.axes
-    curve = (axis[known], found.heights[known])
-    panel.line("landscape", *curve, BLUE)
-    rivals = found.rivals[:0]
-    if alone:
-        rivals = found.rivals
-        x, y = _on_curve(found.path, *curve)
-        panel.points("asked", x, y, INK, size=14, legend=_PATH)
-    _draw_optima(panel, _on_curve(found.optimum, *curve), _on_curve(rivals, *curve))
+    finite = np.isfinite(surface.heights)
+    x = surface.axes[0][finite]
+    heights = surface.heights[finite]
+
+    def on_curve(places: Floats) -> Floats:
+        """Return the places, (m, 1), that the curve covers, with its heights: (2, m)."""
+        at = places[:, 0]
+        at = at[(at >= x[0]) & (at <= x[-1])]
+        return np.stack([at, np.interp(at, x, heights)])
+
+    panel.line("landscape", x, heights, BLUE)
+    path = on_curve(surface.path) if alone else None
+    local_optima = surface.local_optima if alone else surface.local_optima[:0]
+    _draw_marks(panel, path, on_curve(surface.optimum), on_curve(local_optima))
 
 
-def _on_curve(places: Floats, x: Floats, heights: Floats) -> Floats:
-    """Return those places, shape (m, 1), that a curve covers, with its heights: shape (2, m)."""
-    at = places[:, 0]
-    covered = (at >= x[0]) & (at <= x[-1])
-    at = at[covered]
-    return np.stack([at, np.interp(at, x, heights)])
-
-
-def _draw_optima(panel: Panel, optimum: Floats, rivals: Floats) -> None:
-    """Mark the optimum and its rivals, shape (2, m) each."""
+def _draw_marks(panel: Panel, path: Any, optimum: Floats, local_optima: Floats) -> None:
+    """Mark points of the path, the optimum and other optima, shape (2, m) each."""
+    if path is not None:
+        x, y = path
+        panel.points("asked", x, y, INK, size=14, legend="path of the optimiser")
     x, y = optimum
     panel.points("optimum", x, y, VERMILION, marker=DIAMOND, size=90, legend="optimum")
-    if rivals.size:
-        x, y = rivals
+    if local_optima.size:
+        x, y = local_optima
         panel.points("rivals", x, y, VERMILION, marker=CROSS, size=70, legend="other optima")

@@ -9,23 +9,31 @@ import numpy as np
 
 from prbayes._validate import Floats
 from prbayes.optimize.optimum import Optimum
-from prbayes.plots._canvas import BLUE, DASHED, GREY, VERMILION, Canvas, Panel, refuse_look
-from prbayes.plots._names import named, refuse_labels
-from prbayes.plots._objective import (
+from prbayes.plots._canvas import (
+    BLUE,
+    DASHED,
+    GREY,
+    VERMILION,
+    Canvas,
+    Panel,
+    log_ticks,
+    refuse_look,
+    spans_decades,
+)
+from prbayes.plots._labels import named, refuse_labels
+from prbayes.plots._landscape_data import (
     check_optimum,
     free_elements,
     free_names,
     objective,
     objective_label,
 )
-from prbayes.plots._ticks import log_ticks, spans_decades
 
 
 def plot_optimizer(
     optimum: Optimum,
     *,
     labels: Mapping[str, str] | None = None,
-    backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
     """Draw the objective and hyperparameters that an optimiser asked for, by evaluation.
@@ -43,8 +51,6 @@ def plot_optimizer(
         From `minimize`.
     labels : mapping, optional
         What a reader calls a hyperparameter, by its name, with units.
-    backend : {"matplotlib", "bokeh", "plotly"}, optional
-        That of ArviZ's settings by default.
     **pc_kwargs
         ``figsize=(8, 5)``, in inches, of the whole picture; others go to
         ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
@@ -68,54 +74,47 @@ def plot_optimizer(
     ...     y = prb.Simulator(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> list(prb.plot_optimizer(prb.minimize(model), backend="none").viz["asked"])
+    >>> list(prb.plot_optimizer(prb.minimize(model)).viz["asked"])
     ['discrepancy', 'mu']
     """
-    refuse_look(labels, backend, pc_kwargs)
+    refuse_look(labels, pc_kwargs)
     check_optimum(optimum, "plot_optimizer")
     path = free_elements(optimum.evaluator, optimum.search.trace["theta"])
     final = free_elements(optimum.evaluator, optimum.theta[None])
     hyperparameters = free_names(optimum)
-    names = ["discrepancy", *hyperparameters]
     refuse_labels(labels, hyperparameters, evaluator=optimum.evaluator)
-    canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
+    canvas = Canvas(["discrepancy", *hyperparameters], size=(4.6, 3.4), pc_kwargs=pc_kwargs)
     evaluations = optimum.search.trace["evaluations"].astype(np.float64)
     _draw_objective(canvas.panel("discrepancy"), optimum, evaluations)
     ends = evaluations[[0, -1]]
     for name in hyperparameters:
-        values = path[name]
         panel = canvas.panel(name)
-        at = np.repeat(final[name], 2)
-        panel.line("path", evaluations, values, GREY, width=0.8)
-        panel.points("asked", evaluations, values, GREY, size=16, legend="evaluated")
-        panel.line("optimum", ends, at, VERMILION, style=DASHED, legend="optimum")
+        panel.line("path", evaluations, path[name], GREY, width=0.8)
+        panel.points("asked", evaluations, path[name], GREY, size=16, legend="evaluated")
+        level = np.repeat(final[name], 2)
+        panel.line("optimum", ends, level, VERMILION, style=DASHED, legend="optimum")
         panel.axes(x="evaluations", y=named(name, labels))
     return canvas.finish()
 
 
 def _draw_objective(panel: Panel, optimum: Optimum, evaluations: Floats) -> None:
     """Draw the objective of each point, and the lowest so far."""
-    # Anew with the final design and scales, where that costs no response
-    free = not optimum.evaluator.responses_per_theta
-    if free:
+    # Recomputed with the final design and scales, where that costs no response
+    is_free = not optimum.evaluator.responses_per_theta
+    values = optimum.search.trace["discrepancy"]
+    if is_free:
         values = objective(optimum, optimum.evaluator, optimum.search.trace["theta"])
-    else:
-        values = optimum.search.trace["discrepancy"]
-    shown = np.where(np.isfinite(values), values, np.nan)
-    best = np.fmin.accumulate(shown)
-
-    # On an axis of logarithms where it falls by orders of magnitude
+    values = np.where(np.isfinite(values), values, np.nan)
+    best = np.fmin.accumulate(values)
     ticks = None
-    if spans_decades(shown):
-        ticks = log_ticks(shown)
-        shown = np.log10(shown)
+    if spans_decades(values):
+        ticks = log_ticks(values)
+        values = np.log10(values)
         best = np.log10(best)
-
-    known = np.isfinite(shown)
-    x = evaluations[known]
-    y = shown[known]
-    panel.points("asked", x, y, GREY, size=16, legend="evaluated")
+    finite = np.isfinite(values)
+    x = evaluations[finite]
+    panel.points("asked", x, values[finite], GREY, size=16, legend="evaluated")
     # Values of different scales cannot be compared
-    if free or len(optimum.scales) == 1:
-        panel.line("best", x, best[known], BLUE, legend="lowest so far")
+    if is_free or len(optimum.scales) == 1:
+        panel.line("best", x, best[finite], BLUE, legend="lowest so far")
     panel.axes(x="evaluations", y=objective_label(optimum), yticks=ticks)

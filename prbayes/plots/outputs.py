@@ -10,28 +10,31 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._finding import Finding, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, positive_integer
-from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
-from prbayes.plots._canvas import BLUE, DASHED, INK, VERMILION, Canvas, Limits, Panel, refuse_look
-from prbayes.plots._curves import central_range
-from prbayes.plots._ensemble import read_before, read_result, supported
-from prbayes.plots._names import refuse_labels
+from prbayes.plots._canvas import (
+    BLUE,
+    DASHED,
+    INK,
+    SOLID,
+    VERMILION,
+    Canvas,
+    Limits,
+    Panel,
+    refuse_look,
+    round_ticks,
+)
+from prbayes.plots._curves import axis_range, central_range
+from prbayes.plots._ensemble import if_supported, read_before, read_result
+from prbayes.plots._labels import refuse_labels
 from prbayes.plots._panels import Output, outputs_of
 from prbayes.plots._regions import outlines
-from prbayes.plots._ticks import round_ticks
 
-# Outputs of a picture unless others are asked for: ten pairs, by judgement; and of a curve, whose
-# neighbours look alike.
-_SHOWN, _OF_MANY = 5, 4
-# More pairs than those of so many outputs are too small to be read.
+# Most outputs of one picture: the pairs of more are too small to be read.
 _MOST = 7
-# Shares of the population within the lines.
-_SHARES = (0.5, INTERVAL)
 
 
 @locked
@@ -44,7 +47,6 @@ def plot_outputs(
     before: Mapping[str, Any] | bool | None = None,
     n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
-    backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
     """Draw pairs of outputs of a simulator: measured specimens in the calibrated population.
@@ -72,8 +74,6 @@ def plot_outputs(
         elsewhere, where each costs n responses.
     labels : mapping, optional
         What a reader calls an output, by its name, with units.
-    backend : {"matplotlib", "bokeh", "plotly"}, optional
-        That of ArviZ's settings by default.
     **pc_kwargs
         ``figsize=(8, 5)``, in inches, of the whole picture; others go to
         ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
@@ -112,71 +112,61 @@ def plot_outputs(
     ...     y = prb.Simulator(
     ...         "y", response, a, b, metric=metric, observed=data, propagation=cheap
     ...     )
-    >>> list(prb.plot_outputs(prb.minimize(model), backend="none").viz["measured"])
+    >>> list(prb.plot_outputs(prb.minimize(model)).viz["measured"])
     ['life, load']
     """
-    refuse_look(labels, backend, pc_kwargs)
+    refuse_look(labels, pc_kwargs)
     if n_draws is not None:
         positive_integer(n_draws, "n_draws")
-    shown = read_result(result, model, "prb.plot_outputs", n_draws)
-    evaluator = shown.evaluator
-    start, what = read_before(result, evaluator, before)
-    k = _simulator(evaluator, simulator)
-    chosen = _chosen(evaluator, k, outputs)
+    ensemble = read_result(result, model, "prb.plot_outputs", n_draws)
+    evaluator = ensemble.evaluator
+    start, text = read_before(result, evaluator, before)
+    k = _simulator_index(evaluator, simulator)
+    columns = _shown_outputs(evaluator, k, outputs)
     refuse_labels(labels, evaluator.simulators[k].outputs.names, evaluator=evaluator)
-    if len(start) and not supported(evaluator, start)[0]:
-        report(
-            Finding(
-                "population-left-out",
-                f"plot_outputs: before ({what}): left out, because stored responses do not reach "
-                "there.",
-            )
-        )
-        start = start[:0]
-    thetas = shown.center if len(shown.center) else shown.thetas
-    after = _Population.of(evaluator, thetas, k)
+    start = if_supported(evaluator, start, f"plot_outputs: before ({text})")
+    after = _Population.of(evaluator, ensemble.mixture, k)
     earlier = _Population.of(evaluator, start, k) if len(start) else None
-    limits = {output.name: _covered(output, after, earlier) for output in chosen}
+    limits = [_axis_limits(output, after, earlier) for output in columns]
 
-    # One column less than outputs, and one row
-    size = len(chosen) - 1
-    pairs = {(i, j): _pair(chosen[i + 1], chosen[j]) for i in range(size) for j in range(size)}
+    # A triangle of pairs: one column less than outputs, and one row
+    size = len(columns) - 1
+    names = {
+        (i, j): ", ".join(columns[c].name.partition("[")[2][:-1] for c in (i + 1, j))
+        for i in range(size)
+        for j in range(size)
+    }
     side = 5.4 if size == 1 else 3.4
     canvas = Canvas(
-        list(pairs.values()),
-        size=(side, side),
-        backend=backend,
-        pc_kwargs={"col_wrap": size, **pc_kwargs},
+        list(names.values()), size=(side, side), pc_kwargs={"col_wrap": size, **pc_kwargs}
     )
-    for (i, j), name in pairs.items():
+    calibrated = f"calibrated: {ensemble.label}, 50% and {INTERVAL:.0%}"
+    for (i, j), name in names.items():
         panel = canvas.panel(name)
         if j > i:
             panel.blank()
             continue
-        x = chosen[j]
-        y = chosen[i + 1]
+        x = columns[j]
+        y = columns[i + 1]
         if earlier is not None:
-            _draw_regions(panel, "before", earlier, (x, y), VERMILION, DASHED, f"before: {what}")
-        text = f"calibrated: {shown.label}, {_SHARES[0]:.0%} and {_SHARES[1]:.0%}"
-        calibrated = _draw_regions(panel, "after", after, (x, y), BLUE, "C0", text)
-        measured = _draw_measured(panel, x, y)
+            earlier.draw(panel, "before", (x, y), VERMILION, DASHED, f"before: {text}")
+        correlation = after.draw(panel, "after", (x, y), BLUE, SOLID, calibrated)
+        titles = [_written(_draw_measured(panel, x, y)), _written(correlation)]
         # Names on the left and below all panels
-        across = limits[x.name]
-        up = limits[y.name]
         panel.axes(
             x=x.text(labels) if i == size - 1 else "",
             y=y.text(labels) if j == 0 else "",
-            title=_title(measured, calibrated),
-            xlim=across,
-            ylim=up,
-            xticks=round_ticks(*across),
-            yticks=round_ticks(*up),
+            title=f"rank correlation\nmeasured {titles[0]}, calibrated {titles[1]}",
+            xlim=limits[j],
+            ylim=limits[i + 1],
+            xticks=round_ticks(*limits[j]),
+            yticks=round_ticks(*limits[i + 1]),
         )
     return canvas.finish()
 
 
-def _simulator(evaluator: Evaluator, wanted: str | None) -> int:
-    """Return which simulator is drawn: the one of a name, or the first with several outputs."""
+def _simulator_index(evaluator: Evaluator, simulator: str | None) -> int:
+    """Return the index of a simulator by name, or of the first with several outputs."""
     names = [node.name for node in evaluator.simulators]
     several = [node.name for node in evaluator.simulators if len(node.outputs.labels) > 1]
     if not several:
@@ -184,66 +174,50 @@ def _simulator(evaluator: Evaluator, wanted: str | None) -> int:
             f"plot_outputs: got simulators {names} of one output, expected one with several; draw "
             "them by prb.plot_responses"
         )
-    if wanted is None:
+    if simulator is None:
         return names.index(several[0])
-    if not isinstance(wanted, str):
-        raise TypeError(f"simulator: got {called(wanted)}, expected a name, one of {several}")
-    if wanted not in several:
-        raise KeyError(f"simulator: got {wanted!r:.60}, expected one of {several}")
-    return names.index(wanted)
+    if not isinstance(simulator, str):
+        raise TypeError(f"simulator: got {called(simulator)}, expected a name, one of {several}")
+    if simulator not in several:
+        raise KeyError(f"simulator: got {simulator!r:.60}, expected one of {several}")
+    return names.index(simulator)
 
 
-def _chosen(evaluator: Evaluator, k: int, wanted: Sequence[Any] | None) -> list[Output]:
-    """Return the outputs that are drawn."""
+def _shown_outputs(evaluator: Evaluator, k: int, labels: Sequence[Any] | None) -> list[Output]:
+    """Return the outputs of the picture, by their labels or by default."""
     node = evaluator.simulators[k]
-    every = outputs_of(node, alone=len(evaluator.simulators) == 1)
-    if wanted is None:
-        varying = [output for output in every if _varies(output)]
-        every = varying if len(varying) > 1 else every
-        if len(every) <= _SHOWN:
-            return every
-        places = np.linspace(0, len(every) - 1, _OF_MANY)
-        return [every[round(place)] for place in places]
-    if isinstance(wanted, str) or not isinstance(wanted, Sequence):
+    columns = outputs_of(node, alone=len(evaluator.simulators) == 1)
+    if labels is None:
+        varying = [output for output in columns if _varies(output)]
+        columns = varying if len(varying) > 1 else columns
+        if len(columns) <= 5:
+            return columns
+        # Of many outputs, such as a curve, four from the first to the last
+        return [columns[round(place)] for place in np.linspace(0, len(columns) - 1, 4)]
+    known = list(node.outputs.labels)
+    listed = str(known) if len(known) <= 2 * _MOST else f"{str(known[:_MOST])[:-1]}, ...]"
+    if isinstance(labels, str) or not isinstance(labels, Sequence):
         raise TypeError(
-            f"outputs: got {called(wanted)}, expected a list of two to {_MOST} of {_listed(node)}"
+            f"outputs: got {called(labels)}, expected a list of two to {_MOST} of {listed}"
         )
-    if not 2 <= len(wanted) <= _MOST:
-        raise ValueError(
-            f"outputs: got {len(wanted)} outputs, expected two to {_MOST} of {_listed(node)}"
-        )
-    found = [every[_place(node, label)] for label in wanted]
-    if len({output.column for output in found}) < len(found):
-        raise ValueError(f"outputs: got {list(wanted)!r:.200}, expected different ones")
-    return found
+    if not 2 <= len(labels) <= _MOST:
+        raise ValueError(f"outputs: got {len(labels)} outputs, expected two to {_MOST} of {listed}")
+    indices = []
+    for label in labels:
+        names = [x for x in (known, list(node.outputs.names)) if label in x]
+        if not names or isinstance(label, bool):
+            raise KeyError(f"outputs: got {label!r:.60}, expected some of {listed}")
+        indices.append(names[0].index(label))
+    if len(set(indices)) < len(indices):
+        raise ValueError(f"outputs: got {list(labels)!r:.200}, expected different ones")
+    return [columns[i] for i in indices]
 
 
 def _varies(output: Output) -> bool:
-    """Whether specimens differ in an output, by more than rounding."""
+    """Return whether specimens differ in an output, by more than rounding."""
     observed, _ = output.measured()
     finite = observed[np.isfinite(observed)]
     return bool(np.ptp(finite) > 1e-9 * np.abs(finite).max())
-
-
-def _place(node: PopulationSimulator, label: Any) -> int:
-    """Return which output has a label."""
-    outputs = node.outputs
-    for known in (outputs.labels, outputs.names):
-        if label in known and not isinstance(label, bool):
-            return known.index(label)
-    raise KeyError(f"outputs: got {label!r:.60}, expected some of {_listed(node)}")
-
-
-def _listed(node: PopulationSimulator) -> str:
-    """Return the labels of a simulator's outputs, not all of many."""
-    labels = list(node.outputs.labels)
-    many = len(labels) > 2 * _MOST
-    return f"{str(labels[:_MOST])[:-1]}, ...]" if many else str(labels)
-
-
-def _pair(y: Output, x: Output) -> str:
-    """Return the name of the panel of two outputs."""
-    return ", ".join(output.name.partition("[")[2][:-1] for output in (y, x))
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,94 +229,58 @@ class _Population:
 
     @classmethod
     def of(cls, evaluator: Evaluator, thetas: Floats, k: int) -> _Population:
-        """Return the k-th simulator's population at thetas, one for all of them."""
+        """Return the k-th simulator's mixture of populations at thetas."""
         values, weights = evaluator.populations(thetas, k)
-        if evaluator.simulators[k].design is not None:  # whose points are all populations'
+        if evaluator.simulators[k].reweighted is not None:  # all populations have the same points
             values = values[0]
             weights = weights.mean(axis=0)
         else:
             values = values.reshape(-1, values.shape[-1])
             weights = weights.ravel() / len(thetas)
-        kept = (weights > 0) & ~np.isnan(values).any(axis=-1)
-        return cls(values[kept], weights[kept])
+        has_response = (weights > 0) & ~np.isnan(values).any(axis=-1)
+        return cls(values[has_response], weights[has_response])
 
-    def range_of(self, output: Output, tail: float) -> tuple[float, float]:
+    def range_of(self, output: Output, tail: float) -> Limits:
         """Return the range of all but the outermost values of an output."""
         return central_range(output.of(self.values)[None], self.weights[None], tail=tail)
 
-    def of_pair(self, x: Output, y: Output) -> tuple[Floats, Floats]:
-        """Return the points of two outputs, (n, 2), that are finite, and their weights."""
-        points = np.column_stack([x.of(self.values), y.of(self.values)])
-        known = np.isfinite(points).all(axis=1)
-        return points[known], self.weights[known]
+    def draw(
+        self,
+        panel: Panel,
+        visual: str,
+        pair: tuple[Output, Output],
+        color: str,
+        style: str,
+        text: str,
+    ) -> float:
+        """Draw the outlines of regions; return the rank correlation of the two outputs."""
+        points = np.column_stack([output.of(self.values) for output in pair])
+        finite = np.isfinite(points).all(axis=1)
+        points = points[finite]
+        weights = self.weights[finite]
+        if len(points) < 2:
+            return np.nan
+        probs = (0.5, INTERVAL)
+        for prob, (x, y) in zip(probs, outlines(points, weights, probs), strict=True):
+            name = f"{visual}_{100 * prob:.0f}"
+            panel.line(name, x, y, color, style=style, width=1.5, legend=text)
+        return rank_correlation(points, weights)
 
 
-def _covered(output: Output, after: _Population, earlier: _Population | None) -> Limits:
-    """Return what an axis covers: data and population, and the one before unless it is far off."""
+def _axis_limits(output: Output, after: _Population, earlier: _Population | None) -> Limits:
+    # A normal population's region of 89% contains all but 1.8% of one output.
+    before = None if earlier is None else earlier.range_of(output, tail=0.02)
     observed, _ = output.measured()
-    finite = observed[np.isfinite(observed)]
-    # A normal population's region of 89% reaches as far as all but 1.8% of one output
-    low, high = after.range_of(output, tail=0.01)
-    low = min(low, float(finite.min()))
-    high = max(high, float(finite.max()))
-    if earlier is not None:
-        # It widens the axis by at most half on each side
-        first, last = earlier.range_of(output, tail=0.02)
-        room = 0.5 * (high - low)
-        first = max(first, low - room)
-        last = min(last, high + room)
-        low = min(low, first)
-        high = max(high, last)
-    margin = 0.04 * (high - low) or 0.01 * max(abs(low), 1.0)
-    return low - margin, high + margin
+    return axis_range(observed, after.range_of(output, tail=0.01), before, margin=0.04)
 
 
 def _draw_measured(panel: Panel, x: Output, y: Output) -> float:
-    """Draw the specimens that have both outputs; return their correlation."""
-    observed = x.node.observed
-    weights = x.node.weights
-    points = np.column_stack([x.of(observed), y.of(observed)])
-    known = np.isfinite(points).all(axis=1)
-    points = points[known]
+    """Draw the specimens that have both outputs; return their rank correlation."""
+    points = np.column_stack([x.of(x.node.observed), y.of(x.node.observed)])
+    finite = np.isfinite(points).all(axis=1)
+    points = points[finite]
     panel.points("measured", points[:, 0], points[:, 1], INK, size=14, legend="measured")
-    return _of_ranks(points, weights[known])
-
-
-def _draw_regions(
-    panel: Panel,
-    visual: str,
-    population: _Population,
-    pair: tuple[Output, Output],
-    color: str,
-    style: str,
-    text: str,
-) -> float:
-    """Draw the outlines of regions of a population; return the correlation of its outputs."""
-    points, weights = population.of_pair(*pair)
-    if len(points) < 2:
-        return np.nan
-    for share, line in zip(_SHARES, outlines(points, weights, _SHARES), strict=True):
-        name = f"{visual}_{100 * share:.0f}"
-        x, y = line
-        panel.line(name, x, y, color, style=style, width=1.5, legend=text)
-    return _of_ranks(points, weights)
-
-
-def _of_ranks(points: Floats, weights: Floats) -> float:
-    """Return the correlation of the ranks of weighted points: a few far out do not decide it."""
-    return correlation(np.column_stack([_ranks(column, weights) for column in points.T]), weights)
-
-
-def _ranks(values: Floats, weights: Floats) -> Floats:
-    """Return the weight below each value, and half of that of equal ones."""
-    _, place = np.unique(values, return_inverse=True)
-    mass = np.bincount(place, weights)
-    return (np.cumsum(mass) - mass / 2)[place]
-
-
-def _title(measured: float, calibrated: float) -> str:
-    both = f"measured {_written(measured)}, calibrated {_written(calibrated)}"
-    return f"rank correlation\n{both}"
+    return rank_correlation(points, x.node.weights[finite])
 
 
 def _written(r: float) -> str:
@@ -353,12 +291,23 @@ def _written(r: float) -> str:
     return f"{round(r, digits) + 0.0:.{digits}f}"
 
 
+def rank_correlation(points: Floats, weights: Floats) -> float:
+    """Return the correlation of the ranks of weighted points, (n, 2)."""
+    ranks = []
+    for column in points.T:
+        # The weight below each value, and half of that of equal ones
+        _, place = np.unique(column, return_inverse=True)
+        mass = np.bincount(place, weights)
+        ranks.append((np.cumsum(mass) - mass / 2)[place])
+    return correlation(np.column_stack(ranks), weights)
+
+
 def correlation(points: Floats, weights: Floats) -> float:
-    """Return the correlation of weighted points, (n, 2), NaN where one of both does not vary."""
+    """Return the correlation of weighted points, (n, 2); NaN if a coordinate does not vary."""
     if not weights.size:
         return np.nan
     w = weights / weights.sum()
     deviations = points - w @ points
-    (first, both), (_, second) = deviations.T @ (w[:, None] * deviations)
-    product = np.sqrt(first * second)
-    return float(both / product) if product > 0 else np.nan
+    (first, product), (_, second) = deviations.T @ (w[:, None] * deviations)
+    scale = np.sqrt(first * second)
+    return float(product / scale) if scale > 0 else np.nan

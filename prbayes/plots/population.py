@@ -9,21 +9,16 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._stats import INTERVAL
 from prbayes._validate import positive_integer, share
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, SOLID, Canvas, Panel, refuse_look
-from prbayes.plots._ensemble import Ensemble, read_result
-from prbayes.plots._margins import Margin, chosen, margin_densities, margins
-from prbayes.plots._names import named, refuse_labels
-from prbayes.plots._populations import calibrated, draw_calibrated
+from prbayes.plots._ensemble import Calibrated, Ensemble, read_result
+from prbayes.plots._labels import named, refuse_labels
+from prbayes.plots._margins import Margin, margin_densities, margins, select_margins
 from prbayes.plots._regions import outlines
 from prbayes.response.distributions import PopulationSampler
-
-# Elements of a multivariate input that are drawn in pairs: three panels.
-_IN_PAIRS = 3
-# Specimens of which an outline is drawn: its line is smooth.
-_OUTLINED = 200_000
 
 
 @locked
@@ -32,10 +27,9 @@ def plot_population(
     *,
     model: pm.Model | None = None,
     inputs: Sequence[Any] | None = None,
-    prob: float = 0.89,
+    prob: float = INTERVAL,
     n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
-    backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
     """Draw the calibrated population of each aleatory input, with its uncertainty.
@@ -61,8 +55,6 @@ def plot_population(
         Number of populations in the band; 200 by default.
     labels : mapping, optional
         What a reader calls an input, by its name, with units.
-    backend : {"matplotlib", "bokeh", "plotly"}, optional
-        That of ArviZ's settings by default.
     **pc_kwargs
         ``figsize=(8, 5)``, in inches, of the whole picture; others go to
         ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
@@ -86,72 +78,62 @@ def plot_population(
     ...     y = prb.Simulator(
     ...         "y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
+    >>> list(prb.plot_population(prb.minimize(model)).viz["after"])
     ['load']
     """
-    refuse_look(labels, backend, pc_kwargs)
+    refuse_look(labels, pc_kwargs)
     if n_draws is not None:
         positive_integer(n_draws, "n_draws")
     share(prob, "prob")
-    shown = read_result(result, model, "prb.plot_population", n_draws, free=True)
-    wanted = chosen(margins(shown.evaluator), inputs)
-    found = margin_densities(shown.evaluator, wanted, shown.every)
-    names = [margin.name for margin in wanted]
-    refuse_labels(labels, names, evaluator=shown.evaluator)
-    pairs = _pairs(wanted)
-    panels = [*names, *pairs]
-    canvas = Canvas(panels, size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
-    for margin in wanted:
+    ensemble = read_result(result, model, "prb.plot_population", n_draws, free=True)
+    shown = select_margins(margins(ensemble.evaluator), inputs)
+    densities = margin_densities(ensemble.evaluator, shown, ensemble.every)
+    names = [margin.name for margin in shown]
+    refuse_labels(labels, names, evaluator=ensemble.evaluator)
+    pairs = _pairs(shown)
+    canvas = Canvas([*names, *pairs], size=(4.6, 3.9), pc_kwargs=pc_kwargs)
+    for margin in shown:
         panel = canvas.panel(margin.name)
-        grid, curves = found[margin.name]
-        after = calibrated(curves, shown, prob)
-        draw_calibrated(panel, grid, after, shown, prob)
+        grid, curves = densities[margin.name]
+        Calibrated.of(curves, ensemble, prob).draw(panel, grid, ensemble, prob)
         y = "probability" if margin.discrete else "density"
         panel.axes(x=named(margin.name, labels), y=y)
-    for name, (x, other) in pairs.items():
+    for name, (first, second) in pairs.items():
         panel = canvas.panel(name)
-        correlation = _draw_pair(panel, shown, x, other, prob)
-        panel.axes(
-            x=named(x.name, labels),
-            y=named(other.name, labels),
-            title=f"correlation {correlation:.2f}",
-        )
+        correlation = _draw_pair(panel, ensemble, first, second, prob)
+        title = f"correlation {correlation:.2f}"
+        panel.axes(x=named(first.name, labels), y=named(second.name, labels), title=title)
     return canvas.finish()
 
 
-def _pairs(wanted: list[Margin]) -> dict[str, tuple[Margin, Margin]]:
-    """Return the pairs that are drawn, by name: of the first elements of a multivariate input."""
-    found = {}
-    for first in wanted:
-        together = [m for m in wanted if m.dist is first.dist and m.group == first.group]
-        together = together[:_IN_PAIRS]
-        if first not in together or first.discrete:
-            continue
-        for other in together[together.index(first) + 1 :]:
-            found[f"{other.name}, {first.name}"] = (first, other)
-    return found
+def _pairs(shown: list[Margin]) -> dict[str, tuple[Margin, Margin]]:
+    """Return the pairs of the first three elements of each multivariate input, by name."""
+    pairs = {}
+    for x in shown:
+        elements = [m for m in shown if m.dist is x.dist and m.group == x.group][:3]
+        if x in elements and not x.discrete:
+            for y in elements[elements.index(x) + 1 :]:
+                pairs[f"{y.name}, {x.name}"] = (x, y)
+    return pairs
 
 
-def _draw_pair(panel: Panel, shown: Ensemble, x: Margin, y: Margin, prob: float) -> float:
-    """Draw the outlines of regions of a population, the posterior's mixture of them, or one.
-
-    Return the correlation within it.
-    """
-    thetas = shown.center if len(shown.center) else shown.thetas
-    evaluator = shown.evaluator
+def _draw_pair(panel: Panel, ensemble: Ensemble, x: Margin, y: Margin, prob: float) -> float:
+    """Draw outlines of regions of the calibrated population; return the correlation within it."""
+    thetas = ensemble.mixture
+    evaluator = ensemble.evaluator
     sampler = PopulationSampler(evaluator.simulators[x.node].inputs)
     roots = evaluator.roots(thetas, x.node)
-    number = max(2, _OUTLINED // len(thetas))
-    aleatory, _ = sampler(roots, number, np.random.default_rng(0))
+    # 200 000 specimens in all make a smooth line.
+    n = max(2, 200_000 // len(thetas))
+    aleatory, _ = sampler(roots, n, np.random.default_rng(0))
     values: Any = aleatory[x.position]  # (P, n, *event)
     points = np.column_stack([values[(..., *margin.index)].ravel() for margin in (x, y)])
     points = points[np.isfinite(points).all(axis=1)]
     weights = np.full(len(points), 1 / len(points))
-    drawn = {"half": (0.5, DASHED), "region": (prob, SOLID)}
-    lines = outlines(points, weights, tuple(held for held, _ in drawn.values()))
-    for (visual, (held, style)), line in zip(drawn.items(), lines, strict=True):
-        across, up = line
-        text = f"{held:.0%} of the calibrated population: {shown.label}"
+    regions = {"half": (0.5, DASHED), "region": (prob, SOLID)}
+    lines = outlines(points, weights, tuple(p for p, _ in regions.values()))
+    for (visual, (p, style)), (across, up) in zip(regions.items(), lines, strict=True):
+        text = f"{p:.0%} of the calibrated population: {ensemble.label}"
         panel.line(visual, across, up, BLUE, style=style, width=1.5, legend=text)
     correlations: Any = np.corrcoef(points.T)
     return float(correlations[0, 1])

@@ -11,6 +11,7 @@ import pymc as pm
 import xarray as xr
 from scipy.stats import norm
 
+from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, share
 from prbayes.model.elements import (
     read_elements,
@@ -34,10 +35,10 @@ from prbayes.plots._canvas import (
     Canvas,
     Panel,
     refuse_look,
+    round_ticks,
 )
 from prbayes.plots._curves import bounded_density, central_levels
-from prbayes.plots._names import named, refuse_labels
-from prbayes.plots._ticks import round_ticks
+from prbayes.plots._labels import named, refuse_labels
 
 
 def plot_posterior(
@@ -46,9 +47,8 @@ def plot_posterior(
     optimum: Optimum | None = None,
     model: pm.Model | None = None,
     var_names: Sequence[str] | None = None,
-    prob: float = 0.89,
+    prob: float = INTERVAL,
     labels: Mapping[str, str] | None = None,
-    backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
     """Draw the posterior of each hyperparameter against the optimum and the prior.
@@ -72,8 +72,6 @@ def plot_posterior(
         Probability of the intervals.
     labels : mapping, optional
         What a reader calls a hyperparameter, by its name, with units.
-    backend : {"matplotlib", "bokeh", "plotly"}, optional
-        That of ArviZ's settings by default.
     **pc_kwargs
         ``figsize=(8, 5)``, in inches, of the whole picture; others go to
         ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
@@ -102,42 +100,27 @@ def plot_posterior(
     ...     posterior = prb.sample_smc(
     ...         100, chains=2, optimum=optimum, random_seed=1, progressbar=False
     ...     )
-    >>> pc = prb.plot_posterior(posterior, optimum=optimum, model=model, backend="none")
+    >>> pc = prb.plot_posterior(posterior, optimum=optimum, model=model)
     >>> list(pc.viz["posterior"])
     ['mu']
     """
-    refuse_look(labels, backend, pc_kwargs)
+    refuse_look(labels, pc_kwargs)
     _check_results(posterior, optimum, model)
     share(prob, "prob")
-    found = _wanted(_read_hyperparameters(posterior, optimum, model), var_names)
     evaluator = None if model is None else Evaluator.of(model)
+    hyperparameters = _read_hyperparameters(posterior, optimum, evaluator)
+    names = _select(list(hyperparameters), var_names)
     refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
-    canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
-    for name, hyperparameter in found.items():
+    canvas = Canvas(names, size=(4.6, 3.6), pc_kwargs=pc_kwargs)
+    for name in names:
         panel = canvas.panel(name)
-        top = _draw(panel, hyperparameter, prob)
-        x = named(name, labels)
-        panel.axes(x=x, y="density", yticks=round_ticks(0.0, top))
+        top = _draw(panel, hyperparameters[name], prob)
+        panel.axes(x=named(name, labels), y="density", yticks=round_ticks(0.0, top))
     return canvas.finish()
 
 
-def _wanted(
-    found: dict[str, _Hyperparameter], var_names: Sequence[str] | None
-) -> dict[str, _Hyperparameter]:
-    """Return those hyperparameters that were asked for; by default those that are read."""
-    if var_names is None:
-        return {name: found[name] for name in read_elements(found)}
-    asked = [var_names] if isinstance(var_names, str) else list(var_names)
-    unknown = [one for one in asked if not any(one in (name, variable_of(name)) for name in found)]
-    if unknown or not asked:
-        raise KeyError(
-            f"plot_posterior: var_names: got {unknown or 'none'}, expected some of {list(found)}"
-        )
-    return {name: one for name, one in found.items() if name in asked or variable_of(name) in asked}
-
-
 def _check_results(posterior: Any, optimum: Any, model: pm.Model | None) -> None:
-    """Refuse what is of another kind, an optimum of other populations, and other priors."""
+    """Raise for results of another kind, an optimum of other populations, and other priors."""
     if not isinstance(posterior, xr.DataTree) or "posterior" not in posterior:
         raise TypeError(
             f"plot_posterior: got {type(posterior).__name__}, expected a DataTree with a "
@@ -154,114 +137,100 @@ def _check_results(posterior: Any, optimum: Any, model: pm.Model | None) -> None
         require_of_model(posterior, model, "plot_posterior", Level.PRIORS)
 
 
+def _select(names: list[str], var_names: Sequence[str] | None) -> list[str]:
+    """Return the hyperparameters of the picture; by default those that a reader wants."""
+    if var_names is None:
+        return list(read_elements(names))
+    selection = [var_names] if isinstance(var_names, str) else list(var_names)
+    unknown = set(selection) - {*names, *map(variable_of, names)}
+    if unknown or not selection:
+        got = [name for name in selection if name in unknown] or "none"
+        raise KeyError(f"plot_posterior: var_names: got {got}, expected some of {names}")
+    return [name for name in names if {name, variable_of(name)} & set(selection)]
+
+
 @dataclass(frozen=True, eq=False)
 class _Hyperparameter:
-    """What is known of one hyperparameter."""
+    """Posterior draws, (n,), prior draws, the optimum and its standard error, where known."""
 
-    draws: Floats  # (n,): of the posterior
-    prior: Floats | None  # (m,), or None: draws of the prior
-    # The optimum, and its standard error where it is known.
+    draws: Floats
+    prior: Floats | None
     best: float | None
     error: float | None
 
-    @property
-    def grid(self) -> Floats:
-        """What the axis covers: all draws, and three standard errors around the optimum."""
-        low = float(self.draws.min())
-        high = float(self.draws.max())
-        if self.best is not None:
-            reach = 3 * (self.error or 0.0)
-            low = min(low, self.best - reach)
-            high = max(high, self.best + reach)
-        return np.linspace(low, high, 301)
-
 
 def _read_hyperparameters(
-    posterior: xr.DataTree, optimum: Optimum | None, model: pm.Model | None
+    posterior: xr.DataTree, optimum: Optimum | None, evaluator: Evaluator | None
 ) -> dict[str, _Hyperparameter]:
-    """Return by element what posterior, optimum and model share."""
+    """Return the elements that posterior, optimum and model share."""
     stacked = stacked_draws(posterior["posterior"])
     draws = split_elements(stacked)
     shared = {name for name in told_elements(stacked) if np.ptp(draws[name]) > 0}
-
     best, errors = {}, {}
     if optimum is not None:
         best = single_elements(labelled(optimum.evaluator, optimum.point, {}).data_vars)
         errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
         shared &= set(best)
     prior: dict[str, Floats] = {}
-    if model is not None:
-        evaluator = Evaluator.of(model)
-        # So many tell a normal density's peak within 2%.
+    if evaluator is not None:
+        # 4000 draws give a normal density's peak within 2%.
         thetas = evaluator.hyperparameters.prior_thetas(4000, 0)
-        drawn = labelled(
+        values = labelled(
             evaluator, evaluator.hyperparameters.constrained(thetas), {"draw": len(thetas)}
         )
-        prior = split_elements(drawn.data_vars)
+        prior = split_elements(values.data_vars)
         shared &= set(prior)
-
-    found = {}
-    for name, x in draws.items():
-        if name in shared:
-            error = errors.get(name, np.nan)
-            known = np.isfinite(error) and error > 0
-            found[name] = _Hyperparameter(
-                draws=x,
-                prior=prior.get(name),
-                best=best.get(name),
-                error=error if known else None,
-            )
-    if not found:
+    if not shared:
         raise ValueError(
             f"plot_posterior: got a posterior of {list(draws)}, expected hyperparameters of "
             "optimum and model"
         )
-    return found
+    hyperparameters = {}
+    for name in [name for name in draws if name in shared]:
+        error = errors.get(name, np.nan)
+        hyperparameters[name] = _Hyperparameter(
+            draws=draws[name],
+            prior=prior.get(name),
+            best=best.get(name),
+            error=error if np.isfinite(error) and error > 0 else None,
+        )
+    return hyperparameters
 
 
 def _draw(panel: Panel, hyperparameter: _Hyperparameter, prob: float) -> float:
-    """Draw densities, and the intervals below them; return how high the posterior reaches."""
+    """Draw densities, and the intervals below them; return the top of the posterior."""
     draws = hyperparameter.draws
     best = hyperparameter.best
-    grid = hyperparameter.grid
+    error = hyperparameter.error
+    low = float(draws.min())
+    high = float(draws.max())
+    if best is not None:
+        reach = 3 * (error or 0.0)
+        low = min(low, best - reach)
+        high = max(high, best + reach)
+    grid = np.linspace(low, high, 301)
     density = bounded_density(draws, grid)
     top = float(density.max())
-    # So far apart that the diamond of one does not touch the dot of the other.
+    # Far enough apart that the diamond of one does not touch the dot of the other
     posterior_row, optimum_row = np.array([-0.07, -0.15]) * top
 
     if hyperparameter.prior is not None:
-        y = bounded_density(hyperparameter.prior, grid)
-        panel.line("prior", grid, y, GREY, style=DOTTED, legend="prior")
-
+        prior = bounded_density(hyperparameter.prior, grid)
+        panel.line("prior", grid, prior, GREY, style=DOTTED, legend="prior")
     panel.line("posterior", grid, density, BLUE, width=2.2, legend="posterior")
-    interval = np.quantile(draws, central_levels(prob))
+    levels = central_levels(prob)
     row = np.repeat(posterior_row, 2)
     text = f"{prob:.0%} intervals"
-    panel.line("interval", interval, row, BLUE, width=3, legend=text)
+    panel.line("interval", np.quantile(draws, levels), row, BLUE, width=3, legend=text)
     mean = draws.mean()
     panel.points("mean", mean, posterior_row, BLUE, size=90, legend="posterior mean")
-
-    if best is not None:
-        if hyperparameter.error is not None:
-            _draw_normal(panel, grid, best, hyperparameter.error, prob, optimum_row)
-        panel.points(
-            "optimum",
-            best,
-            optimum_row,
-            VERMILION,
-            marker=DIAMOND,
-            size=110,
-            legend="optimum",
-        )
+    if best is None:
+        return top
+    if error is not None:
+        normal = norm(best, error)
+        text = "normal with the optimum's standard error"
+        panel.line("normal", grid, normal.pdf(grid), VERMILION, style=DASHED, legend=text)
+        panel.line("stderr", normal.ppf(levels), np.repeat(optimum_row, 2), VERMILION, width=3)
+    look: dict[str, Any] = {"marker": DIAMOND, "size": 110, "legend": "optimum"}
+    panel.points("optimum", best, optimum_row, VERMILION, **look)
     return top
-
-
-def _draw_normal(
-    panel: Panel, grid: Floats, best: float, error: float, prob: float, row: float
-) -> None:
-    """Draw the normal distribution of the optimum's standard error, and its interval."""
-    normal = norm(best, error)
-    text = "normal with the optimum's standard error"
-    panel.line("normal", grid, normal.pdf(grid), VERMILION, style=DASHED, legend=text)
-    ends = normal.ppf(central_levels(prob))
-    panel.line("stderr", ends, np.repeat(row, 2), VERMILION, width=3)

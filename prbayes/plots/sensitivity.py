@@ -1,4 +1,4 @@
-"""What moves a decision quantity."""
+"""Sensitivity indices of a decision quantity."""
 
 from __future__ import annotations
 
@@ -16,20 +16,15 @@ from prbayes.plots._canvas import (
     GREY,
     VERMILION,
     Canvas,
-    Panel,
     refuse_look,
 )
-from prbayes.plots._names import named, refuse_labels
-
-_PANELS = ("hyperparameter", "input")
-_MARKERS = {"first": CIRCLE, "total": DIAMOND}
+from prbayes.plots._labels import named, refuse_labels
 
 
 def plot_sensitivity(
     table: xr.Dataset,
     *,
     labels: Mapping[str, str] | None = None,
-    backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
     """Draw the shares of hyperparameters and inputs, a row per factor.
@@ -43,8 +38,6 @@ def plot_sensitivity(
         From `sensitivity`.
     labels : mapping, optional
         What a reader calls a factor, by its name.
-    backend : {"matplotlib", "bokeh", "plotly"}, optional
-        That of ArviZ's settings by default.
     **pc_kwargs
         ``figsize=(8, 5)``, in inches, of the whole picture; others go to
         ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
@@ -67,47 +60,42 @@ def plot_sensitivity(
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0, name="x")
     ...     y = prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=[0, 2, 4])
     >>> table = prb.sensitivity(prb.minimize(model), prb.decision.Mean(np.square, x))
-    >>> sorted(prb.plots.plot_sensitivity(table, backend="none").viz["first"])
+    >>> sorted(prb.plots.plot_sensitivity(table).viz["first"])
     ['hyperparameter', 'input']
     """
-    refuse_look(labels, backend, pc_kwargs)
-    needed = {"first", "total", "first_error", "total_error", "factor", "kind"}
-    if not isinstance(table, xr.Dataset) or not needed <= set(table.variables):
+    refuse_look(labels, pc_kwargs)
+    variables = {"first", "total", "first_error", "total_error", "factor", "kind"}
+    if not isinstance(table, xr.Dataset) or not variables <= set(table.variables):
         got = type(table).__name__
         raise TypeError(
             f"plot_sensitivity: table: got {got}, expected the Dataset of prb.sensitivity"
         )
-    by_panel = {kind: table.sel(factor=(table.kind == kind).values) for kind in _PANELS}
     refuse_labels(labels, map(str, table.factor.values))
-    count = max(own.sizes["factor"] for own in by_panel.values())
-    top = count - 1.0
-    limits = (-0.6, top + 0.6)
-    size = (4.8, 1.6 + 0.4 * count)
-    canvas = Canvas(list(_PANELS), size=size, backend=backend, pc_kwargs=pc_kwargs)
     titles = {
         "hyperparameter": "share of the quantity's variance",
         "input": f"share of the variance of\n{table.attrs.get('of_inputs', 'the response')}",
     }
+    by_kind = {kind: table.sel(factor=(table.kind == kind).values) for kind in titles}
+    n = max(factors.sizes["factor"] for factors in by_kind.values())
+    limits = (-0.6, n - 0.4)
+    canvas = Canvas(list(titles), size=(4.8, 1.6 + 0.4 * n), pc_kwargs=pc_kwargs)
     for kind, title in titles.items():
-        own = by_panel[kind]
-        rows = top - np.arange(own.sizes["factor"])
+        factors = by_kind[kind]
+        rows = n - 1.0 - np.arange(factors.sizes["factor"])
         panel = canvas.panel(kind)
         for end in (0.0, 1.0):
             panel.line(f"end_{end:.0f}", [end, end], limits, GREY, style=DOTTED, width=1.0)
-        _draw(panel, own, "first", rows + 0.12, BLUE, "by itself")
-        _draw(panel, own, "total", rows - 0.12, VERMILION, "with all others known")
-        names = [named(str(factor), labels) for factor in own.factor.values]
+        for key, shift, color, marker, text in (
+            ("first", 0.12, BLUE, CIRCLE, "by itself"),
+            ("total", -0.12, VERMILION, DIAMOND, "with all others known"),
+        ):
+            indices = factors[key].values
+            errors = 2 * factors[f"{key}_error"].values
+            y = rows + shift
+            for i in np.flatnonzero(np.isfinite(indices)):
+                ends = [indices[i] - errors[i], indices[i] + errors[i]]
+                panel.line(f"{key}_{i}", ends, [y[i], y[i]], color, width=2)
+            panel.points(key, indices, y, color, marker=marker, legend=text)
+        names = [named(str(factor), labels) for factor in factors.factor.values]
         panel.axes(x=title, ylim=limits, yticks=(rows.tolist(), names))
     return canvas.finish()
-
-
-def _draw(panel: Panel, own: xr.Dataset, key: str, rows: Any, color: str, text: str) -> None:
-    """Draw shares with two standard errors."""
-    shares = own[key].values
-    errors = own[f"{key}_error"].values
-    low = shares - 2 * errors
-    high = shares + 2 * errors
-    for i in np.flatnonzero(np.isfinite(shares)):
-        row = rows[i]
-        panel.line(f"{key}_{i}", [low[i], high[i]], [row, row], color, width=2)
-    panel.points(key, shares, rows, color, marker=_MARKERS[key], legend=text)

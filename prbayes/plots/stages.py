@@ -1,28 +1,33 @@
-"""The stages of a sampler: how it came from the prior to the posterior."""
+"""The stages of a sampler from the prior to the posterior."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from prbayes._validate import Floats
-from prbayes.plots._canvas import CYCLE, DASHDOT, DASHED, DOTTED, SOLID, Canvas, Panel, refuse_look
-from prbayes.plots._names import STATISTIC_LABELS, named, refuse_labels
-from prbayes.plots._ticks import Ticks, log_ticks, spans_decades
-
-# Chains differ in colour and in style; five times four before they repeat.
-_STYLES = (SOLID, DASHED, DOTTED, DASHDOT)
+from prbayes.plots._canvas import (
+    CYCLE,
+    DASHDOT,
+    DASHED,
+    DOTTED,
+    SOLID,
+    Canvas,
+    Panel,
+    log_ticks,
+    refuse_look,
+    spans_decades,
+)
+from prbayes.plots._labels import STATISTIC_LABELS, named, refuse_labels
 
 
 def plot_stages(
     posterior: xr.DataTree,
     *,
     labels: Mapping[str, str] | None = None,
-    backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
     """Draw the stages of a sequential Monte Carlo run, a line per chain, a panel per statistic.
@@ -38,8 +43,6 @@ def plot_stages(
         From `sample_smc`, with a ``sample_stats`` group of dims (chain, stage).
     labels : mapping, optional
         What a reader calls a statistic or a simulator, by its name.
-    backend : {"matplotlib", "bokeh", "plotly"}, optional
-        That of ArviZ's settings by default.
     **pc_kwargs
         ``figsize=(8, 5)``, in inches, of the whole picture; others go to
         ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
@@ -63,91 +66,70 @@ def plot_stages(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
     ...     posterior = prb.sample_smc(100, chains=2, random_seed=1, progressbar=False)
-    >>> "chain_1" in prb.plot_stages(posterior, backend="none").viz
+    >>> "chain_1" in prb.plot_stages(posterior).viz
     True
     """
-    refuse_look(labels, backend, pc_kwargs)
-    known = _read_statistics(posterior)
-    # Those of the last stage only come last
-    statistics = sorted(known, key=lambda statistic: statistic.once)
-    names = [statistic.name for statistic in statistics]
-    canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
-    all_labels = STATISTIC_LABELS | dict(labels or {})
-    refuse_labels(labels, names)
-    for statistic in statistics:
-        panel = canvas.panel(statistic.name)
-        _draw(panel, statistic, named(statistic.name, all_labels))
+    refuse_look(labels, pc_kwargs)
+    statistics = _read_statistics(posterior)
+    refuse_labels(labels, statistics)
+    canvas = Canvas(list(statistics), size=(4.6, 3.4), pc_kwargs=pc_kwargs)
+    for name, values in statistics.items():
+        label = named(name, STATISTIC_LABELS | dict(labels or {}))
+        _draw(canvas.panel(name), values, label)
     return canvas.finish()
 
 
-@dataclass(frozen=True, eq=False)
-class _Statistic:
-    """A statistic by chain and stage."""
+def _read_statistics(posterior: xr.DataTree) -> dict[str, xr.DataArray]:
+    """Return the statistics by stage, (chains, stages); those of one stage only come last.
 
-    name: str
-    chains: list[Any]  # names of the chains
-    rows: Floats  # (chains, stages): NaN where it is not known, or after the last stage of a chain
-
-    @property
-    def once(self) -> bool:
-        """Whether it is known at one stage only."""
-        known = np.isfinite(self.rows).sum(axis=1)
-        return bool((known <= 1).all())
-
-
-def _read_statistics(posterior: xr.DataTree) -> list[_Statistic]:
-    """Return the statistics by stage, by order of the group."""
+    NaN is unknown, or after the last stage of a chain.
+    """
     if not isinstance(posterior, xr.DataTree) or "sample_stats" not in posterior:
         raise TypeError(
             f"plot_stages: posterior: got {type(posterior).__name__}, expected the DataTree of "
             "prb.sample_smc, with sample_stats"
         )
-    found = []
-    for name, values in posterior["sample_stats"].data_vars.items():
-        if set(values.dims) == {"chain", "stage"}:
-            ordered = values.transpose("chain", "stage")
-            rows = np.asarray(ordered, dtype=np.float64)
-            chains = ordered.chain.values.tolist()
-            found.append(_Statistic(str(name), chains, rows))
-    if not found:
+    statistics = {
+        str(name): values.transpose("chain", "stage").astype(np.float64)
+        for name, values in posterior["sample_stats"].data_vars.items()
+        if set(values.dims) == {"chain", "stage"}
+    }
+    if not statistics:
         raise ValueError(
             "plot_stages: got sample_stats without dims (chain, stage), expected those of "
             "prb.sample_smc"
         )
-    return found
+    return dict(sorted(statistics.items(), key=lambda item: _is_of_one_stage(item[1].values)))
 
 
-def _draw(panel: Panel, statistic: _Statistic, label: str) -> None:
+def _is_of_one_stage(rows: Floats) -> bool:
+    return bool((np.isfinite(rows).sum(axis=1) <= 1).all())
+
+
+def _draw(panel: Panel, values: xr.DataArray, label: str) -> None:
     """Draw a statistic of each chain: by stage, or by chain if it is known once."""
-    # Beta starts at a small value and grows by orders of magnitude
-    ticks, rows = None, statistic.rows
-    if statistic.name == "beta" and spans_decades(rows):
+    rows = values.values
+    chains = [str(chain) for chain in values.chain.values.tolist()]
+    is_once = _is_of_one_stage(rows)
+    ticks = None
+    if values.name == "beta" and spans_decades(rows):
+        # Beta starts at a small value and grows by orders of magnitude
         ticks = log_ticks(rows)
         rows = np.log10(rows)
-
-    for c, chain in enumerate(statistic.chains):
+    # Chains differ in colour and in style; five times four before they repeat
+    styles = (SOLID, DASHED, DOTTED, DASHDOT)
+    for c, (chain, row) in enumerate(zip(chains, rows, strict=True)):
         visual = f"chain_{chain}"
-        text = f"chain {chain}"
         color = CYCLE[c % len(CYCLE)]
-        known = np.flatnonzero(np.isfinite(rows[c]))
-        y = rows[c][known]
-        if statistic.once:
-            panel.points(visual, [c + 1.0], y[-1:], color, size=45)
+        stages = np.flatnonzero(np.isfinite(row))
+        if is_once:
+            panel.points(visual, [c + 1.0], row[stages][-1:], color, size=45)
         else:
-            style = _STYLES[c % len(_STYLES)]
-            panel.line(visual, known + 1.0, y, color, style=style, legend=text)
-
-    if statistic.once:
-        x = "chain"
-        names = [str(chain) for chain in statistic.chains]
-    else:
-        x = "stage"
-        names = [str(stage + 1) for stage in range(rows.shape[1])]
-    panel.axes(x=x, y=label, xticks=_whole(names), yticks=ticks)
-
-
-def _whole(names: list[str]) -> Ticks:
-    """Return ticks at 1, 2 and so on, or at ten of them at most."""
-    every = -(-len(names) // 10)
-    at = [float(place + 1) for place in range(0, len(names), every)]
-    return at, names[::every]
+            style = styles[c % len(styles)]
+            text = f"chain {chain}"
+            panel.line(visual, stages + 1.0, row[stages], color, style=style, legend=text)
+    names = chains if is_once else [str(stage + 1) for stage in range(rows.shape[1])]
+    step = -(-len(names) // 10)  # at most ten ticks
+    places = [float(place + 1) for place in range(0, len(names), step)]
+    x = "chain" if is_once else "stage"
+    panel.axes(x=x, y=label, xticks=(places, names[::step]), yticks=ticks)

@@ -71,7 +71,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         For simulators with `Fresh`, or with `Resimulated` and a metric that declares nothing of its
         minimum: their epsilon has to be given.
     ValueError
-        If nothing is known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`), or
+        If nothing is known around the optimum (``search.at_edge`` and ``search.at_jump``), or
         nothing is identified; if the prior was part of it, its model has changed since, or no
         simulator has an epsilon.
 

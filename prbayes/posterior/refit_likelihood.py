@@ -399,7 +399,7 @@ def _draw(
     for members in groups(evaluator.nodes):
         columns = np.unique(np.concatenate([numbers[k] for k in members]))
         first = members[0]
-        size = evaluator.designs[evaluator.nodes[first].name].n_points
+        size = evaluator.nodes[first].bound.n_points
         chosen = points[first][np.ix_(converged, columns)]
         counts.append(_counted(chosen, size))
     return _Drawn(x[converged], tuple(counts), estimates[converged])
@@ -438,8 +438,8 @@ def _is_supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
     """Return at which thetas stored responses support the populations, (S,)."""
     supported = np.ones(len(thetas), dtype=bool)
     for name, support in evaluator.support(thetas).items():
-        design = evaluator.designs[name]
-        supported &= supports_each(support, design.required_ess, design.config.max_lost, TOLERABLE)
+        bound = evaluator.reweighted[name]
+        supported &= supports_each(support, bound.required_ess, bound.max_lost, TOLERABLE)
     return supported
 
 

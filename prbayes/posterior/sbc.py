@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -30,6 +29,7 @@ from prbayes.optimize.specimen_refits import (
 from prbayes.posterior.sample import draw_posterior
 from prbayes.posterior.smc import Adjustment, Sampling, refuse_adjustment, sample
 from prbayes.posterior.trees import calibration_tree
+from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 
 # Data sets that a worker analyses before it reports: seconds of work, against milliseconds of
@@ -196,10 +196,7 @@ def _analyse(
     rows: list[_Row] = []
     for i in job.which:
         rng = np.random.default_rng([job.random_seed, i])
-        with ExitStack() as stack:
-            stack.enter_context(shown(False))
-            for design in evaluator.designs.values():
-                stack.enter_context(design.undone())
+        with shown(False), designs_restored(evaluator.reweighted.values()):
             try:
                 rows.append(_one(evaluator, job, rng))
             except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:

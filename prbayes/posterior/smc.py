@@ -43,7 +43,7 @@ from prbayes.posterior.results import (
 )
 from prbayes.posterior.target import estimate_target, prior_conflicts, require_density
 from prbayes.posterior.trees import posterior_tree, share_of_lossy
-from prbayes.propagation.base import Missing
+from prbayes.propagation.base import Missing, discrepancy_error
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -158,7 +158,7 @@ def sample_smc(
     ------
     TypeError, ValueError
         If an argument is not as described, no prior draw has a finite density, or nothing is known
-        around the optimum (``at_edge`` and ``at_jump`` of `Optimum`) and it is needed.
+        around the optimum (``search.at_edge`` and ``search.at_jump``) and it is needed.
     DesignError
         If a design does not support the posterior after refinement.
     StoreError
@@ -511,7 +511,7 @@ class Rounds:
             If a budget is spent before.
         """
         evaluator = self.run.evaluator
-        refines = self.asked.refine and bool(evaluator.designs)
+        refines = self.asked.refine and bool(evaluator.reweighted)
         for round_ in range(MAX_ROUNDS + 1):
             children = self.seeds.spawn(self.asked.chains)
             saved = self.run.saved_refinement(round_)
@@ -692,7 +692,7 @@ def _at_the_best(
     missing = {}
     for k, node in enumerate(evaluator.nodes):
         roots = evaluator.roots(best, k)
-        errors.append(node.bound.discrepancy_error(roots))
+        errors.append(discrepancy_error(node.bound, roots))
         missing[node.name] = missing_mass(evaluator, best[0], k)
     return np.array(errors), missing
 

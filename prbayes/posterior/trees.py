@@ -247,8 +247,8 @@ def share_of_lossy(lost: Floats, max_lost: float) -> float:
 def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
     """Return the settings of each simulator."""
     nodes = evaluator.nodes
-    designs = [node.design for node in nodes]
-    required = [np.nan if design is None else design.required_ess for design in designs]
+    bounds = [node.reweighted for node in nodes]
+    required = [np.nan if bound is None else bound.required_ess for bound in bounds]
     return {
         "epsilon": ("simulator", evaluator.epsilon),
         "required_ess": ("simulator", required),

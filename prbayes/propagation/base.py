@@ -84,27 +84,30 @@ class Bound(ABC):
     inputs : Inputs
     target : Discrepancy
     responses : Responses
+    first_points : sequence of ndarray, shapes (n, *event)
+        Aleatory inputs at which responses were computed at the first use.
+    first_responses : ndarray, shape (n,) or (n, m)
+        The responses there.
     n_per_theta : int
         Number of responses that one evaluation of the discrepancy computes.
     symbolic : bool
-        Whether the responses are part of the graph, so that ``responses`` does not count them.
+        Whether the responses are part of the graph, where ``responses`` does not count them.
     stored : bool
-        Whether the responses are stored, and theta moves their weights; then a theta costs no
-        response.
+        Whether the responses are stored, and theta moves their weights: a theta costs no response.
     random : bool
-        Whether every evaluation draws anew, so that the discrepancy is random and has no gradient.
+        Whether every evaluation draws specimens: the discrepancy is random and has no gradient.
     support_moves : bool
-        Whether points are inside the population's support at some thetas and outside at others, so
-        that their weights change along an edge only.
+        Whether points are inside the population's support at some thetas and outside at others:
+        their weights change along an edge only.
     is_line : bool
         Whether the points are a quadrature rule of one dimension, whose error falls like 1 / n.
     max_lost : float
         Largest share of a population's weight, at an answer, on points without response.
     draws : int
-        Number of evaluations so far that a random propagation's next draws depend on; with the
-        seeds and the roots it determines them.
-    stream : int
-        Seed of the sampler that is at work, which they depend on as well.
+        Number of evaluations so far, which determines the next draws of a random propagation.
+    lost : ndarray, shape (k,)
+        Share of the weight on points without response, of the populations evaluated last. NaN of
+        stored responses.
     """
 
     n_per_theta: int = 0
@@ -112,49 +115,11 @@ class Bound(ABC):
     stored: ClassVar[bool] = False
     random: ClassVar[bool] = False
     support_moves: bool = False
+    is_line: bool = False
     max_lost: float = MAX_LOST
     draws: int = 0
-    stream: int = 0
-    # Of the populations whose discrepancies were asked for last, (k,): share of the weight on
-    # points without response. NaN of stored responses, whose support tells.
     lost: Floats | float = np.nan
-    # Of the populations that were looked at last.
-    _missing: Missing | None = None
-    _probed: Floats = np.empty(0)
-    _probed_at: Sequence[Floats] = ()
-
-    @property
-    def known_responses(self) -> Floats:
-        """Responses computed at the first use; the first of them stay the first."""
-        return self._probed
-
-    @property
-    def first_responses(self) -> Floats:
-        """Those that are there before any other is asked for."""
-        return self._probed
-
-    @property
-    def dimensions(self) -> int:
-        """Number of aleatory numbers that make one specimen."""
-        return self.inputs.dimensions
-
-    def aim(self, target: Discrepancy) -> None:
-        """Compare with the same data in another way from here on."""
-        self.target = target
-
-    @property
-    def known_points(self) -> Sequence[Floats]:
-        """The aleatory inputs of the same, shapes ``(n, *event)``."""
-        return self._probed_at
-
-    @property
-    def is_line(self) -> bool:
-        """Whether the points are a quadrature rule of one dimension."""
-        return False
-
-    def same_points(self, other: Bound) -> bool:
-        """Return whether another bound of the same settings and inputs has the same points."""
-        return True
+    _missing: Missing | None = None  # of the populations evaluated last
 
     def __init__(
         self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses
@@ -163,17 +128,17 @@ class Bound(ABC):
         self.inputs = inputs
         self.target = target
         self.responses = responses
+        self.first_points: Sequence[Floats] = ()
+        self.first_responses: Floats = np.empty(0)
 
     def copied(self) -> Self:
         """Return the same propagation with its own count of responses, for a clone of the model."""
-        other = copy.copy(self)
-        other.responses = self.responses.copied()
-        return other
+        copied = copy.copy(self)
+        copied.responses = self.responses.copied()
+        return copied
 
-    def restart(self, stream: int) -> None:
+    def restart(self, stream: int) -> None:  # noqa: B027 (of random ones alone)
         """Begin a sampler's own stream of random draws."""
-        self.stream = stream
-        self.draws = 0
 
     @property
     def n_points(self) -> int:
@@ -184,6 +149,15 @@ class Bound(ABC):
     def n_runs(self) -> int:
         """Number of computed responses that one evaluation of the discrepancy rests on."""
         return self.n_points
+
+    @property
+    def blocks(self) -> NDArray[np.intp]:
+        """Which of eight smaller sets of the same kind each point belongs to, shape (n_points,)."""
+        return np.arange(self.n_points) * N_BLOCKS // self.n_points
+
+    def same_points(self, other: Bound) -> bool:
+        """Return whether another bound of the same settings and inputs has the same points."""
+        return True
 
     def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy as a scalar graph of the roots' values."""
@@ -227,38 +201,13 @@ class Bound(ABC):
     def missing(self, params: Sequence[Any]) -> Missing:
         """Return the shares without numbers of the population at given roots, shapes (1, ...).
 
-        It was looked at last, commonly, and is then not computed again.
+        The population that was evaluated last is not computed again.
         """
         if self._missing is None or self._missing.lost.size != 1:
             if not self.valid(params).all():
                 return Missing(np.ones(1), np.zeros(1))
             self._missing = Missing.of(*self.populations(params))
         return self._missing
-
-    @property
-    def blocks(self) -> NDArray[np.intp]:
-        """Which of eight smaller sets of the same kind each point belongs to, shape (n_points,)."""
-        return np.arange(self.n_points) * N_BLOCKS // self.n_points
-
-    def discrepancy_error(self, params: Sequence[Any]) -> float:
-        """Return the standard error of the discrepancy at given roots, shapes (1, ...).
-
-        From leaving out each eighth of the responses. Right for random draws (`Fresh`), and an
-        upper bound for common points, which are better than random ones.
-        """
-        if self.n_points < 2 * N_BLOCKS:
-            return np.nan
-        values, weights = self.populations(params)
-        self._missing = Missing.of(values, weights)
-        without_block = []
-        for block in range(N_BLOCKS):
-            left = self.blocks != block
-            kept = weights[:, left]
-            kept = kept / kept.sum()
-            found = self.target.of(values[:, left], kept)
-            without_block.append(found[0])
-        # The jackknife of grouped points.
-        return float(np.sqrt((N_BLOCKS - 1) * np.var(without_block)))
 
     @cached_property
     def _valid(self) -> Any:
@@ -268,41 +217,58 @@ class Bound(ABC):
 
     def valid(self, params: Sequence[Any]) -> Any:
         """Return which of a batch of roots give valid distributions (sigma > 0), shape (k,)."""
-        (found,) = self._valid(*params)
-        size = len(params[0])
-        of_each = np.broadcast_to(found, size)
-        return of_each.astype(bool)
-
-    def valid_only(self, params: Sequence[Floats]) -> list[Floats]:
-        """Leave out the roots that give no valid distributions, or raise if none does."""
-        refuse_lopsided(self.name, self.inputs, params)
-        ok = self.valid(params)
-        if not ok.any():
-            names = ", ".join(str(r.name) for r in self.inputs.roots)
-            raise ValueError(
-                f"{self.name}: priors: got invalid parameters of the inputs at all {len(ok)} draws "
-                f"of {names}, expected valid ones; give scales a prior on positive numbers, "
-                "such as pm.HalfNormal"
-            )
-        return [p[ok] for p in params]
+        (is_valid,) = self._valid(*params)
+        return np.broadcast_to(is_valid, len(params[0])).astype(bool)
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
         """Draw responses of ``size`` specimens at one value of the roots, (size,) or (size, m).
 
         They are specimens of the population's points, by weight and with replacement.
         """
-        at = [np.asarray(p)[None] for p in params]
-        nowhere = np.full((size, *self.target.event), np.nan)
-        if not self.valid(at).all():
-            return nowhere
-        values, weights = self.populations(at)
+        roots = [np.asarray(p)[None] for p in params]
+        no_response = np.full((size, *self.target.event), np.nan)
+        if not self.valid(roots).all():
+            return no_response
+        values, weights = self.populations(roots)
         points = values[0]
-        known = ~lacking(points)
-        mass = np.where(known, weights[0], 0.0)
+        mass = np.where(~lacking(points), weights[0], 0.0)
         total = mass.sum()
         if not total > 0:
-            return nowhere
+            return no_response
         return rng.choice(points, size=size, p=mass / total)
+
+
+def discrepancy_error(bound: Bound, params: Sequence[Any]) -> float:
+    """Return the standard error of the discrepancy at given roots, shapes (1, ...).
+
+    By the grouped jackknife over eighths of the responses. Right for random draws (`Fresh`), and an
+    upper bound for common points, which are better than random ones.
+    """
+    if bound.n_points < 2 * N_BLOCKS:
+        return np.nan
+    values, weights = bound.populations(params)
+    bound._missing = Missing.of(values, weights)
+    without_block = []
+    for block in range(N_BLOCKS):
+        is_used = bound.blocks != block
+        part = weights[:, is_used]
+        part = part / part.sum()
+        without_block.append(bound.target.of(values[:, is_used], part)[0])
+    return float(np.sqrt((N_BLOCKS - 1) * np.var(without_block)))
+
+
+def valid_roots(bound: Bound, params: Sequence[Floats]) -> list[Floats]:
+    """Return the roots that give valid distributions, or raise if none does."""
+    refuse_lopsided(bound.name, bound.inputs, params)
+    ok = bound.valid(params)
+    if not ok.any():
+        names = ", ".join(str(r.name) for r in bound.inputs.roots)
+        raise ValueError(
+            f"{bound.name}: priors: got invalid parameters of the inputs at all {len(ok)} draws "
+            f"of {names}, expected valid ones; give scales a prior on positive numbers, "
+            "such as pm.HalfNormal"
+        )
+    return [p[ok] for p in params]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -387,17 +353,14 @@ def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...
     ResponseError
         If the response raises, has the wrong shape, or is NaN everywhere.
     """
-    draws = prior_draws(bound.inputs.roots, 64, seed)  # of which a few at least are valid
-    two = [draw[:2] for draw in bound.valid_only(draws)]
-    rng = np.random.default_rng(seed)
-    aleatory, epistemic = sampler(two, 8, rng)
+    draws = prior_draws(bound.inputs.roots, 64, seed)  # a few of them at least are valid
+    two = [draw[:2] for draw in valid_roots(bound, draws)]
+    aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)
     refuse_all_nan(bound.name, values)
-    bound._probed = values.reshape(-1, *bound.target.event)
-    probed_at = []
-    for x, shape in zip(aleatory, bound.inputs.event_shapes, strict=True):
-        probed_at.append(x.reshape(-1, *shape))
-    bound._probed_at = probed_at
+    bound.first_responses = values.reshape(-1, *bound.target.event)
+    shapes = bound.inputs.event_shapes
+    bound.first_points = [x.reshape(-1, *s) for x, s in zip(aleatory, shapes, strict=True)]
     return values, aleatory, epistemic
 
 

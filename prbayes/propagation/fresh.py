@@ -92,8 +92,14 @@ class FreshBound(Bound):
         self.n_per_theta = config.n
         self.max_lost = config.max_lost
         self._seed = config.random_seed
+        self._stream = 0  # seed of the sampler at work
         self._sampler = PopulationSampler(inputs)
         probe(self, self._sampler, config.random_seed)
+
+    def restart(self, stream: int) -> None:
+        """Begin a sampler's own stream of random draws."""
+        self._stream = stream
+        self.draws = 0
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return an operation that draws and evaluates."""
@@ -102,7 +108,7 @@ class FreshBound(Bound):
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""
         self.draws += 1
-        rng = np.random.default_rng([self._seed, self.stream, self.draws, _digest_of(params)])
+        rng = np.random.default_rng([self._seed, self._stream, self.draws, _digest_of(params)])
         aleatory, epistemic = self._sampler(params, self.n_per_theta, rng)
         values = self.responses(aleatory, epistemic)
         equal = np.broadcast_to(1 / self.n_per_theta, (len(values), self.n_per_theta))

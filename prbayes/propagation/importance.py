@@ -1,8 +1,8 @@
-"""Points that a design takes weights of: its runs, or a cloud whose responses are emulated."""
+"""Weighted samples of populations: stored runs, and points between them with emulated responses."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.emulators.mixing_weight import share_of_runs
 from prbayes.emulators.multifidelity import Following
 from prbayes.emulators.selection import (
     Runs,
@@ -18,203 +17,225 @@ from prbayes.emulators.selection import (
     chosen,
     emulated,
     emulated_without_each,
+    share_of_runs,
 )
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import N_BLOCKS
-
-# Points of a cloud at first, and at most: they cost no run.
-CLOUD = 8192
-LARGEST_CLOUD = 65536
-# Populations of a group at most: more would cost time and add nothing.
-_POPULATIONS = 384
-# The share of a cloud that the prior keeps beside populations that are known to matter: it is only
-# to stay in reach, and its points among theirs are noise. Of those the mixture is of few, so that
-# each has enough points to fill its space evenly, and of more in a larger cloud.
-_OF_PRIOR = 1 / 16
-_FROM_PRIOR = 96
-_NEAR = 30
-# Share of the runs in a population from which on it is theirs alone, and to which it is the
-# emulator's: what is in between has the least error.
-_ALONE, _LITTLE = 0.95, 0.05
+from prbayes.response.budget import unlimited
+from prbayes.response.failures import Replace, ResponseError
+from prbayes.response.response import Responses
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Points with their responses and density, of which weights are taken.
+@dataclass(frozen=True)
+class EmulatedSizes:
+    """Sizes of emulated samples, whose points cost no run.
 
-    Attributes
-    ----------
-    points : tuple of ndarray, shapes (n, *event)
-        Of each aleatory input.
-    values : ndarray, shape (n,) or (n, m)
-        Their responses.
-    log_g : ndarray, shape (n,)
-        Log density of the mixture that they were drawn from.
-    blocks : ndarray, shape (n,)
-        Which of eight coarser tables each point belongs to.
+    The mixture that a sample is drawn from has few populations beside the prior, so that each fills
+    its space evenly.
     """
 
-    points: tuple[Floats, ...]
-    values: Floats
-    log_g: Floats
-    blocks: NDArray[np.intp]
+    first: int = 8192  # points
+    largest: int = 65536  # points
+    prior_share: float = 1 / 16  # of the points, beside populations that matter
+    from_prior: int = 96  # populations, beside others that matter
+    near: int = 30  # populations of another group, in a sample of the first size
+    # Shares of the runs in a population above which the runs stay alone, and below which they are
+    # left out: a mixture has the least error in between.
+    runs_alone: float = 0.95
+    runs_negligible: float = 0.05
+
+
+SIZES = EmulatedSizes()
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
-    """Points without runs, and how their responses are emulated."""
+class Sample:
+    """Points with their responses and proposal density, for importance weights."""
 
-    points: tuple[Floats, ...]  # (M, *event): of each aleatory input
-    log_g: Floats  # (M,)
-    coarse: Floats | None = None  # (M, m): of a coarse response, if emulators follow one
+    points: tuple[Floats, ...]  # (n, *event), by aleatory input
+    values: Floats  # (n,) or (n, m); NaN without a response
+    log_density: Floats  # (n,): of the mixture that the points were drawn from
+    blocks: NDArray[np.intp]  # (n,): which of eight coarser samples a point belongs to
 
     def __len__(self) -> int:
-        return len(self.log_g)
+        return len(self.values)
+
+    def rows(self, mask: NDArray[np.bool_]) -> Sample:
+        """Return some of the points."""
+        points = tuple(x[mask] for x in self.points)
+        return Sample(points, self.values[mask], self.log_density[mask], self.blocks[mask])
 
 
 @dataclass(frozen=True, eq=False)
-class Emulation:
-    """An emulator of one response on the runs of a design, with a cloud to say it of.
+class EmulatedPoints:
+    """Points between the runs, with a coarse response if emulators follow one."""
+
+    inputs: tuple[Floats, ...]  # (M, *event), by aleatory input
+    coarse: Floats | None = None  # (M, m)
+
+    def __len__(self) -> int:
+        return len(self.inputs[0])
+
+
+@dataclass(frozen=True, eq=False)
+class DesignEmulator:
+    """An emulator of one response, fitted to the runs of a design.
 
     Attributes
     ----------
     runs : Runs
-    models : tuple
-        The surface that was chosen for each output.
-    said : ndarray, shape (n, m)
-        What they say of runs that were left out.
+    surfaces : tuple
+        By output.
+    left_out : ndarray, shape (n, m)
+        Predictions of runs that were left out.
     weights : ndarray, shape (T, n)
         Of the runs in the populations that matter.
-    share : float
-        The share of a population that the runs are.
+    run_share : float
+        Mixing weight of the runs among the points of a population.
     error : float
-        Root mean square error of the worst output at runs that were left out, where the populations
-        that matter live, in units of its spread there.
+        Root mean square error of the worst output at runs that were left out, in units of its
+        spread in the populations that matter.
     event : tuple of int
         Shape of one response: () or (m,).
     """
 
     runs: Runs
-    models: tuple[Any, ...]
-    said: Floats
+    surfaces: tuple[Any, ...]
+    left_out: Floats
     weights: Floats
-    share: float
+    run_share: float
     error: float
     event: tuple[int, ...]
 
-    @classmethod
-    @one_thread()
-    def of(
-        cls,
-        emulator: Any,
-        points: Sequence[Floats],
-        values: Floats,
-        weights: Floats,
-        blocks: NDArray[np.intp],
-        coarse: Floats | None = None,
-    ) -> Emulation | None:
-        """Choose an emulator; None where runs alone are as good.
-
-        Parameters
-        ----------
-        emulator : str, Surface or regressor
-            Several are tried by default.
-        points : sequence of ndarray, shapes (n, *event)
-        values : ndarray, shape (n,) or (n, m)
-        weights : ndarray, shape (T, n)
-            Of the runs in the populations that matter.
-        blocks : ndarray, shape (n,)
-        coarse : ndarray, shape (n, m), optional
-            A coarse response at the runs.
-        """
-        x = columns(points)
-        y = values.reshape(len(values), -1)
-        runs = Runs(x, y, weights.mean(axis=0), blocks, coarse)
-        try:
-            tried = candidates(*x.shape) if isinstance(emulator, str) else [emulator]
-            models, said = chosen(tried, runs)
-        except np.linalg.LinAlgError:
-            return None
-        return cls._judged(runs, models, said, weights, values.shape[1:])
-
-    @classmethod
-    def _judged(
-        cls,
-        runs: Runs,
-        models: tuple[Any, ...],
-        said: Floats,
-        weights: Floats,
-        event: tuple[int, ...],
-    ) -> Emulation | None:
-        """Return it with the share that the runs have, for the populations that matter."""
-        share = share_of_runs(weights, runs.y, said, runs.blocks)
-        if share > _ALONE:
-            return None
-        share = 0.0 if share < _LITTLE else share
-        error = _error(runs, said, weights.mean(axis=0))
-        return cls(
-            runs=runs,
-            models=models,
-            said=said,
-            weights=weights,
-            share=share,
-            error=error,
-            event=event,
-        )
-
-    def elsewhere(self, weights: Floats) -> Emulation | None:
+    def for_populations(self, weights: Floats) -> DesignEmulator | None:
         """Return the same surfaces for other populations; None where runs alone are as good."""
-        return self._judged(self.runs, self.models, self.said, weights, self.event)
+        return _weighed(self.runs, self.surfaces, self.left_out, weights, self.event)
 
     @property
-    def following(self) -> int:
-        """How many outputs follow a coarse response, of which a cloud then needs values."""
-        return sum(isinstance(model, Following) for model in self.models)
+    def n_following(self) -> int:
+        """Number of outputs that follow a coarse response."""
+        return sum(isinstance(surface, Following) for surface in self.surfaces)
 
     @one_thread()
-    def at(self, cloud: Cloud) -> Floats:
-        """Return the responses at the cloud's points, (M,) or (M, m)."""
-        found = emulated(self.models, self.runs, columns(cloud.points), coarse=cloud.coarse)
-        return found.reshape(-1, *self.event)
+    def at(self, points: EmulatedPoints) -> Floats:
+        """Return the responses at points, (M,) or (M, m)."""
+        x = columns(points.inputs)
+        values = emulated(self.surfaces, self.runs, x, coarse=points.coarse)
+        return values.reshape(-1, *self.event)
 
     @one_thread()
-    def without_each_block(self, cloud: Cloud) -> list[Floats]:
-        """Return the same from emulators that were fitted without a block of the runs each."""
-        at = columns(cloud.points)
-        found = emulated_without_each(self.models, self.runs, at, cloud.coarse)
-        return [values.reshape(-1, *self.event) for values in found]
+    def without_each_block(self, points: EmulatedPoints) -> list[Floats]:
+        """Return the responses by emulators that were fitted without one block of the runs."""
+        x = columns(points.inputs)
+        by_block = emulated_without_each(self.surfaces, self.runs, x, points.coarse)
+        return [values.reshape(-1, *self.event) for values in by_block]
 
-    def joined(self, cloud: Cloud, said: Floats, runs: Table) -> Table:
-        """Return cloud and runs as one table, in which the runs have their share."""
-        m = len(cloud)
-        n = len(runs.log_g)
+    def joined(self, points: EmulatedPoints, log_density: Floats, runs: Sample) -> Sample:
+        """Return emulated points and runs as one sample, in which runs have their share."""
+        m, n = len(points), len(runs)
+        values = self.at(points)
         blocks = np.arange(m) * N_BLOCKS // m
-        if not self.share:
-            return Table(cloud.points, said, cloud.log_g, blocks)
-        # Weights are p / g: that of all points together is on average one.
-        of_cloud = cloud.log_g - np.log((1 - self.share) * (m + n) / m)
-        of_runs = runs.log_g - np.log(self.share * (m + n) / n)
-        pairs = zip(cloud.points, runs.points, strict=True)
-        return Table(
+        if not self.run_share:
+            return Sample(points.inputs, values, log_density, blocks)
+        # Weights are p / g: the mean over all points together is one.
+        of_points = log_density - np.log((1 - self.run_share) * (m + n) / m)
+        of_runs = runs.log_density - np.log(self.run_share * (m + n) / n)
+        pairs = zip(points.inputs, runs.points, strict=True)
+        return Sample(
             points=tuple(np.concatenate([a, b]) for a, b in pairs),
-            values=np.concatenate([said, runs.values]),
-            log_g=np.concatenate([of_cloud, of_runs]),
+            values=np.concatenate([values, runs.values]),
+            log_density=np.concatenate([of_points, of_runs]),
             blocks=np.concatenate([blocks, runs.blocks]),
         )
 
 
-def _error(runs: Runs, said: Floats, importance: Floats) -> float:
-    """Return the relative error of the worst output at runs that were left out."""
-    known = runs.good & np.isfinite(said).all(axis=1)
-    y = runs.y[known]
-    importance = importance[known]
+@one_thread()
+def fit_emulator(
+    emulator: Any, runs: Sample, weights: Floats, coarse: Floats | None = None
+) -> DesignEmulator | None:
+    """Fit an emulator to runs; None where the runs alone are as good.
+
+    ``emulator`` is a surface or a regressor, or a text for the best of several. ``weights``,
+    (T, n), are those of the runs in the populations that matter. ``coarse``, (n, m), is a coarse
+    response at the runs.
+    """
+    x = columns(runs.points)
+    y = runs.values.reshape(len(runs), -1)
+    fitted = Runs(x, y, weights.mean(axis=0), runs.blocks, coarse)
+    try:
+        surfaces = candidates(*x.shape) if isinstance(emulator, str) else [emulator]
+        best, left_out = chosen(surfaces, fitted)
+    except np.linalg.LinAlgError:
+        return None
+    return _weighed(fitted, best, left_out, weights, runs.values.shape[1:])
+
+
+def _weighed(
+    runs: Runs,
+    surfaces: tuple[Any, ...],
+    left_out: Floats,
+    weights: Floats,
+    event: tuple[int, ...],
+) -> DesignEmulator | None:
+    """Return an emulator with the share of the runs; None where they stay alone."""
+    share = share_of_runs(weights, runs.y, left_out, runs.blocks)
+    if share > SIZES.runs_alone:
+        return None
+    share = 0.0 if share < SIZES.runs_negligible else share
+    error = _relative_error(runs, left_out, weights.mean(axis=0))
+    return DesignEmulator(runs, surfaces, left_out, weights, share, error, event)
+
+
+def _relative_error(runs: Runs, left_out: Floats, importance: Floats) -> float:
+    """Return the error of the worst output at runs that were left out, in its spreads."""
+    is_known = runs.good & np.isfinite(left_out).all(axis=1)
+    y = runs.y[is_known]
+    importance = importance[is_known]
     total = importance.sum()
     if not total > 0:
         return np.nan
     importance = importance / total
     spread = np.sqrt(importance @ (y - importance @ y) ** 2)
-    off = np.sqrt(importance @ (said[known] - y) ** 2)
-    return float((off / np.where(spread > 0, spread, 1.0)).max())
+    error = np.sqrt(importance @ (left_out[is_known] - y) ** 2)
+    return float((error / np.where(spread > 0, spread, 1.0)).max())
+
+
+class CoarseResponse:
+    """A coarse response of a simulator, which costs no run.
+
+    Its values are NaN where it raises, which is logged.
+    """
+
+    def __init__(self, function: Callable[..., Any], expensive: Responses, executor: Any) -> None:
+        self._responses = Responses(
+            f"{expensive.name}: coarse",
+            function,
+            expensive.inputs,
+            executor=executor,
+            on_failure=Replace(),
+            outputs=expensive.outputs,
+        )
+        self._has_values = False
+
+    def __call__(self, points: Sequence[Floats]) -> Floats:
+        """Return the outputs at points, (n, m).
+
+        Raises
+        ------
+        ResponseError
+            If they are no real numbers, have another shape than those of the expensive response, or
+            are not finite at any of the points of the first call.
+        """
+        with unlimited():  # the user limits the expensive response
+            values = self._responses(points, [])
+        self._has_values = self._has_values or bool(np.isfinite(values).any())
+        if not self._has_values:
+            reason = next((failure.reason for failure in self._responses.failed), "it is infinite")
+            raise ResponseError(
+                f"{self._responses.name}: got no number at any of {len(values)} runs ({reason}), "
+                "expected a response of the same inputs; repair it, or leave coarse= out"
+            )
+        return values.reshape(len(values), -1)
 
 
 def columns(points: Sequence[Floats]) -> Floats:
@@ -223,32 +244,27 @@ def columns(points: Sequence[Floats]) -> Floats:
     return np.concatenate(flat, axis=1)
 
 
-def some_of(group: Sequence[Floats], most: int = _POPULATIONS) -> list[Floats]:
-    """Return populations of a group, spread over it; a few come again and again, equally often."""
+def spread_over(group: Sequence[Floats], count: int) -> list[Floats]:
+    """Return ``count`` populations, spread evenly over a group; those of a small one repeat."""
     size = len(group[0])
-    places = np.linspace(0, size - 1, most).astype(int)
-    if size < most:
-        places = np.arange(most) * size // most
-    return [values[places] for values in group]
+    rows = np.linspace(0, size - 1, count).astype(int)
+    if size < count:
+        rows = np.arange(count) * size // count
+    return [values[rows] for values in group]
 
 
 def mixture_of(groups: Sequence[Sequence[Floats]], size: int) -> tuple[list[Floats], Floats]:
-    """Return the populations that a cloud is drawn from, and the share that each has of it.
+    """Return the populations that an emulated sample is drawn from, and the share of each.
 
-    Parameters
-    ----------
-    groups : sequence
-        The prior's, and others that are known to matter; arrays (k, *shape) of the roots each.
-    size : int
-        Of the cloud.
+    The first group is the prior; groups have one array of roots, (k, *shape), by root.
     """
     prior, *others = groups
     if not others:
-        found = some_of(prior)
-        return found, np.full(_POPULATIONS, 1 / _POPULATIONS)
-    near = _NEAR * size // CLOUD
-    chosen = [some_of(prior, _FROM_PRIOR), *(some_of(group, near) for group in others)]
-    each = (1 - _OF_PRIOR) / (near * len(others))
-    shares = np.full(_FROM_PRIOR + near * len(others), each)
-    shares[:_FROM_PRIOR] = _OF_PRIOR / _FROM_PRIOR
-    return [np.concatenate(same) for same in zip(*chosen, strict=True)], shares
+        count = 384  # more cost time and change nothing
+        return spread_over(prior, count), np.full(count, 1 / count)
+    near = SIZES.near * size // SIZES.first
+    parts = [spread_over(prior, SIZES.from_prior), *(spread_over(g, near) for g in others)]
+    each = (1 - SIZES.prior_share) / (near * len(others))
+    shares = np.full(SIZES.from_prior + near * len(others), each)
+    shares[: SIZES.from_prior] = SIZES.prior_share / SIZES.from_prior
+    return [np.concatenate(same) for same in zip(*parts, strict=True)], shares

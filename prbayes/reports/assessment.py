@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes.plots._names import named
+from prbayes.plots._labels import named
 from prbayes.plots.validity import in_directions
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import (

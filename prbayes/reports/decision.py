@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes.plots._names import named
+from prbayes.plots._labels import named
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import number, percentage, plus_minus
 from prbayes.reports.schema import kind_of_decision

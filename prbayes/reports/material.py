@@ -24,7 +24,7 @@ from prbayes.model.fingerprint import (
 )
 from prbayes.model.fingerprint import from_attributes as identity_of_attributes
 from prbayes.optimize.optimum import Optimum, identity_in
-from prbayes.plots._names import refuse_labels
+from prbayes.plots._labels import refuse_labels
 from prbayes.response.outputs import ONE, Outputs, read_observed
 from prbayes.results.compare import compare
 from prbayes.results.diagnose import Diagnosis, diagnose

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from prbayes.plots._names import named
+from prbayes.plots._labels import named
 from prbayes.plots.validity import in_directions
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike

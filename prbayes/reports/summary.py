@@ -14,8 +14,7 @@ from prbayes.model.elements import (
     told_of,
     variable_of,
 )
-from prbayes.plots._names import named
-from prbayes.plots._objective import metric_label
+from prbayes.plots._labels import metric_label, named
 from prbayes.plots.validity import in_directions
 from prbayes.reports.decision import interval_of
 from prbayes.reports.material import Material

@@ -1,4 +1,4 @@
-"""A program that computes the response of one specimen, run in a folder of its own."""
+"""External programs as responses, each run in its own folder."""
 
 from __future__ import annotations
 
@@ -21,13 +21,6 @@ import numpy as np
 from prbayes._validate import Floats, called, flag, folder_path, positive_number
 from prbayes.response.call import scalar
 
-# Characters of what a program wrote that an error repeats: its last lines say what went wrong.
-_REPEATED = 1000
-# Files of a run that an error names: what fits a line.
-_NAMED = 12
-# Seconds for a program without a time limit: 46 days, the longest that Windows waits for.
-_LONGEST = 4e6
-
 
 def command(
     arguments: Sequence[str | PathLike[str]],
@@ -39,10 +32,10 @@ def command(
     folder: str | PathLike[str] | None = None,
     keep: bool = False,
 ) -> scalar:
-    """Turn a program into a response: it is run once for each specimen, in a folder of its own.
+    """Turn a program into a response: it runs once for each specimen, in a folder of the run.
 
-    There is no shell: arguments reach the program as they are. What it prints is in the files
-    ``stdout.txt`` and ``stderr.txt`` of the folder. The response is of one output or several.
+    There is no shell: arguments reach the program unchanged. Its printed output is in the files
+    ``stdout.txt`` and ``stderr.txt`` of the folder. The response has one output or several.
 
     Parameters
     ----------
@@ -52,9 +45,9 @@ def command(
         Names of the simulator's inputs, in their order. ``{name}`` or ``{name:.6e}`` in an argument
         or a template stands for the value; other braces are left alone.
     read : callable
-        ``read(folder)`` takes the response, in the unit of the observed values, from the files in
+        ``read(folder)`` returns the response, in the unit of the observed values, from the files in
         the folder: a number, or for several outputs an array, shape (m,), or a mapping of numbers
-        or arrays by the names that they have in what was observed.
+        or arrays by the names in ``observed``.
     write : mapping of str to str or path, optional
         Files to write before each run: the name of the file in the folder, and the text of its
         template, or the path of a template.
@@ -63,8 +56,7 @@ def command(
     folder : path, optional
         Where the folders of the runs are made; by default where temporary files are.
     keep : bool
-        Whether folders are kept. Those of runs that failed are kept in any case where ``folder`` is
-        given.
+        Whether folders are kept. With ``folder``, those of failed runs are kept in any case.
 
     Raises
     ------
@@ -76,9 +68,9 @@ def command(
     Notes
     -----
     A run fails if the program ends with another code than zero, takes longer than ``timeout``, or
-    if ``read`` raises, or gives no numbers. The error tells what the program wrote last; a
-    propagation's ``on_failure`` says what becomes of the point. Programs run outside Python, so
-    that threads serve as an executor.
+    if ``read`` raises, or returns no numbers. The error repeats the last lines of the program; the
+    propagation's ``on_failure`` applies. Programs run outside Python, so threads serve as an
+    executor.
 
     Examples
     --------
@@ -97,17 +89,79 @@ def command(
             f"command: read: got {called(read)}, expected a function of the run's folder that "
             "returns numbers"
         )
-    found = Program(
-        arguments=_arguments(arguments),
-        inputs=_names(inputs),
-        templates=_templates({} if write is None else write),
+    program = Program(
+        arguments=_checked_arguments(arguments),
+        inputs=_checked_names(inputs),
+        templates=_read_templates({} if write is None else write),
         read=read,
         timeout=None if timeout is None else positive_number(timeout, "command: timeout"),
         folder=None if folder is None else folder_path(folder, "command: folder"),
         keep=flag(keep, "command: keep"),
     )
-    found.refuse_unused()
-    return scalar(found)
+    program.refuse_unused_inputs()
+    return scalar(program)
+
+
+def _checked_arguments(arguments: object) -> tuple[str, ...]:
+    """Return the path of the program, and its arguments."""
+    if isinstance(arguments, str) or not isinstance(arguments, Sequence) or not arguments:
+        raise TypeError(
+            f"command: arguments: got {called(arguments)}, expected a list of the program and its "
+            'arguments, such as ["solver", "input.txt"]'
+        )
+    texts = []
+    for argument in arguments:
+        if not isinstance(argument, str | PathLike):
+            raise TypeError(
+                f"command: arguments: got {called(argument)} among them, expected texts and paths"
+            )
+        texts.append(os.fspath(argument))
+    path = shutil.which(texts[0])
+    if path is None:
+        raise FileNotFoundError(
+            f"command: got the program {texts[0]!r}, which is not there or cannot be run, expected "
+            "one on the path, or its whole path"
+        )
+    return (os.path.abspath(path), *texts[1:])  # it runs in another folder
+
+
+def _checked_names(inputs: object) -> tuple[str, ...]:
+    if isinstance(inputs, str) or not isinstance(inputs, Sequence):
+        raise TypeError(
+            f"command: inputs: got {called(inputs)}, expected a list of the simulator's inputs, "
+            'such as ["modulus", "force"]'
+        )
+    names = tuple(inputs)
+    for name in names:
+        if not isinstance(name, str) or not name.isidentifier() or names.count(name) > 1:
+            raise ValueError(
+                f"command: inputs: got {name!r}, expected names of letters and digits, each once"
+            )
+    return names
+
+
+def _read_templates(write: object) -> dict[str, str]:
+    """Return the texts of the templates by the name of their file."""
+    if not isinstance(write, Mapping):
+        raise TypeError(
+            f"command: write: got {called(write)}, expected templates by the name of their file"
+        )
+    texts: dict[str, str] = {}
+    for name, template in write.items():
+        path = Path(name) if isinstance(name, str) else Path()
+        if not path.parts or path.is_absolute() or ".." in path.parts:
+            raise ValueError(
+                f"command: write: got the file {name!r}, expected a name inside the run's folder"
+            )
+        if not isinstance(template, str | PathLike):
+            raise TypeError(
+                f"command: write: got {called(template)} for {name}, expected the text of a "
+                "template, or its path"
+            )
+        if isinstance(template, PathLike):
+            template = Path(template).read_text(encoding="utf-8")
+        texts[name] = template
+    return texts
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +181,11 @@ class Program:
         """The name of the program."""
         return Path(self.arguments[0]).name
 
-    def refuse_unused(self) -> None:
-        """Raise if an input occurs nowhere, or cannot be written as it is asked for."""
-        written = [*self.arguments[1:], *self.templates.values()]
+    def refuse_unused_inputs(self) -> None:
+        """Raise if an input occurs nowhere, or with a format that is not of a number."""
+        texts = [*self.arguments[1:], *self.templates.values()]
         for name in self.inputs:
-            fields = [field for text in written for field in _field(name).finditer(text)]
+            fields = [field for text in texts for field in _fields(name, text)]
             if not fields:
                 raise ValueError(
                     f"command: inputs: got {name!r}, which occurs neither in the arguments nor in "
@@ -140,7 +194,7 @@ class Program:
                 )
             for field in fields:
                 try:
-                    _formatted(1.0, field["format"])
+                    _formatted(1.0, field)
                 except ValueError:
                     raise ValueError(
                         f"command: got the field {field[0]}, expected the format of a number, such "
@@ -171,192 +225,120 @@ class Program:
                 f"{self.__name__}: got {len(values)} inputs, expected {len(self.inputs)}: "
                 f"{', '.join(self.inputs)}{hint}"
             )
-        known = dict(zip(self.inputs, values, strict=True))
+        by_name = dict(zip(self.inputs, values, strict=True))
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
-        here = Path(tempfile.mkdtemp(prefix=f"{self.__name__}-", dir=self.folder))
-        failed = True
+        folder = Path(tempfile.mkdtemp(prefix=f"{self.__name__}-", dir=self.folder))
+        has_failed = True
         try:
             for name, template in self.templates.items():
-                path = here / name
+                path = folder / name
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(_filled(template, known), encoding="utf-8")
-            self._run([_filled(text, known) for text in self.arguments], here)
-            found = self._read(here)
-            failed = False
+                path.write_text(_filled(template, by_name), encoding="utf-8")
+            self._run([_filled(text, by_name) for text in self.arguments], folder)
+            outputs = self._outputs(folder)
+            has_failed = False
         finally:
-            kept = self.keep or (failed and self.folder is not None)
-            if not kept:
-                shutil.rmtree(here, ignore_errors=True)
-        return found
+            if not (self.keep or (has_failed and self.folder is not None)):
+                shutil.rmtree(folder, ignore_errors=True)
+        return outputs
 
-    def _run(self, arguments: list[str], here: Path) -> None:
+    def _run(self, arguments: list[str], folder: Path) -> None:
         """Run the program to its end, or end it."""
         with (
-            (here / "stdout.txt").open("wb") as stdout,
-            (here / "stderr.txt").open("wb") as stderr,
+            (folder / "stdout.txt").open("wb") as stdout,
+            (folder / "stderr.txt").open("wb") as stderr,
             subprocess.Popen(
                 arguments,
-                cwd=here,
+                cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=stdout,
                 stderr=stderr,
                 start_new_session=True,
             ) as process,
         ):
-            limit = _LONGEST if self.timeout is None else self.timeout
             try:
-                # With a limit it looks again and again, so that what is raised in a worker's thread
-                # arrives; without one, only when the program has ended.
-                code = process.wait(limit)
+                code = process.wait(self.timeout)
             except subprocess.TimeoutExpired:
                 raise TimeoutError(
-                    f"{self.__name__}: no result within timeout = {limit:g} s"
-                    f"{self._last_words(here)}"
+                    f"{self.__name__}: no result within timeout = {self.timeout:g} s"
+                    f"{self._last_lines(folder)}"
                 ) from None
             finally:
-                # Whatever ends the wait: a limit, Ctrl-C, a worker's time limit.
+                # Whatever ends the wait: the time limit, Ctrl-C, a worker's time limit.
                 if process.returncode is None:
-                    _end(process)
+                    _kill_tree(process)
         if code != 0:
             raise RuntimeError(
-                f"{self.__name__}: ended with code {code}, expected 0{self._last_words(here)}"
+                f"{self.__name__}: ended with code {code}, expected 0{self._last_lines(folder)}"
             )
 
-    def _read(self, here: Path) -> float | Floats | dict[str, float | Floats]:
-        """Return what the program computed, as numbers."""
+    def _outputs(self, folder: Path) -> float | Floats | dict[str, float | Floats]:
+        """Return the results of the program as numbers."""
         try:
-            found = self.read(here)
-            if isinstance(found, Mapping):
-                return {name: _numbers(value) for name, value in found.items()}
-            return _numbers(found)
+            result = self.read(folder)
+            if isinstance(result, Mapping):
+                return {name: _numbers(value) for name, value in result.items()}
+            return _numbers(result)
         except TimeoutError:  # a worker's time limit
             raise
         except Exception as error:
-            files = sorted(path.name for path in here.iterdir())
+            files = sorted(path.name for path in folder.iterdir())
             raise RuntimeError(
                 f"{self.__name__}: its results cannot be read ({type(error).__name__}: "
                 f"{error!s:.300}), expected numbers in the files that it wrote; there are "
-                f"{', '.join(files[:_NAMED])}{self._last_words(here)}"
+                f"{', '.join(files[:12])}{self._last_lines(folder)}"
             ) from error
 
-    def _last_words(self, here: Path) -> str:
-        """Return the end of what the program wrote, and where all of it is, to add to an error."""
-        written = "; it wrote nothing"
+    def _last_lines(self, folder: Path) -> str:
+        """Return the end of the program's printed output, and its folder, to add to an error."""
+        printed = "; it wrote nothing"
         for name in ("stderr.txt", "stdout.txt"):
-            text = (here / name).read_text(encoding="utf-8", errors="replace").strip()
+            text = (folder / name).read_text(encoding="utf-8", errors="replace").strip()
             if text:
-                written = f"; it wrote: {text[-_REPEATED:]}"
+                printed = f"; it wrote: {text[-1000:]}"
                 break
-        return written if self.folder is None else f"{written}\nfolder: {here}"
+        return printed if self.folder is None else f"{printed}\nfolder: {folder}"
 
 
-def _arguments(arguments: object) -> tuple[str, ...]:
-    """Return the program, where it is, and its arguments."""
-    if isinstance(arguments, str) or not isinstance(arguments, Sequence) or not arguments:
-        raise TypeError(
-            f"command: arguments: got {called(arguments)}, expected a list of the program and its "
-            'arguments, such as ["solver", "input.txt"]'
-        )
-    found = []
-    for argument in arguments:
-        if not isinstance(argument, str | PathLike):
-            raise TypeError(
-                f"command: arguments: got {called(argument)} among them, expected texts and paths"
-            )
-        found.append(os.fspath(argument))
-    where = shutil.which(found[0])
-    if where is None:
-        raise FileNotFoundError(
-            f"command: got the program {found[0]!r}, which is not there or cannot be run, expected "
-            "one on the path, or its whole path"
-        )
-    # The program runs in another folder.
-    return (os.path.abspath(where), *found[1:])
+def _fields(name: str, text: str) -> list[re.Match[str]]:
+    """Return the places of an input in a text, with its format if it has one."""
+    return list(re.finditer(r"\{" + re.escape(name) + r"(?P<format>:[^{}]*)?\}", text))
 
 
-def _names(inputs: object) -> tuple[str, ...]:
-    if isinstance(inputs, str) or not isinstance(inputs, Sequence):
-        raise TypeError(
-            f"command: inputs: got {called(inputs)}, expected a list of the simulator's inputs, "
-            'such as ["modulus", "force"]'
-        )
-    names = tuple(inputs)
-    for name in names:
-        if not isinstance(name, str) or not name.isidentifier() or names.count(name) > 1:
-            raise ValueError(
-                f"command: inputs: got {name!r}, expected names of letters and digits, each once"
-            )
-    return names
-
-
-def _templates(write: object) -> dict[str, str]:
-    """Return the texts of the files to write, by name."""
-    if not isinstance(write, Mapping):
-        raise TypeError(
-            f"command: write: got {called(write)}, expected templates by the name of their file"
-        )
-    found = {}
-    for name, template in write.items():
-        if not isinstance(name, str) or not _is_inside(name):
-            raise ValueError(
-                f"command: write: got the file {name!r}, expected a name inside the run's folder"
-            )
-        if isinstance(template, PathLike):
-            found[name] = Path(template).read_text(encoding="utf-8")
-        elif isinstance(template, str):
-            found[name] = template
-        else:
-            raise TypeError(
-                f"command: write: got {called(template)} for {name}, expected the text of a "
-                "template, or its path"
-            )
-    return found
-
-
-def _is_inside(name: str) -> bool:
-    path = Path(name)
-    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
-
-
-def _field(name: str) -> re.Pattern[str]:
-    """Return what finds an input in a text, with its format if it has one."""
-    return re.compile(r"\{" + re.escape(name) + r"(?P<format>:[^{}]*)?\}")
+def _formatted(value: float, field: re.Match[str]) -> str:
+    """Return a number in the format of a field, by default with all digits."""
+    layout = field["format"]
+    return repr(float(value)) if layout is None else format(float(value), layout[1:])
 
 
 def _filled(text: str, values: Mapping[str, float]) -> str:
-    """Return a text with values in the place of their names."""
+    """Return a text with values in place of their names."""
     for name, value in values.items():
         parts = []
         end = 0
-        for field in _field(name).finditer(text):
-            parts += [text[end : field.start()], _formatted(value, field["format"])]
+        for field in _fields(name, text):
+            parts += [text[end : field.start()], _formatted(value, field)]
             end = field.end()
         text = "".join([*parts, text[end:]])
     return text
 
 
-def _formatted(value: float, layout: str | None) -> str:
-    # All digits, unless it is said how many.
-    return repr(float(value)) if layout is None else format(float(value), layout[1:])
-
-
-def _numbers(found: object) -> float | Floats:
-    """Return what was read as a number, or an array of them; a text may be one."""
-    array = np.asarray(found)
+def _numbers(result: object) -> float | Floats:
+    """Return a result as a number, or an array of numbers; a text may be one."""
+    array = np.asarray(result)
     if array.dtype.kind in "Oc":
-        raise TypeError(f"got {called(found)}")
+        raise TypeError(f"got {called(result)}")
     return array.astype(np.float64) if array.ndim else float(array)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a program that is still there, and what it started."""
+def _kill_tree(process: subprocess.Popen[bytes]) -> None:
+    """End a running program, and all processes that it started."""
     if sys.platform == "win32":
         tree = ["taskkill", "/T", "/F", "/PID", str(process.pid)]
         subprocess.run(tree, capture_output=True, check=False)
     else:
-        # It is the first of a session of its own, and was not waited for, so that its number is
-        # still its own.
-        # A system may refuse where all of it is over already.
+        # The leader of a session that was not waited for still has its number. A system may refuse
+        # where all processes have ended.
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Compilation of graphs: in batches, where one invalid row leaves the others alone, and once."""
+"""Compilation of PyTensor graphs, in batches and once for each structure."""
 
 from __future__ import annotations
 
@@ -23,37 +23,34 @@ from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.variable import TensorVariable
 
-# Operands of a sum: NumPy has 32 for one operation, the result among them, and PyTensor puts all
-# terms of a sum into one.
-_OPERANDS = 30
 
+def _split_long_sums(fgraph: Any, node: Any) -> Any:
+    """Split a sum or product of many terms, which PyTensor makes one operation.
 
-def _sums_of_sums(fgraph: Any, node: Any) -> Any:
-    """Divide what has too many terms, or factors, into several of as many as there may be."""
+    NumPy takes 32 operands, the result among them.
+    """
     op = node.op
     terms = node.inputs
-    if len(terms) <= _OPERANDS or not op.scalar_op.associative:
+    most = 30
+    if len(terms) <= most or not op.scalar_op.associative:
         return False
     parts = []
-    for first in range(0, len(terms), _OPERANDS):
-        part = terms[first : first + _OPERANDS]
+    for first in range(0, len(terms), most):
+        part = terms[first : first + most]
         parts.append(op(*part) if len(part) > 1 else part[0])
     return [op(*parts)]
 
 
-def _softplus_of_arrays(fgraph: Any, node: Any) -> Any:
-    """Return log(1 + exp(x)) in steps that NumPy has: PyTensor's would loop over numbers."""
+def _softplus_by_ufuncs(fgraph: Any, node: Any) -> Any:
+    """Return log(1 + exp(x)) by NumPy's functions: PyTensor's would loop over numbers."""
     if node.op.scalar_op != pt.softplus.scalar_op:
         return False
     (x,) = node.inputs
     return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
 
 
-def _elements_of_rows(fgraph: Any, node: Any) -> Any:
-    """Take x[i] of each row at once, as of the groups' own hyperparameters, where both are batched.
-
-    PyTensor's would loop over rows.
-    """
+def _index_batches(fgraph: Any, node: Any) -> Any:
+    """Take x[i] in all rows at once, as of hyperparameters of groups: PyTensor would loop."""
     op = node.op.core_op
     is_element = isinstance(op, Subtensor) and len(op.idx_list) == 1 and len(node.inputs) == 2
     if not is_element or isinstance(op.idx_list[0], slice):
@@ -71,7 +68,7 @@ def _elements_of_rows(fgraph: Any, node: Any) -> Any:
 class _Where(Op):
     """Choose between arrays, at no cost where the first is chosen throughout.
 
-    Every density asks whether its values and parameters are in its support, and most often all are.
+    Every density checks whether its values and parameters are in its support; most often all are.
     """
 
     __props__ = ()
@@ -95,41 +92,33 @@ class _Where(Op):
 _where = _Where()
 
 
-def _choices_if_any(fgraph: Any, node: Any) -> Any:
-    """Choose between arrays only where there is a choice."""
+def _switch_to_where(fgraph: Any, node: Any) -> Any:
     if node.op.scalar_op != pt.switch.scalar_op:
         return False
     return [_where(*node.inputs)]
 
 
-# Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion
-# every elementwise operation is one NumPy ufunc; with it, the Python linker would loop over
-# scalars. Sums and the like are divided last, lest they be put together again.
+# Batched NumPy calls: a heavy compilation does not pay. Without fusion every elementwise operation
+# is one NumPy ufunc; with it, the Python linker would loop over scalars. Sums are split last, as
+# other rewrites would merge them.
 PLAIN = (
     Mode(linker="py", optimizer="fast_run")
     .excluding("fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition")
-    .register((out2in(node_rewriter([Elemwise])(_softplus_of_arrays)), 1000))
-    .register((out2in(node_rewriter([Blockwise])(_elements_of_rows)), 1000))
-    .register((out2in(node_rewriter([Elemwise])(_sums_of_sums)), 1001))
-    .register((out2in(node_rewriter([Elemwise])(_choices_if_any)), 1001))
+    .register((out2in(node_rewriter([Elemwise])(_softplus_by_ufuncs)), 1000))
+    .register((out2in(node_rewriter([Blockwise])(_index_batches)), 1000))
+    .register((out2in(node_rewriter([Elemwise])(_split_long_sums)), 1001))
+    .register((out2in(node_rewriter([Elemwise])(_switch_to_where)), 1001))
 )
 
-# Functions that are kept, the oldest of which goes: a model has about ten. What they hold beside
-# their code are constants, 4 MB of them at the most.
-_KEPT = 64
-_LARGEST = 1 << 16  # bytes of constants
-
-_known: OrderedDict[Hashable, Any] = OrderedDict()
-_lock = Lock()
-_flags = RLock()
+_flags_lock = RLock()
 
 
 @contextmanager
 def interpreted() -> Iterator[None]:
-    """Compile what is inside without a C++ compiler, loops of PyTensor's too.
+    """Compile in the block without a C++ compiler, loops of PyTensor's too.
 
-    It calls one for the inside of a loop, whatever the mode: ten seconds for a prior of
-    correlations, and a warning where there is no BLAS to link to.
+    PyTensor compiles the inside of a loop whatever the mode: ten seconds for a prior of
+    correlations, and a warning where there is no BLAS.
     """
     with untraced(), pytensor.config.change_flags(cxx=""):
         yield
@@ -137,17 +126,21 @@ def interpreted() -> Iterator[None]:
 
 @contextmanager
 def untraced() -> Iterator[None]:
-    """Build the graphs inside without a note in each node of the lines that made it.
-
-    PyTensor reads those lines from files: about a tenth of a short calibration.
-    """
-    # The flags are the same for all threads: each has to find them as they were.
-    with _flags, pytensor.config.change_flags(traceback__limit=0):
+    """Build graphs in the block without traces of source lines, a tenth of a short calibration."""
+    # The flags are global: one thread at a time may change them.
+    with _flags_lock, pytensor.config.change_flags(traceback__limit=0):
         yield
 
 
-class _NotKeptError(Exception):
-    """A graph holds something of a user's, which is not to be kept alive."""
+# -- compiled functions by structure ---------------------------------------------------------------
+
+# Compiled functions by the structure of their graphs, the latest last.
+_cache: OrderedDict[Hashable, Any] = OrderedDict()
+_cache_lock = Lock()
+
+
+class _NotCacheableError(Exception):
+    """A graph has something of a user's, which must not be kept alive."""
 
 
 def compiled(
@@ -156,44 +149,38 @@ def compiled(
     *,
     allow_input_downcast: bool | None = None,
 ) -> Any:
-    """Compile a graph, unless the same graph was compiled before in this process.
+    """Compile a graph, unless a graph of the same structure was compiled in this process.
 
-    The second evaluator of a model, and of a model that was built again, asks for what the first
-    one did. It gets a copy of that function, with a memory of its own: two threads may call both.
-    Shared variables are those of the one who asks; what is kept has others, of no values.
+    Another evaluator of the same model gets a copy with its own storage, so two threads may call
+    both. Shared variables are those of the graph; the cached function has empty ones.
     """
-    shared = _shared(outputs)
+    shared = [
+        v
+        for v in ancestors(outputs)
+        if isinstance(v, TensorSharedVariable) and v.default_update is None
+    ]
     try:
         key = (allow_input_downcast, _structure([*inputs, *shared], outputs))
-    except _NotKeptError:
+    except _NotCacheableError:
         return _function(inputs, outputs, allow_input_downcast)
-    with _lock:
-        known = _known.get(key)
-        if known is not None:
-            _known.move_to_end(key)
-    if known is None:
-        empty = {variable: _empty(variable) for variable in shared}
+    with _cache_lock:
+        cached = _cache.get(key)
+        if cached is not None:
+            _cache.move_to_end(key)
+    if cached is None:
+        empty: dict[Any, Any] = {}
+        for variable in shared:
+            shape = variable.type.shape
+            values = np.zeros([size or 0 for size in shape], dtype=variable.dtype)
+            empty[variable] = pytensor.shared(values, shape=shape)
         graphs = graph_replace(list(outputs), empty, strict=False) if empty else outputs
-        known = _function(inputs, graphs, allow_input_downcast), list(empty.values())
-    function, of_nothing = known
-    with _lock:
-        _known[key] = known
-        while len(_known) > _KEPT:
-            _known.popitem(last=False)
-        return function.copy(swap=dict(zip(of_nothing, shared, strict=True)))
-
-
-def _shared(outputs: Sequence[TensorVariable]) -> list[Any]:
-    """Return the shared variables of a graph, but not generators of random numbers."""
-    found = ancestors(outputs)
-    return [v for v in found if isinstance(v, TensorSharedVariable) and v.default_update is None]
-
-
-def _empty(variable: Any) -> Any:
-    """Return a shared variable of the same type that holds next to nothing."""
-    shape = variable.type.shape
-    nothing = np.zeros([size or 0 for size in shape], dtype=variable.dtype)
-    return pytensor.shared(nothing, shape=shape)
+        cached = _function(inputs, graphs, allow_input_downcast), list(empty.values())
+    function, empty_shared = cached
+    with _cache_lock:
+        _cache[key] = cached
+        while len(_cache) > 64:  # a model has about ten functions, with 4 MB of constants at most
+            _cache.popitem(last=False)
+        return function.copy(swap=dict(zip(empty_shared, shared, strict=True)))
 
 
 def _function(
@@ -214,57 +201,58 @@ def _function(
 def _structure(
     inputs: Sequence[TensorVariable], outputs: Sequence[TensorVariable]
 ) -> tuple[Hashable, ...]:
-    """Return what makes a graph that graph: its operations, constants and how they hang together.
-
-    Names do not.
+    """Return the operations, constants and connections of a graph, without names.
 
     Raises
     ------
-    _NotKeptError
-        If the graph has random numbers, operations of a user's or of ours, or many constants.
+    _NotCacheableError
+        If the graph has random numbers, operations outside PyTensor, or many constants.
     """
     number: dict[Variable, int] = {}
-    said: list[Hashable] = []
+    structure: list[Hashable] = []
     size = 0
     for variable in inputs:
         number.setdefault(variable, len(number))
-        said.append(variable.type)
+        structure.append(variable.type)
 
     def numbered(variable: Variable) -> int:
         nonlocal size
         if variable in number:
             return number[variable]
         if not isinstance(variable, Constant):
-            raise _NotKeptError
+            raise _NotCacheableError
         if isinstance(variable.data, np.ndarray | np.generic):
             size += variable.data.nbytes
             data: Hashable = (variable.data.shape, variable.data.tobytes())
         elif isinstance(variable.data, slice | int | float | None):
             data = repr(variable.data)
         else:
-            raise _NotKeptError
-        if size > _LARGEST:
-            raise _NotKeptError
+            raise _NotCacheableError
+        if size > 1 << 16:  # bytes of constants
+            raise _NotCacheableError
         number[variable] = len(number)
-        said.append((variable.type, data))
+        structure.append((variable.type, data))
         return number[variable]
 
     for node in toposort(list(outputs), blockers=list(inputs)):
-        if not _foreign(node.op):
-            raise _NotKeptError
-        said.append((node.op, *map(numbered, node.inputs)))
+        if not _is_stateless(node.op):
+            raise _NotCacheableError
+        structure.append((node.op, *map(numbered, node.inputs)))
         for variable in node.outputs:
             number[variable] = len(number)
-    said.append(tuple(map(numbered, outputs)))
-    return tuple(said)
+    structure.append(tuple(map(numbered, outputs)))
+    return tuple(structure)
 
 
-def _foreign(op: Op) -> bool:
-    """Return whether an operation, with those inside it, is PyTensor's own, and without state."""
+def _is_stateless(op: Op) -> bool:
+    """Return whether an operation, with those inside it, is one of PyTensor's, without state."""
     names = getattr(op, "__props__", None) or ()
-    within = [getattr(op, name, None) for name in names]
-    own = type(op).__module__.startswith("pytensor.")
-    return own and all(_foreign(inner) for inner in within if isinstance(inner, Op))
+    inner = [getattr(op, name, None) for name in names]
+    is_pytensor = type(op).__module__.startswith("pytensor.")
+    return is_pytensor and all(_is_stateless(part) for part in inner if isinstance(part, Op))
+
+
+# -- batches ---------------------------------------------------------------------------------------
 
 
 def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
@@ -283,7 +271,7 @@ def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
 
 
 def with_leading_axis(symbols: Sequence[TensorVariable]) -> list[TensorVariable]:
-    """Return symbols for batches of others, of the same names."""
+    """Return symbols of the same names with a leading axis for batches."""
     return [pt.tensor(name=s.name, dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
 
 

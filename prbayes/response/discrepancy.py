@@ -1,4 +1,4 @@
-"""Model inadequacy: what a response leaves out over a condition, with coefficients of its own."""
+"""Model discrepancy: the error of a response as a function of a condition."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from prbayes._validate import Floats, called, real_array
 from prbayes.response.call import scalar
 
 
-class Inadequacy(ABC):
-    """What a response leaves out over a condition such as time, temperature or load.
+class ModelDiscrepancy(ABC):
+    """The error of a response over a condition such as time, temperature or load.
 
     Parameters
     ----------
     seen : array_like, shape (n,)
         Conditions under which there are data, in any unit; its ends count.
     shape : callable, optional
-        ``shape(condition)`` is the course over the condition, shape (...) for one coefficient, or
-        (..., m) for m; by default a straight line from 0 at the lower end of ``seen`` to 1 at the
-        upper one.
+        ``shape(condition)`` of shape (...) for one coefficient, or (..., m) for m; by default a
+        straight line from 0 at the lower end of ``seen`` to 1 at the upper one.
     """
 
     def __init__(self, seen: ArrayLike, shape: Callable[[Floats], Any] | None = None) -> None:
@@ -43,8 +42,7 @@ class Inadequacy(ABC):
         self.low = float(conditions.min())
         self.high = float(conditions.max())
         self.shape = self._line if shape is None else shape
-        two = np.array([self.low, self.high])
-        values = self._shapes(two)
+        values = self._basis(np.array([self.low, self.high]))
         if values.shape[:1] != (2,) or values.ndim > 2 or not np.isfinite(values).all():
             raise ValueError(
                 f"{label}: shape: got {np.array2string(values, threshold=4)} of two conditions, "
@@ -55,20 +53,20 @@ class Inadequacy(ABC):
     def _line(self, condition: Floats) -> Floats:
         return (condition - self.low) / (self.high - self.low)
 
-    def _shapes(self, condition: Floats) -> Floats:
+    def _basis(self, condition: Floats) -> Floats:
         return np.asarray(self.shape(condition), dtype=np.float64)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__} over {self.low:g} to {self.high:g}"
 
     def value(self, coefficients: ArrayLike, condition: ArrayLike) -> Floats:
-        """Return the inadequacy, the coefficients times the shape.
+        """Return the discrepancy, the coefficients times the shape.
 
         Parameters
         ----------
         coefficients : array_like, shape (...), or (..., m) for m coefficients
         condition : array_like, shape (...)
-            Broadcast against the coefficients; NaN where there is no inadequacy, which is then 0.
+            Broadcast against the coefficients; the discrepancy is 0 where it is NaN.
 
         Examples
         --------
@@ -78,23 +76,22 @@ class Inadequacy(ABC):
         array([0. , 1.5, 3. ])
         """
         at = np.asarray(condition, dtype=np.float64)
-        without = np.isnan(at)
-        course = self._shapes(np.where(without, self.low, at))
-        product = np.asarray(coefficients) * course
+        basis = self._basis(np.where(np.isnan(at), self.low, at))
+        product = np.asarray(coefficients) * basis
         if self.event:
             product = product.sum(axis=-1)
-        return np.asarray(np.where(without, 0.0, product))
+        return np.asarray(np.where(np.isnan(at), 0.0, product))
 
     @abstractmethod
     def combined(self, response: Floats, value: Floats) -> Floats:
-        """Return a response with its inadequacy."""
+        """Return a response with its discrepancy."""
 
     def of(self, response: Callable[..., Any], condition: ArrayLike) -> Callable[..., Any]:
-        """Return a response with the inadequacy under a condition; its last input is new.
+        """Return a response with the discrepancy under a condition, and one more input.
 
-        That input is the coefficients: a ``.dist()``, whose hyperparameters say how large the
-        inadequacy is and how much it differs from specimen to specimen. A model variable, common to
-        all specimens, goes with `Resimulated`.
+        The last input is the coefficients: a ``.dist()``, whose hyperparameters are the size of the
+        discrepancy and its scatter between specimens. A model variable, common to all specimens,
+        goes with `Resimulated`.
 
         Parameters
         ----------
@@ -102,14 +99,13 @@ class Inadequacy(ABC):
             As for `Simulator`; one that returns a mapping is refused where it is called.
         condition : array_like, shape () or (k,)
             Of a response of one output, or of each of its k outputs, such as times of a curve; NaN
-            for an output without inadequacy.
+            for an output without discrepancy.
 
         Returns
         -------
         callable
-            For `Simulator`, `predict` and all that takes a response. Where the condition is outside
-            what was seen, a warning is logged wherever it is used, and predictions say so in the
-            attribute ``caveats``.
+            For `Simulator`, `predict` and all that takes a response. If the condition is outside
+            ``seen``, each use logs a warning, and predictions have it in their ``findings``.
 
         Raises
         ------
@@ -123,8 +119,8 @@ class Inadequacy(ABC):
         >>> hot = rise.of(lambda k: k, 1000.0)
         >>> hot(5.0, 2.5)
         array(7.5)
-        >>> rise.of(lambda k: k, 1200.0).caveats
-        ('<lambda> at 1200: extrapolates its inadequacy, seen from 20 to 1000',)
+        >>> print(*rise.of(lambda k: k, 1200.0).findings)
+        <lambda> at 1200: extrapolates its model discrepancy, seen from 20 to 1000.
         """
         label = f"prb.response.{type(self).__name__}.of"
         if not callable(response) or isinstance(response, type):
@@ -135,15 +131,15 @@ class Inadequacy(ABC):
         if at.ndim > 1 or np.isinf(at).any() or np.isnan(at).all():
             raise ValueError(
                 f"{label}: condition: got {condition!r:.60}, expected a number, or one for each "
-                "output, NaN for those without inadequacy"
+                "output, NaN for those without discrepancy"
             )
         if isinstance(response, scalar):
             return scalar(Corrected(response.function, self, at))
         return Corrected(response, self, at)
 
 
-class Additive(Inadequacy):
-    r"""A model inadequacy that is added: :math:`y = S(x; c) + \sum_j b_j \phi_j(c)`.
+class Additive(ModelDiscrepancy):
+    r"""An additive model discrepancy: :math:`y = S(x; c) + \sum_j b_j \phi_j(c)`.
 
     Coefficients are in units of the response.
 
@@ -162,11 +158,10 @@ class Additive(Inadequacy):
 
     Notes
     -----
-    A shape that is zero somewhere says where the response is right; one that is constant cannot be
-    told from a shift of it. `minimize` warns where the coefficients' hyperparameters cannot be told
-    from those of the other inputs. Unlike the Gaussian process of [1]_ the inadequacy has a
-    form that is chosen, is no wider between the data's conditions than at them, and goes on in the
-    same form beyond.
+    The response is right where the shape is zero. A constant shape is a shift of the response.
+    `minimize` warns if the data cannot separate the coefficients' hyperparameters from those of the
+    other inputs. Unlike the Gaussian process of [1]_ the discrepancy has a parametric form, between
+    the conditions of the data and beyond.
 
     References
     ----------
@@ -194,8 +189,8 @@ class Additive(Inadequacy):
         return np.asarray(response + value)
 
 
-class Multiplicative(Inadequacy):
-    r"""A model inadequacy that multiplies: :math:`y = S(x; c) \exp \sum_j b_j \phi_j(c)`.
+class Multiplicative(ModelDiscrepancy):
+    r"""A multiplicative model discrepancy: :math:`y = S(x; c) \exp \sum_j b_j \phi_j(c)`.
 
     Coefficients have no unit: .05 is about five percent. The sign of a response stays.
 
@@ -231,13 +226,13 @@ class Multiplicative(Inadequacy):
 
 
 class Corrected:
-    """A response with its inadequacy under a condition, whose last input is the coefficients."""
+    """A response with its discrepancy under a condition; the last input is the coefficients."""
 
     def __init__(
-        self, response: Callable[..., Any], inadequacy: Inadequacy, condition: Floats
+        self, response: Callable[..., Any], discrepancy: ModelDiscrepancy, condition: Floats
     ) -> None:
         self.response = response
-        self.inadequacy = inadequacy
+        self.discrepancy = discrepancy
         self.condition = condition
 
     @property
@@ -245,33 +240,29 @@ class Corrected:
         return str(getattr(self.response, "__name__", type(self.response).__name__))
 
     def __repr__(self) -> str:
-        return f"{self.__name__} with {self.inadequacy!r} at {self._told}"
+        return f"{self.__name__} with {self.discrepancy!r} at {self._conditions}"
 
     @property
-    def _told(self) -> str:
-        known = np.atleast_1d(self.condition)
-        ends = np.unique([np.nanmin(known), np.nanmax(known)])
+    def _conditions(self) -> str:
+        ends = np.unique([np.nanmin(self.condition), np.nanmax(self.condition)])
         return " to ".join(f"{end:g}" for end in ends)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Whether it extrapolates."""
-        seen = self.inadequacy
-        outside = (self.condition < seen.low) | (self.condition > seen.high)
-        if not outside.any():
+        """A warning if the condition is outside the data's."""
+        low, high = self.discrepancy.low, self.discrepancy.high
+        if not ((self.condition < low) | (self.condition > high)).any():
             return ()
-        return (
-            Finding(
-                "extrapolated-discrepancy",
-                f"{self.__name__} at {self._told}: extrapolates its inadequacy, seen from "
-                f"{seen.low:g} to {seen.high:g}.",
-            ),
+        text = (
+            f"{self.__name__} at {self._conditions}: extrapolates its model discrepancy, seen from "
+            f"{low:g} to {high:g}."
         )
+        return (Finding("extrapolated-discrepancy", text),)
 
     def __call__(self, *inputs: Any) -> Floats:
-        """Return the response with its inadequacy."""
-        *own, coefficients = inputs
-        response = self.response(*own)
+        """Return the response with its discrepancy."""
+        *arguments, coefficients = inputs
+        response = self.response(*arguments)
         if isinstance(response, Mapping):
             raise TypeError(
                 f"{self.__name__}: got a mapping, expected an array of outputs, each of which has "
@@ -279,37 +270,30 @@ class Corrected:
             )
         response = np.asarray(response)
         coefficients = np.asarray(coefficients)
-        self._refuse_outputs(response, coefficients.ndim - len(self.inadequacy.event))
-        if self.condition.ndim:
-            # Outputs are the last axis, behind which the coefficients are.
-            place = coefficients.ndim - len(self.inadequacy.event)
-            coefficients = np.expand_dims(coefficients, place)
-        value = self.inadequacy.value(coefficients, self.condition)
-        return self.inadequacy.combined(response, value)
-
-    def _refuse_outputs(self, response: Floats, batch: int) -> None:
-        """Raise unless a response has the outputs that have conditions.
-
-        ``batch`` is the number of axes of specimens that coefficients have; common ones have none.
-        """
+        batch_ndim = coefficients.ndim - len(self.discrepancy.event)
         outputs = self.condition.shape
-        axes = response.ndim - len(outputs)
-        as_many = response.shape[axes:] == outputs
-        common = batch == 0 and axes == 1
-        if response.ndim and not (as_many and (axes == batch or common)):
+        response_ndim = response.ndim - len(outputs)
+        has_outputs = response.shape[response_ndim:] == outputs
+        is_common = batch_ndim == 0 and response_ndim == 1  # of coefficients of all specimens
+        if response.ndim and not (has_outputs and (response_ndim == batch_ndim or is_common)):
             raise ValueError(
                 f"{self.__name__}: got a response of shape {response.shape}, expected "
                 f"{('...', *outputs)}: one output, or one for each condition"
             )
+        if self.condition.ndim:
+            # Before the axis of coefficients, one for the outputs.
+            coefficients = np.expand_dims(coefficients, batch_ndim)
+        value = self.discrepancy.value(coefficients, self.condition)
+        return self.discrepancy.combined(response, value)
 
 
-def corrected(function: Callable[..., Any]) -> bool:
-    """Return whether the last input of a function is the coefficients of an inadequacy."""
+def has_discrepancy(function: Callable[..., Any]) -> bool:
+    """Return whether the last input of a function is the coefficients of a model discrepancy."""
     inner = function.function if isinstance(function, scalar) else function
     return isinstance(inner, Corrected)
 
 
 def findings_of(function: Callable[..., Any]) -> tuple[Finding, ...]:
-    """Return what a response with a model discrepancy reports where it is used."""
+    """Return the warnings that a function declares for its users."""
     inner = function.function if isinstance(function, scalar) else function
     return tuple(getattr(inner, "findings", ()))

@@ -1,9 +1,8 @@
-"""What is read off PyMC distributions: log-densities, inverse distribution functions, draws."""
+"""Log-densities, inverse distribution functions and draws of PyMC distributions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -37,7 +36,7 @@ def log_density(
 ) -> TensorVariable:
     """Return log p(x), shape (n,), of values (n, *event), summed over the aleatory inputs.
 
-    ``instead`` has, for some of the inputs by their positions, what is taken for their log-density.
+    ``instead`` has other log-densities for some inputs, by their positions.
     """
     total: Any = 0.0
     triples = zip(aleatory, values, inputs.event_shapes, strict=True)
@@ -46,8 +45,11 @@ def log_density(
             logp = instead[i](dist, x)
         elif is_elliptical(dist):
             logp = _elliptical_logp(dist, x, shape[-1])
+        elif _is_random_walk(dist):  # PyMC's density takes one value at a time
+            value = dist.type()
+            logp = vectorize_graph(quiet_logp(dist, value), {value: x})
         else:
-            logp = _logp(dist, x)
+            logp = pm.logp(dist, x, warn_rvs=False)
         # Elements of a vector of independent inputs.
         if logp.type.ndim > 1:
             logp = logp.sum(axis=tuple(range(1, logp.type.ndim)))
@@ -55,44 +57,26 @@ def log_density(
     return total
 
 
-def _logp(dist: TensorVariable, x: Any) -> TensorVariable:
-    """Return PyMC's log p(x) of values (n, *event); that of random walks takes one at a time."""
-    if not _is_walk(dist):
-        return pm.logp(dist, x, warn_rvs=False)
-    one = dist.type()
-    return vectorize_graph(quiet_logp(dist, one), {one: x})
-
-
-def _is_walk(dist: TensorVariable) -> bool:
-    """Whether a distribution is a random walk."""
-    return isinstance(dist.owner.op, pm.RandomWalk.rv_type)
-
-
 @untraced()
 def compiled_log_density(inputs: Inputs) -> Any:
     """Return log p(x) as a function of roots (k, *shape), then points (n, *event): (k, n)."""
-    symbols, points, density = _log_density(inputs)
-    return compile_batched(symbols, [density], points)
-
-
-def _log_density(inputs: Inputs) -> tuple[list[Any], list[Any], TensorVariable]:
-    """Return symbols of roots, (*shape), and points, (n, *event), and their log-density, (n,)."""
     symbols = inputs.placeholders()
-    points = []
-    for x in inputs.aleatory:
-        shape = (None,) * (x.type.ndim + 1)
-        points.append(pt.tensor(dtype=x.dtype, shape=shape))
     dists, _ = inputs.rebuilt(symbols)
-    return symbols, points, log_density(inputs, dists, points)
+    points = [pt.tensor(dtype=x.dtype, shape=(None,) * (x.type.ndim + 1)) for x in inputs.aleatory]
+    return compile_batched(symbols, [log_density(inputs, dists, points)], points)
+
+
+def _is_random_walk(dist: TensorVariable) -> bool:
+    return isinstance(dist.owner.op, pm.RandomWalk.rv_type)
 
 
 def is_mvnormal(dist: TensorVariable) -> bool:
-    """Whether a distribution is a multivariate normal."""
+    """Return whether a distribution is a multivariate normal."""
     return isinstance(dist.owner.op, type(MvNormal.rv_op))
 
 
 def is_elliptical(dist: TensorVariable) -> bool:
-    """Whether a distribution is a multivariate normal or Student's t: positive everywhere."""
+    """Return whether a distribution is a multivariate normal or Student's t."""
     return is_mvnormal(dist) or isinstance(dist.owner.op, MvStudentT.rv_type)
 
 
@@ -103,28 +87,30 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     """
     *freedom, mean, covariance = dist.owner.op.dist_params(dist.owner)
     root = _cholesky(covariance, size)
-    diagonal = [root[i][i] for i in range(size)]
     # Solve root z = x - mean.
     z: list[Any] = []
     for i in range(size):
-        away = x[..., i] - mean[..., i]
-        above = sum(root[i][j] * z[j] for j in range(i))
-        z.append((away - above) / diagonal[i])
+        sum_before = sum(root[i][j] * z[j] for j in range(i))
+        z.append((x[..., i] - mean[..., i] - sum_before) / root[i][i])
     logp: Any = 0
     if freedom:
-        logp = _studentt_logp(freedom[0], z)
-        for scale in diagonal:
-            logp = logp - pt.log(scale)
+        (nu,) = freedom
+        power = (nu + size) / 2
+        gammas = pt.gammaln(power) - pt.gammaln(nu / 2)
+        norm = gammas - 0.5 * size * pt.log(nu * np.pi)
+        squared_distance = sum(z_i**2 for z_i in z)
+        logp = norm - power * pt.log1p(squared_distance / nu)
+        logp = pt.switch(nu > 0, logp, -np.inf)
+        for i in range(size):
+            logp = logp - pt.log(root[i][i])
     else:
-        constant = 0.5 * np.log(2 * np.pi)
-        for z_i, scale in zip(z, diagonal, strict=True):
-            normal = -0.5 * z_i**2 - pt.log(scale) - constant
-            logp = logp + normal
+        for i in range(size):
+            logp = logp + (-0.5 * z[i] ** 2 - pt.log(root[i][i]) - 0.5 * np.log(2 * np.pi))
     return pt.switch(pt.isnan(logp), -np.inf, logp)
 
 
 def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
-    """Return the rows of a lower Cholesky factor, not numbers if the matrix is not positive.
+    """Return the rows of a lower Cholesky factor, NaN if the matrix is not positive definite.
 
     Elementwise if it is small: PyTensor's loops over the matrices of a batch.
     """
@@ -135,44 +121,28 @@ def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
     for i in range(size):
         row: list[Any] = []
         for j in range(i):
-            known = sum(row[k] * rows[j][k] for k in range(j))
-            row.append((matrix[..., i, j] - known) / rows[j][j])
+            product = sum(row[k] * rows[j][k] for k in range(j))
+            row.append((matrix[..., i, j] - product) / rows[j][j])
         squares = sum(element**2 for element in row)
         row.append(pt.sqrt(matrix[..., i, i] - squares))
         rows.append(row)
     return rows
 
 
-def _studentt_logp(nu: Any, z: Sequence[Any]) -> Any:
-    """Return the log-density of Student's t with a unit matrix, at coordinates z."""
-    size = len(z)
-    distance = sum(z_i**2 for z_i in z)
-    power = (nu + size) / 2
-    gammas = pt.gammaln(power) - pt.gammaln(nu / 2)
-    norm = gammas - 0.5 * size * pt.log(nu * np.pi)
-    logp = norm - power * pt.log1p(distance / nu)
-    return pt.switch(nu > 0, logp, -np.inf)
-
-
 def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None:
     """Raise if a covariance is not symmetric, at values of the roots, (k, *shape).
 
-    Its density and its draws read one half of the matrix, as if the other were alike.
+    Density and draws read one half of the matrix only.
     """
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
-    covariances = []
-    for dist in filter(is_elliptical, dists):
-        *_, covariance = dist.owner.op.dist_params(dist.owner)
-        covariances.append(covariance)
+    covariances = [d.owner.op.dist_params(d.owner)[-1] for d in dists if is_elliptical(d)]
     if not covariances:
         return
     for covariance in compile_batched(symbols, covariances)(*params):
-        mirrored = np.swapaxes(covariance, -1, -2)
-        gap = np.abs(covariance - mirrored)
-        size = np.abs(covariance).max(axis=(-2, -1), keepdims=True)
-        # Products of the same numbers in another order differ by rounding, 1e-16 of them.
-        if np.any(gap > 1e-8 * size):
+        difference = np.abs(covariance - np.swapaxes(covariance, -1, -2))
+        scale = np.abs(covariance).max(axis=(-2, -1), keepdims=True)
+        if np.any(difference > 1e-8 * scale):  # more than rounding
             raise ValueError(
                 f"{name}: got an input whose covariance is not symmetric, expected a covariance "
                 "matrix; pm.LKJCorr is no correlation matrix but its Cholesky factor L: "
@@ -208,19 +178,16 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
 
 
 def _density(dist: TensorVariable) -> TensorVariable | None:
-    """Return the log-density at zero as a graph, None where PyMC has none.
-
-    One that is drawn, as that of a `pymc.Simulator`, is none.
-    """
+    """Return the log-density at zero as a graph, None where PyMC has none, or draws it."""
     try:
         density = quiet_logp(dist, pt.zeros_like(dist))
     except NotImplementedError:
         return None
-    if _is_walk(dist):
-        return density  # its parts stand in it for their shapes alone
+    if _is_random_walk(dist):
+        return density  # which uses only the shapes of its parts
     # Zero takes its shape from the distribution.
-    above = set(ancestors([density], blockers=[dist])) - {dist}
-    return None if any(map(is_random, above)) else density
+    parts = set(ancestors([density], blockers=[dist])) - {dist}
+    return None if any(map(is_random, parts)) else density
 
 
 def refuse_without_density(name: str, inputs: Inputs) -> None:
@@ -242,59 +209,57 @@ def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
 
     if inputs.nested:
         return pt.constant(True)
-    # The densities check their parameters, such as sigma > 0, wherever they are evaluated; what has
-    # none says nothing of its parameters.
-    logps = [density for d in aleatory if (density := _density(d)) is not None]
+    # The densities check their parameters, such as sigma > 0.
+    densities = [density for d in aleatory if (density := _density(d)) is not None]
     conditions = []
-    for v in ancestors(logps):
+    for v in ancestors(densities):
         if v.owner is not None and isinstance(v.owner.op, CheckParameterValue):
-            _, *checked = v.owner.inputs
-            conditions += [pt.all(c) for c in checked]
+            conditions += [pt.all(c) for c in v.owner.inputs[1:]]
     return pt.all(conditions) if conditions else pt.constant(True)
 
 
-def _generators(function: Any) -> list[Any]:
-    """Return the random number generators of a compiled function."""
-    return [v for v in function.get_shared() if isinstance(v.type, RandomGeneratorType)]
+# -- draws -----------------------------------------------------------------------------------------
 
 
-def _seed(generators: Sequence[Any], rng: np.random.Generator) -> None:
-    """Give each generator a stream of its own."""
+def _seed(function: Any, rng: np.random.Generator) -> None:
+    """Give each generator of a compiled function its own stream."""
+    generators = [v for v in function.get_shared() if isinstance(v.type, RandomGeneratorType)]
     for shared, child in zip(generators, rng.spawn(len(generators)), strict=True):
         shared.set_value(child, borrow=True)
 
 
 class PriorSampler:
-    """Draws of variables from the prior, all in one call of a function that is compiled once."""
+    """Draws of variables from the prior, all in one call of a compiled function."""
 
     @untraced()
     def __init__(self, roots: Sequence[TensorVariable]) -> None:
         self._names = ", ".join(str(r.name) for r in roots)
         self._shapes = [event_shape(r) for r in roots]
+        # PyMC gives a `str_repr` to the variables of a model.
+        parents = [v for v in ancestors(roots) if hasattr(v, "str_repr") and is_random(v)]
+        variables = [*roots, *(v for v in parents if v not in roots)]
         n = pt.iscalar("n")
         try:
             # Variables that depend on no other are drawn n times; the others follow.
             batches = {}
-            drawn = [*roots, *_model_variables_above(roots)]
-            for root in drawn:
-                if not any(a in drawn for a in ancestors([root]) if a is not root):
-                    batches[root] = change_dist_size(root, (n,), expand=True)
+            for v in variables:
+                if not any(a in variables for a in ancestors([v]) if a is not v):
+                    batches[v] = change_dist_size(v, (n,), expand=True)
             outputs = vectorize_graph(list(roots), batches)
             with interpreted():
                 self._function = pm.compile([n], outputs, mode=PLAIN)
-            self._batched = True
+            self._is_batched = True
         except (NotImplementedError, ValueError, MissingInputError):
             # Not vectorized, or not resized: one draw at a time.
             with interpreted():
                 self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
-            self._batched = False
-        self._generators = _generators(self._function)
+            self._is_batched = False
 
     def __call__(self, k: int, seed: int) -> list[Floats]:
         """Return k draws of each variable, shapes (k, *shape)."""
-        _seed(self._generators, np.random.default_rng(seed))
+        _seed(self._function, np.random.default_rng(seed))
         try:
-            if self._batched:
+            if self._is_batched:
                 # Samplers of SciPy's drop leading axes of length one.
                 pairs = zip(self._function(k), self._shapes, strict=True)
                 return [np.asarray(v).reshape(k, *shape) for v, shape in pairs]
@@ -308,20 +273,13 @@ class PriorSampler:
         return [np.array(column) for column in zip(*draws, strict=True)]
 
 
-def _model_variables_above(roots: Sequence[TensorVariable]) -> list[TensorVariable]:
-    """Return the other random variables of a model that variables depend on."""
-    # PyMC gives a `str_repr` to the variables of a model.
-    above = [v for v in ancestors(roots) if hasattr(v, "str_repr") and is_random(v)]
-    return [v for v in above if v not in roots]
-
-
 def prior_draws(roots: Sequence[TensorVariable], k: int, seed: int) -> list[Floats]:
     """Draw the roots k times from the prior; arrays of shape (k, *shape)."""
     return PriorSampler(roots)(k, seed)
 
 
 class PriorPoints:
-    """Points of the unit cube brought to the prior, each variable given those above it.
+    """Points of the unit cube mapped to the prior, each variable given those that it depends on.
 
     Raises
     ------
@@ -335,22 +293,21 @@ class PriorPoints:
         self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
         self.size = sum(self._sizes)
         symbols = [pt.tensor(dtype="float64", shape=s) for s in self._shapes]
-        placed: dict[Variable, Variable] = {}
+        values: dict[Variable, Variable] = {}
         for v, u in zip(variables, symbols, strict=True):
-            (given,) = graph_replace([v], placed, strict=False)
-            placed[v] = quantiles("priors", given, u)
-        if any(is_random(v) for v in ancestors(list(placed.values()))):
+            (conditional,) = graph_replace([v], values, strict=False)
+            values[v] = quantiles("priors", conditional, u)
+        if any(is_random(v) for v in ancestors(list(values.values()))):
             raise TypeError(
                 "priors: got one that depends on a random variable which is not in the model"
             )
-        self._function = compile_batched(symbols, list(placed.values()))
+        self._function = compile_batched(symbols, list(values.values()))
 
     def __call__(self, cube: Floats) -> list[Floats]:
         """Return values of each variable, shapes (k, *shape), for points of shape (k, size)."""
-        edges = np.cumsum([0, *self._sizes])
-        parts = []
-        for (a, b), shape in zip(pairwise(edges), self._shapes, strict=True):
-            parts.append(cube[:, a:b].reshape(len(cube), *shape))
+        columns = np.split(cube, np.cumsum(self._sizes)[:-1], axis=1)
+        pairs = zip(columns, self._shapes, strict=True)
+        parts = [part.reshape(len(cube), *shape) for part, shape in pairs]
         return [np.asarray(v) for v in self._function(*parts)]
 
 
@@ -365,21 +322,20 @@ class PopulationSampler:
         n = pt.iscalar("n")
         batched = with_leading_axis(symbols)
         per_specimen = _per_specimen(aleatory, symbols, batched, n)
-        self._batched = True
+        common = epistemic
+        self._is_batched = True
         try:
             specimens = vectorize_graph(aleatory, per_specimen)
-            common = epistemic
             if epistemic:
                 common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True)))
         except (NotImplementedError, ValueError):
-            # What PyTensor does not vectorize: one population at a time.
-            self._batched, batched = False, symbols
+            # Not vectorized by PyTensor: one population at a time.
+            self._is_batched, batched = False, symbols
             # Resized before the roots are replaced, since PyMC resizes a CustomDist with its first
             # parameters.
             resized = [change_dist_size(d, (n,), expand=True) for d in inputs.aleatory]
             replaced = dict(zip(inputs.roots, symbols, strict=True))
             specimens = graph_replace(resized, replaced, strict=False)
-            common = epistemic
         self._event_shapes = inputs.event_shapes
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
         with interpreted():
@@ -390,7 +346,6 @@ class PopulationSampler:
                 on_unused_input="ignore",
                 allow_input_downcast=True,
             )
-        self._generators = _generators(self._function)
 
     def __call__(
         self, params: Sequence[Any], n: int, rng: np.random.Generator
@@ -409,9 +364,13 @@ class PopulationSampler:
         aleatory : list of ndarray, shapes (k, n, *event)
         epistemic : list of ndarray, shapes (k, 1, *event), or (*event) where they depend on no root
         """
-        _seed(self._generators, rng)
+        _seed(self._function, rng)
         try:
-            values = self._drawn(params, n)
+            if self._is_batched:
+                values = list(self._function(n, *params))
+            else:
+                populations = [self._function(n, *row) for row in zip(*params, strict=True)]
+                values = [np.stack(column) for column in zip(*populations, strict=True)]
         except (NotImplementedError, RuntimeError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise TypeError(
@@ -419,21 +378,16 @@ class PopulationSampler:
                 "distributions from which specimens can be drawn; give a pm.CustomDist its random="
             ) from None
         n_aleatory = len(self._event_shapes)
-        aleatory = []
-        for v, shape in zip(values[:n_aleatory], self._event_shapes, strict=True):
-            # SciPy's generators, behind some distributions, drop leading axes of length one.
-            aleatory.append(np.reshape(v, (len(params[0]), n, *shape)))
-        epistemic = []
-        for v, ndim in zip(values[n_aleatory:], self._epistemic_ndims, strict=True):
-            epistemic.append(v[:, None] if v.ndim > ndim else v)
+        # SciPy's generators, behind some distributions, drop leading axes of length one.
+        aleatory = [
+            np.reshape(v, (len(params[0]), n, *shape))
+            for v, shape in zip(values[:n_aleatory], self._event_shapes, strict=True)
+        ]
+        epistemic = [
+            v[:, None] if v.ndim > ndim else v
+            for v, ndim in zip(values[n_aleatory:], self._epistemic_ndims, strict=True)
+        ]
         return aleatory, epistemic
-
-    def _drawn(self, params: Sequence[Any], n: int) -> list[Floats]:
-        """Return all inputs, of n specimens from each of k populations."""
-        if self._batched:
-            return list(self._function(n, *params))
-        populations = [self._function(n, *row) for row in zip(*params, strict=True)]
-        return [np.stack(column) for column in zip(*populations, strict=True)]
 
 
 def _per_specimen(
@@ -442,17 +396,16 @@ def _per_specimen(
     batched: Sequence[TensorVariable],
     n: TensorVariable,
 ) -> dict[Variable, Variable]:
-    """Return what stands for roots and distributions in a graph of n specimens of each theta."""
+    """Return replacements of roots and distributions for n specimens of each theta."""
     size = (batched[0].shape[0], n)
     replaced: dict[Variable, Variable] = {}
     for symbol, batch in zip(symbols, batched, strict=True):
         shape = [batch.shape[i] for i in range(1, batch.ndim)]
         replaced[symbol] = pt.broadcast_to(batch[:, None], (*size, *shape))
-    # Distributions without any root above them are not batched by their parameters: resize them.
+    # Distributions that depend on no root are not batched by their parameters: resize them.
     for v in ancestors(aleatory):
-        if not is_random(v):
-            continue
-        above = [a for a in ancestors([v]) if a is not v]
-        if not any(a in symbols or is_random(a) for a in above):
-            replaced[v] = change_dist_size(v, size, expand=True)
+        if is_random(v):
+            parents = [a for a in ancestors([v]) if a is not v]
+            if not any(a in symbols or is_random(a) for a in parents):
+                replaced[v] = change_dist_size(v, size, expand=True)
     return replaced

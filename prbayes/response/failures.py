@@ -1,4 +1,4 @@
-"""What to do when a response raises, or is not a number."""
+"""Failure policies for responses that raise or are not a number."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Failure:
     """A point whose response failed."""
 
     inputs: Floats  # (columns,): the arguments of the response, one after the other
-    reason: str  # what was raised, in words
+    reason: str
 
 
 class OnFailure:
@@ -26,18 +26,13 @@ class OnFailure:
 
     @property
     def tries(self) -> int:
-        """How often a point is computed, at most."""
+        """Largest number of computations of a point."""
         return 1
 
     @property
     def final(self) -> OnFailure:
-        """What holds after the last try."""
+        """The policy after the last try."""
         return self
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether the run goes on when a response raises at the last try."""
-        return True
 
     @property
     def refuses_nan(self) -> bool:
@@ -46,15 +41,20 @@ class OnFailure:
 
     @property
     def replacement(self) -> float | None:
-        """What takes the place of a response that failed; without it NaN stays, as a result."""
+        """Value in place of a response that failed; without one NaN stays, as a result."""
         return None
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the run goes on when a response raises at the last try."""
+        return self.replacement is not None
 
 
 @dataclass(frozen=True)
 class Abort(OnFailure):
-    """Stop when a response raises, and, if asked for, when one is NaN.
+    """Stop when a response raises, and optionally when one is NaN.
 
-    What was computed stays in the store.
+    Computed responses stay in the store.
 
     Parameters
     ----------
@@ -74,13 +74,8 @@ class Abort(OnFailure):
         flag(self.on_nan, "Abort: on_nan")
 
     @property
-    def goes_on(self) -> bool:
-        """It does not."""
-        return False
-
-    @property
     def refuses_nan(self) -> bool:
-        """If asked for."""
+        """Whether NaN ends the run."""
         return self.on_nan
 
 
@@ -157,10 +152,10 @@ class Retry(OnFailure):
 
     @property
     def tries(self) -> int:
-        """Once, and as often again as was asked for."""
+        """One try more than ``times``."""
         return 1 + self.times
 
     @property
     def final(self) -> OnFailure:
-        """What was asked for."""
+        """The policy ``then``."""
         return self.then

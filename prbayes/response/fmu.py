@@ -1,41 +1,41 @@
-"""A Functional Mock-up Unit (FMU): a model of another tool, run in this process for each specimen.
+"""Functional Mock-up Units (FMU) as responses: co-simulation of another tool's model.
 
-What is told here to FMPy is the FMI standard (https://fmi-standard.org) for co-simulation, versions
-2 and 3: a unit is unzipped and loaded once in a process, and its instances are used again.
+The FMI standard (https://fmi-standard.org), versions 2 and 3. A unit is unzipped and loaded once in
+a process, and its instances are reused. FMPy calls the library; its driver `simulate_fmu` does not
+serve here, as it repeats a discarded step without end, and has no points of communication between
+equal steps, where curves are read.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
+import shutil
+import tempfile
+import threading
 import time
+import zipfile
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from multiprocessing.util import Finalize
 from os import PathLike
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from prbayes._validate import Floats, called, file_path, flag, positive_number, real_array
 from prbayes.response.call import scalar
-from prbayes.response.fmi import (
-    Unit,
-    Value,
-    Variable,
-    Variables,
-    last_words,
-    listed,
-    opened,
-    read_unit,
-)
 from prbayes.response.outputs import Outputs
 
-# Steps from start to stop where neither the user nor the unit says how many: those of FMPy. The
-# error of a unit that takes an internal step for each is its own; `step=` sets others.
-_STEPS_IN_ALL = 500
-# Relative to a step: how far a time may be from a whole number of steps, for rounding; any value
-# from 1e-9 to 1e-3 does that.
-_OFF_GRID = 1e-6
+type Value = float | int | bool | str
 
 
 def fmu(
@@ -62,27 +62,26 @@ def fmu(
     path : str or path
         The unit: an ``.fmu`` for co-simulation, FMI 2 or 3.
     inputs : sequence of str
-        The unit's variables, parameters or inputs, that are the simulator's inputs, in their order.
+        Variables of the unit, parameters or inputs, for the simulator's inputs, in their order.
     outputs : sequence of str, or mapping of str to str
-        The unit's variables that are the outputs; with a mapping, by the names that they have in
-        what was observed.
+        Variables of the unit that are the outputs; a mapping has them by the names in ``observed``.
     parameters : mapping, optional
         Values of other variables of the unit, the same for all specimens: numbers, flags, texts.
     times : array_like, shape (T,), optional
         Times, increasing, at which each output is read: curves. By default outputs are read at the
         end.
     start_time, stop_time : float, optional
-        In the unit's own; by default those that the unit states. With ``times`` the last of them is
+        In the time unit of the FMU; by default those that it states. With ``times`` the last one is
         the end.
     step : float, optional
-        Longest step between two points of communication. By default that which the unit states, or
-        a 500th of the whole.
+        Longest step between two points of communication. By default the one that the unit states,
+        or a 500th of the duration.
     timeout : float, optional
-        Seconds that one response may take. It is looked at between steps; what hangs within one
-        ends by the propagation's ``timeout=``, with processes.
+        Seconds for one response, checked between steps. A step that hangs is ended by the
+        propagation's ``timeout=``, with processes.
     reset : bool
-        Whether an instance of the unit is used for one specimen after the other. Pass False for
-        units that ``fmi2Reset`` does not bring back to their start: each specimen has a new one.
+        Whether an instance of the unit is reused for the next specimen. Pass False for units that
+        ``fmi2Reset`` does not return to their start: each specimen has a new instance.
 
     Raises
     ------
@@ -96,15 +95,15 @@ def fmu(
 
     Notes
     -----
-    One output is a number, (T,) of them with ``times``. Several come as a mapping by their names,
-    and what was observed has the same names, so that none is taken for another: a DataFrame, or a
-    mapping of arrays (N,), with ``times`` (N, T).
+    One output is a number, or (T,) numbers with ``times``. Several are a mapping by their names,
+    which have to be those of ``observed``: a DataFrame, or a mapping of arrays (N,), with ``times``
+    (N, T).
 
-    A response fails where the unit says so, stops before its end, or takes too long; the error
-    repeats what it logged. Units compute outside Python as a rule, so that threads serve as an
-    executor; each that is at work at the same time has an instance of its own, but for units that
-    may be instantiated only once. A unit runs in this process, and may end it: with processes as
-    an executor that costs a specimen. The response can be pickled; the file has to be where it was.
+    A response fails if the unit reports a failure, stops before its end, or takes too long; the
+    error repeats the unit's log. Most units compute outside Python, so threads serve as an
+    executor. Each thread has its own instance, except for units that may be instantiated only once.
+    A unit runs in this process and may end it; with processes as an executor that costs a specimen.
+    The response can be pickled; the file has to stay where it is.
 
     Examples
     --------
@@ -118,53 +117,55 @@ def fmu(
     Traceback (most recent call last):
     FileNotFoundError: fmu: path: got spring.fmu, which is not there, expected an FMU
     """
-    where = file_path(path, "fmu: path")
-    if not where.is_file():
-        raise FileNotFoundError(f"fmu: path: got {where}, which is not there, expected an FMU")
-    chosen = _Chosen(_names(inputs), _labelled(outputs), _parameters(parameters))
+    file = file_path(path, "fmu: path")
+    if not file.is_file():
+        raise FileNotFoundError(f"fmu: path: got {file}, which is not there, expected an FMU")
+    input_names, output_names = _input_names(inputs), _output_names(outputs)
+    values = _parameter_values(parameters)
+    repeated = set(input_names) & set(values)
+    if repeated:
+        raise ValueError(
+            f"fmu: parameters: got {min(repeated)!r}, which is among the inputs too, expected each "
+            "variable once"
+        )
     limit = None if timeout is None else positive_number(timeout, "fmu: timeout")
-    again = flag(reset, "fmu: reset")
-    unit, description = read_unit(where)
-    grid = _grid(description, times, start_time, stop_time, step)
-    variables = Variables(unit, {v.name: v for v in description.modelVariables})
-    found = MockUp(
+    reuse = flag(reset, "fmu: reset")
+    unit, description = _read_unit(file)
+    grid = _time_grid(description, times, start_time, stop_time, step)
+    variables = _Variables(unit, {v.name: v for v in description.modelVariables})
+    parameter_values = []
+    for name, value in values.items():
+        variable = variables.settable(name, "parameters")
+        parameter_values.append((variable, variable.converted(value, "fmu: parameters")))
+    model = Simulation(
         unit,
-        tuple(variables.settable(name, "inputs") for name in chosen.inputs),
-        {label: variables.readable(name) for label, name in chosen.outputs.items()},
-        tuple((variables.settable(n, "parameters"), v) for n, v in chosen.parameters.items()),
+        tuple(variables.settable(name, "inputs") for name in input_names),
+        {label: variables.readable(name) for label, name in output_names.items()},
+        tuple(parameter_values),
         grid,
         limit,
-        again,
+        reuse,
     )
-    found.refuse_unfit_parameters()
-    with opened(unit).instance(again):
+    with _opened(unit).instance(reuse):
         pass
-    return scalar(found)
+    return scalar(model)
 
 
-# -- what is asked for -----------------------------------------------------------------------------
+# -- arguments -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Chosen:
-    """Variables by name, as the user chose them."""
-
-    inputs: tuple[str, ...]
-    outputs: dict[str, str]  # by their names in what was observed
-    parameters: dict[str, Value]
-
-    def __post_init__(self) -> None:
-        twice = set(self.inputs) & set(self.parameters)
-        if twice:
-            raise ValueError(
-                f"fmu: parameters: got {min(twice)!r}, which is among the inputs too, expected "
-                "each variable once"
-            )
+def _are_names(names: object) -> bool:
+    """Return whether an object is a sequence of different texts."""
+    return (
+        isinstance(names, Sequence)
+        and not isinstance(names, str)
+        and bool(names)
+        and all(isinstance(n, str) and names.count(n) == 1 for n in names)
+    )
 
 
-def _names(inputs: object) -> tuple[str, ...]:
-    texts = not isinstance(inputs, str) and isinstance(inputs, Sequence)
-    if not isinstance(inputs, Sequence) or not texts or not _are_names(inputs):
+def _input_names(inputs: Any) -> tuple[str, ...]:
+    if not _are_names(inputs):
         raise TypeError(
             f"fmu: inputs: got {called(inputs)}, expected a list of the unit's variables, each "
             'once, such as ["stiffness", "damping"]'
@@ -172,17 +173,12 @@ def _names(inputs: object) -> tuple[str, ...]:
     return tuple(inputs)
 
 
-def _labelled(outputs: object) -> dict[str, str]:
+def _output_names(outputs: Any) -> dict[str, str]:
     """Return variables by the names of the outputs."""
-    if isinstance(outputs, Mapping):
-        labels = list(outputs)
-        names = list(outputs.values())
-    elif isinstance(outputs, Sequence) and not isinstance(outputs, str):
-        labels = list(outputs)
-        names = list(outputs)
-    else:
-        labels, names = [], []
-    if not labels or not _are_names(labels) or not all(isinstance(name, str) for name in names):
+    is_mapping = isinstance(outputs, Mapping)
+    labels = list(outputs) if is_mapping else outputs
+    names = list(outputs.values()) if is_mapping else outputs
+    if not _are_names(labels) or not all(isinstance(name, str) for name in names):
         raise TypeError(
             f"fmu: outputs: got {called(outputs)}, expected a list of the unit's variables, each "
             'once, such as ["mass.s"], or a mapping of names to these'
@@ -190,11 +186,7 @@ def _labelled(outputs: object) -> dict[str, str]:
     return dict(zip(labels, names, strict=True))
 
 
-def _are_names(names: Sequence[object]) -> bool:
-    return bool(names) and all(isinstance(n, str) and names.count(n) == 1 for n in names)
-
-
-def _parameters(parameters: object) -> dict[str, Value]:
+def _parameter_values(parameters: object) -> dict[str, Value]:
     if parameters is None:
         return {}
     if not isinstance(parameters, Mapping) or not all(isinstance(name, str) for name in parameters):
@@ -202,105 +194,270 @@ def _parameters(parameters: object) -> dict[str, Value]:
             f"fmu: parameters: got {called(parameters)}, expected a mapping of the unit's "
             'variables to their values, such as {"mass.m": 2.0}'
         )
-    plain = {name: v.item() if isinstance(v, np.generic) else v for name, v in parameters.items()}
-    for name, value in plain.items():
+    values = {name: v.item() if isinstance(v, np.generic) else v for name, v in parameters.items()}
+    for name, value in values.items():
         if not isinstance(value, bool | int | float | str):
             raise TypeError(
                 f"fmu: parameters: got {called(value)} for {name!r}, expected a number, a flag or "
                 "a text"
             )
-    return plain
+    return values
+
+
+# -- the file --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Grid:
+class Unit:
+    """The file of a unit, and what its instances need."""
+
+    path: str
+    digest: str
+    name: str
+    identifier: str
+    token: str
+    version: int  # of FMI
+    is_single: bool  # whether a process may have one instance only
+
+
+def _fmpy() -> Any:
+    try:
+        import fmpy
+    except ImportError:
+        raise ImportError(
+            "fmu: got no package fmpy, expected it for Functional Mock-up Units; run pip install "
+            "prbayes[codes]"
+        ) from None
+    return fmpy
+
+
+def _digest(path: str | Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read_unit(path: Path) -> tuple[Unit, Any]:
+    """Return a unit and its model description, or raise if it cannot be simulated here."""
+    fmpy = _fmpy()
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("modelDescription.xml") as file:
+            version = str(ElementTree.parse(file).getroot().get("fmiVersion"))
+        description = None
+        if version[:2] in ("2.", "3."):
+            description = fmpy.read_model_description(str(path), validate=False)
+        platforms = fmpy.supported_platforms(str(path))
+    except Exception as error:
+        raise ValueError(
+            f"fmu: path: got {path}, which cannot be read as an FMU ({type(error).__name__}: "
+            f"{error!s:.200}), expected a zip archive with a modelDescription.xml"
+        ) from None
+    interface = getattr(description, "coSimulation", None)
+    if description is None or interface is None:
+        lack = "" if description is None else " without co-simulation"
+        raise ValueError(
+            f"fmu: path: got {path}, of FMI {version}{lack}, expected FMI 2 or 3 for "
+            "co-simulation; let the tool that made it export it so"
+        )
+    if fmpy.platform not in platforms:
+        raise ValueError(
+            f"fmu: path: got {path}, which runs on {', '.join(platforms) or 'no platform'}, "
+            f"expected {fmpy.platform}; let the tool that made it export it for that, or, where it "
+            "has c-code, run `fmpy compile`"
+        )
+    unit = Unit(
+        str(path.absolute()),
+        _digest(path),
+        str(description.modelName),
+        str(interface.modelIdentifier),
+        str(description.guid),
+        int(version[0]),
+        bool(interface.canBeInstantiatedOnlyOncePerProcess),
+    )
+    return unit, description
+
+
+_INTEGERS = ("Integer", *(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)))
+_REALS = ("Real", "Float64", "Float32")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A scalar variable of a unit."""
+
+    name: str
+    reference: int
+    kind: str  # as in the names of FMI functions
+
+    def converted(self, value: Value, label: str) -> Value:
+        """Return a value in the type of the variable, or raise `ValueError`."""
+        expected = "a number"
+        if self.kind == "String":
+            if isinstance(value, str):
+                return value
+            expected = "a text"
+        elif self.kind == "Boolean":
+            if value in (0, 1):
+                return bool(value)
+            expected = "0 or 1"
+        elif not isinstance(value, str):
+            if self.kind in _REALS:
+                return float(value)
+            if float(value).is_integer():
+                return int(value)
+            expected = "a whole number"
+        raise ValueError(f"{label}: got {value!r} for {self.name}, expected {expected}")
+
+
+@dataclass(frozen=True)
+class _Variables:
+    """The variables of a unit, by name, as FMPy describes them."""
+
+    unit: Unit
+    described: dict[str, Any]
+
+    def settable(self, name: str, argument: str) -> Variable:
+        """Return a variable that can be set before a simulation begins."""
+        variable = self._named(name, argument)
+        if not _is_settable(variable):
+            names = [n for n, v in self.described.items() if _is_settable(v)]
+            raise ValueError(
+                f"fmu: {argument}: got {name!r}, which {self.unit.name} computes itself ("
+                f"{variable.causality}, {variable.initial or variable.variability}), expected a "
+                f"parameter or an input: {_listed(names)}"
+            )
+        return self._scalar(variable, argument)
+
+    def readable(self, name: str) -> Variable:
+        """Return a variable that has numbers."""
+        return self._scalar(self._named(name, "outputs"), "outputs")
+
+    def _named(self, name: str, argument: str) -> Any:
+        if name in self.described:
+            return self.described[name]
+        close = get_close_matches(name, self.described, n=3)
+        hint = f"did you mean {' or '.join(map(repr, close))}?"
+        raise ValueError(
+            f"fmu: {argument}: got {name!r}, expected a variable of {self.unit.name}; "
+            f"{hint if close else 'it has ' + _listed(list(self.described))}"
+        )
+
+    def _scalar(self, variable: Any, argument: str) -> Variable:
+        """Return a variable with one number, or for a parameter one value."""
+        kind = str(variable.type)
+        if kind == "Enumeration":
+            kind = "Integer" if self.unit.version == 2 else "Int64"
+        takes_text = argument == "parameters"
+        kinds = (*_REALS, *_INTEGERS, "Boolean", *(("String",) if takes_text else ()))
+        if variable.shape or kind not in kinds:
+            got = "an array" if variable.shape else f"of type {kind}"
+            raise ValueError(
+                f"fmu: {argument}: got {variable.name!r}, which is {got} in {self.unit.name}, "
+                f"expected a variable with {'one value' if takes_text else 'one number'}"
+            )
+        return Variable(str(variable.name), int(variable.valueReference), kind)
+
+
+def _is_settable(variable: Any) -> bool:
+    is_input = variable.causality in ("input", "parameter")
+    has_start = variable.initial in ("exact", "approx")
+    return variable.variability != "constant" and (is_input or has_start)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first ten names as a text."""
+    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
+    return ", ".join(map(repr, names[:10])) + more if names else "none"
+
+
+# -- points of communication -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _TimeGrid:
     """The points of communication of a simulation."""
 
     start: float
-    marks: tuple[float, ...]  # where outputs are read; the last is the end
-    curves: bool  # whether the times were asked for
+    times: tuple[float, ...]  # at which outputs are read; the last one is the end
+    has_curves: bool  # whether the user stated the times
     step: float  # at most
-    even: bool  # whether all steps have to be of this size
-    tolerance: float | None  # that the unit states
+    is_even: bool  # whether all steps have this size
+    tolerance: float | None  # of the unit
 
     def steps(self) -> Iterator[tuple[float, float, bool]]:
-        """Yield where each step begins, its size, and whether outputs are read behind it."""
-        first, done = self.start, 0
-        for mark in self.marks:
-            n = max(1, math.ceil((mark - first) / self.step - _OFF_GRID))
+        """Yield the begin and size of each step, and whether outputs are read after it."""
+        begin, n_steps = self.start, 0
+        for end in self.times:
+            n = max(1, math.ceil((end - begin) / self.step - 1e-6))
             for i in range(n):
-                last = i == n - 1
-                if self.even:
-                    yield self.start + done * self.step, self.step, last
+                is_last = i == n - 1
+                if self.is_even:
+                    yield self.start + n_steps * self.step, self.step, is_last
                 else:
-                    size = (mark - first) / n
-                    yield first + i * size, size, last
-                done += 1
-            first = mark
+                    size = (end - begin) / n
+                    yield begin + i * size, size, is_last
+                n_steps += 1
+            begin = end
 
 
-def _grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -> _Grid:
-    """Return the points of communication that a unit and the user state.
+def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -> _TimeGrid:
+    """Return the points of communication, from the user's arguments and the unit's defaults."""
+    defaults = description.defaultExperiment
+    interface = description.coSimulation
 
-    Raises
-    ------
-    TypeError, ValueError
-        If there are none, or the unit cannot take such steps.
-    """
-    stated = description.defaultExperiment
-    kind = description.coSimulation
-
-    def known(given: Any, name: str, key: str) -> float | None:
-        if given is not None:
-            return float(_number(given, name))
-        value = getattr(stated, key, None)
+    def default(key: str) -> float | None:
+        value = getattr(defaults, key, None)
         return None if value is None else float(value)
 
-    begin = known(start, "start_time", "startTime") or 0.0
-    marks = _marks(times, begin, known(stop, "stop_time", "stopTime"), stop is not None)
-    duration = marks[-1] - begin
-    size = getattr(stated, "stepSize", None) if step is None else positive_number(step, "fmu: step")
-    inner = getattr(kind, "fixedInternalStepSize", None)
-    even = not kind.canHandleVariableCommunicationStepSize
-    if size is None and inner is not None:
-        size = float(inner) * max(1, round(duration / _STEPS_IN_ALL / float(inner)))
-    if size is None and even:
+    begin = default("startTime") if start is None else _finite(start, "start_time")
+    begin = begin or 0.0
+    end = default("stopTime") if stop is None else _finite(stop, "stop_time")
+    if times is not None:
+        marks = _increasing_times(times, begin, end if stop is not None else None)
+    elif end is None or end <= begin:
+        got = "none, and the unit states none" if end is None else f"{end:g}"
+        raise ValueError(f"fmu: stop_time: got {got}, expected a time after start_time = {begin:g}")
+    else:
+        marks = (end,)
+    # 500 steps where neither the user nor the unit states a step, as FMPy does.
+    longest = (marks[-1] - begin) / 500
+    size = default("stepSize") if step is None else positive_number(step, "fmu: step")
+    internal = getattr(interface, "fixedInternalStepSize", None)
+    is_even = not interface.canHandleVariableCommunicationStepSize
+    if size is None and internal is not None:
+        size = float(internal) * max(1, round(longest / float(internal)))
+    if size is None and is_even:
         raise ValueError(
             f"fmu: step: got none, and {description.modelName} takes steps of one size only and "
             "does not say which, expected a number"
         )
-    size = duration / _STEPS_IN_ALL if size is None else float(size)
-    if even:
-        _refuse_uneven(description.modelName, begin, marks, size)
-    tolerance = getattr(stated, "tolerance", None)
-    told = None if tolerance is None else float(tolerance)
-    return _Grid(begin, marks, times is not None, size, even, told)
+    size = longest if size is None else float(size)
+    for mark in marks if is_even else ():
+        count = (mark - begin) / size
+        if abs(count - round(count)) > 1e-6 or round(count) < 1:
+            raise ValueError(
+                f"fmu: got the time {mark:g}, which steps of {size:g} from {begin:g} do not reach, "
+                f"expected multiples of the step, as {description.modelName} takes steps of one "
+                "size only; pass other times, or step="
+            )
+    return _TimeGrid(begin, marks, times is not None, size, is_even, default("tolerance"))
 
 
-def _number(value: object, name: str) -> float:
-    array = real_array(value, f"fmu: {name}")  # type: ignore[arg-type]
+def _finite(value: Any, name: str) -> float:
+    array = real_array(value, f"fmu: {name}")
     if array.ndim or not np.isfinite(array):
         raise ValueError(f"fmu: {name}: got {value!r:.60}, expected a finite number")
     return float(array)
 
 
-def _marks(times: Any, begin: float, end: float | None, asked: bool) -> tuple[float, ...]:
-    """Return the times at which outputs are read."""
-    if times is None:
-        if end is None or end <= begin:
-            got = "none, and the unit states none" if end is None else f"{end:g}"
-            raise ValueError(
-                f"fmu: stop_time: got {got}, expected a time after start_time = {begin:g}"
-            )
-        return (end,)
+def _increasing_times(times: Any, begin: float, end: float | None) -> tuple[float, ...]:
     marks = real_array(times, "fmu: times")
-    rising = marks.ndim == 1 and marks.size > 0 and np.isfinite(marks).all()
-    if not rising or marks[0] <= begin or (np.diff(marks) <= 0).any():
+    is_list = marks.ndim == 1 and marks.size > 0 and np.isfinite(marks).all()
+    if not is_list or marks[0] <= begin or (np.diff(marks) <= 0).any():
         raise ValueError(
             f"fmu: times: got {times!r:.60}, expected increasing times after start_time = "
             f"{begin:g}, (T,)"
         )
-    if asked and end is not None and marks[-1] > end:
+    if end is not None and marks[-1] > end:
         raise ValueError(
             f"fmu: times: got {marks[-1]:g} as the last, expected none after stop_time = {end:g}; "
             "leave stop_time out"
@@ -308,30 +465,18 @@ def _marks(times: Any, begin: float, end: float | None, asked: bool) -> tuple[fl
     return tuple(marks.tolist())
 
 
-def _refuse_uneven(name: str, begin: float, marks: tuple[float, ...], step: float) -> None:
-    """Raise if a time is not reached by steps of one size."""
-    for mark in marks:
-        count = (mark - begin) / step
-        if abs(count - round(count)) > _OFF_GRID or round(count) < 1:
-            raise ValueError(
-                f"fmu: got the time {mark:g}, which steps of {step:g} from {begin:g} do not reach, "
-                f"expected multiples of the step, as {name} takes steps of one size only; pass "
-                "other times, or step="
-            )
-
-
-# -- at work ---------------------------------------------------------------------------------------
+# -- simulation ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class MockUp:
-    """A unit as a function of one specimen's inputs."""
+class Simulation:
+    """The simulation of a unit as a function of one specimen's inputs."""
 
     unit: Unit
     inputs: tuple[Variable, ...]
     outputs: dict[str, Variable]  # by their names
     parameters: tuple[tuple[Variable, Value], ...]
-    grid: _Grid
+    grid: _TimeGrid
     timeout: float | None
     reset: bool
 
@@ -346,7 +491,7 @@ class MockUp:
         Raises
         ------
         RuntimeError
-            If the unit says that something went wrong, or ends too early.
+            If the unit reports a failure, or ends too early.
         TimeoutError
             If it takes too long.
         ValueError
@@ -354,72 +499,57 @@ class MockUp:
         """
         if len(values) != len(self.inputs):
             self._refuse_inputs(self.unit.name, [1] * len(values))
-        pairs = [*self.parameters, *zip(self.inputs, map(float, values), strict=True)]
-        given = [(variable, self._typed(variable, value)) for variable, value in pairs]
-        with opened(self.unit).instance(self.reset) as slave:
-            rows = self._simulated(slave, given)
+        start_values = [*self.parameters]
+        for variable, value in zip(self.inputs, values, strict=True):
+            start_values.append((variable, variable.converted(float(value), self.unit.name)))
+        with _opened(self.unit).instance(self.reset) as slave:
+            rows = self._rows(slave, start_values)
         columns = np.array(rows).T
-        found = dict(zip(self.outputs, columns if self.grid.curves else columns[:, 0], strict=True))
-        if len(found) > 1:
-            return found
-        (lone,) = found.values()
-        return lone if self.grid.curves else float(lone)
+        curves = dict(zip(self.outputs, columns, strict=True))
+        results = curves if self.grid.has_curves else {k: float(v[0]) for k, v in curves.items()}
+        return results if len(results) > 1 else next(iter(results.values()))
 
-    def _typed(self, variable: Variable, value: Value) -> Value:
-        try:
-            return variable.typed(value)
-        except ValueError as error:
-            raise ValueError(f"{self.unit.name}: {error}") from None
-
-    def _simulated(self, slave: Any, given: list[tuple[Variable, Value]]) -> list[list[float]]:
+    def _rows(self, slave: Any, start_values: list[tuple[Variable, Value]]) -> list[list[float]]:
         """Return the outputs at each time."""
         clock = time.monotonic()
         grid = self.grid
-        stop = self.grid.marks[-1]
-        stated = {"tolerance": grid.tolerance, "startTime": grid.start, "stopTime": stop}
+        stop = grid.times[-1]
+        experiment = {"tolerance": grid.tolerance, "startTime": grid.start, "stopTime": stop}
         if self.unit.version == 2:
-            slave.setupExperiment(**stated)
-        for variable, value in given:
+            slave.setupExperiment(**experiment)
+        for variable, value in start_values:
             getattr(slave, f"set{variable.kind}")([variable.reference], [value])
-        slave.enterInitializationMode(**({} if self.unit.version == 2 else stated))
+        slave.enterInitializationMode(**({} if self.unit.version == 2 else experiment))
         slave.exitInitializationMode()
         rows = []
-        for begin, size, last in grid.steps():
+        for begin, size, is_read in grid.steps():
             if self.timeout is not None and time.monotonic() - clock > self.timeout:
                 raise TimeoutError(
                     f"{self.unit.name}: no result within timeout = {self.timeout:g} s, at time "
-                    f"{begin:g} of {stop:g}{last_words()}"
+                    f"{begin:g} of {stop:g}{_log_text()}"
                 )
-            told = slave.doStep(currentCommunicationPoint=begin, communicationStepSize=size)
+            state = slave.doStep(currentCommunicationPoint=begin, communicationStepSize=size)
             # In FMI 3: an event, the end, an early return, and the time that was reached.
-            if told is not None and (told[1] or told[2]):
+            if state is not None and (state[1] or state[2]):
                 raise RuntimeError(
-                    f"{self.unit.name}: it ended at time {told[3]:g}, expected {stop:g}"
-                    f"{last_words()}"
+                    f"{self.unit.name}: it ended at time {state[3]:g}, expected {stop:g}"
+                    f"{_log_text()}"
                 )
-            if last:
-                rows.append([self._value(slave, v) for v in self.outputs.values()])
+            if is_read:
+                row = []
+                for variable in self.outputs.values():
+                    (number,) = getattr(slave, f"get{variable.kind}")([variable.reference])
+                    row.append(float(number))
+                rows.append(row)
         slave.terminate()
         return rows
-
-    def _value(self, slave: Any, variable: Variable) -> float:
-        (value,) = getattr(slave, f"get{variable.kind}")([variable.reference])
-        return float(value)
-
-    def refuse_unfit_parameters(self) -> None:
-        """Raise if a parameter has a value of another kind."""
-        for variable, value in self.parameters:
-            try:
-                variable.typed(value)
-            except ValueError as error:
-                raise ValueError(f"fmu: parameters: {error}") from None
 
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Outputs | None) -> None:
         """Raise if a simulator has other inputs or outputs than the unit."""
         self._refuse_inputs(name, sizes)
         if outputs is None:
             return
-        size = len(self.grid.marks) if self.grid.curves else None
+        size = len(self.grid.times) if self.grid.has_curves else None
         if len(self.outputs) == 1:
             event = () if size is None else (size,)
             if outputs.event != event:
@@ -430,12 +560,12 @@ class MockUp:
                     f"{next(iter(self.outputs))!r} of {self.unit.name}"
                 )
         elif set(outputs.keys) != {(label, size) for label in self.outputs}:
-            each = "(N,)" if size is None else f"(N, {size})"
+            shape = "(N,)" if size is None else f"(N, {size})"
             named = [key if n is None else f"{key} (N, {n})" for key, n in outputs.keys]
             raise ValueError(
                 f"{name}: observed: got {', '.join(named) or 'outputs without names'}, expected a "
-                f"mapping of names to arrays {each}{'' if size else ', or a DataFrame'}, with "
-                f"{listed(list(self.outputs))}: the outputs of {self.unit.name}"
+                f"mapping of names to arrays {shape}{'' if size else ', or a DataFrame'}, with "
+                f"{_listed(list(self.outputs))}: the outputs of {self.unit.name}"
             )
 
     def _refuse_inputs(self, name: str, sizes: Sequence[int]) -> None:
@@ -445,3 +575,178 @@ class MockUp:
                 f"{len(self.inputs)} of one each: {', '.join(v.name for v in self.inputs)}, for "
                 f"{self.unit.name}"
             )
+
+
+# -- instances in a process ------------------------------------------------------------------------
+
+
+class _Log(threading.local):
+    """The last five messages of the unit at work in a thread."""
+
+    def __init__(self) -> None:
+        self.lines: deque[bytes] = deque(maxlen=5)
+
+
+_log = _Log()
+
+
+def _record_message(*arguments: Any) -> None:
+    """Keep a warning or error of a unit of FMI 2 or 3."""
+    status, _, message = arguments[-3:]
+    if status != 0 and message:
+        _log.lines.append(message)
+
+
+def _log_text() -> str:
+    """Return the last messages of the unit at work in this thread, to add to an error."""
+    lines = [" ".join(line.decode("utf-8", "replace").split()) for line in _log.lines]
+    return f"; it logged: {' | '.join(lines)}" if lines else "; it logged nothing"
+
+
+@cache
+def _callbacks() -> Any:
+    """Return the functions that units of FMI 2 call, for as long as this process lives.
+
+    FMPy's proxy for messages with arguments is left out: it calls the logger of the first unit even
+    after that is gone. Messages keep their %s.
+    """
+    from fmpy import calloc, fmi2, free
+
+    callbacks = fmi2.fmi2CallbackFunctions()
+    callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_record_message)
+    callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(calloc)
+    callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(free)
+    return callbacks
+
+
+class _OpenUnit:
+    """A unit that is unzipped in this process, with its idle instances."""
+
+    def __init__(self, unit: Unit) -> None:
+        is_file = Path(unit.path).is_file()
+        if not is_file or _digest(unit.path) != unit.digest:
+            what = "has changed since" if is_file else "is not there"
+            raise RuntimeError(
+                f"{unit.name}: got {unit.path}, which {what}, expected the file with which the "
+                "response was made, also where its workers are; make the response again"
+            )
+        self.unit = unit
+        self.folder = tempfile.mkdtemp(prefix="prbayes-fmu-")
+        # Workers end without `atexit`.
+        Finalize(None, shutil.rmtree, (self.folder, True), exitpriority=0)
+        try:
+            _fmpy().extract(unit.path, self.folder)
+        except Exception as error:
+            raise ValueError(
+                f"{unit.name}: got {unit.path}, which cannot be unzipped ({error!s:.200}), "
+                "expected a sound archive; copy it anew"
+            ) from None
+        self.idle: list[Any] = []
+        self.n_loaded = 0
+        self.lock: AbstractContextManager[Any] = (
+            threading.Lock() if unit.is_single else nullcontext()
+        )
+
+    @contextmanager
+    def instance(self, reset: bool) -> Iterator[Any]:
+        """Lend an instance at its start; it is freed after an error, and reused otherwise."""
+        from fmpy.fmi1 import FMICallException
+
+        with self.lock:
+            _log.lines.clear()
+            slave = self._idle_instance(reset) if self.idle else self._new_instance()
+            try:
+                yield slave
+            except FMICallException as error:
+                if error.status != 4:  # after a fatal error no function may be called
+                    _free(slave)
+                text = f"{self.unit.name}: {str(error).rstrip('.')}{_log_text()}"
+                raise RuntimeError(text) from None
+            except BaseException:
+                _free(slave)
+                raise
+            self.idle.append(slave)
+
+    def _idle_instance(self, reset: bool) -> Any:
+        """Return an idle instance at its start, reset or instantiated again."""
+        try:
+            slave = self.idle.pop()
+        except IndexError:  # another thread took the last one
+            return self._new_instance()
+        if reset:
+            with suppress(Exception):  # not all units have a reset
+                slave.reset()
+                return slave
+        _free(slave)
+        self._instantiate(slave)
+        return slave
+
+    def _new_instance(self) -> Any:
+        from fmpy import fmi2, fmi3
+
+        unit = self.unit
+        self.n_loaded += 1
+        kind = fmi2.FMU2Slave if unit.version == 2 else fmi3.FMU3Slave
+        with _lock:
+            folder = os.getcwd()  # where FMPy does not return if loading fails
+            try:
+                slave = kind(
+                    guid=unit.token,
+                    unzipDirectory=self.folder,
+                    modelIdentifier=unit.identifier,
+                    instanceName=f"{unit.identifier}-{self.n_loaded}",
+                )
+            except Exception as error:
+                raise RuntimeError(
+                    f"{unit.name}: got a library that cannot be loaded from {unit.path} "
+                    f"({error!s:.300}), expected one for this machine; it may need others that are "
+                    "not installed"
+                ) from None
+            finally:
+                os.chdir(folder)
+        self._instantiate(slave)
+        return slave
+
+    def _instantiate(self, slave: Any) -> None:
+        try:
+            if self.unit.version == 2:
+                slave.instantiate(callbacks=_callbacks(), loggingOn=True)
+            else:
+                slave.instantiate(logMessage=_record_message, loggingOn=True)
+        except Exception as error:
+            raise RuntimeError(
+                f"{self.unit.name}: got no instance of {self.unit.path} ({error!s:.200})"
+                f"{_log_text()}, expected one; look at its licence, and at what it needs"
+            ) from None
+
+
+def _free(slave: Any) -> None:
+    """Free an instance; its library stays loaded."""
+    with suppress(Exception):
+        free = getattr(slave, "fmi2FreeInstance", None) or slave.fmi3FreeInstance
+        free(slave.component)
+
+
+_open_units: dict[Unit, _OpenUnit] = {}
+_lock = threading.RLock()
+
+
+def _opened(unit: Unit) -> _OpenUnit:
+    """Return the unit as it is open in this process."""
+    with _lock:
+        if unit not in _open_units:
+            _open_units[unit] = _OpenUnit(unit)
+        return _open_units[unit]
+
+
+def _forget_units() -> None:
+    """Start without open units after a fork: instances stay with the parent."""
+    global _lock
+    _inherited.append(dict(_open_units))  # keeps them from being freed
+    _open_units.clear()
+    _lock = threading.RLock()
+
+
+_inherited: list[Any] = []
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_units)

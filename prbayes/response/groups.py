@@ -1,4 +1,4 @@
-"""Groups of specimens, such as suppliers or batches, which have hyperparameters of their own."""
+"""Groups of specimens, such as suppliers or batches, with hyperparameters of their own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from prbayes._validate import plain_text, real_array
 
 
 class GroupRV(RandomVariable):  # type: ignore[misc]
-    """The group of a specimen, as a number: each as often as any other, where nobody says which."""
+    """The group of a specimen as a number, by default uniformly distributed."""
 
     name = "group"
     signature = "()->()"
@@ -40,7 +40,7 @@ class GroupRV(RandomVariable):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class Groups:
-    """The groups that specimens of an input are of."""
+    """The groups of the specimens of an input."""
 
     dim: str
     labels: tuple[Any, ...]
@@ -51,18 +51,17 @@ class Groups:
         return list(map(str, self.labels))
 
     def name(self, simulator: str, place: int) -> str:
-        """Return what a group's part of a simulator is called, such as 'y[Adler]'."""
+        """Return the name of a group's part of a simulator, such as 'y[Adler]'."""
         return f"{simulator}[{self.names[place]}]"
 
 
 def group(dim: str) -> TensorVariable:
     """Return the group of a specimen, such as its supplier, as an index of hyperparameters.
 
-    Specimens of each group are a population of their own. A simulator whose inputs depend on the
-    group compares each population with the measured responses of its group, which
-    ``observed`` tells: a DataArray with a coordinate called ``dim`` along the specimens, a
-    DataFrame with a column of that name, or a Series with it in its index. All groups share the
-    runs of the response.
+    The specimens of each group are a population. A simulator whose inputs depend on the group
+    compares each population with the measured responses of its group. ``observed`` has the groups:
+    a DataArray with a coordinate called ``dim`` along the specimens, a DataFrame with a column of
+    that name, or a Series with it in its index. All groups share the runs of the response.
 
     Parameters
     ----------
@@ -82,10 +81,8 @@ def group(dim: str) -> TensorVariable:
     Notes
     -----
     The simulator is one term of the model for each group, called ``y[Adler]`` and so on, each with
-    an epsilon of its own. `predict` gives a dimension of groups. Hyperparameters above those of the
-    groups, such as their spread between groups, are told by the prior alone: write them so that
-    groups are ``pm.Normal("mu", m, tau, dims="supplier")``, and the posterior is that of all
-    together.
+    its own epsilon. `predict` gives a dimension of groups. With a population of groups, as in
+    ``pm.Normal("mu", m, tau, dims="supplier")``, the posterior is that of all groups together.
 
     Examples
     --------
@@ -108,97 +105,90 @@ def group(dim: str) -> TensorVariable:
     model = pm.Model.get_context(error_if_none=False)
     if model is None:
         raise TypeError(f"{caller}: got no model on the context, expected `with pm.Model():`")
-    known = model.coords.get(dim)
-    if known is None:
+    labels = model.coords.get(dim)
+    if labels is None:
+        known = [name for name, values in model.coords.items() if values is not None]
         raise ValueError(
-            f"{caller}: dim: got {dim!r}, expected a dimension with a coordinate, of "
-            f"{[name for name, own in model.coords.items() if own is not None]}; write "
-            f"pm.Model(coords={{{dim!r}: ['Adler', 'Busch']}}), with the names of the groups"
+            f"{caller}: dim: got {dim!r}, expected a dimension with a coordinate, of {known}; "
+            f"write pm.Model(coords={{{dim!r}: ['Adler', 'Busch']}}), with the names of the groups"
         )
-    found = Groups(dim, tuple(known))
-    texts = found.names
+    names = [str(label) for label in labels]
     # A slash ends a name in a file.
-    if len(texts) < 2 or len(set(texts)) < len(texts) or any("/" in text for text in texts):
+    if len(names) < 2 or len(set(names)) < len(names) or any("/" in name for name in names):
         raise ValueError(
-            f"{caller}: coords: got the groups {texts} of {dim!r}, expected two or more different "
+            f"{caller}: coords: got the groups {names} of {dim!r}, expected two or more different "
             "names without a slash"
         )
-    op = GroupRV(dim=dim, labels=found.labels)
+    op = GroupRV(dim=dim, labels=tuple(labels))
     rng = pt.random.shared_rng(seed=None)
-    _, variable = op(len(texts), rng=rng, return_next_rng=True)
+    _, variable = op(len(names), rng=rng, return_next_rng=True)
     variable.name = f"group of {dim}"
     return variable
 
 
 def is_group(variable: Variable) -> bool:
     """Return whether a variable is the group of a specimen."""
-    # Asked, not by its class: a module may be loaded twice.
+    # By an attribute, not by its class: a module may be loaded twice.
     return variable.owner is not None and getattr(variable.owner.op, "is_group", False)
 
 
 def groups_of(name: str, roots: Iterable[Variable]) -> Groups | None:
-    """Return the groups that inputs depend on, by what is above them, None if they do not.
-
-    Raises
-    ------
-    ValueError
-        If there are several.
-    """
-    found = [variable.owner.op for variable in roots if is_group(variable)]
-    if not found:
+    """Return the groups among the roots of inputs, None if there are none; several are refused."""
+    ops = [variable.owner.op for variable in roots if is_group(variable)]
+    if not ops:
         return None
-    if len(found) > 1:
+    if len(ops) > 1:
         raise ValueError(
-            f"{name}: inputs: got {len(found)} calls of prb.response.group, of "
-            f"{[op.dim for op in found]}, expected one; call it once, and use what it returns for "
+            f"{name}: inputs: got {len(ops)} calls of prb.response.group, of "
+            f"{[op.dim for op in ops]}, expected one; call it once, and use what it returns for "
             "all inputs; two partitions are one whose groups are their pairs"
         )
-    return Groups(found[0].dim, found[0].labels)
+    return Groups(ops[0].dim, ops[0].labels)
 
 
 def refuse_groups(name: str, roots: Iterable[Variable]) -> None:
-    """Raise where inputs depend on the group of a specimen, and one population is asked for."""
-    found = groups_of(name, roots)
-    if found is not None:
+    """Raise if inputs of one population depend on the group of a specimen."""
+    groups = groups_of(name, roots)
+    if groups is not None:
         raise TypeError(
-            f"{name}: inputs: got one that depends on prb.response.group({found.dim!r}), expected "
+            f"{name}: inputs: got one that depends on prb.response.group({groups.dim!r}), expected "
             "inputs of one population; prb.predict has a population for each of "
-            f"{found.names}, whose responses can be compared"
+            f"{groups.names}, whose responses can be compared"
         )
 
 
 def places_of(name: str, observed: Any, groups: Groups) -> tuple[NDArray[np.intp], Any]:
-    """Return the number of each specimen's group, (N,), and what was observed, without groups.
+    """Return the number of each specimen's group, (N,), and the observed values without groups.
 
     Raises
     ------
     TypeError, ValueError
-        If there are no labels of groups, others than the model has, or groups without specimens.
+        If there are no labels of groups, unknown ones, or groups without specimens.
     """
-    labels, values = _labelled(f"{name}: observed", observed, groups.dim)
-    known = {text: place for place, text in enumerate(groups.names)}
-    unknown = [label for label in dict.fromkeys(map(str, labels)) if label not in known]
-    lacking = [text for text in groups.names if text not in set(map(str, labels))]
-    if unknown or lacking:
-        wrong = f"specimens of {unknown}" if unknown else f"no specimen of {lacking}"
+    labels, values = _labels_and_values(f"{name}: observed", observed, groups.dim)
+    texts = [str(label) for label in labels]
+    place = {text: i for i, text in enumerate(groups.names)}
+    unknown = [text for text in dict.fromkeys(texts) if text not in place]
+    empty = [text for text in groups.names if text not in set(texts)]
+    if unknown or empty:
+        got = f"specimens of {unknown}" if unknown else f"no specimen of {empty}"
         raise ValueError(
-            f"{name}: observed: got {wrong}, expected some of each of the groups {groups.names} "
+            f"{name}: observed: got {got}, expected some of each of the groups {groups.names} "
             "and of no other, as the model's coords have them"
         )
-    return np.array([known[str(label)] for label in labels], dtype=np.intp), values
+    return np.array([place[text] for text in texts], dtype=np.intp), values
 
 
-def _labelled(name: str, observed: Any, dim: str) -> tuple[list[Any], Any]:
+def _labels_and_values(name: str, observed: Any, dim: str) -> tuple[list[Any], Any]:
     """Return the group of each specimen, and the observed values without it."""
     if hasattr(observed, "dims") and hasattr(observed, "coords") and dim in observed.coords:
-        along = observed.coords[dim]
-        if along.dims == observed.dims[:1]:
-            return along.values.tolist(), observed
+        coordinate = observed.coords[dim]
+        if coordinate.dims == observed.dims[:1]:
+            return coordinate.values.tolist(), observed
     if hasattr(observed, "columns") and dim in observed.columns:
-        labels = list(observed[dim])
-        rest = observed.drop(columns=dim)
-        only = rest.shape[1] == 1
-        return labels, real_array(rest.iloc[:, 0], name) if only else rest
+        values = observed.drop(columns=dim)
+        is_single = values.shape[1] == 1
+        return list(observed[dim]), real_array(values.iloc[:, 0], name) if is_single else values
     index: Any = getattr(observed, "index", None)
     if dim in getattr(index, "names", ()) and not hasattr(observed, "columns"):
         return list(index.get_level_values(dim)), real_array(observed, name)

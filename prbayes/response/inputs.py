@@ -1,10 +1,10 @@
-"""The inputs of a response: aleatory (a ``.dist()``), epistemic (a model variable) or constant."""
+"""Inputs of a response: aleatory (a ``.dist()``), epistemic (a model variable) or constant."""
 
 from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -27,12 +27,11 @@ from prbayes.response.groups import Groups, groups_of, is_group
 class Inputs:
     """The inputs of one response, in the order of its arguments."""
 
-    # One entry per argument: an int (position in ``aleatory``), a variable (epistemic), or an
+    # An entry for each argument: an int (position in ``aleatory``), a variable (epistemic), or an
     # array.
     arguments: tuple[Any, ...]
     aleatory: tuple[TensorVariable, ...]  # the distinct ``.dist()`` objects
-    # The model's random variables above the aleatory and epistemic inputs.
-    roots: tuple[TensorVariable, ...]
+    roots: tuple[TensorVariable, ...]  # model variables that the inputs depend on
     nested: bool  # whether a ``.dist()`` depends on another one
 
     @property
@@ -42,29 +41,29 @@ class Inputs:
 
     @cached_property
     def data(self) -> dict[str, Any]:
-        """The values above the inputs that can be set anew, as `pymc.Data`, by name."""
-        above = walk([*self.aleatory, *self.epistemic], _inputs_of)
-        found = {}
-        for i, variable in enumerate(above):
-            if hasattr(variable, "get_value") and isinstance(variable, TensorVariable):
-                found[str(variable.name or f"shared variable {i}")] = variable
-        return found
+        """The data that the inputs depend on and that can be changed, as `pymc.Data`, by name."""
+        ancestry = _ancestry([*self.aleatory, *self.epistemic])
+        return {
+            str(variable.name or f"shared variable {i}"): variable
+            for i, variable in enumerate(ancestry)
+            if hasattr(variable, "get_value") and isinstance(variable, TensorVariable)
+        }
 
     @property
     def groups(self) -> Groups | None:
-        """The groups that the inputs depend on, of which each specimen has one."""
+        """The groups of specimens that the inputs depend on."""
         return groups_of("", self.roots)
 
     def roots_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
-        """Return the roots above some arguments, by their positions; none above constants."""
-        known = set(self.roots)
-        found: dict[TensorVariable, None] = {}
+        """Return the roots of the arguments at some positions; constants have none."""
+        ends: set[Variable] = set(self.roots)
+        roots: dict[TensorVariable, None] = {}
         for position in positions:
             argument = self.arguments[position]
             x = self.aleatory[argument] if isinstance(argument, int) else argument
             if isinstance(x, Variable):
-                found.update((v, None) for v in _ancestry(x, known) if v in known)
-        return tuple(found)
+                roots.update((v, None) for v in _ancestry([x], ends) if v in ends)
+        return tuple(roots)
 
     def ordered_as(self, other: Inputs) -> Inputs:
         """Return the same arguments with the aleatory inputs in the order of equal ones."""
@@ -113,8 +112,11 @@ class Inputs:
         return [p[(0,) * (p.ndim - r.type.ndim)] for p, r in zip(params, self.roots, strict=True)]
 
     def placeholders(self) -> list[TensorVariable]:
-        """Return a fresh symbol for each root."""
+        """Return a new symbol for each root."""
         return [r.type(name=r.name) for r in self.roots]
+
+
+# -- reading ---------------------------------------------------------------------------------------
 
 
 def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
@@ -123,26 +125,24 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     Raises
     ------
     TypeError, ValueError
-        If one is none of the three, if none is aleatory, or if no model variable is above any of
-        them.
+        If one is none of the three, if none is aleatory, or if none depends on a model variable.
     """
-    known: set[Variable] = set(model.basic_RVs)
+    model_variables: set[Variable] = set(model.basic_RVs)
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
     roots: dict[TensorVariable, None] = {}
-    within: list[set[Variable]] = []  # of each aleatory input, what it is made of besides itself
+    is_nested = False
     for i, x in enumerate(inputs):
         label = f"{name}: input {i + 1}"
         if not isinstance(x, Variable):
             arguments.append(_constant(x, label))
             continue
-        known.update(filter(is_group, _ancestry(x, known)))
-        above = _ancestry(x, known)
-        _refuse_labelled(above, label)
-        roots.update((v, None) for v in above if v in known)
-        latent = [v for v in above if v not in known and is_random(v)]
-        _refuse_strays(x, above, latent, label)
-        if x in known or not latent:
+        model_variables.update(filter(is_group, _ancestry([x], model_variables)))
+        ancestry = _ancestry([x], model_variables)
+        roots.update((v, None) for v in ancestry if v in model_variables)
+        latent = [v for v in ancestry if v not in model_variables and is_random(v)]
+        _refuse_foreign_variables(x, ancestry, latent, label)
+        if x in model_variables or not latent:
             arguments.append(x)
             continue
         if not is_random(x):
@@ -152,22 +152,36 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             )
         if x not in aleatory:
             aleatory.append(x)
-            within.append(set(latent) - {x})
+            parts = set(latent) - {x}
+            is_nested = is_nested or (bool(parts) and not _has_marginal_density(x, parts))
         arguments.append(aleatory.index(x))
     groups_of(name, roots)
-    hyperparameters = [root for root in roots if not is_group(root)]
-    _refuse_too_little(name, len(inputs), bool(aleatory), bool(hyperparameters))
-    nested = any(
-        parts and not _marginal(x, parts) for x, parts in zip(aleatory, within, strict=True)
-    )
-    return Inputs(tuple(arguments), tuple(aleatory), tuple(roots), nested)
+    if not aleatory:
+        raise ValueError(
+            f"{name}: got {len(inputs)} inputs, none of them aleatory, expected at least one that "
+            "varies between specimens; pass a distribution made with `.dist()`, such as "
+            "pm.Normal.dist(mu, sigma)"
+        )
+    if all(map(is_group, roots)):
+        raise ValueError(
+            f"{name}: got inputs that depend on no variable of the model, expected hyperparameters "
+            "to calibrate; give the `.dist()` parameters that are model variables, such as "
+            "mu = pm.Normal('mu', 0, 1)"
+        )
+    return Inputs(tuple(arguments), tuple(aleatory), tuple(roots), is_nested)
 
 
-def _marginal(x: TensorVariable, parts: set[Variable]) -> bool:
-    """Return whether PyMC knows the density of an input without a value of its parts.
+def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) -> list[Variable]:
+    """Return variables and their ancestors, without those of the ends."""
 
-    As of a mixture, which has copies of what it is made of.
-    """
+    def parents(variable: Variable) -> Any:
+        return None if variable in ends or variable.owner is None else variable.owner.inputs
+
+    return list(walk(variables, parents))
+
+
+def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:
+    """Return whether the density of an input depends on no value of its parts, as of a mixture."""
     try:
         density = quiet_logp(x, pt.zeros_like(x))
     except (NotImplementedError, TypeError, ValueError):
@@ -175,73 +189,33 @@ def _marginal(x: TensorVariable, parts: set[Variable]) -> bool:
     return not parts & set(ancestors([density], blockers=[x]))
 
 
-def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
-    """Return PyMC's log p(x), without its warning of the parts of a random walk."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
-        return pm.logp(dist, x, warn_rvs=False)
-
-
-def _refuse_too_little(name: str, n: int, aleatory: bool, roots: bool) -> None:
-    """Refuse inputs of which none varies between specimens, or none is to be calibrated."""
-    if not aleatory:
-        raise ValueError(
-            f"{name}: got {n} inputs, none of them aleatory, expected at least one that "
-            "varies between specimens; pass a distribution made with `.dist()`, such as "
-            "pm.Normal.dist(mu, sigma)"
-        )
-    if not roots:
-        raise ValueError(
-            f"{name}: got inputs that depend on no variable of the model, expected hyperparameters "
-            "to calibrate; give the `.dist()` parameters that are model variables, such as "
-            "mu = pm.Normal('mu', 0, 1)"
-        )
-
-
-def _refuse_labelled(above: Sequence[Variable], label: str) -> None:
-    """Refuse variables of `pymc.dims`, whose arrays carry their own names of dimensions."""
-    for variable in above:
+def _refuse_foreign_variables(
+    x: Variable, ancestry: Sequence[Variable], latent: Sequence[Variable], label: str
+) -> None:
+    """Refuse variables of `pymc.dims`, loose symbols, and variables of another model."""
+    for variable in ancestry:
         if is_labelled(variable):
             raise TypeError(
                 f"{label}: got {variable} of pymc.dims, expected variables of PyMC itself, since "
                 "populations are evaluated in batches of plain arrays; write "
                 "pm.Normal(..., dims=...) and pm.Normal.dist(...) for all that simulators depend on"
             )
-
-
-def is_labelled(variable: object) -> bool:
-    """Whether a variable is one of `pymc.dims`."""
-    return isinstance(variable, Variable) and hasattr(variable.type, "dims")
-
-
-def _inputs_of(variable: Variable) -> Any:
-    return None if variable.owner is None else variable.owner.inputs
-
-
-def _ancestry(x: Variable, known: set[Variable]) -> list[Variable]:
-    """Return an input and what is above it, up to the model's variables."""
-
-    def parents(variable: Variable) -> Any:
-        if variable in known or variable.owner is None:
-            return None
-        return variable.owner.inputs
-
-    return list(walk([x], parents))
-
-
-def _refuse_strays(
-    x: Variable, above: Sequence[Variable], latent: Sequence[Variable], label: str
-) -> None:
-    """Refuse an input that depends on a loose symbol, or on a variable of another model."""
-    loose = [v for v in above if v.owner is None and not _is_bound(v)]
+    # Constants, shared variables and generators have a value.
+    loose = [
+        v
+        for v in ancestry
+        if v.owner is None
+        and isinstance(v, TensorVariable)
+        and not hasattr(v, "data")
+        and not hasattr(v, "get_value")
+    ]
     # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
     foreign = [v for v in latent if hasattr(v, "str_repr")]
-    strays = [*loose, *foreign]
-    if strays:
+    if loose or foreign:
         raise TypeError(
-            f"{label}: got {x} which depends on {strays[0]}, expected a `.dist()`, a variable of "
-            "this model or a constant; create the variables it depends on inside the same "
-            "`with pm.Model()`"
+            f"{label}: got {x} which depends on {[*loose, *foreign][0]}, expected a `.dist()`, a "
+            "variable of this model or a constant; create the variables it depends on inside the "
+            "same `with pm.Model()`"
         )
 
 
@@ -259,48 +233,35 @@ def _constant(x: object, label: str) -> Any:
         )
     if array.ndim == 0:
         return float(array)
-    # Neither the user nor the response is to change it between two responses.
+    # Neither the user nor the response may change it between two responses.
     array = array.copy()
     array.setflags(write=False)
     return array
 
 
-def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
-    """Return what a reader calls each aleatory input.
+# -- variables of a graph --------------------------------------------------------------------------
 
-    The name of its distribution, or of the response's argument that takes it, or its number.
-    """
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):
-        parameters = []
-    plain = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    arguments = [p.name for p in parameters if p.kind in plain]
-    found = []
-    for position, x in enumerate(inputs.aleatory):
-        place = inputs.arguments.index(position)
-        argument = arguments[place] if place < len(arguments) else f"input {place + 1}"
-        found.append(str(x.name or argument))
-    return found
+
+def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
+    """Return PyMC's log p(x), without its warning of the parts of a random walk."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
+        return pm.logp(dist, x, warn_rvs=False)
+
+
+def is_labelled(variable: object) -> bool:
+    """Return whether a variable is one of `pymc.dims`."""
+    return isinstance(variable, Variable) and hasattr(variable.type, "dims")
 
 
 def is_random(variable: Variable) -> bool:
-    """Whether a variable of a graph is a random one: drawn, not computed."""
+    """Return whether a variable of a graph is a random one: drawn, not computed."""
     if variable.owner is None:
         return False
     op = variable.owner.op
     return (
         isinstance(op, RandomVariable | pm.distributions.distribution.SymbolicRandomVariable)
         and variable is variable.owner.outputs[op.default_output or 0]
-    )
-
-
-def _is_bound(variable: Variable) -> bool:
-    """Whether a graph's leaf has a value: constants, shared variables, generators."""
-    return (
-        hasattr(variable, "data")
-        or hasattr(variable, "get_value")
-        or not isinstance(variable, TensorVariable)
     )
 
 
@@ -312,23 +273,37 @@ def event_shape(dist: TensorVariable) -> tuple[int, ...]:
     if None not in shape:
         return tuple(int(s) for s in shape if s is not None)
     with interpreted():
-        drawn = pm.draw(dist, random_seed=0, mode=PLAIN)
-    return tuple(int(s) for s in drawn.shape)
+        draw = pm.draw(dist, random_seed=0, mode=PLAIN)
+    return tuple(int(s) for s in draw.shape)
+
+
+def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
+    """Return a name of each aleatory input: of its distribution, or the response's argument."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        parameters = []
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    arguments = [p.name for p in parameters if p.kind in positional]
+    names = []
+    for position, x in enumerate(inputs.aleatory):
+        place = inputs.arguments.index(position)
+        argument = arguments[place] if place < len(arguments) else f"input {place + 1}"
+        names.append(str(x.name or argument))
+    return names
 
 
 def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
-    """Return the model given, or the one on the context, or raise.
-
-    Within another model, the outermost: that has the variables of all.
-    """
-    found = pm.Model.get_context(error_if_none=False) if model is None else model
-    if not isinstance(found, pm.Model):
-        got = "no model on the context" if found is None else type(found).__name__
+    """Return the model, by default the one on the context; of nested models the outermost."""
+    if model is None:
+        model = pm.Model.get_context(error_if_none=False)
+    if not isinstance(model, pm.Model):
+        got = "no model on the context" if model is None else type(model).__name__
         raise TypeError(
             f"{caller}: got {got}, expected a pm.Model; "
             "call it inside `with pm.Model():` or pass model="
         )
-    return found.root
+    return model.root
 
 
 # -- batches ---------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What one run of a response gives: a number, or several outputs of the same specimen."""
+"""Outputs of a run: one number, or several numbers of the same specimen, with names and units."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from prbayes._validate import Floats, real_array
 
 @dataclass(frozen=True)
 class Outputs:
-    """The outputs of one specimen, in the order of the columns of what was observed.
+    """The outputs of one specimen, in the order of the columns of ``observed``.
 
     Attributes
     ----------
     labels : tuple
-        Of each output: a text, or a number where the outputs are a curve over it; none if a run
-        gives one number.
+        A text for each output, or a number where the outputs are a curve; none if a run gives one
+        number.
     dim : str
         Name of their dimension in results.
     keys : tuple of (str, int or None)
         Keys of a response that returns a mapping, and how many outputs each has; None for one
         number without an axis. Empty where outputs have no names.
     units : tuple of str
-        Of each output, where they are known.
+        Units of the outputs, where they are known.
     """
 
     labels: tuple[Any, ...] = ()
@@ -46,15 +46,14 @@ class Outputs:
         return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
 
     def by_key(self, values: Floats) -> dict[str, Floats]:
-        """Return outputs in the last axis, (..., m), as the mapping that they were assembled of."""
-        found = {}
-        first = 0
+        """Return outputs in the last axis, (..., m), as a mapping with the response's keys."""
+        arrays = {}
+        start = 0
         for key, size in self.keys:
-            last = first + (1 if size is None else size)
-            columns = values[..., first:last]
-            found[key] = columns[..., 0] if size is None else columns
-            first = last
-        return found
+            stop = start + (1 if size is None else size)
+            arrays[key] = values[..., start] if size is None else values[..., start:stop]
+            start = stop
+        return arrays
 
     def assembled(self, result: Mapping[str, Any]) -> Any:
         """Return a mapping's arrays as one, outputs in the last axis.
@@ -69,11 +68,11 @@ class Outputs:
                 f"the response returned a mapping with the keys {list(result)}, expected an array; "
                 "outputs have no names: pass observed= as a mapping, or as a DataFrame, with these"
             )
-        wanted = [key for key, _ in self.keys]
-        if set(result) != set(wanted):
+        expected = [key for key, _ in self.keys]
+        if set(result) != set(expected):
             raise KeyError(
-                f"the response returned a mapping with the keys {list(result)}, expected {wanted}, "
-                "those of observed"
+                f"the response returned a mapping with the keys {list(result)}, expected "
+                f"{expected}, those of observed"
             )
         columns = []
         for key, size in self.keys:
@@ -87,20 +86,23 @@ ONE = Outputs()
 
 def outputs_of_result(result: Mapping[str, Any], batch_ndim: int) -> Outputs:
     """Return the outputs that a response's mapping has."""
-    sizes: list[tuple[str, int | None]] = []
+    keys: list[tuple[str, int | None]] = []
     for key, column in result.items():
         array = np.asarray(column)
-        sizes.append((str(key), array.shape[-1] if array.ndim > batch_ndim else None))
-    return outputs_of_keys(sizes)
+        keys.append((str(key), array.shape[-1] if array.ndim > batch_ndim else None))
+    return outputs_of_keys(keys)
 
 
 def outputs_of_keys(keys: Sequence[tuple[str, int | None]]) -> Outputs:
-    """Return the outputs of a mapping with these keys, and as many outputs of each."""
-    return Outputs(_labels(list(keys)), keys=tuple(keys))
+    """Return the outputs of a mapping with these keys, and a number of outputs for each."""
+    labels = []
+    for key, size in keys:
+        labels += [key] if size is None else [f"{key}[{i}]" for i in range(size)]
+    return Outputs(tuple(labels), keys=tuple(keys))
 
 
 def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
-    """Return observed responses, (N,) or (N, m), and what their columns are.
+    """Return observed responses, (N,) or (N, m), and their outputs.
 
     Parameters
     ----------
@@ -118,76 +120,62 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     """
     label = f"{name}: observed"
     if isinstance(observed, Mapping):
-        return _of_mapping(label, observed)
+        return _from_mapping(label, observed)
     _refuse_texts(label, observed)
     if np.ma.is_masked(observed) and np.ndim(observed) == 2:
         observed = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
     values = observed if np.ma.is_masked(observed) else real_array(observed, label)
-    if np.ndim(values) != 2:
-        return values, _of_one(observed)
-    _, m = values.shape
-    if not m:
-        raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
-    return values, _of_columns(observed, m)
+    if np.ndim(values) == 2:
+        if not values.shape[1]:
+            raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
+        return values, _labelled_columns(observed, values.shape[1])
+    unit = getattr(observed, "attrs", {}).get("units") if hasattr(observed, "dims") else None
+    return values, Outputs(units=(str(unit),)) if unit else ONE
 
 
 def _refuse_texts(label: str, observed: Any) -> None:
     """Raise if columns of a DataFrame are no numbers, such as names of groups."""
     if not hasattr(observed, "columns") or not hasattr(observed, "dtypes"):
         return
-    others = []
+    texts = []
     for place, (name, kind) in enumerate(zip(observed.columns, observed.dtypes, strict=True)):
         if kind.kind not in "biufO" or any(isinstance(v, str) for v in observed.iloc[:, place]):
-            others.append(name)
-    if others:
+            texts.append(name)
+    if texts:
         raise TypeError(
-            f"{label}: got a DataFrame whose columns {others} hold no numbers, expected a column "
+            f"{label}: got a DataFrame whose columns {texts} hold no numbers, expected a column "
             "of measured responses for each output; leave others out, as in df['life'], and where "
             "one names groups, such as suppliers, index hyperparameters by "
-            f"prb.response.group({str(others[0])!r})"
+            f"prb.response.group({str(texts[0])!r})"
         )
 
 
-def _of_one(observed: Any) -> Outputs:
-    """Return what a DataArray of one output says of its units."""
-    unit = getattr(observed, "attrs", {}).get("units") if hasattr(observed, "dims") else None
-    return Outputs(units=(str(unit),)) if unit else ONE
-
-
-def _of_columns(observed: Any, m: int) -> Outputs:
-    """Return what the columns of an array, DataFrame or DataArray say of themselves."""
+def _labelled_columns(observed: Any, m: int) -> Outputs:
+    """Return the outputs of an array, DataFrame or DataArray of m columns."""
+    labels: tuple[Any, ...] = tuple(range(m))
+    units: tuple[str, ...] = ()
     if hasattr(observed, "dims") and hasattr(observed, "coords"):
         dim = str(observed.dims[1])
-        labels = tuple(range(m))
         if dim in observed.coords:
             labels = tuple(observed.coords[dim].values.tolist())
-        units = _units(observed, m)
-        return Outputs(labels, dim, _keys(labels), units)
-    if hasattr(observed, "columns"):
+        # One unit for all, or a coordinate of units.
+        unit = observed.attrs.get("units")
+        if "units" in observed.coords:
+            stated: NDArray[Any] = np.broadcast_to(observed.coords["units"].values, m)
+            units = tuple(map(str, stated.tolist()))
+        elif unit:
+            units = (str(unit),) * m
+    elif hasattr(observed, "columns"):
         labels = tuple(np.asarray(observed.columns).tolist())
-        named = getattr(observed.columns, "name", None)
-        return Outputs(labels, str(named or "output"), _keys(labels))
-    return Outputs(tuple(range(m)))
+        dim = str(getattr(observed.columns, "name", None) or "output")
+    else:
+        return Outputs(labels)
+    are_names = all(isinstance(label, str) for label in labels)
+    return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else (), units)
 
 
-def _keys(labels: Sequence[Any]) -> tuple[tuple[str, int | None], ...]:
-    """Return the keys of a response whose outputs are named one by one, if they are by texts."""
-    if all(isinstance(label, str) for label in labels):
-        return tuple((label, None) for label in labels)
-    return ()
-
-
-def _units(observed: Any, m: int) -> tuple[str, ...]:
-    """Return the units that a DataArray states: one for all, or a coordinate of them."""
-    if "units" in observed.coords:
-        stated: NDArray[Any] = np.broadcast_to(observed.coords["units"].values, m)
-        return tuple(map(str, stated.tolist()))
-    unit = observed.attrs.get("units")
-    return (str(unit),) * m if unit else ()
-
-
-def _of_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:
-    columns, sizes = [], []
+def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:
+    columns, keys = [], []
     for key, column in observed.items():
         if not isinstance(key, str):
             raise TypeError(f"{label}: got the key {key!r:.60}, expected names of outputs")
@@ -197,7 +185,7 @@ def _of_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Output
                 f"{label}[{key!r}]: got shape {values.shape}, expected (N,), or (N, k) for k "
                 "outputs of one name"
             )
-        sizes.append((key, None if values.ndim == 1 else values.shape[1]))
+        keys.append((key, None if values.ndim == 1 else values.shape[1]))
         columns.append(values[:, None] if values.ndim == 1 else values)
     lengths = [len(column) for column in columns]
     if len(set(lengths)) != 1:
@@ -205,17 +193,10 @@ def _of_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Output
             f"{label}: got arrays of {lengths} values, expected one value for each specimen in "
             "every output; NaN where it was not measured"
         )
-    return np.concatenate(columns, axis=1), Outputs(_labels(sizes), keys=tuple(sizes))
-
-
-def _labels(sizes: Sequence[tuple[str, int | None]]) -> tuple[str, ...]:
-    labels = []
-    for key, size in sizes:
-        labels += [key] if size is None else [f"{key}[{i}]" for i in range(size)]
-    return tuple(labels)
+    return np.concatenate(columns, axis=1), outputs_of_keys(keys)
 
 
 def lacking(values: Floats) -> NDArray[np.bool_]:
-    """Return which points have no response, (n,) or (n, m) -> (n,): an output of theirs is NaN."""
+    """Return which points, (n,) or (n, m) -> (n,), have an output that is NaN: no response."""
     nan = np.isnan(values)
     return nan.any(axis=-1) if nan.ndim > 1 else nan

@@ -1,9 +1,8 @@
-"""Computed responses on disk, keyed by their inputs: none is lost.
+"""Store of computed responses on disk, keyed by their inputs.
 
-A store is a folder with one SQLite file for all simulators that were given it. Runs are only ever
-appended, a transaction for each chunk of them: whatever moment a process is killed at, what was
-committed is found again, and several processes may write at once. Every run carries a checksum: a
-damaged file is refused with a sentence, and never read as other numbers.
+A store is a folder with one SQLite file for all of its simulators. Runs are only appended, with a
+transaction for each chunk, so committed runs survive a killed process, and several processes may
+write at once. A checksum of every run reveals damage.
 """
 
 from __future__ import annotations
@@ -11,7 +10,9 @@ from __future__ import annotations
 import os
 import sqlite3
 import threading
+import uuid
 import weakref
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -23,24 +24,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats, plain_text, positive_integer, stated_path
-from prbayes.response.database import (
-    COMPUTED,
-    FAILED,
-    INSERT_RESPONSE,
-    INSERT_RUN,
-    SELECT_RESPONSES,
-    SELECT_RUNS,
-    Complaint,
-    checksum,
-    complaint_about,
-    complaint_of,
-    connected,
-    create,
-    damaged,
-    transaction,
-)
 
-_FILE = "responses.sqlite"  # what users see in their folder
 _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
 
@@ -48,41 +32,31 @@ class StoreError(RuntimeError):
     """A store that cannot be read or written, or is of something else; never overwritten."""
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """A response in the file: its number there, and of how many values its inputs are made."""
-
-    number: int
-    columns: int
-
-
 @dataclass(eq=False)
 class _Session:
-    """The file as one thread of one process has it open, and what it has read of it.
-
-    Attributes
-    ----------
-    connection : sqlite3.Connection
-    opened : tuple of int
-        Process, and device and number of the file.
-    entry : _Entry
-    known : dict
-        Values of the store's response, all outputs of a run together, by keys, both as bytes.
-    failed : dict
-        Why there is no value, by the keys of those that failed.
-    seen : int
-        The last run that was read, of any response.
-    """
+    """A connection of one thread of one process, and the runs that it has read."""
 
     connection: sqlite3.Connection
-    opened: tuple[int, ...]
-    entry: _Entry
-    known: dict[bytes, bytes] = field(default_factory=dict)
-    failed: dict[bytes, str] = field(default_factory=dict)
-    seen: int = 0
+    opened: tuple[int, ...]  # process, device and number of the file
+    response: int  # number of the store's response in the file
+    columns: int  # numbers that make the inputs of one run
+    known: dict[bytes, bytes] = field(default_factory=dict)  # values of all outputs by inputs
+    failed: dict[bytes, str] = field(default_factory=dict)  # reasons by inputs
+    n_read: int = 0  # runs of any response
 
     def __post_init__(self) -> None:
         self.close = weakref.finalize(self, _close, self.connection, os.getpid())
+
+
+# Connections of the parent process after a fork, which must not be closed in the child.
+_inherited: list[sqlite3.Connection] = []
+
+
+def _close(connection: sqlite3.Connection, process: int) -> None:
+    if process == os.getpid():
+        connection.close()
+    else:
+        _inherited.append(connection)
 
 
 class Store:
@@ -99,7 +73,7 @@ class Store:
         Of the simulator.
     columns : int, optional
         Number of values that the inputs of one point are made of. By default that of the stored
-        responses; there must be some, then.
+        responses, of which there must be one.
     version : str, optional
         Of the response; those of each version are kept apart, as are those without one.
     outputs : int, optional
@@ -108,8 +82,8 @@ class Store:
     Attributes
     ----------
     verified : bool
-        Whether the stored responses are known to be those of the response at hand: a version says
-        so, or one of them was computed again.
+        Whether the stored responses are known to be those of the present response: by a version, or
+        because one of them was computed again.
 
     Raises
     ------
@@ -162,50 +136,37 @@ class Store:
     @property
     def path(self) -> Path:
         """The file."""
-        return self.folder / _FILE
+        return self.folder / "responses.sqlite"
 
     def __len__(self) -> int:
         return len(self._read().known)
 
     def find(self, inputs: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return stored responses of inputs (n, columns), and which were found, shape (n,).
+        """Return stored responses of inputs (n, columns), and whether there is one, shape (n,).
 
-        Of several outputs the responses have shape (n, m).
+        Several outputs have shape (n, m).
         """
         session = self._read()
-        known = session.known
-        found = [known.get(key) for key in _keys(inputs)]
-        present = np.array([value is not None for value in found], dtype=bool)
-        nothing = _NAN * self._width(session)
-        return self._values(session, (nothing if v is None else v for v in found)), present
-
-    def _width(self, session: _Session) -> int:
-        """Return how many outputs a run has."""
-        first = next(iter(session.known.values()), None)
-        return self.outputs or (1 if first is None else len(first) // len(_NAN))
-
-    def _values(self, session: _Session, values: Iterable[bytes]) -> Floats:
-        """Return responses as numbers, (n,), or (n, m) of several outputs."""
-        width = self._width(session)
-        numbers = _numbers(values)
-        return numbers if width == 1 else numbers.reshape(-1, width)
+        values = [session.known.get(key) for key in _keys(inputs)]
+        is_known = np.array([value is not None for value in values], dtype=bool)
+        missing = _NAN * self._n_outputs(session)
+        return self._as_array(session, (v or missing for v in values)), is_known
 
     def failed(self, inputs: Floats) -> dict[int, str]:
-        """Return which of the inputs, (n, columns), are stored as failed, and why, by row."""
+        """Return why inputs, (n, columns), are stored as failed, by the rows of those that are."""
         failed = self._read().failed
         if not failed:
             return {}
-        keys = enumerate(_keys(inputs))
-        return {row: failed[key] for row, key in keys if key in failed}
+        return {row: failed[key] for row, key in enumerate(_keys(inputs)) if key in failed}
 
     def known(self) -> tuple[Floats, Floats]:
-        """Return inputs, (n, columns), and values, (n,) or (n, m), in the order in which they came.
+        """Return inputs, (n, columns), and values, (n,) or (n, m), in the order of their storage.
 
-        NaN is a result, or a response that failed; `failed` tells.
+        NaN is a result, or a response that failed; see `failed`.
         """
         session = self._read()
-        inputs = _numbers(session.known).reshape(-1, session.entry.columns)
-        return inputs, self._values(session, session.known.values())
+        inputs = _numbers(session.known).reshape(-1, session.columns)
+        return inputs, self._as_array(session, session.known.values())
 
     def add(self, inputs: Floats, values: Floats, reasons: Mapping[int, str] | None = None) -> None:
         """Append responses, safe on disk when this returns.
@@ -215,7 +176,7 @@ class Store:
         inputs : ndarray, shape (n, columns)
         values : ndarray, shape (n,) or (n, m)
         reasons : mapping, optional
-            Of those that failed: why, by row.
+            Reasons of failed responses, by row.
         """
         self.add_all([(inputs, values, reasons or {})])
 
@@ -224,7 +185,11 @@ class Store:
         session = self._read()
         rows = []
         for inputs, values, reasons in parts:
-            rows += _rows(session.entry.number, inputs, values, reasons)
+            numbers = np.asarray(values, dtype="<f8")
+            for i, key in enumerate(_keys(inputs)):
+                state = "failed" if i in reasons else "computed"
+                row = (session.response, key, state, reasons.get(i), numbers[i].tobytes())
+                rows.append((*row, checksum(*row)))
         with self._explained(), transaction(session.connection):
             session.connection.executemany(INSERT_RUN, rows)
 
@@ -235,7 +200,7 @@ class Store:
         -------
         Dataset
             ``inputs``, dims (point, column), ``response``, dim (point) or dims (point, output), and
-            ``reason``, dim (point), in the order in which they came; a reason is empty where the
+            ``reason``, dim (point), in the order of their storage; a reason is empty where the
             response did not fail.
         """
         inputs, values = self.known()
@@ -257,23 +222,33 @@ class Store:
             session.close()
             del self._local.session
 
+    def _n_outputs(self, session: _Session) -> int:
+        first = next(iter(session.known.values()), _NAN)
+        return self.outputs or len(first) // len(_NAN)
+
+    def _as_array(self, session: _Session, values: Iterable[bytes]) -> Floats:
+        """Return responses as numbers, (n,), or (n, m) of several outputs."""
+        n_outputs = self._n_outputs(session)
+        numbers = _numbers(values)
+        return numbers if n_outputs == 1 else numbers.reshape(-1, n_outputs)
+
     def _read(self) -> _Session:
-        """Return the session of this thread, after reading what others have written meanwhile."""
+        """Return the session of this thread with all runs that are in the file."""
         session: _Session | None = getattr(self._local, "session", None)
         with self._explained():
-            # After a fork, and where another file is in its place, the session is an old one. It is
-            # closed first: closing deletes the log of writes, by name.
-            if session is not None and session.opened != self._opened():
+            # A session from before a fork, or of another file in this place, is closed first:
+            # closing deletes the log of writes, by name.
+            if session is not None and session.opened != self._file_identity():
                 session.close()
                 session = None
             if session is None:
                 session = self._open()
-            self._read_on(session)
+            self._read_new_runs(session)
         self._local.session = session
         return session
 
-    def _opened(self) -> tuple[int, ...]:
-        """Return what tells processes and files apart; nothing if there is no file."""
+    def _file_identity(self) -> tuple[int, ...]:
+        """Return process, device and number of the file; nothing if there is no file."""
         try:
             file = self.path.stat()
         except FileNotFoundError:
@@ -281,109 +256,105 @@ class Store:
         return os.getpid(), file.st_dev, file.st_ino
 
     def _open(self) -> _Session:
-        """Open the file, made if it does not exist, after a look whether it is a sound store."""
+        """Open the file, made if it does not exist, and check it."""
         if self.folder.exists() and not self.folder.is_dir():
             raise StoreError(
                 f"{self.name}: store: got {self.folder}, which is a file, expected a folder"
             )
         if not self.path.exists():
             create(self.path)
-        connection = connected(self.path)
+        connection = connect(self.path)
         try:
-            complaint = complaint_about(self.path, connection)
-            if complaint is not None:
-                raise self._refusal(complaint)
-            return _Session(connection, self._opened(), self._entry(connection))
+            check_file(self.path, connection)
+            response, columns = self._response(connection)
+            return _Session(connection, self._file_identity(), response, columns)
         except BaseException:
             connection.close()
             raise
 
-    def _entry(self, connection: sqlite3.Connection) -> _Entry:
-        """Return the store's response in the file, where it is entered if it is new."""
-        own = self.name, self.version
-        if own not in self._entries(connection):
-            self._enter(connection)
-        entries = self._entries(connection)
-        if own not in entries:
-            got = f"which holds no responses of simulator {_called(*own)}"
-            todo = "look at name, version and folder"
-            known = ", ".join(_called(*each) for each in entries)
-            raise self._refusal(Complaint(got, f"one of [{known}]", todo))
-        entry = entries[own]
-        if self.columns not in (None, entry.columns):
-            got = f"which holds inputs of {entry.columns} values for simulator {self.name!r}"
-            todo = "nothing was changed: give the simulator another name, or pass another folder"
-            raise self._refusal(Complaint(got, f"{self.columns} values", todo))
-        return entry
+    def _response(self, connection: sqlite3.Connection) -> tuple[int, int]:
+        """Return number and columns of the store's response in the file; add it if it is new."""
+        name = self.name, self.version
+        responses = _responses(connection)
+        if name not in responses and self.columns is not None:
+            self._refuse_older_files()
+            row = (self.name, self.columns, self.version)
+            with transaction(connection):
+                values = (*row, checksum(*row), self.name, self.version)
+                connection.execute(_INSERT_RESPONSE, values)
+            responses = _responses(connection)  # another process may have been faster
+        if name not in responses:
+            texts = [
+                repr(n) if v is None else f"{n!r}, version {v!r}" for n, v in [name, *responses]
+            ]
+            raise _FileError(
+                f"which holds no responses of simulator {texts[0]}",
+                f"one of [{', '.join(texts[1:])}]",
+                "look at name, version and folder",
+            )
+        _, columns = responses[name]
+        if self.columns not in (None, columns):
+            raise _FileError(
+                f"which holds inputs of {columns} values for simulator {self.name!r}",
+                f"{self.columns} values",
+                "nothing was changed: give the simulator another name, or pass another folder",
+            )
+        return responses[name]
 
-    def _enter(self, connection: sqlite3.Connection) -> None:
-        """Enter the response, unless another process has, or stores of before SQLite have it."""
-        if self.columns is None:
-            return
-        safe = "".join(c if c.isalnum() or c in "-_." else f"%{ord(c):x}" for c in self.name)
-        older = [end for end in (".nc", ".journal") if (self.folder / f"{safe}{end}").exists()]
-        if older:
-            got = f"beside {safe}{older[0]}, which an older version wrote"
-            todo = "this version does not read it: move it away, or pass another folder"
-            raise self._refusal(Complaint(got, "no such file", todo))
-        row = (self.name, self.columns, self.version)
-        with transaction(connection):
-            connection.execute(INSERT_RESPONSE, (*row, checksum(*row), self.name, self.version))
+    def _refuse_older_files(self) -> None:
+        """Raise if the folder has runs of this simulator from before SQLite."""
+        stem = "".join(c if c.isalnum() or c in "-_." else f"%{ord(c):x}" for c in self.name)
+        for file in (f"{stem}.nc", f"{stem}.journal"):
+            if (self.folder / file).exists():
+                raise _FileError(
+                    f"beside {file}, which an older version wrote",
+                    "no such file",
+                    "this version does not read it: move it away, or pass another folder",
+                )
 
-    def _entries(self, connection: sqlite3.Connection) -> dict[tuple[str, str | None], _Entry]:
-        """Return the responses in the file, by name and version."""
-        entries = {}
-        for number, *row, written in connection.execute(SELECT_RESPONSES).fetchall():
-            if written != checksum(*row):
-                raise self._refusal(damaged(f"response {number} does not match its checksum"))
-            name, columns, version = row
-            entries[name, version] = _Entry(number, columns)
-        return entries
-
-    def _read_on(self, session: _Session) -> None:
-        """Read the runs that the session has not seen; every one has to be there, and sound."""
-        with closing(session.connection.execute(SELECT_RUNS, (session.seen,))) as runs:
-            for number, *row, written in runs:
-                if number != session.seen + 1:
-                    raise self._refusal(damaged(f"run {session.seen + 1} is missing"))
-                if written != checksum(*row):
-                    raise self._refusal(damaged(f"run {number} does not match its checksum"))
+    def _read_new_runs(self, session: _Session) -> None:
+        """Read the runs that the session has not read; numbers and checksums have to match."""
+        with closing(session.connection.execute(_SELECT_RUNS, (session.n_read,))) as runs:
+            for number, *row, stored_checksum in runs:
+                if number != session.n_read + 1:
+                    raise _damaged(f"run {session.n_read + 1} is missing")
+                if stored_checksum != checksum(*row):
+                    raise _damaged(f"run {number} does not match its checksum")
                 response, key, state, reason, value = row
-                if response == session.entry.number:
+                if response == session.response:
                     self._refuse_other_outputs(session, value)
+                    # The last run of a point counts: a failed one may have been tried again.
                     session.known[key] = value
-                    # The last run of a point counts: one that failed may have been tried again.
                     session.failed.pop(key, None)
-                    if state == FAILED:
+                    if state == "failed":
                         session.failed[key] = reason
-                session.seen = number
+                session.n_read = number
 
     def _refuse_other_outputs(self, session: _Session, value: bytes) -> None:
         """Raise if a stored run has another number of outputs."""
-        found = len(value) // len(_NAN)
-        width = self._width(session)
-        if (session.known and found != width) or self.outputs not in (None, found):
-            got = f"which holds runs with {found} outputs for simulator {self.name!r}"
-            todo = "nothing was changed: pass version= with a name for the response as it is now"
-            raise self._refusal(Complaint(got, f"{width}", todo))
+        n = len(value) // len(_NAN)
+        expected = self._n_outputs(session)
+        if (session.known and n != expected) or self.outputs not in (None, n):
+            raise _FileError(
+                f"which holds runs with {n} outputs for simulator {self.name!r}",
+                f"{expected}",
+                "nothing was changed: pass version= with a name for the response as it is now",
+            )
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Turn what SQLite reports into a sentence."""
+        """Turn errors of the file into `StoreError`."""
         try:
             yield
-        except sqlite3.Error as error:
-            raise self._refusal(complaint_of(error)) from error
-
-    def _refusal(self, complaint: Complaint) -> StoreError:
-        return StoreError(
-            f"{self.name}: store: got {self.path}, {complaint.got}, expected {complaint.expected}; "
-            f"{complaint.todo}"
-        )
+        except (sqlite3.Error, _FileError) as error:
+            got, expected, action = explanation(error)
+            cause = error if isinstance(error, sqlite3.Error) else None
+            raise StoreError(
+                f"{self.name}: store: got {self.path}, {got}, expected {expected}; {action}"
+            ) from cause
 
 
-def _called(name: str, version: str | None) -> str:
-    """Return what a response is called, for messages."""
+def _name_text(name: str, version: str | None) -> str:
     return repr(name) if version is None else f"{name!r}, version {version!r}"
 
 
@@ -395,25 +366,186 @@ def _numbers(values: Iterable[bytes]) -> Floats:
     return np.frombuffer(bytearray(b"".join(values)), dtype="<f8").astype(np.float64)
 
 
-def _rows(
-    response: int, inputs: Floats, values: Floats, reasons: Mapping[int, str]
-) -> list[tuple[Any, ...]]:
-    """Return rows of the table of runs."""
-    numbers = np.asarray(values, dtype="<f8")
-    rows = []
-    for i, key in enumerate(_keys(inputs)):
-        state = FAILED if i in reasons else COMPUTED
-        row = (response, key, state, reasons.get(i), numbers[i].tobytes())
-        rows.append((*row, checksum(*row)))
-    return rows
+# -- the file --------------------------------------------------------------------------------------
+
+# Distinguishes stores from other databases (https://www.sqlite.org/pragma.html).
+_APPLICATION = int.from_bytes(b"prby")
+_LAYOUT = 2  # version of the tables below: files of other versions are refused
+# Seconds to wait for other writers: a chunk takes 10 ms, so a thousand writers fit.
+_PATIENCE = 60.0
+
+# A response has a name and a version. Key and value of a run are float64, little-endian, so every
+# bit survives; a key has the constants, too. Runs are numbered without gaps, which shows losses.
+_TABLES = (
+    "CREATE TABLE response (id INTEGER PRIMARY KEY, name TEXT NOT NULL, columns INTEGER NOT NULL, "
+    "version TEXT, checksum INTEGER NOT NULL)",
+    "CREATE TABLE run (id INTEGER PRIMARY KEY, response INTEGER NOT NULL, key BLOB NOT NULL, "
+    "state TEXT NOT NULL, reason TEXT, value BLOB NOT NULL, checksum INTEGER NOT NULL)",
+)
+_INSERT_RESPONSE = (
+    "INSERT INTO response (name, columns, version, checksum) SELECT ?, ?, ?, ? "
+    "WHERE NOT EXISTS (SELECT 1 FROM response WHERE name = ? AND version IS ?)"
+)
+INSERT_RUN = (
+    "INSERT INTO run (response, key, state, reason, value, checksum) VALUES (?, ?, ?, ?, ?, ?)"
+)
+_SELECT_RUNS = (
+    "SELECT id, response, key, state, reason, value, checksum FROM run WHERE id > ? ORDER BY id"
+)
 
 
-# Connections that came with a fork: they are the parent's, and must not be closed here.
-_inherited: list[sqlite3.Connection] = []
+def checksum(*row: Any) -> int:
+    """Return the checksum of a row's entries, types included."""
+    return zlib.crc32(ascii(row).encode())
 
 
-def _close(connection: sqlite3.Connection, process: int) -> None:
-    if process == os.getpid():
+def create(path: Path) -> None:
+    """Make an empty store; it appears complete or not at all, and replaces none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
+    try:
+        with closing(connect(part, "rwc")) as connection:
+            # Readers and the writer do not wait for each other, and a commit is one flush.
+            connection.execute("PRAGMA journal_mode = WAL")
+            with transaction(connection):
+                for table in _TABLES:
+                    connection.execute(table)
+                connection.execute(f"PRAGMA application_id = {_APPLICATION}")
+                connection.execute(f"PRAGMA user_version = {_LAYOUT}")
+        try:
+            os.link(part, path)
+        except FileExistsError:
+            return  # another process was faster
+        except OSError:
+            part.rename(path)  # a file system without links
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def connect(path: Path, mode: str = "rw") -> sqlite3.Connection:
+    """Return a connection that does not trust the contents of the file."""
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode={mode}",
+        uri=True,
+        timeout=_PATIENCE,
+        isolation_level=None,  # transactions begin where the code says so
+        check_same_thread=False,  # the garbage collector may close it in another thread
+    )
+    try:
+        # For files that may be damaged (https://www.sqlite.org/security.html).
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA cell_size_check = ON")
+        connection.execute("PRAGMA mmap_size = 0")
+        connection.execute("PRAGMA synchronous = FULL")  # a commit has been flushed to disk
+    except sqlite3.Error:
         connection.close()
-    else:
-        _inherited.append(connection)
+        raise
+    return connection
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    """Write all or nothing; it waits for other writers at the beginning, not in the middle."""
+    connection.execute("BEGIN IMMEDIATE")
+    with connection:
+        yield
+
+
+def check_file(path: Path, connection: sqlite3.Connection) -> None:
+    """Raise if a file is damaged, or of another program or layout."""
+    # The smallest page (https://www.sqlite.org/fileformat.html): an empty file is a new one to
+    # SQLite.
+    if path.stat().st_size < 512:
+        raise _damaged("it was cut to less than a page")
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    if application != _APPLICATION:
+        raise _FileError(
+            "which is a database of another program",
+            "a store of prbayes",
+            "nothing was changed: pass another folder",
+        )
+    (layout,) = connection.execute("PRAGMA user_version").fetchone()
+    if layout != _LAYOUT:
+        raise _FileError(
+            f"which has layout {layout}",
+            f"layout {_LAYOUT}",
+            "use the version of prbayes that wrote it, or pass another folder",
+        )
+    tables = connection.execute("SELECT sql FROM sqlite_master ORDER BY name").fetchall()
+    if tables != [(table,) for table in _TABLES]:
+        raise _damaged("its tables are others")
+    (result,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+    last = result.splitlines()[-1]  # the lines before name the database
+    if last != "ok":
+        raise _damaged(last)
+
+
+def _responses(connection: sqlite3.Connection) -> dict[tuple[str, str | None], tuple[int, int]]:
+    """Return number and columns of the responses in the file, by name and version."""
+    query = "SELECT id, name, columns, version, checksum FROM response ORDER BY id"
+    responses = {}
+    for number, *row, stored_checksum in connection.execute(query).fetchall():
+        if stored_checksum != checksum(*row):
+            raise _damaged(f"response {number} does not match its checksum")
+        name, columns, version = row
+        responses[name, version] = number, columns
+    return responses
+
+
+# -- errors ----------------------------------------------------------------------------------------
+
+
+class _FileError(Exception):
+    """A file that is no store for this response: got, expected, what to do."""
+
+
+def _damaged(reason: str) -> _FileError:
+    return _FileError(
+        f"which is damaged: {reason}",
+        "what was written",
+        "nothing was changed: put back a copy, move the file away, or pass another folder; the "
+        "program sqlite3 may recover what is left (.recover)",
+    )
+
+
+_FULL = (
+    "which cannot grow",
+    "space on the disk, and within its quota and the largest size of a file",
+    "all that was written before is kept: free some space and run again",
+)
+_LOCKED = (
+    f"which another process has locked for {_PATIENCE:.0f} s",
+    "to wait for milliseconds",
+    "end that process, if it hangs, and run again",
+)
+_CLOSED = (
+    "which cannot be opened",
+    "a file that may be read and written",
+    "nothing was changed: look at the rights of folder and file, or pass another folder",
+)
+_EXPLANATIONS = {
+    sqlite3.SQLITE_FULL: _FULL,
+    sqlite3.SQLITE_IOERR_WRITE: _FULL,
+    sqlite3.SQLITE_IOERR_FSYNC: _FULL,
+    sqlite3.SQLITE_IOERR_TRUNCATE: _FULL,
+    sqlite3.SQLITE_IOERR_SHMSIZE: _FULL,
+    sqlite3.SQLITE_BUSY: _LOCKED,
+    sqlite3.SQLITE_LOCKED: _LOCKED,
+    sqlite3.SQLITE_CANTOPEN: _CLOSED,
+    sqlite3.SQLITE_READONLY: _CLOSED,
+    sqlite3.SQLITE_PERM: _CLOSED,
+    sqlite3.SQLITE_IOERR: _CLOSED,
+}
+
+
+def explanation(error: sqlite3.Error | _FileError) -> tuple[str, str, str]:
+    """Return got, expected and what to do; an unknown error of SQLite is damage."""
+    if isinstance(error, _FileError):
+        return error.args
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
+    # The kind of an extended result code (https://www.sqlite.org/rescode.html).
+    known = _EXPLANATIONS.get(code) or _EXPLANATIONS.get(code & 0xFF)
+    if known is None:
+        return explanation(_damaged(f"{error!s:.200}"))  # it may quote what is damaged
+    got, expected, action = known
+    return f"{got} ({error})", expected, action

@@ -596,8 +596,8 @@ class _Coverage:
 def _computed_coverage(evaluator: Evaluator, thetas: Floats) -> _Coverage:
     """Return the coverage by the designs as they are now."""
     needs = {
-        name: (design.required_ess, design.config.max_lost, design.n_points)
-        for name, design in evaluator.designs.items()
+        name: (bound.required_ess, bound.max_lost, bound.n_points)
+        for name, bound in evaluator.reweighted.items()
     }
     return _Coverage.of(evaluator.support(thetas), needs)
 

@@ -37,8 +37,8 @@ from prbayes.model.locking import locked
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
-from prbayes.propagation.new_specimens import new_specimens
-from prbayes.propagation.reweighted import Design, UntoldError
+from prbayes.propagation.points import new_specimens
+from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.groups import is_group
@@ -447,23 +447,24 @@ def _resampled_responses(
     rng: np.random.Generator,
 ) -> _Drawn:
     """Return responses of n design points for each population."""
-    design = node.design
-    assert design is not None
-    roots = [points[str(rv.name)] for rv in design.inputs.roots]
+    bound = node.reweighted
+    assert bound is not None
+    roots = [points[str(rv.name)] for rv in bound.inputs.roots]
     try:
-        values = design.values_of(responses)
-    except UntoldError:
-        with design.alone():
+        values = bound.values_of(responses)
+    except PoorEmulatorError:
+        with designs_restored([bound]):
+            bound.design = bound.design.runs_alone()
             return _resampled_responses(node, responses, points, n, rng)
-    chosen = _resampled(node.name, design, roots, n, rng)
+    chosen = _resampled(node.name, bound, roots, n, rng)
     values = values[chosen]
-    specimens = [x[chosen] for x in design.points_of(responses.inputs)]
+    specimens = [x[chosen] for x in bound.points_of(responses.inputs)]
     what = "design points" if responses.count else "stored responses"
     return _Drawn(values, specimens, f"{what} of {node.name}")
 
 
 def _resampled(
-    name: str, design: Design, roots: list[Floats], n: int, rng: np.random.Generator
+    name: str, design: ReweightedBound, roots: list[Floats], n: int, rng: np.random.Generator
 ) -> NDArray[np.intp]:
     """Return design points of n specimens for each population, shape (k, n), in random order.
 
@@ -476,7 +477,7 @@ def _resampled(
     return rng.permuted(found, axis=1)
 
 
-def refuse_unsupported(name: str, design: Design, roots: list[Floats]) -> None:
+def refuse_unsupported(name: str, design: ReweightedBound, roots: list[Floats]) -> None:
     """Raise if the design does not support most of the populations."""
     support = design.support(roots)
     ess = np.median(support["weight_ess"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
@@ -18,7 +17,7 @@ from prbayes.model.fingerprint import Level, require_same
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.reweighted import UntoldError
+from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import data_digest, in_order, serving, specimen_names
@@ -106,13 +105,14 @@ class JointNull(Null):
         require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
         evaluator = self.optimum.evaluator
         sampling = self.optimum.sampling()
-        with ExitStack() as runs_alone:
+        bounds = evaluator.reweighted.values()
+        with designs_restored(bounds):
             try:
                 tested = [self._tested(case, condition) for condition in case.conditions]
-            except UntoldError as error:
+            except PoorEmulatorError as error:
                 # All responses at the same points: those of the runs.
-                for design in evaluator.designs.values():
-                    runs_alone.enter_context(design.alone())
+                for bound in bounds:
+                    bound.design = bound.design.runs_alone()
                 short = shortcomings(evaluator, self.optimum.theta[None])
                 if short:
                     reasons = "; ".join(f"{name}: {reason}" for name, reason in short.items())
@@ -202,8 +202,8 @@ class JointNull(Null):
                 "has, expected its .dist() objects; only then is it known which responses belong "
                 "to the specimens of the calibration"
             )
-        assert node.design is not None
-        return _Tested(condition, nodes.index(node), node.design.values_of(responses))
+        assert node.reweighted is not None
+        return _Tested(condition, nodes.index(node), node.reweighted.values_of(responses))
 
 
 def _require_responses(responses: object) -> None:

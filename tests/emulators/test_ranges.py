@@ -7,7 +7,14 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
-from prbayes.emulators.ranges import Range, Ranges, read_ranges
+from prbayes.emulators.ranges import (
+    POPULATIONS,
+    SPECIMENS,
+    Range,
+    Ranges,
+    predictive_inputs,
+    read_ranges,
+)
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 
@@ -129,3 +136,39 @@ def test_prior_predictive_rows_are_inside_and_ranges_uniform() -> None:
     assert len(rows) == pytest.approx(0.9 * 2**15, rel=1e-3)
     np.testing.assert_allclose(np.quantile(rows[:, 1], [0.25, 0.5, 0.75]), [1, 2, 3], atol=0.1)
     assert read_ranges("s", {"x": (0, 1)}, 0.9, 0)[1] is None
+
+
+def test_each_population_has_its_own_parameters() -> None:
+    with pm.Model():
+        mu = pm.Normal("mu", 3, 2)
+        x, again = predictive_inputs("s", [pm.Normal.dist(mu, 0.5), mu], 1)
+    assert x.shape == again.shape == (POPULATIONS, SPECIMENS)
+    # A variable of the model is one value for all specimens.
+    assert (np.ptp(again, axis=1) == 0).all()
+    # Standard errors: .063 of a population's mean, 2 / sqrt(512) = .09 of all.
+    assert np.abs(x.mean(axis=1) - again[:, 0]).max() < 5 * 0.063
+    assert x.mean() == pytest.approx(3, abs=4 * 0.09)
+    assert x.std(axis=1).mean() == pytest.approx(0.5, rel=0.02)
+
+
+def test_invalid_parameters_give_way_to_valid_ones() -> None:
+    with pm.Model():
+        sd = pm.Normal("sd", 0, 1)
+        (x,) = predictive_inputs("s", [pm.Normal.dist(0, sd)], 1)
+    assert np.isfinite(x).all()
+    with pm.Model(), pytest.raises(ValueError, match="invalid parameters of the inputs at all"):
+        predictive_inputs("s", [pm.Normal.dist(0, -pm.HalfNormal("sd"))], 1)
+
+
+def test_a_seed_gives_the_same_draws() -> None:
+    def drawn(random_seed: int) -> Any:
+        with pm.Model():
+            return predictive_inputs("s", [pm.Normal.dist(pm.Normal("mu"), 1)], random_seed)[0]
+
+    np.testing.assert_array_equal(drawn(3), drawn(3))
+    assert (drawn(3) != drawn(4)).all()
+
+
+def test_there_must_be_a_model() -> None:
+    with pytest.raises(TypeError, match="s: inputs that are distributions"):
+        predictive_inputs("s", [pm.Normal.dist(0, 1)], 0)

@@ -15,8 +15,9 @@ from prbayes.emulators.selection import (
     chosen,
     emulated,
     emulated_without_each,
-    enough,
+    has_enough_runs,
     left_out,
+    share_of_runs,
 )
 from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
 
@@ -134,8 +135,8 @@ def test_a_process_without_a_block_is_that_of_the_other_runs(kernel: str, bad: f
 
 
 def test_runs_that_determine_no_surface_are_told() -> None:
-    assert not enough(Polynomial(3), 20, 3)
-    assert enough(Polynomial(1), 20, 3)
+    assert not has_enough_runs(Polynomial(3), 20, 3)
+    assert has_enough_runs(Polynomial(1), 20, 3)
     with pytest.raises(np.linalg.LinAlgError):
         chosen([Polynomial(9)], runs(two))
 
@@ -160,3 +161,58 @@ def test_a_surface_of_a_users_own_and_a_regressor_serve() -> None:
         found = emulated([model, model], known, known.x)
         np.testing.assert_allclose(found, np.broadcast_to(known.y.mean(axis=0), (64, 2)))
         assert not hasattr(model, "value")
+
+
+N = 256
+Y = np.random.default_rng(5).standard_normal((N, 1))
+EVEN = np.full((3, N), 1 / N)
+BLOCKS = np.arange(N) % 8
+
+
+def test_an_emulator_that_is_right_is_trusted() -> None:
+    assert share_of_runs(EVEN, Y, Y + 1e-9, BLOCKS) < 0.01
+
+
+def test_scatter_around_the_response_is_no_bias() -> None:
+    near = Y + 0.02 * np.random.default_rng(6).standard_normal((N, 1))
+    assert share_of_runs(EVEN, Y, near, BLOCKS) < 0.1
+
+
+def test_a_rounding_is_no_bias_where_many_specimens_have_one_value() -> None:
+    capped = np.minimum(Y, 0.5)
+    assert (capped == 0.5).mean() > 0.2
+    off = 1e-3 * np.random.default_rng(7).standard_normal((N, 1))
+    assert share_of_runs(EVEN, capped, capped + off, BLOCKS) < 0.01
+    assert share_of_runs(EVEN, capped, capped + 0.5, BLOCKS) > 0.5
+
+
+def test_levels_are_where_the_populations_are() -> None:
+    # A tenth of the runs are where the populations are, a thousandth as wide as the others.
+    here = np.arange(440)[:, None] >= 400
+    z = np.random.default_rng(5).standard_normal((440, 1))
+    y = np.where(here, 1e-3 * z, z)
+    weights = np.repeat(here.T / 40, 3, axis=0)
+    blocks = np.arange(440) % 8
+    wider = np.where(here, 3 * y, y)
+    wrong_elsewhere = np.where(here, y, y + 2.0)
+    assert share_of_runs(weights, y, wider, blocks) > 0.5
+    assert share_of_runs(weights, y, wrong_elsewhere, blocks) < 0.01
+
+
+def test_an_emulator_that_is_wrong_is_not_trusted() -> None:
+    assert share_of_runs(EVEN, Y, 0 * Y, BLOCKS) > 0.9
+    assert share_of_runs(EVEN, Y, Y + 1.0, BLOCKS) > 0.9
+
+
+def test_few_runs_leave_more_to_the_emulator() -> None:
+    uneven = np.zeros((1, N))
+    uneven[:, :16] = 1 / 16
+    biased = Y + 0.3
+    assert share_of_runs(uneven, Y, biased, BLOCKS) < share_of_runs(EVEN, Y, biased, BLOCKS)
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf])
+def test_a_failure_that_the_emulator_does_not_know_of_is_a_bias(lost: float) -> None:
+    failed = np.where(Y > 0.5, lost, Y)
+    assert share_of_runs(EVEN, failed, Y, BLOCKS) >= 0.0
+    assert share_of_runs(EVEN, Y, failed, BLOCKS) > 0.5

@@ -189,9 +189,9 @@ def test_what_is_looked_at_stays_when_the_design_grows() -> None:
     theta = evaluator.hyperparameters.initial
     information = Information(evaluator, 0, theta, n_sets=20)
     before = identified_by_area(information)
-    (design,) = evaluator.designs.values()
-    design.add([np.atleast_1d(values) for values in evaluator.roots(theta[None], 0)], 512)
-    assert design.n_points == 1536
+    (bound,) = evaluator.reweighted.values()
+    bound.add([np.atleast_1d(values) for values in evaluator.roots(theta[None], 0)], 512)
+    assert bound.n_points == 1536
     np.testing.assert_array_equal(identified_by_area(information), before)
 
 

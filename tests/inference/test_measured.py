@@ -13,6 +13,7 @@ from prbayes._validate import Floats
 from prbayes.inference.measured import Refits, drawn_in, principal_axes
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
+from prbayes.propagation.reweighted import designs_restored
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 60)
 N = OBSERVED.size
@@ -143,9 +144,9 @@ def test_refits_are_remembered_and_forgotten_with_the_design() -> None:
     assert (
         Refits.at(evaluator, at[0], 7 * at[1]) is first
     )  # a scale of one simulator changes nothing
-    (design,) = evaluator.designs.values()
-    with design.undone():
-        design.add(evaluator.roots(np.array([[1.0]]), 0))
+    (bound,) = evaluator.reweighted.values()
+    with designs_restored([bound]):
+        bound.add(evaluator.roots(np.array([[1.0]]), 0))
         assert Refits.at(evaluator, *at) is not first
     assert Refits.at(evaluator, *at) is first
 

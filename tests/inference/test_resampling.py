@@ -27,6 +27,7 @@ from prbayes.inference.resampling import (
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import differences
+from prbayes.propagation.reweighted import designs_restored
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 N = OBSERVED.size
@@ -344,7 +345,7 @@ def test_observing_another_number_of_responses_drops_the_weights() -> None:
 
 def test_batches_added_inside_are_undone() -> None:
     evaluator = Evaluator.of(build(KL, sd=None))
-    (design,) = evaluator.designs.values()
+    (bound,) = evaluator.reweighted.values()
     thetas = evaluator.hyperparameters.prior_thetas(30, 1)
     before, support = evaluator(thetas).discrepancies, evaluator.support(thetas)["y"]
     inside = []
@@ -352,12 +353,12 @@ def test_batches_added_inside_are_undone() -> None:
         thetas[:3],
         thetas[3:6],
     ):  # one after the other, without a look at the first design between them
-        with design.undone():
-            design.add(evaluator.roots(at, 0))
-            assert design.n_points == 512
-            assert design.n_batches == 2
+        with designs_restored([bound]):
+            bound.add(evaluator.roots(at, 0))
+            assert bound.n_points == 512
+            assert len(bound.design.batch_sizes) == 2
             inside.append(evaluator(thetas).discrepancies)
-        assert (design.n_points, design.n_batches) == (256, 1)
+        assert (bound.n_points, len(bound.design.batch_sizes)) == (256, 1)
     np.testing.assert_array_equal(evaluator(thetas).discrepancies, before)
     for key, value in evaluator.support(thetas)["y"].items():
         np.testing.assert_array_equal(value, support[key])
@@ -373,23 +374,23 @@ def test_batches_added_inside_are_undone() -> None:
 
 def test_a_failure_inside_is_undone_too() -> None:
     evaluator = Evaluator.of(build())
-    (design,) = evaluator.designs.values()
+    (bound,) = evaluator.reweighted.values()
 
     def fail() -> None:
-        with design.undone():
-            design.add(evaluator.roots(np.zeros((1, 1)), 0))
+        with designs_restored([bound]):
+            bound.add(evaluator.roots(np.zeros((1, 1)), 0))
             raise KeyError
 
     with pytest.raises(KeyError):
         fail()
-    assert design.n_points == 256
+    assert bound.n_points == 256
 
 
 def test_designs_of_the_same_points() -> None:
-    a, b, c = (n.bound for n in pair(None, None).nodes)
+    a, b, c = pair(None, None).reweighted.values()
     assert a.same_points(b)
     assert not a.same_points(c)
-    with b.undone():
+    with designs_restored([b]):
         b.add([np.zeros(3)])
         assert not a.same_points(b)
     assert a.same_points(b)

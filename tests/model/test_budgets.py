@@ -20,25 +20,25 @@ from prbayes.response import BudgetError
 )
 def test_a_design_is_what_it_was_where_work_is_interrupted(stops: Any, points: int) -> None:
     model, node = build(prb.Reweighted(16))
-    design = node.design
-    assert design is not None
+    bound = node.reweighted
+    assert bound is not None
     at = [np.array([2.5]), np.array([0.7])]
 
     def work() -> None:
         with designs_as_before(Evaluator.of(model)):
-            design.add(at)
-            values.append(design.values[16:])
+            bound.add(at)
+            values.append(bound.design.sample.values[16:])
             raise stops
 
     values: list[Any] = []
     with pytest.raises(stops):
         work()
-    assert design.n_points == points
+    assert bound.n_points == points
     if points == 16:
         # The same batch again is the same, and was counted once as computed.
-        design.add(at)
-        assert np.array_equal(design.values[16:], values[0])
-        assert (design.responses.count, design.responses.computed) == (48, 32)
+        bound.add(at)
+        assert np.array_equal(bound.design.sample.values[16:], values[0])
+        assert (bound.responses.count, bound.responses.computed) == (48, 32)
 
 
 def test_what_is_kept_is_told(tmp_path: Path) -> None:

@@ -428,8 +428,10 @@ def test_large_designs_have_coarser_ones() -> None:
     assert [node.bound.n_points for node in coarser.nodes] == [128, 1024]
     assert [node.bound.n_points for node in evaluator.nodes] == [128, 8192]
     assert coarser.nodes[0].bound is evaluator.nodes[0].bound
-    design = evaluator.designs["large"]
-    np.testing.assert_array_equal(coarser.designs["large"].values, design.values[:1024])
+    bound = evaluator.reweighted["large"]
+    np.testing.assert_array_equal(
+        coarser.reweighted["large"].design.sample.values, bound.design.sample.values[:1024]
+    )
     thetas = np.linspace(-1, 1, 5)[:, None]
     found, expected = coarser(thetas), evaluator(thetas)
     np.testing.assert_array_equal(found.discrepancies[:, 0], expected.discrepancies[:, 0])

@@ -183,8 +183,8 @@ def test_clones_that_order_variables_otherwise_are_the_same_problem() -> None:
 def test_a_design_that_has_grown_is_another_run_of_the_same_problem() -> None:
     model = clone_model(base())
     (node,) = nodes(model).values()
-    assert node.design is not None
-    node.design.add([np.array([1.0, 2.0])])
+    assert node.reweighted is not None
+    node.reweighted.add([np.array([1.0, 2.0])])
     grown = identity_of(Evaluator.of(model))
     assert differences(grown, identity(), Level.POSTERIOR) == []
     assert "number of responses of y" in differences(grown, identity(), Level.RUN)[0]
@@ -451,7 +451,6 @@ def new_input(change: str) -> Any:
     return pm.Normal.dist(other_model(change)["mu"], 1.0)
 
 
-PICTURE: dict[str, Any] = {"backend": "none"}
 PAIRS: dict[str, tuple[Level, Callable[[str], Any]]] = {
     "predict: optimum, model": (
         Level.POPULATIONS,
@@ -495,25 +494,23 @@ PAIRS: dict[str, tuple[Level, Callable[[str], Any]]] = {
     ),
     "plot_landscape: optimum, model": (
         Level.POPULATIONS,
-        lambda change: prb.plot_landscape(
-            optimum(), model=other_model(change), points=5, **PICTURE
-        ),
+        lambda change: prb.plot_landscape(optimum(), model=other_model(change), points=5),
     ),
     "plot_population: posterior, model": (
         Level.POPULATIONS,
-        lambda change: prb.plot_population(posterior(), model=other_model(change), **PICTURE),
+        lambda change: prb.plot_population(posterior(), model=other_model(change)),
     ),
     "plot_responses: optimum, model": (
         Level.POPULATIONS,
-        lambda change: prb.plot_responses(optimum(), model=other_model(change), **PICTURE),
+        lambda change: prb.plot_responses(optimum(), model=other_model(change)),
     ),
     "plot_posterior: posterior, optimum": (
         Level.POPULATIONS,
-        lambda change: prb.plot_posterior(posterior(), optimum=other_optimum(change), **PICTURE),
+        lambda change: prb.plot_posterior(posterior(), optimum=other_optimum(change)),
     ),
     "plot_posterior: posterior, model": (
         Level.PRIORS,
-        lambda change: prb.plot_posterior(posterior(), model=other_model(change), **PICTURE),
+        lambda change: prb.plot_posterior(posterior(), model=other_model(change)),
     ),
     "diagnose: posterior, model": (
         Level.OPTIMUM,

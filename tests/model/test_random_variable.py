@@ -134,9 +134,9 @@ def test_a_copy_shares_nothing_that_changes(way: str) -> None:
     assert its(AT) == pytest.approx(before / 2, rel=1e-12)
     assert mine(AT) == pytest.approx(2 * before, rel=1e-12)
     # The design, and its count of responses
-    design = node_of(other).design
-    assert design is not None
-    design.add([np.full(4, 1.2), np.full(4, 0.7)])
+    bound = node_of(other).reweighted
+    assert bound is not None
+    bound.add([np.full(4, 1.2), np.full(4, 0.7)])
     assert its(AT) != pytest.approx(before / 2, rel=1e-12)
     assert mine(AT) == pytest.approx(2 * before, rel=1e-12)
     assert (node_of(model).bound.n_points, node_of(other).bound.n_points) == (64, 128)

@@ -264,7 +264,7 @@ def test_predictive_draws_are_different_specimens(name: str, kind: str) -> None:
     assert abs(stats.spearmanr(np.tile(np.arange(N), len(sets)), inside.ravel()).statistic) < 0.1
     if name == "Reweighted":
         assert RESPONSES["Reweighted"].count == stored == POINTS
-        assert np.isin(sets, model_of(name)[1].bound.values).all()
+        assert np.isin(sets, model_of(name)[1].bound.design.sample.values).all()
 
 
 @pytest.mark.long
@@ -497,11 +497,13 @@ def test_simulators_of_one_response_share_their_design_s_runs() -> None:
     first_use(model)
     assert asked == [128]
     first, second = Evaluator.of(model).nodes
-    np.testing.assert_array_equal(first.design.values, second.design.values)
+    np.testing.assert_array_equal(
+        first.reweighted.design.sample.values, second.reweighted.design.sample.values
+    )
     narrow = np.array([[2.0, np.log(0.05)]])
     prb.refine(model, thetas=narrow)
-    assert first.design.n_points == second.design.n_points > 128
-    assert sum(asked) == first.design.n_points
+    assert first.bound.n_points == second.bound.n_points > 128
+    assert sum(asked) == first.bound.n_points
     assert prb.minimize(model, progressbar=False).search.n_computed == sum(asked)
 
 

@@ -12,7 +12,7 @@ import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.optimize.caveats import between_runs, breakdown, caveats, elements_at_edge
 from prbayes.optimize.local_optima import Rival
-from prbayes.propagation.importance import LARGEST_CLOUD
+from prbayes.propagation.importance import SIZES
 
 
 def test_what_breaks_down_is_said_by_name_and_only_then() -> None:
@@ -27,18 +27,18 @@ def test_what_breaks_down_is_said_by_name_and_only_then() -> None:
 @pytest.mark.parametrize(("clouds", "told"), [
     ([None], "pass a larger n or max_points to prb.Reweighted (now 300 runs)"),
     ([16384], "pass a larger n"),
-    ([LARGEST_CLOUD, None], "pass a larger n"),
-    ([LARGEST_CLOUD, LARGEST_CLOUD], "between its 300 runs are 65536 emulated points, the most"),
+    ([SIZES.largest, None], "pass a larger n"),
+    ([SIZES.largest, SIZES.largest], "between its 300 runs are 65536 emulated points, the most"),
 ])  # fmt: skip
 def test_no_larger_design_is_asked_for_where_points_cost_nothing(
     clouds: list[int | None], told: str
 ) -> None:
     of = [None if size is None else range(size) for size in clouds]
     designs = {
-        f"y{k}": SimpleNamespace(n_runs=300, contents=SimpleNamespace(cloud=cloud))
+        f"y{k}": SimpleNamespace(design=SimpleNamespace(n_runs=300, emulated=cloud))
         for k, cloud in enumerate(of)
     }
-    evaluator: Any = SimpleNamespace(nodes=(), designs=designs)
+    evaluator: Any = SimpleNamespace(nodes=(), reweighted=designs)
     (finding,) = caveats(evaluator, None, (), 0.4)
     assert "by about 0.40 standard errors, expected at most 0.1" in finding.text
     assert told in finding.text

@@ -29,6 +29,7 @@ from prbayes.optimize.local_optima import (
     verified_rivals,
 )
 from prbayes.optimize.objective import Ridge
+from prbayes.propagation.reweighted import designs_restored
 
 DATA = (np.random.default_rng(3).normal(2.0, 0.3, 40) - 1) ** 2
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -295,13 +296,13 @@ def test_what_few_points_tell_is_looked_at_with_more(
     mu: float | None, sigma: float, real: bool
 ) -> None:
     optimum = followed(0)
-    design = optimum.evaluator.designs["y"]
+    bound = optimum.evaluator.reweighted["y"]
     mirror = 2 - optimum.point["mu"]
     there = optimum.theta.copy()
     there[:2] = mirror + 0.05 if mu is None else mu, np.log(sigma)
-    before = design.contents
+    before = bound.design
     found = mirror_optimum(around(0), there)
-    assert design.contents is before  # and not a run more
+    assert bound.design is before  # and not a run more
     if not real:
         assert found is None
         return
@@ -318,12 +319,12 @@ def test_clouds_that_reach_a_mirror_reach_the_best_optimum_as_well() -> None:
     def at_the_best() -> float:
         return float(best.evaluator.support(best.theta[None])["y"]["weight_ess"][0])
 
-    design = best.evaluator.designs["y"]
-    with design.undone():
+    bound = best.evaluator.reweighted["y"]
+    with designs_restored([bound]):
         (found,) = verified_rivals(best, [far])
         beside = at_the_best()
     assert found.theta[0] == pytest.approx(there[0], abs=0.05)
-    with design.undone():
+    with designs_restored([bound]):
         refine_at(best.evaluator, found.theta[None])
         alone = at_the_best()
     assert beside > 1.2 * alone
@@ -350,7 +351,7 @@ class Landscape:
     """A discrepancy that is a formula, in place of a model."""
 
     formula: Any
-    designs: dict[str, Any] = field(default_factory=dict)
+    reweighted: dict[str, Any] = field(default_factory=dict)
     nodes: tuple[Any, ...] = ()
 
     def total(self, thetas: Floats, scales: Floats) -> Floats:

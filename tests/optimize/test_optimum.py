@@ -18,6 +18,7 @@ from prbayes.optimize.convergence import apart_from_data
 from prbayes.optimize.optimum import (
     _delta_method,
     plain,
+    point_and_stderr,
     require_refits,
     require_sampling,
 )

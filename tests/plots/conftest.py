@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pymc as pm
 import pytest
@@ -23,12 +22,6 @@ Array = np.ndarray[Any, Any]
 def same(x: Any) -> Any:
     """Return the input; of NumPy's own functions older versions do not tell what theirs is called."""
     return np.positive(x)
-
-
-@pytest.fixture(autouse=True)
-def _close() -> Iterator[None]:
-    yield
-    plt.close("all")
 
 
 @pytest.fixture(scope="session")
@@ -117,8 +110,8 @@ def pair() -> SimpleNamespace:
     tree = xr.DataTree.from_dict({"posterior": draws})
 
     @cache
-    def drawn(backend: str) -> Any:
-        return prb.plot_outputs(tree, model=model, backend=backend)
+    def drawn() -> Any:
+        return prb.plot_outputs(tree, model=model)
 
     return SimpleNamespace(
         model=model,
@@ -144,12 +137,8 @@ def read() -> SimpleNamespace:
         return pc.viz[visual][panel].item()
 
     def xy(pc: Any, visual: str, panel: str) -> Array:
-        """Return the places of a line or of markers, shape (2, n), on any backend."""
+        """Return the places of a line or of markers, shape (2, n)."""
         drawn = artist(pc, visual, panel)
-        if pc.backend == "plotly":
-            return np.array([drawn.x, drawn.y], dtype=float)
-        if pc.backend == "bokeh":
-            return np.array([drawn.data_source.data[k] for k in ("x", "y")], dtype=float)
         if hasattr(drawn, "get_offsets"):
             return np.array(drawn.get_offsets().T, dtype=float)
         return np.array(drawn.get_data(), dtype=float)
@@ -189,11 +178,11 @@ def pictures(
 
 
 @pytest.fixture(scope="session")
-def drawn(pictures: dict[str, Callable[..., Any]]) -> Callable[[str, str], Any]:
-    """How to get a picture on a backend, drawn once; it must not be changed."""
+def drawn(pictures: dict[str, Callable[..., Any]]) -> Callable[[str], Any]:
+    """How to get a picture, drawn once; it must not be changed."""
 
     @cache
-    def draw(picture: str, backend: str = "matplotlib") -> Any:
-        return pictures[picture](backend=backend)
+    def draw(picture: str) -> Any:
+        return pictures[picture]()
 
     return draw

@@ -1,18 +1,17 @@
-"""What all pictures have in common, on every backend."""
+"""What all pictures have in common: labels, size, legend, colour bar, ticks."""
 
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import arviz as az
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.image import imread
 
 import prbayes as prb
+from prbayes.plots._canvas import draw_legend, log_ticks, round_ticks, spans_decades
 
 PICTURES = (
     "responses",
@@ -30,48 +29,8 @@ PICTURES = (
 
 
 @pytest.mark.parametrize("picture", PICTURES)
-@pytest.mark.parametrize("backend", ["plotly", "bokeh"])
-def test_every_backend_draws_the_same(
-    picture: str, backend: str, read: SimpleNamespace, drawn: Callable[..., Any]
-) -> None:
-    ours, other = (drawn(picture, b) for b in ("matplotlib", backend))
-    assert isinstance(other, az.PlotCollection)
-    compared = 0
-    for visual in ours.viz.children:
-        if visual in {"plot", "row_index", "col_index", "band", "landscape_lines"}:
-            continue
-        for panel in ours.viz[visual].data_vars:
-            if hasattr(read.artist(ours, visual, panel), "levels"):
-                continue
-            np.testing.assert_allclose(
-                read.xy(other, visual, panel), read.xy(ours, visual, panel), err_msg=visual
-            )
-            compared += 1
-            if hasattr(read.artist(ours, visual, panel), "get_sizes") and visual != "rug":
-                found = read.artist(other, visual, panel)
-                size = found.marker.size if backend == "plotly" else found.glyph.size
-                assert size**2 == pytest.approx(read.artist(ours, visual, panel).get_sizes()[0])
-    assert compared
-    figure = other.viz["figure"].item()
-    wanted = [
-        t.get_text() for legend in ours.viz["figure"].item().legends for t in legend.get_texts()
-    ]
-    shaded = {"responses": 1, "ecdf": 1, "population": 1}.get(picture, 0)
-    if backend == "plotly":
-        assert [t.name for t in figure.data if t.showlegend] == wanted
-        assert sum(getattr(t, "fill", None) == "tonexty" for t in figure.data) == shaded
-    else:
-        panels = list(figure.select({"type": import_module("bokeh.models").Plot}))
-        assert {i.label.value for p in panels for legend in p.legend for i in legend.items} == set(
-            wanted
-        )
-        glyphs = [type(getattr(r, "glyph", None)).__name__ for p in panels for r in p.renderers]
-        assert glyphs.count("VArea") == shaded
-
-
-@pytest.mark.parametrize("picture", PICTURES)
 def test_every_picture_comes_out(picture: str, tmp_path: Path, drawn: Callable[..., Any]) -> None:
-    drawn(picture, "matplotlib").savefig(tmp_path / "picture.png", dpi=60)
+    drawn(picture).savefig(tmp_path / "picture.png", dpi=60)
     image = imread(tmp_path / "picture.png")[..., :3]
     assert min(image.shape[:2]) > 100
     assert (image.min(axis=2) < 0.9).mean() > 0.01
@@ -89,26 +48,91 @@ def test_labels_reach_the_axes(picture: str, pictures: dict[str, Callable[..., A
     }
     if picture == "outputs":
         labels = {"frame": "FRAME", "first": "FIRST", "mu": "MEAN"}
-    pc = pictures[picture](backend="none", labels=labels)
+    pc = pictures[picture](labels=labels)
     panels = [pc.get_target(name, {}) for name in pc.data.data_vars]
-    calls = [call for panel in panels for call in panel]
-    found = {call["string"] for call in calls if call["function"] in ("xlabel", "ylabel")}
+    found = {text for panel in panels for text in (panel.get_xlabel(), panel.get_ylabel())}
     assert found & set(labels.values())
     assert not found & (set(labels) - {"x", "y"})
 
 
 def test_settings_of_the_collection_are_passed_on(posterior: xr.DataTree) -> None:
-    pc = prb.plot_posterior(
-        posterior, backend="matplotlib", col_wrap=1, figure_kwargs={"figsize": (3, 7)}
-    )
+    pc = prb.plot_posterior(posterior, col_wrap=1, figure_kwargs={"figsize": (3, 7)})
     assert tuple(pc.viz["figure"].item().get_size_inches()) == (3, 7)
     assert pc.viz["row_index"]["sigma"].item() == 1
 
 
-def test_the_size_is_in_inches_on_every_backend(posterior: xr.DataTree) -> None:
-    figure = prb.plot_posterior(posterior, backend="matplotlib", figsize=(9, 3)).viz["figure"]
+def test_the_size_is_in_inches(posterior: xr.DataTree) -> None:
+    figure = prb.plot_posterior(posterior, figsize=(9, 3)).viz["figure"]
     assert tuple(figure.item().get_size_inches()) == (9, 3)
-    figure = prb.plot_posterior(posterior, backend="plotly", figsize=(9, 3)).viz["figure"]
-    assert figure.item().layout.width == 900
     with pytest.raises(ValueError, match=r"figsize: got 'wide', expected width and height"):
-        prb.plot_posterior(posterior, backend="none", figsize="wide")
+        prb.plot_posterior(posterior, figsize="wide")
+
+
+def test_another_backend_is_refused(posterior: xr.DataTree) -> None:
+    with pytest.raises(TypeError, match=r"backend: got str 'plotly', expected none"):
+        prb.plot_posterior(posterior, backend="plotly")
+
+
+# -- legend ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("width", "columns"), [(3, 1), (5, 2), (12, 4)])
+def test_entries_are_in_rows_of_equal_length_that_fit(width: float, columns: int) -> None:
+    figure, axes = plt.subplots(1, 2, figsize=(width, 3), layout="constrained")
+    for axis in axes:
+        for text in ("a first entry", "a second entry", "a third entry", "a fourth one"):
+            axis.plot([0, 1], label=text)
+    draw_legend(figure, list(axes))
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == 4
+    assert legend._ncols == columns
+
+
+# -- colour bar ------------------------------------------------------------------------------
+
+
+def test_the_bar_undoes_what_was_done_to_the_heights(
+    optimum: prb.Optimum, drawn: Callable[..., Any]
+) -> None:
+    """The colours are of roots: the height above the lowest goes with the square of the place."""
+    bar = drawn("landscape").viz["figure"].item().axes[-1]
+    assert bar.get_ylabel() == "discrepancy (area metric)"
+    values = np.array([text.get_text() for text in bar.get_yticklabels()], dtype=float)
+    above = (values - values[0]) / (values[-1] - values[0])
+    np.testing.assert_allclose(above, bar.get_yticks() ** 2, atol=0.005)  # three digits
+    assert values[0] >= 0.995 * optimum.discrepancy
+
+
+# -- ticks -----------------------------------------------------------------------------------
+
+
+def test_ticks_are_few_and_round() -> None:
+    assert round_ticks(1.06, 1.22)[1] == ["1.1", "1.15", "1.2"]
+    assert round_ticks(-1.0, 1.0)[1] == ["-1", "-0.5", "0", "0.5", "1"]
+    for low, high in ((0.0, 13.0), (1e-6, 3e-6), (-3.0, 1e5)):
+        at, labels = round_ticks(low, high)
+        assert 2 <= len(at) <= 6
+        np.testing.assert_allclose(at, [float(text) for text in labels], rtol=1e-9)
+
+
+def test_zero_is_called_zero() -> None:
+    at, labels = round_ticks(-0.3, 0.3)
+    assert labels[len(labels) // 2] == "0"
+    assert min(at) >= -0.3
+    assert max(at) <= 0.3
+
+
+def test_ticks_of_logarithms_stand_where_their_labels_say() -> None:
+    for values in (np.array([0.011, 0.4]), np.array([1e-9, 1.0]), np.array([3.0, 70.0, np.nan])):
+        assert spans_decades(values)
+        at, labels = log_ticks(values)
+        assert 2 <= len(at) <= 7
+        np.testing.assert_allclose(10 ** np.array(at), [float(text) for text in labels])
+
+
+def test_a_logarithm_needs_positive_values_of_different_orders() -> None:
+    assert spans_decades(np.array([1.0, 20.1]))
+    assert not spans_decades(np.array([1.0, 20.0]))
+    assert not spans_decades(np.array([-1.0, 500.0]))
+    assert not spans_decades(np.array([0.0, 500.0]))
+    assert not spans_decades(np.array([np.nan, np.inf]))

@@ -14,7 +14,7 @@ import prbayes as prb
 def test_a_comparison_has_a_row_for_each_result(
     optimum: prb.Optimum, comparison: xr.Dataset, read: SimpleNamespace, drawn: Callable[..., Any]
 ) -> None:
-    pc = drawn("comparison", "matplotlib")
+    pc = drawn("comparison")
     table = comparison.sel(hyperparameter="sigma")
     for i, row in ((0, 1.0), (1, 0.0)):
         ends = [float(table[k][i]) for k in ("lower", "upper")]
@@ -26,7 +26,7 @@ def test_a_comparison_has_a_row_for_each_result(
     at = dict(zip(axis.get_yticks(), [t.get_text() for t in axis.get_yticklabels()], strict=True))
     assert at == {1.0: "optimum", 0.0: "draws"}
     np.testing.assert_allclose(read.xy(pc, "first", "sigma")[0], optimum.point["sigma"])
-    scores = drawn("scores", "matplotlib")
+    scores = drawn("scores")
     np.testing.assert_allclose(
         read.xy(scores, "score", "AreaMetric"), [comparison.AreaMetric.values, [1, 0]]
     )

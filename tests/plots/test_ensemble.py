@@ -11,7 +11,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.plots._ensemble import read_before, read_result, supported
+from prbayes.plots._ensemble import Calibrated, Ensemble, read_before, read_result, supported
 
 
 def test_an_optimum_stands_for_its_sampling_distribution(optimum: prb.Optimum) -> None:
@@ -73,3 +73,27 @@ def test_what_the_design_does_not_reach_is_not_supported(
     np.testing.assert_array_equal(found, [True, False, False, False])
     everywhere = supported(Evaluator.of(build(prb.Resimulated(64))), thetas)
     np.testing.assert_array_equal(everywhere, [True, True, False, True])
+
+
+CURVES = np.arange(11.0)[:, None] * np.array([1.0, -1.0])
+
+
+def shown(optimum: prb.Optimum, centers: int) -> Ensemble:
+    thetas = np.zeros((11 - centers, 2))
+    return Ensemble(optimum.evaluator, np.zeros((centers, 2)), thetas, "", "")
+
+
+def test_the_curve_of_a_posterior_is_the_mean_in_its_band(optimum: prb.Optimum) -> None:
+    found = Calibrated.of(CURVES, shown(optimum, 0), 0.8)
+    np.testing.assert_allclose(found.middle, [5, -5])
+    np.testing.assert_allclose(found.band, [[1, -9], [9, -1]])
+    assert found.top == 9
+
+
+def test_the_curve_of_an_optimum_is_its_own_and_no_part_of_the_band(optimum: prb.Optimum) -> None:
+    found = Calibrated.of(CURVES, shown(optimum, 1), 0.8)
+    np.testing.assert_allclose(found.middle, [0, 0])
+    np.testing.assert_allclose(found.band, [[1.9, -9.1], [9.1, -1.9]])
+    alone = Calibrated.of(CURVES[:1], shown(optimum, 1), 0.8)
+    assert alone.band is None
+    assert alone.top == 0

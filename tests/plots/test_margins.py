@@ -7,7 +7,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.plots._margins import chosen, margin_densities, margins
+from prbayes.plots._margins import margin_densities, margins, select_margins
 from prbayes.propagation.base import Propagation
 
 
@@ -48,10 +48,10 @@ def test_margins_are_the_closed_forms_and_named_as_the_response_names_them() -> 
     evaluator = Evaluator.of(model)
     known = margins(evaluator)
     assert [m.name for m in known] == ["load[0]", "load[1]", "gap"]
-    assert chosen(known, ["gap"]) == chosen(known, [gap]) == known[2:]
-    assert chosen(known, "load") == chosen(known, [load]) == known[:2]
+    assert select_margins(known, ["gap"]) == select_margins(known, [gap]) == known[2:]
+    assert select_margins(known, "load") == select_margins(known, [load]) == known[:2]
     with pytest.raises(KeyError, match=r"got nothing, expected some of \['load\[0\]'"):
-        chosen(known, ["nothing"])
+        select_margins(known, ["nothing"])
     thetas = np.array(
         [
             evaluator.hyperparameters.unconstrained({"mu": m, "size": s})

@@ -14,7 +14,7 @@ import prbayes as prb
 def test_the_trace_is_in_the_users_units(
     optimum: prb.Optimum, read: SimpleNamespace, drawn: Callable[..., Any]
 ) -> None:
-    pc = drawn("optimizer", "matplotlib")
+    pc = drawn("optimizer")
     trace = optimum.search.trace
     np.testing.assert_allclose(
         read.xy(pc, "asked", "mu"), [trace["evaluations"], trace["theta"][:, 0]]
@@ -49,7 +49,7 @@ def test_the_objective_of_a_trace_is_that_of_the_final_scales(
                 observed=factor * known.observed,
             )
         found = prb.minimize()
-    _, y = read.xy(prb.plot_optimizer(found, backend="matplotlib"), "best", "discrepancy")
+    _, y = read.xy(prb.plot_optimizer(found), "best", "discrepancy")
     assert min(y[-1], 10 ** y[-1], key=lambda v: abs(v - found.discrepancy)) == pytest.approx(
         found.discrepancy
     )

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import stats
 
 import prbayes as prb
-from prbayes.plots.outputs import _chosen
+from prbayes.plots.outputs import _shown_outputs
 from prbayes.response.outputs import Outputs
 
 
@@ -19,7 +19,7 @@ from prbayes.response.outputs import Outputs
 def test_regions_are_the_ellipses_of_a_normal_population(
     pair: SimpleNamespace, read: SimpleNamespace, share: float, visual: str
 ) -> None:
-    x, y = read.xy(pair.drawn("matplotlib"), visual, "second, first")
+    x, y = read.xy(pair.drawn(), visual, "second, first")
     known = np.isfinite(x)
     points = np.column_stack([x, y])[known] - pair.mean
     squares = np.einsum("ij,jk,ik->i", points, np.linalg.inv(pair.covariance), points)
@@ -31,7 +31,7 @@ def test_regions_are_the_ellipses_of_a_normal_population(
 def test_points_are_the_specimens_that_have_both_outputs(
     pair: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    points = read.xy(pair.drawn("matplotlib"), "measured", "second, first")
+    points = read.xy(pair.drawn(), "measured", "second, first")
     both = np.isfinite(pair.observed).all(axis=1)
     np.testing.assert_allclose(points.T, pair.observed[both])
     assert both.sum() == len(both) - 3
@@ -40,7 +40,7 @@ def test_points_are_the_specimens_that_have_both_outputs(
 def test_axes_have_the_names_and_units_and_the_title_both_correlations(
     pair: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = pair.drawn("matplotlib")
+    pc = pair.drawn()
     axis = pc.viz["plot"]["second, first"].item()
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("first (Hz)", "second (Hz)")
     both = pair.observed[np.isfinite(pair.observed).all(axis=1)]
@@ -52,16 +52,14 @@ def test_axes_have_the_names_and_units_and_the_title_both_correlations(
         "calibrated: posterior predictive, 50% and 89%",
         "measured",
     ]
-    named = prb.plot_outputs(
-        pair.posterior, model=pair.model, before=False, labels={"first": "F"}, backend="matplotlib"
-    )
+    named = prb.plot_outputs(pair.posterior, model=pair.model, before=False, labels={"first": "F"})
     assert named.viz["plot"]["second, first"].item().get_xlabel() == "F"
     assert "before_50" not in named.viz
 
 
 def test_a_picture_of_stored_responses_computes_none(pair: SimpleNamespace) -> None:
     count = pair.calls()
-    pair.drawn("none")
+    prb.plot_outputs(pair.posterior, model=pair.model)
     assert pair.calls() == count
 
 
@@ -103,7 +101,7 @@ def test_by_default_an_output_that_does_not_vary_is_left_out() -> None:
     outputs = Outputs(("none", "one", "two"))
     node: Any = SimpleNamespace(name="y", outputs=outputs, observed=data, weights=np.full(5, 0.2))
     evaluator: Any = SimpleNamespace(simulators=[node])
-    assert [output.name for output in _chosen(evaluator, 0, None)] == ["y[one]", "y[two]"]
+    assert [output.name for output in _shown_outputs(evaluator, 0, None)] == ["y[one]", "y[two]"]
 
 
 def pairs(pc: Any) -> list[str]:
@@ -114,18 +112,18 @@ def pairs(pc: Any) -> list[str]:
 @pytest.mark.long
 def test_pairs_are_a_triangle(several: SimpleNamespace) -> None:
     how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4}
-    pc = prb.plot_outputs(several.posterior, outputs=["p", "r/s", "u"], backend="matplotlib", **how)
+    pc = prb.plot_outputs(several.posterior, outputs=["p", "r/s", "u"], **how)
     assert pairs(pc) == ["r\u2215s, p", "u, p", "u, r\u2215s"]
     axes = np.array(pc.viz["figure"].item().axes, dtype=object).reshape(2, 2)
     assert [axis.axison for axis in axes.ravel()] == [True, False, True, True]
     assert axes[0, 0].get_xlabel() == axes[1, 1].get_ylabel() == ""
     assert (axes[1, 0].get_xlabel(), axes[1, 0].get_ylabel()) == ("five: p", "five: u")
-    every = prb.plot_outputs(several.posterior, backend="none", **how)
+    every = prb.plot_outputs(several.posterior, **how)
     assert len(pairs(every)) == 10
 
 
 def test_of_a_curve_some_places_are_drawn(several: SimpleNamespace) -> None:
-    how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4, "backend": "none"}
+    how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4}
     pc = prb.plot_outputs(several.posterior, simulator="curve", **how)
     assert pairs(pc)[-1] == "5.5, 3.5"
     assert len(pairs(pc)) == 6

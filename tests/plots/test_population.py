@@ -15,16 +15,14 @@ import prbayes as prb
 def test_the_population_is_the_closed_form(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_population(
-        posterior, model=optimum.model, n_draws=300, prob=0.8, backend="matplotlib"
-    )
+    pc = prb.plot_population(posterior, model=optimum.model, n_draws=300, prob=0.8)
     x, y = read.xy(pc, "after", "x")
     each = stats.norm.pdf(x, known.mu.reshape(-1, 1), known.sigma.reshape(-1, 1))
     np.testing.assert_allclose(y, each.mean(axis=0), atol=1e-9)
     some = slice(10, 240, 15)
     expected = np.quantile(each, [0.1, 0.9], axis=0)[:, some]
     np.testing.assert_allclose(read.sides(pc, "band", "x", x[some]), expected, atol=1e-6)
-    x, y = read.xy(prb.plot_population(optimum, backend="matplotlib"), "after", "x")
+    x, y = read.xy(prb.plot_population(optimum), "after", "x")
     np.testing.assert_allclose(
         y, stats.norm.pdf(x, optimum.point["mu"], optimum.point["sigma"]), atol=1e-9
     )
@@ -66,7 +64,7 @@ def test_a_multivariate_input_has_its_pairs(read: SimpleNamespace) -> None:
         }
     )
     posterior = xr.DataTree.from_dict({"posterior": draws})
-    pc = prb.plot_population(posterior, model=correlated(), prob=0.89, backend="matplotlib")
+    pc = prb.plot_population(posterior, model=correlated(), prob=0.89)
     pairs = ["loads[1], loads[0]", "loads[2], loads[0]", "loads[2], loads[1]"]
     assert list(pc.viz["region"].data_vars) == list(pc.viz["half"].data_vars) == pairs
     # The ellipse of 89%: as far out as the root of a chi-square quantile, and as inclined.
@@ -80,5 +78,5 @@ def test_a_multivariate_input_has_its_pairs(read: SimpleNamespace) -> None:
     titles = [axis.get_title() for axis in pc.viz["region"][pairs[0]].item().figure.axes]
     assert any("correlation 0.6" in title for title in titles)
     # One margin alone has no pair.
-    alone = prb.plot_population(posterior, model=correlated(), inputs=["loads[0]"], backend="none")
+    alone = prb.plot_population(posterior, model=correlated(), inputs=["loads[0]"])
     assert "region" not in alone.viz

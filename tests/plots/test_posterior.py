@@ -17,9 +17,7 @@ from prbayes.plots._canvas import BLUE, VERMILION
 def test_the_posterior_stands_against_the_optimum(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_posterior(
-        posterior, optimum=optimum, model=optimum.model, prob=0.8, backend="matplotlib"
-    )
+    pc = prb.plot_posterior(posterior, optimum=optimum, model=optimum.model, prob=0.8)
     for name, draws in (("mu", known.mu), ("sigma", known.sigma)):
         x, y = read.xy(pc, "posterior", name)
         expected = stats.norm.pdf(x, draws.mean(), draws.std())
@@ -43,7 +41,7 @@ def test_the_posterior_stands_against_the_optimum(
 def test_posterior_and_optimum_have_their_own_colours_and_rows(
     drawn: Callable[..., Any], read: SimpleNamespace
 ) -> None:
-    pc = drawn("posterior", "matplotlib")
+    pc = drawn("posterior")
     for visual in ("posterior", "interval"):
         assert read.artist(pc, visual, "mu").get_color() == BLUE
     for visual in ("normal", "stderr"):
@@ -54,10 +52,10 @@ def test_posterior_and_optimum_have_their_own_colours_and_rows(
 
 
 def test_a_posterior_alone(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
-    pc = prb.plot_posterior(posterior, backend="matplotlib")
+    pc = prb.plot_posterior(posterior)
     assert not {"optimum", "normal", "prior"} & set(pc.viz.children)
     blind = replace(optimum, stderr={"mu": np.inf, "sigma": np.nan})
-    pc = prb.plot_posterior(posterior, optimum=blind, backend="matplotlib")
+    pc = prb.plot_posterior(posterior, optimum=blind)
     assert "optimum" in pc.viz
     assert "normal" not in pc.viz
 
@@ -70,7 +68,7 @@ def test_some_of_the_variables(posterior: xr.DataTree) -> None:
     tree = xr.DataTree.from_dict({"posterior": many})
 
     def drawn(var_names: Any) -> list[str]:
-        return list(prb.plot_posterior(tree, var_names=var_names, backend="none").viz["posterior"])
+        return list(prb.plot_posterior(tree, var_names=var_names).viz["posterior"])
 
     assert drawn(["rate"]) == ["rate[Adler]", "rate[Busch]"]
     assert drawn("mu") == ["mu"]
@@ -89,9 +87,9 @@ def test_a_packed_factor_is_drawn_where_it_is_asked_for() -> None:
         for name, size in sizes.items()
     }
     tree = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
-    drawn = list(prb.plot_posterior(tree, backend="none").viz["posterior"])
+    drawn = list(prb.plot_posterior(tree).viz["posterior"])
     assert drawn == ["chol_stds[0]", "chol_stds[1]", "chol_corr[0]"]
-    drawn = list(prb.plot_posterior(tree, var_names="chol", backend="none").viz["posterior"])
+    drawn = list(prb.plot_posterior(tree, var_names="chol").viz["posterior"])
     assert drawn == ["chol[0]", "chol[1]", "chol[2]"]
 
 

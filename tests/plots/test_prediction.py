@@ -18,7 +18,7 @@ MEASURED = np.array([-1.0, 0.2, 0.4, 1.5])
 
 
 def test_steps_and_curve_are_distribution_functions(read: SimpleNamespace) -> None:
-    pc = prb.plots.plot_prediction(MEASURED, PREDICTED, backend="matplotlib")
+    pc = prb.plots.plot_prediction(MEASURED, PREDICTED)
     x, y = read.xy(pc, "measured", "later")
     for value, below, above in zip(
         MEASURED, (0, 0.25, 0.5, 0.75), (0.25, 0.5, 0.75, 1), strict=True
@@ -31,7 +31,7 @@ def test_steps_and_curve_are_distribution_functions(read: SimpleNamespace) -> No
 
 
 def test_the_band_holds_its_share_of_the_populations(read: SimpleNamespace) -> None:
-    pc = prb.plots.plot_prediction(MEASURED, PREDICTED, prob=0.5, backend="matplotlib")
+    pc = prb.plots.plot_prediction(MEASURED, PREDICTED, prob=0.5)
     x, _ = read.xy(pc, "predicted", "later")
     at = x[[100, 128, 150]]
     low, high = read.sides(pc, "band", "later", at)
@@ -45,7 +45,7 @@ def test_what_failed_and_what_is_missing(read: SimpleNamespace) -> None:
     predicted[:, :, :40] = np.inf  # a tenth fails
     predicted[:, :, 40:80] = np.nan
     measured = np.append(MEASURED, [np.inf, np.nan])
-    pc = prb.plots.plot_prediction(measured, predicted, backend="matplotlib")
+    pc = prb.plots.plot_prediction(measured, predicted)
     assert read.xy(pc, "measured", "later")[1].max() == pytest.approx(0.8)
     assert read.xy(pc, "predicted", "later")[1].max() <= 1 - 40 / 360 + 1e-9
     title = pc.viz["plot"]["later"].item().get_title()
@@ -57,7 +57,7 @@ def test_conditions_and_outputs_have_panels() -> None:
     both = both.assign_coords(part=["shaft", "disk"])
     measured = np.column_stack([MEASURED, 2 * MEASURED])
     pc = prb.plots.plot_prediction(
-        {"cold": MEASURED, "hot": measured}, {"cold": PREDICTED, "hot": both}, backend="none"
+        {"cold": MEASURED, "hot": measured}, {"cold": PREDICTED, "hot": both}
     )
     assert list(pc.viz["measured"]) == ["cold", "hot[shaft]", "hot[disk]"]
 

@@ -18,7 +18,7 @@ import prbayes as prb
 def test_responses_are_the_closed_forms(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_responses(posterior, model=optimum.model, n_draws=300, backend="matplotlib")
+    pc = prb.plot_responses(posterior, model=optimum.model, n_draws=300)
     x, y = read.xy(pc, "after", "y")
     h = 0.9 * 0.5 * 700**-0.2  # about Silverman's for the weights' effective number
     each = stats.norm.pdf(x, known.mu.reshape(-1, 1), np.hypot(known.sigma.reshape(-1, 1), h))
@@ -30,9 +30,7 @@ def test_responses_are_the_closed_forms(
     assert (high - low).max() > 0.15
     truth = stats.norm.pdf(some, 1, 0.5)
     assert ((low - 0.02 <= truth) & (truth <= high + 0.02)).all()
-    narrow = prb.plot_responses(
-        posterior, model=optimum.model, n_draws=300, prob=0.5, backend="matplotlib"
-    )
+    narrow = prb.plot_responses(posterior, model=optimum.model, n_draws=300, prob=0.5)
     inner = read.sides(narrow, "band", "y", some)
     assert np.ptp(inner, axis=0).max() < 0.6 * (high - low).max()
     x, y = read.xy(pc, "before", "y")
@@ -48,13 +46,13 @@ def test_the_legend_says_what_is_before_and_after(
     pictures: dict[str, Callable[..., Any]],
     drawn: Callable[..., Any],
 ) -> None:
-    assert read.texts(drawn("responses", "matplotlib")) == [
+    assert read.texts(drawn("responses")) == [
         "measured",
         "before: prior's initial point",
         "89% band of the posterior",
         "calibrated: posterior predictive",
     ]
-    pc = pictures["ecdf"](backend="matplotlib", prob=0.5)
+    pc = pictures["ecdf"](prob=0.5)
     assert read.texts(pc)[2:] == ["50% band of the standard error", "calibrated: optimum"]
     before, after = (read.artist(pc, name, "y") for name in ("before", "after"))
     assert before.get_linestyle() != after.get_linestyle()
@@ -69,7 +67,7 @@ def test_the_legend_says_what_is_before_and_after(
 def test_distribution_functions_of_an_optimum(
     optimum: prb.Optimum, read: SimpleNamespace, pictures: dict[str, Callable[..., Any]]
 ) -> None:
-    pc = pictures["ecdf"](backend="matplotlib", before={"mu": 3.0, "sigma": 1.0})
+    pc = pictures["ecdf"](before={"mu": 3.0, "sigma": 1.0})
     mu, sigma = optimum.point["mu"], optimum.point["sigma"]
     for name, mean, sd in (("after", mu, sigma), ("before", 3.0, 1.0)):
         x, y = read.xy(pc, name, "y")
@@ -91,9 +89,9 @@ def test_without_a_sampling_distribution_there_is_no_band_and_before_can_be_left
     optimum: prb.Optimum,
 ) -> None:
     alone = replace(optimum, covariance=np.full((2, 2), np.nan))
-    pc = prb.plot_responses(alone, before=False, backend="matplotlib")
+    pc = prb.plot_responses(alone, before=False)
     assert not {"band", "before"} & set(pc.viz.children)
-    assert "band" not in prb.plot_population(alone, backend="matplotlib").viz
+    assert "band" not in prb.plot_population(alone).viz
 
 
 def test_stored_responses_cost_nothing_and_others_as_little_as_said(
@@ -104,7 +102,7 @@ def test_stored_responses_cost_nothing_and_others_as_little_as_said(
 ) -> None:
     before = optimum.n_responses, optimum.evaluator.n_responses
     for name in ("responses", "ecdf", "population", "landscape", "optimizer"):
-        pictures[name](backend="none")
+        pictures[name]()
     assert (optimum.n_responses, optimum.evaluator.n_responses) == before
     for propagation, cost in ((prb.Resimulated(64), 41 * 64), (prb.Fresh(50), 41 * 50)):
         seen: list[int] = []
@@ -116,18 +114,18 @@ def test_stored_responses_cost_nothing_and_others_as_little_as_said(
         model = build(propagation, counted)
         first_use(model)
         seen.clear()
-        pc = prb.plot_responses(posterior, model=model, backend="none")
+        pc = prb.plot_responses(posterior, model=model)
         assert "after" in pc.viz
         assert sum(seen) <= cost + 300  # a few more where a response is tried first
         seen.clear()
-        prb.plot_population(posterior, model=model, backend="none")
+        prb.plot_population(posterior, model=model)
         assert sum(seen) <= 300
 
 
 def test_what_the_stored_responses_do_not_reach(
     caplog: pytest.LogCaptureFixture, optimum: prb.Optimum, posterior: xr.DataTree
 ) -> None:
-    pc = prb.plot_responses(optimum, before={"mu": 50.0, "sigma": 0.1}, backend="none")
+    pc = prb.plot_responses(optimum, before={"mu": 50.0, "sigma": 0.1})
     assert "before" not in pc.viz
     assert "stored responses do not reach there" in caplog.text
     far = posterior.copy(deep=True)
@@ -135,13 +133,13 @@ def test_what_the_stored_responses_do_not_reach(
     with pytest.raises(
         prb.propagation.DesignError, match="support 0 of 200 populations of the posterior"
     ):
-        prb.plot_responses(far, model=optimum.model, backend="none")
+        prb.plot_responses(far, model=optimum.model)
 
 
 def test_a_narrow_peak_before_does_not_flatten_the_data(
     optimum: prb.Optimum, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_responses(optimum, before={"mu": 1.0, "sigma": 0.05}, backend="matplotlib")
+    pc = prb.plot_responses(optimum, before={"mu": 1.0, "sigma": 0.05})
     low, high = pc.viz["plot"]["y"].item().get_ylim()
     assert high < 3
     assert low < 0
@@ -158,7 +156,7 @@ def test_wrong_arguments_are_refused(optimum: prb.Optimum) -> None:
 def test_each_output_has_a_panel_with_what_was_measured_of_it(
     pair: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_responses(pair.posterior, model=pair.model, backend="matplotlib")
+    pc = prb.plot_responses(pair.posterior, model=pair.model)
     for column, mean in (("first", 2.0), ("second", 6.6)):
         x, y = read.xy(pc, "after", f"frame[{column}]")
         np.testing.assert_allclose(y, stats.norm.pdf(x, mean, 1), atol=0.025)

@@ -24,7 +24,7 @@ def table() -> xr.Dataset:
 
 
 def test_a_factor_has_a_row_with_two_errors(table: xr.Dataset, read: SimpleNamespace) -> None:
-    pc = prb.plots.plot_sensitivity(table, labels={"mu": "mean"}, backend="matplotlib")
+    pc = prb.plots.plot_sensitivity(table, labels={"mu": "mean"})
     np.testing.assert_allclose(read.xy(pc, "first", "hyperparameter"), [[0.7, 0.2], [1.12, 0.12]])
     np.testing.assert_allclose(read.xy(pc, "first_0", "hyperparameter")[0], [0.66, 0.74])
     np.testing.assert_allclose(read.xy(pc, "total_1", "hyperparameter")[0], [0.28, 0.32])

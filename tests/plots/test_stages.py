@@ -12,7 +12,7 @@ import prbayes as prb
 
 
 def test_stages_by_chain(read: SimpleNamespace, drawn: Callable[..., Any]) -> None:
-    pc = drawn("stages", "matplotlib")
+    pc = drawn("stages")
     np.testing.assert_allclose(read.xy(pc, "chain_0", "accept_rate"), [[1, 2, 3], [0.2, 0.3, 0.4]])
     np.testing.assert_allclose(read.xy(pc, "chain_1", "accept_rate"), [[1, 2], [0.5, 0.6]])
     np.testing.assert_allclose(read.xy(pc, "chain_0", "beta"), [[1, 2, 3], [-3, -1, 0]])

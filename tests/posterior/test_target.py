@@ -104,7 +104,7 @@ def _vague(mu: Floats, sigma: Floats) -> Floats:
 
 
 def test_a_prior_away_from_the_estimate_is_reported() -> None:
-    model = normal_model(KLD, DATA, mu=lambda: pm.Normal("mu", 0.0, 0.1))
+    model = normal_model(KLD, DATA, mu=lambda: pm.Normal("mu", 0.0, 0.2))
     tree = prb.sample(50, chains=1, model=model, **QUIET)
     findings = from_json(tree.posterior.attrs["findings"])
     (finding,) = [finding for finding in findings if finding.code == "prior-conflict"]

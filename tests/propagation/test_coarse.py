@@ -16,8 +16,8 @@ from first_use import first_use
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import SimulatorIdentity, identity_of
-from prbayes.propagation.importance import CLOUD
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.importance import SIZES
+from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 from prbayes.response.budget import limited
 from prbayes.response.failures import ResponseError
 
@@ -53,45 +53,45 @@ def build(beside: Any = coarse, response: Any = fine, n: int = 64, **keywords: A
     return model
 
 
-def design_of(model: pm.Model) -> Design:
-    return Evaluator.of(model).designs["y"]
+def design_of(model: pm.Model) -> ReweightedBound:
+    return Evaluator.of(model).reweighted["y"]
 
 
-def off(design: Design) -> float:
+def off(bound: ReweightedBound) -> float:
     """Return by how much the cloud's responses are off, in spreads of the response."""
-    cloud = design.contents.cloud
+    cloud = bound.design.emulated
     assert cloud is not None
-    truth = fine(*cloud.points)
-    return float(np.std(design.values[: len(cloud)] - truth) / np.std(truth))
+    truth = fine(*cloud.inputs)
+    return float(np.std(bound.design.sample.values[: len(cloud)] - truth) / np.std(truth))
 
 
 def test_a_cloud_follows_the_coarse_response_at_its_own_points() -> None:
     followed, without = design_of(build()), design_of(build(None))
     assert off(without) > 0.05
     assert off(followed) < 0.01
-    assert "It follows the coarse response." in followed.told
-    assert "coarse" not in without.told
+    assert "It follows the coarse response." in followed.design.summary("y")
+    assert "coarse" not in without.design.summary("y")
 
 
 def test_emulators_that_lack_runs_follow_it_too() -> None:
-    design = design_of(build())
-    cloud = design.contents.cloud
+    bound = design_of(build())
+    cloud = bound.design.emulated
     assert cloud is not None
-    for said in design.left_out():
-        assert np.std(said[: len(cloud)] - fine(*cloud.points)) < 0.02 * OBSERVED.std()
+    for said in bound.design.without_each_block():
+        assert np.std(said[: len(cloud)] - fine(*cloud.inputs)) < 0.02 * OBSERVED.std()
 
 
 def test_runs_that_are_added_have_a_coarse_response_as_well() -> None:
     evaluator = Evaluator.of(build())
-    design = evaluator.designs["y"]
-    with design.undone():
-        design.add(evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0), 32)
-        known = design.batches.coarse
+    bound = evaluator.reweighted["y"]
+    with designs_restored([bound]):
+        bound.add(evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0), 32)
+        known = bound.design.coarse
         assert known is not None
-        np.testing.assert_allclose(known[:, 0], coarse(*design.batches.points))
-        assert off(design) < 0.01
-    assert design.batches.coarse is not None
-    assert len(design.batches.coarse) == design.n_runs == 64
+        np.testing.assert_allclose(known[:, 0], coarse(*bound.design.runs.points))
+        assert off(bound) < 0.01
+    assert bound.design.coarse is not None
+    assert len(bound.design.coarse) == bound.n_runs == 64
 
 
 def test_runs_that_are_added_where_there_is_none_are_no_mistake() -> None:
@@ -99,14 +99,14 @@ def test_runs_that_are_added_where_there_is_none_are_no_mistake() -> None:
         return np.where(a > 4, np.nan, coarse(a, b))
 
     evaluator = Evaluator.of(build(partly))
-    design = evaluator.designs["y"]
+    bound = evaluator.reweighted["y"]
     far = [
         np.full_like(root, 30.0 if i == 0 else 1.0)
         for i, root in enumerate(evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0))
     ]
-    design.add(far, 16)
-    assert design.n_runs == 80
-    assert np.isfinite(design.values).all()
+    bound.add(far, 16)
+    assert bound.n_runs == 80
+    assert np.isfinite(bound.design.sample.values).all()
 
 
 def test_its_calls_are_neither_counted_nor_limited() -> None:
@@ -119,7 +119,7 @@ def test_its_calls_are_neither_counted_nor_limited() -> None:
     with limited(None, max_runs=64):
         evaluator = Evaluator.of(build(called))
     assert evaluator.n_responses == 64
-    assert sum(calls) == 64 + CLOUD
+    assert sum(calls) == 64 + SIZES.first
 
 
 def test_one_that_tells_nothing_is_not_called_between_the_runs() -> None:
@@ -132,10 +132,10 @@ def test_one_that_tells_nothing_is_not_called_between_the_runs() -> None:
     def smooth(a: Any, b: Any, scale: Any) -> Any:
         return a * np.exp(0.3 * b)
 
-    design, without = design_of(build(called, smooth)), design_of(build(None, smooth))
-    np.testing.assert_array_equal(design.values, without.values)
+    bound, without = design_of(build(called, smooth)), design_of(build(None, smooth))
+    np.testing.assert_array_equal(bound.design.sample.values, without.design.sample.values)
     assert sum(calls) == 64
-    assert "It does not follow the coarse response" in design.told
+    assert "It does not follow the coarse response" in bound.design.summary("y")
 
 
 def test_where_it_raises_the_emulator_goes_on_without_it(caplog: pytest.LogCaptureFixture) -> None:
@@ -145,11 +145,11 @@ def test_where_it_raises_the_emulator_goes_on_without_it(caplog: pytest.LogCaptu
         return float(coarse(a, b, scale))
 
     with caplog.at_level(logging.WARNING, "prbayes"):
-        design = design_of(build(prb.scalar(partly)))
+        bound = design_of(build(prb.scalar(partly)))
     assert "y: coarse: " in caplog.text
     assert "no equilibrium" in caplog.text
-    assert np.isfinite(design.values).all()
-    assert off(design) < 0.7 * off(design_of(build(None)))
+    assert np.isfinite(bound.design.sample.values).all()
+    assert off(bound) < 0.7 * off(design_of(build(None)))
 
 
 def test_threads_compute_it_where_they_compute_the_response() -> None:
@@ -162,7 +162,9 @@ def test_threads_compute_it_where_they_compute_the_response() -> None:
     with ThreadPoolExecutor(2, "worker") as threads:
         there = design_of(build(told, executor=threads))
     assert all(name.startswith("worker") for name in seen)
-    np.testing.assert_array_equal(there.values, design_of(build()).values)
+    np.testing.assert_array_equal(
+        there.design.sample.values, design_of(build()).design.sample.values
+    )
 
 
 RUNS: list[int] = []
@@ -198,8 +200,8 @@ def test_several_outputs_are_followed_one_by_one() -> None:
         return np.stack([coarse(a, b), unrelated(a, b)], axis=-1)
 
     observed = np.stack([OBSERVED, OBSERVED**2], axis=1)
-    design = design_of(build(coarse_both, both, observed=observed))
-    assert "It follows the coarse response in 1 of 2 outputs." in design.told
+    bound = design_of(build(coarse_both, both, observed=observed))
+    assert "It follows the coarse response in 1 of 2 outputs." in bound.design.summary("y")
     with pytest.raises(ResponseError, match=r"y: coarse: .* expected \(\d+, 2\): 2 outputs"):
         first_use(build(coarse, both, observed=observed))
 
@@ -233,7 +235,9 @@ def test_another_coarse_response_is_another_problem() -> None:
 def test_a_model_with_one_travels() -> None:
     model = build()
     there = cloudpickle.loads(cloudpickle.dumps(model))
-    np.testing.assert_array_equal(design_of(there).values, design_of(model).values)
+    np.testing.assert_array_equal(
+        design_of(there).design.sample.values, design_of(model).design.sample.values
+    )
 
 
 @pytest.mark.long

@@ -21,8 +21,10 @@ from prbayes.optimize.design_refinement import (
     refine_at,
 )
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.importance import CLOUD, columns, mixture_of, some_of
-from prbayes.propagation.reweighted import Design, UntoldError
+from prbayes.propagation.exponential_families import PointDensity
+from prbayes.propagation.importance import SIZES, columns, mixture_of, spread_over
+from prbayes.propagation.points import MixtureSampler
+from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.budget import BudgetError
 from prbayes.response.compile import PLAIN
 
@@ -61,9 +63,9 @@ def build(response: Any = smooth, n: int = 64, *, known: bool = False, **keyword
     return model
 
 
-def design_of(model: pm.Model) -> tuple[Evaluator, Design]:
+def design_of(model: pm.Model) -> tuple[Evaluator, ReweightedBound]:
     evaluator = Evaluator.of(model)
-    return evaluator, evaluator.designs["y"]
+    return evaluator, evaluator.reweighted["y"]
 
 
 def theta_of(evaluator: Evaluator) -> Floats:
@@ -92,58 +94,58 @@ def _truth_at(response: Any) -> float:
 
 def test_runs_are_counted_and_cloud_points_are_not() -> None:
     model = build()
-    evaluator, design = design_of(model)
-    assert evaluator.n_responses == design.n_runs == 64
-    assert design.n_points == CLOUD
-    assert len(design.known_responses) == len(design.first_responses) == 64
+    evaluator, bound = design_of(model)
+    assert evaluator.n_responses == bound.n_runs == 64
+    assert bound.n_points == SIZES.first
+    assert len(bound.first_responses) == 64
 
 
 def test_weights_are_one_on_average_with_runs_among_the_points() -> None:
-    evaluator, design = design_of(build(jumping, 256))
-    emulation = design.contents.emulation
+    evaluator, bound = design_of(build(jumping, 256))
+    emulation = bound.design.emulator
     if emulation is None:
-        assert design.n_points == 256
+        assert bound.n_points == 256
     support = evaluator.support(theta_of(evaluator))["y"]
     assert support["mean_weight"] == pytest.approx(1.0, abs=0.2)
 
 
 def test_a_response_that_no_surface_follows_keeps_its_runs() -> None:
-    _, design = design_of(build(jumping, 256))
-    emulation = design.contents.emulation
-    assert emulation is None or emulation.share > 0.1
+    _, bound = design_of(build(jumping, 256))
+    emulation = bound.design.emulator
+    assert emulation is None or emulation.run_share > 0.1
 
 
 def test_a_cloud_reaches_other_populations_without_a_run() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     far = theta_of(evaluator) + np.array([1.0, 1.0, -1.0, -1.0])
     before = evaluator.support(far)["y"]["weight_ess"]
-    design.reach(evaluator.roots(far + 0.1 * np.random.default_rng(0).standard_normal((64, 4)), 0))
+    bound.reach(evaluator.roots(far + 0.1 * np.random.default_rng(0).standard_normal((64, 4)), 0))
     assert evaluator.support(far)["y"]["weight_ess"] > 2 * before
     assert evaluator.n_responses == 64
 
 
 def test_the_prior_stays_in_reach() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     far = theta_of(evaluator) + np.array([1.0, 1.0, -2.0, -2.0])
     for _ in range(3):
-        design.reach(evaluator.roots(np.repeat(far, 16, axis=0), 0))
+        bound.reach(evaluator.roots(np.repeat(far, 16, axis=0), 0))
     prior = evaluator.hyperparameters.prior_thetas(200, 1)
     assert np.median(evaluator.support(prior)["y"]["mean_weight"]) == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.long
 def test_clouds_grow_for_their_points_and_runs_for_what_emulators_say() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     thetas = theta_of(evaluator) + 0.1 * np.random.default_rng(0).standard_normal((64, 4))
     assert not grow(evaluator, thetas, DesignErrors(points=0.05, emulators=0.05))
     assert grow(evaluator, thetas, DesignErrors(points=0.2, emulators=0.0))
-    assert (design.n_runs, design.n_points) == (64, 2 * CLOUD)
+    assert (bound.n_runs, bound.n_points) == (64, 2 * SIZES.first)
     assert grow(evaluator, thetas, DesignErrors(points=0.0, emulators=0.2))
-    assert (design.n_runs, design.n_points) == (128, 2 * CLOUD)
+    assert (bound.n_runs, bound.n_points) == (128, 2 * SIZES.first)
     # Another emulator has another cloud: whether that is large enough is seen next.
     assert grow(evaluator, thetas, DesignErrors(points=0.2, emulators=0.2))
-    assert design.n_runs > 128
-    assert design.n_points == 2 * CLOUD
+    assert bound.n_runs > 128
+    assert bound.n_points == 2 * SIZES.first
 
 
 @pytest.mark.parametrize(("little", "runs"), [(0.25, 64), (0.0, 80)])
@@ -152,18 +154,19 @@ def test_runs_are_added_where_emulators_tell_little(
 ) -> None:
     monkeypatch.setattr("prbayes.optimize.design_refinement._POOR_EMULATOR", little)
     far = np.array([[2.5, 0.0, 2.5, 0.0]]) + 0.01 * np.random.default_rng(0).normal(size=(64, 4))
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     assert refine_at(evaluator, far)
-    assert design.n_runs == runs
+    assert bound.n_runs == runs
 
 
 def test_a_part_of_a_cloud_is_a_cloud_of_its_own_for_a_while() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     theta = theta_of(evaluator)
     values, weights = evaluator.populations(theta, 0)
     (whole,) = evaluator(theta).discrepancies
-    rows = design.blocks == 3
-    with design.part(rows):
+    rows = bound.blocks == 3
+    with designs_restored([bound]):
+        bound.design = bound.design.rows(rows)
         some, of_some = evaluator.populations(theta, 0)
         expected = weights[:, rows] / weights[:, rows].sum()
         np.testing.assert_allclose(of_some, expected, rtol=1e-9)
@@ -201,7 +204,7 @@ def test_parts_of_a_cloud_without_a_minimum_leave_its_error_to_the_others(
 
 
 def test_another_response_is_computed_at_the_runs_and_emulated() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     calls: list[int] = []
 
     def double(a: Any, b: Any) -> Any:
@@ -210,7 +213,9 @@ def test_another_response_is_computed_at_the_runs_and_emulated() -> None:
 
     other = evaluator.nodes[0].bound.responses.copied()
     other.function = double
-    np.testing.assert_allclose(design.values_of(other), 2 * design.values, rtol=1e-2, atol=1e-2)
+    np.testing.assert_allclose(
+        bound.values_of(other), 2 * bound.design.sample.values, rtol=1e-2, atol=1e-2
+    )
     assert sum(calls) == 64
 
 
@@ -222,15 +227,17 @@ def rough(a: Any, b: Any) -> Any:
 def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() -> None:
     model = build(n=700, known=True, emulator=prb.surrogate.RadialBasis())
     optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
-    (design,) = optimum.evaluator.designs.values()
+    (bound,) = optimum.evaluator.reweighted.values()
     values, weights = optimum.evaluator.populations(optimum.theta[None], 0)
     other = optimum.evaluator.nodes[0].bound.responses.copied()
     other.function = rough
-    with pytest.raises(UntoldError, match="another response of the same specimens is not told"):
-        design.values_of(other)
+    with pytest.raises(
+        PoorEmulatorError, match="another response of the same specimens is not told"
+    ):
+        bound.values_of(other)
     inputs = optimum.evaluator.nodes[0].bound.inputs.aleatory
     predicted = prb.predict(optimum, rough, *inputs, n_samples=2000, random_seed=1)
-    runs = rough(*design.batches.points)
+    runs = rough(*bound.design.runs.points)
     assert np.isin(predicted, runs).all()
     # Sines of uniform phases.
     assert float(predicted.std()) == pytest.approx(1.0, abs=0.15)
@@ -259,21 +266,21 @@ def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
 
 
 def test_a_design_goes_back_to_what_it_was() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     before = evaluator(theta_of(evaluator)).discrepancies
-    with design.undone():
-        design.add(evaluator.roots(theta_of(evaluator), 0), 32)
-        assert design.n_runs == 96
-    assert design.n_runs == 64
+    with designs_restored([bound]):
+        bound.add(evaluator.roots(theta_of(evaluator), 0), 32)
+        assert bound.n_runs == 96
+    assert bound.n_runs == 64
     np.testing.assert_array_equal(evaluator(theta_of(evaluator)).discrepancies, before)
 
 
 def test_a_discrepancy_follows_the_cloud_that_was_drawn_last() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     thetas = theta_of(evaluator)
     before = evaluator(thetas).discrepancies
     compiled = evaluator.model.compile_logp(vars=[evaluator.model["y"]], mode=PLAIN)
-    design.reach(evaluator.roots(thetas, 0))
+    bound.reach(evaluator.roots(thetas, 0))
     after = evaluator(thetas).discrepancies
     assert 0 < abs(after - before)[0, 0] < 0.05 * before[0, 0]
     prb.set_epsilon(evaluator.model, {"y": 1.0})
@@ -286,30 +293,33 @@ def test_on_the_way_surfaces_stay_and_what_they_are_worth_is_judged_anew() -> No
     def corner(a: Any, b: Any) -> Any:
         return smooth(a, b) + np.abs(b - 0.5)
 
-    evaluator, design = design_of(build(corner))
-    before = design.contents.emulation
+    evaluator, bound = design_of(build(corner))
+    before = bound.design.emulator
     roots = evaluator.roots(theta_of(evaluator), 0)
-    design.reach(roots, on_the_way=True)
-    after = design.contents.emulation
+    bound.reach(roots, same_surfaces=True)
+    after = bound.design.emulator
     assert before is not None
     assert after is not None
-    assert after.models is before.models
+    assert after.surfaces is before.surfaces
     assert after.runs is before.runs
     assert after.error != before.error
     # The same as if they were chosen anew, but for the surfaces.
-    design.reach(roots)
-    anew = design.contents.emulation
+    bound.reach(roots)
+    anew = bound.design.emulator
     assert anew is not None
     assert anew.runs is not before.runs
     np.testing.assert_array_equal(anew.weights, after.weights)
 
 
 def test_left_out_emulators_differ_where_the_emulator_is_wrong() -> None:
-    _, design = design_of(build(lambda a, b: np.abs(a - 1) + b))
-    spread = [np.abs(values - design.values).max() for values in design.left_out()]
+    _, bound = design_of(build(lambda a, b: np.abs(a - 1) + b))
+    spread = [
+        np.abs(values - bound.design.sample.values).max()
+        for values in bound.design.without_each_block()
+    ]
     assert len(spread) == 8
     assert min(spread) > 1e-3
-    assert design_of(build(emulator=None))[1].left_out() == []
+    assert design_of(build(emulator=None))[1].design.without_each_block() == []
 
 
 def test_an_optimum_from_few_runs_is_that_of_many() -> None:
@@ -334,7 +344,7 @@ def test_one_input_and_discrete_ones_are_not_emulated() -> None:
         prb.Simulator(
             "y", lambda a: a, a, metric=prb.AreaMetric(), observed=OBSERVED, propagation=stored
         )
-    assert design_of(model)[1].contents.cloud is None
+    assert design_of(model)[1].design.emulated is None
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
         k = pm.Poisson.dist(pm.LogNormal("lam", 1, 0.3))
@@ -343,7 +353,7 @@ def test_one_input_and_discrete_ones_are_not_emulated() -> None:
             "y", lambda a, k: a + k, a, k,
             metric=prb.AreaMetric(), observed=OBSERVED, propagation=stored,
         )  # fmt: skip
-    assert design_of(model)[1].contents.cloud is None
+    assert design_of(model)[1].design.emulated is None
 
 
 def test_a_users_emulator_with_nothing_to_do_is_refused() -> None:
@@ -358,11 +368,11 @@ def test_a_users_emulator_with_nothing_to_do_is_refused() -> None:
 
 
 def test_another_response_that_no_surface_follows_is_refused() -> None:
-    evaluator, design = design_of(build(n=256))
+    evaluator, bound = design_of(build(n=256))
     other = evaluator.nodes[0].bound.responses.copied()
     other.function = jumping
     with pytest.raises(DesignError, match="another response of the same specimens is not told"):
-        design.values_of(other)
+        bound.values_of(other)
 
 
 @pytest.mark.long
@@ -390,13 +400,13 @@ def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
     assert aligned(evaluator.nodes)
     _enlarge_samples(evaluator, far, {"two"})
     assert aligned(evaluator.nodes)
-    assert {d.n_points for d in evaluator.designs.values()} == {2 * CLOUD}
+    assert {d.n_points for d in evaluator.reweighted.values()} == {2 * SIZES.first}
 
 
 def test_another_cloud_is_another_design() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     before = identity_of(evaluator).simulators[0]
-    design.reach(evaluator.roots(theta_of(evaluator), 0))
+    bound.reach(evaluator.roots(theta_of(evaluator), 0))
     after = identity_of(evaluator).simulators[0]
     assert (before.n_points, after.n_points) == (64, 64)
     assert before.batches != after.batches
@@ -419,25 +429,27 @@ def test_inputs_are_columns() -> None:
 
 def test_clouds_are_of_populations_that_matter_and_the_prior_stays() -> None:
     groups = [[np.zeros(500)], [np.ones(500)], [np.full(3, 2.0)]]
-    for size in (CLOUD, 2 * CLOUD):
+    for size in (SIZES.first, 2 * SIZES.first):
         (found,), shares = mixture_of(groups, size)
         of_each = [shares[found == k].sum() for k in range(3)]
         np.testing.assert_allclose(of_each, [1 / 16, 15 / 32, 15 / 32])
-        assert (found > 0).sum() == 60 * size / CLOUD
-    (only,), shares = mixture_of(groups[:1], CLOUD)
+        assert (found > 0).sum() == 60 * size / SIZES.first
+    (only,), shares = mixture_of(groups[:1], SIZES.first)
     np.testing.assert_allclose(shares, 1 / only.size)
 
 
 def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
-    evaluator, design = design_of(build())
+    evaluator, bound = design_of(build())
     thetas = evaluator.hyperparameters.prior_thetas(2, 0)
-    _, counts = design._place(evaluator.roots(thetas, 0), 1024, 3, np.array([0.125, 0.875]))
-    np.testing.assert_array_equal(counts, [128, 896])
+    shares = np.array([0.125, 0.875])
+    sampler = MixtureSampler("y", bound.inputs, PointDensity(bound.inputs))
+    _, mixture = sampler.draw(evaluator.roots(thetas, 0), 1024, 3, shares)
+    np.testing.assert_array_equal(mixture.counts, [128, 896])
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 40, 200])
 def test_populations_of_a_group_count_alike(size: int) -> None:
-    (found,) = some_of([np.arange(size)], 40)
+    (found,) = spread_over([np.arange(size)], 40)
     assert len(found) == 40
     assert found[0] == 0
     counts = np.bincount(found, minlength=size)

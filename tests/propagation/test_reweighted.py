@@ -19,7 +19,7 @@ from prbayes.metrics.multivariate import CompositeDiscrepancy
 from prbayes.model.coverage import shortcomings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses
@@ -47,16 +47,16 @@ def line(
     return model
 
 
-def design(model: pm.Model, name: str = "y") -> Design:
+def bound_of(model: pm.Model, name: str = "y") -> ReweightedBound:
     bound = {n.name: n.bound for n in nodes(model).values()}[name]
-    assert isinstance(bound, Design)
+    assert isinstance(bound, ReweightedBound)
     return bound
 
 
-def log_mixture(d: Design, x: Floats) -> Floats:
+def log_mixture(d: ReweightedBound, x: Floats) -> Floats:
     """log g at x from the list of thetas of a normal input, by SciPy."""
-    mu, sigma = (t[:, None] for t in d.batches.components)
-    shares = np.log(d.batches.counts / d.batches.counts.sum())[:, None]
+    mu, sigma = (t[:, None] for t in d.design.mixture.components)
+    shares = np.log(d.design.mixture.counts / d.design.mixture.counts.sum())[:, None]
     return np.asarray(logsumexp(norm.logpdf(x, mu, sigma) + shares, axis=0))
 
 
@@ -68,7 +68,7 @@ def once() -> pm.Model:
 @cache
 def twice() -> pm.Model:
     model = line()
-    design(model).add([np.full(64, 1.0), np.linspace(0.2, 0.3, 64)])
+    bound_of(model).add([np.full(64, 1.0), np.linspace(0.2, 0.3, 64)])
     return model
 
 
@@ -77,10 +77,14 @@ def twice() -> pm.Model:
 
 
 def test_points_of_one_input_have_equal_mass() -> None:
-    d = design(once())
-    (points,) = d.batches.points
-    mu, sigma = (t[:, None] for t in d.batches.components)
-    mass = d.batches.counts @ norm.cdf(np.sort(points), mu, sigma) / d.batches.counts.sum()
+    d = bound_of(once())
+    (points,) = d.design.runs.points
+    mu, sigma = (t[:, None] for t in d.design.mixture.components)
+    mass = (
+        d.design.mixture.counts
+        @ norm.cdf(np.sort(points), mu, sigma)
+        / d.design.mixture.counts.sum()
+    )
     gaps = np.diff(mass) * len(points)
     np.testing.assert_allclose(np.median(gaps), 1.0, rtol=0.01)
     # Gaps of 4096 draft points in the outermost parts are bridged by straight lines.
@@ -106,11 +110,11 @@ def test_points_have_equal_mass_where_the_density_is_infinite_or_has_narrow_peak
         x = SINGULAR[kind]()
         propagation = prb.Reweighted(n)
         prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED, propagation=propagation)
-    d = design(model)
-    drawn = PopulationSampler(d.inputs)(d.batches.components, 64, np.random.default_rng(0))
+    d = bound_of(model)
+    drawn = PopulationSampler(d.inputs)(d.design.mixture.components, 64, np.random.default_rng(0))
     population = drawn[0][0].ravel()
     levels = np.arange(1, 10) / 10
-    share = [np.mean(population <= q) for q in np.quantile(d.values, levels)]
+    share = [np.mean(population <= q) for q in np.quantile(d.design.sample.values, levels)]
     np.testing.assert_allclose(share, levels, atol=0.03)
 
 
@@ -128,9 +132,9 @@ def test_a_density_that_is_infinite_at_its_edge_leaves_weights_that_are_numbers(
 @pytest.mark.exact
 @pytest.mark.parametrize("model", [once, twice])
 def test_weights_are_the_populations_density_over_the_mixture(model: Any) -> None:
-    d = design(model())
-    (points,) = d.batches.points
-    assert len(points) == d.n_points == d.batches.counts.sum()
+    d = bound_of(model())
+    (points,) = d.design.runs.points
+    assert len(points) == d.n_points == d.design.mixture.counts.sum()
     mu, sigma = np.array([0.0, 1.0, -2.0]), np.array([1.0, 0.3, 0.7])
     logs = norm.logpdf(points, mu[:, None], sigma[:, None]) - log_mixture(d, points)
     values, weights = d.populations([mu, sigma])
@@ -153,7 +157,7 @@ def test_the_weights_integrate(model: Any) -> None:
     # and weighted moments are those of the population; with stratified points much better than by
     # sampling.
     mu, sigma = (a.ravel() for a in np.meshgrid(np.linspace(-3, 3, 13), [0.3, 0.6, 1.2]))
-    d = design(model())
+    d = bound_of(model())
     np.testing.assert_allclose(d.support([mu, sigma])["mean_weight"], 1.0, atol=0.02)
     x, w = d.populations([mu, sigma])
     mean = (x * w).sum(axis=-1)
@@ -163,23 +167,23 @@ def test_the_weights_integrate(model: Any) -> None:
 
 def test_a_second_batch_supports_what_it_was_added_for() -> None:
     thetas = [np.array([1.0]), np.array([0.25])]
-    before, after = (design(m()).support(thetas)["weight_ess"][0] for m in (once, twice))
-    assert design(twice()).n_points == 512
+    before, after = (bound_of(m()).support(thetas)["weight_ess"][0] for m in (once, twice))
+    assert bound_of(twice()).n_points == 512
     assert after > before + 200  # nearly all of the 256 points
     elsewhere = [np.array([-2.0]), np.array([0.5])]
     lost = (
-        design(twice()).support(elsewhere)["weight_ess"][0]
-        / design(once()).support(elsewhere)["weight_ess"][0]
+        bound_of(twice()).support(elsewhere)["weight_ess"][0]
+        / bound_of(once()).support(elsewhere)["weight_ess"][0]
     )
     assert lost > 0.95  # the balance heuristic forgets nothing
 
 
 def test_mass_out_of_reach_shows_in_the_mean_weight() -> None:
     # A population far wider than any of the design's: many points count, but its tails are missing.
-    support = design(once()).support([np.array([0.0]), np.array([100.0])])
+    support = bound_of(once()).support([np.array([0.0]), np.array([100.0])])
     assert support["mean_weight"][0] < 0.3
     assert support["weight_ess"][0] > 20
-    far = design(once()).support([np.array([60.0]), np.array([0.1])])
+    far = bound_of(once()).support([np.array([60.0]), np.array([0.1])])
     assert far["weight_ess"][0] == pytest.approx(1.0)
     assert far["mean_weight"][0] < 1e-100
     short = str(shortcomings(Evaluator.of(once()), np.array([[0.0, np.log(100.0)]]))["y"])
@@ -188,16 +192,18 @@ def test_mass_out_of_reach_shows_in_the_mean_weight() -> None:
 
 
 def test_a_design_is_deterministic() -> None:
-    one, two, other = design(line()), design(line()), design(line(seed=1))
-    np.testing.assert_array_equal(one.batches.points[0], two.batches.points[0])
-    np.testing.assert_array_equal(one.batches.components[0], two.batches.components[0])
-    assert not np.isin(other.batches.points[0], one.batches.points[0]).any()
+    one, two, other = bound_of(line()), bound_of(line()), bound_of(line(seed=1))
+    np.testing.assert_array_equal(one.design.runs.points[0], two.design.runs.points[0])
+    np.testing.assert_array_equal(
+        one.design.mixture.components[0], two.design.mixture.components[0]
+    )
+    assert not np.isin(other.design.runs.points[0], one.design.runs.points[0]).any()
     batches = [np.array([1.0, 2.0]), np.array([0.5, 0.5])]
     for d in (one, two):
         d.add(batches)
-    np.testing.assert_array_equal(one.batches.points[0], two.batches.points[0])
+    np.testing.assert_array_equal(one.design.runs.points[0], two.design.runs.points[0])
     assert (
-        np.unique(one.batches.points[0]).size == 512
+        np.unique(one.design.runs.points[0]).size == 512
     )  # a batch repeats no point of an earlier one
 
 
@@ -225,7 +231,7 @@ def test_blocks_of_populations_change_nothing(
     thetas[4] = 3.0  # no population at all
     whole = evaluator.discrepancies(thetas, 0)
     monkeypatch.setattr("prbayes.propagation.reweighted._BLOCK", 1)
-    monkeypatch.setattr("prbayes.propagation.reweighted._AT_LEAST", 3)
+    monkeypatch.setattr("prbayes.propagation.reweighted._MIN_POPULATIONS", 3)
     np.testing.assert_allclose(evaluator.discrepancies(thetas, 0), whole, rtol=1e-12)
     assert np.flatnonzero(np.isinf(whole)).tolist() == [4]
     assert evaluator.discrepancies(thetas[:0], 0).shape == (0,)
@@ -242,9 +248,9 @@ def test_an_input_without_inverse_distribution_function() -> None:
             pm.icdf(x, 0.5, warn_rvs=False)
         prb.Simulator("y", same, x, metric=AREA, observed=data, propagation=prb.Reweighted(256))
     mu = np.array([-1.0, 0.0, 1.0])
-    support = design(model).support([mu])
+    support = bound_of(model).support([mu])
     np.testing.assert_allclose(support["mean_weight"], 1.0, atol=0.02)
-    values, weights = design(model).populations([mu])
+    values, weights = bound_of(model).populations([mu])
     np.testing.assert_allclose((values * weights).sum(axis=-1), mu + 0.5, atol=0.02)
     optimum = prb.minimize(model, method="Nelder-Mead")
     # The area metric with one location parameter fits medians: sd of the data about 0.58.
@@ -259,12 +265,12 @@ def test_a_discrete_input() -> None:
         x = pm.Poisson.dist(pm.Gamma("rate", 2, 0.5))
         prb.Simulator("y", same, x, metric=AREA, observed=data, propagation=prb.Reweighted(1024))
     rates = np.array([2.0, 4.0, 8.0])
-    values, weights = design(model).populations([rates])
-    ess = design(model).support([rates])["weight_ess"]
+    values, weights = bound_of(model).populations([rates])
+    ess = bound_of(model).support([rates])["weight_ess"]
     assert (ess > 200).all()
     # Drawn at random: importance sampling with its ordinary error.
     assert (np.abs((values * weights).sum(axis=-1) - rates) < 4 * np.sqrt(rates / ess)).all()
-    np.testing.assert_allclose(design(model).support([rates])["mean_weight"], 1.0, atol=0.2)
+    np.testing.assert_allclose(bound_of(model).support([rates])["mean_weight"], 1.0, atol=0.2)
     optimum = prb.minimize(model, method="Nelder-Mead")
     assert abs(optimum.point["rate"] - data.mean()) < 3 * (4.0 / 40) ** 0.5
     assert set(np.unique(values)) <= set(range(60))
@@ -276,7 +282,7 @@ def test_a_discrete_input() -> None:
 
 def test_lost_mass_is_the_probability_of_failure() -> None:
     model = line(512, response=lambda x: np.where(x < 0, np.nan, x), max_lost=0.2)
-    d = design(model)
+    d = bound_of(model)
     mu, sigma = np.array([0.0, 1.0, 3.0]), np.array([1.0, 1.0, 0.5])
     np.testing.assert_allclose(
         d.support([mu, sigma])["lost_mass"], norm.cdf(-mu / sigma), atol=0.01
@@ -363,7 +369,7 @@ def test_refinement_of_two_correlated_inputs(caplog: pytest.LogCaptureFixture) -
     assert "to 1024 runs" in caplog.text
     assert not shortcomings(evaluator, thetas)
     for name, response in zip(("sum", "difference"), responses, strict=True):
-        assert points[name] == response.count == design(model, name).n_points
+        assert points[name] == response.count == bound_of(model, name).n_points
         assert points[name] % 512 == 0
         assert 512 < points[name] <= 512 * 9
         support = evaluator.support(thetas)[name]
@@ -394,7 +400,7 @@ def test_two_designs_agree_in_the_optimum_of_the_hard_case(metric: prb.Metric) -
         evaluator = Evaluator.of(model)
         assert not shortcomings(evaluator, optimum.theta[None])
         for name, support in evaluator.support(optimum.theta[None]).items():
-            assert support["weight_ess"][0] > design(model, name).required_ess
+            assert support["weight_ess"][0] > bound_of(model, name).required_ess
         assert prb.diagnose(optimum, model=model).ok
         optima.append(optimum)
     one, two = optima
@@ -461,7 +467,7 @@ def test_a_wide_population_is_refused_where_a_narrow_design_may_not_grow() -> No
         x = pm.Normal.dist(0, pm.LogNormal("sigma", -1.1, 0.1))  # about a third
         propagation = prb.Reweighted(256, max_points=256)
         prb.Simulator("y", same, x, metric=AREA, observed=data, propagation=propagation)
-    assert np.abs(design(model).batches.points[0]).max() < 3
+    assert np.abs(bound_of(model).design.runs.points[0]).max() < 3
     for find in (prb.minimize, prb.refine):
         with pytest.raises(
             prb.propagation.DesignError,
@@ -498,7 +504,7 @@ def test_minimize_refines_where_the_answer_is_far_out_in_the_prior() -> None:
     evaluator = Evaluator.of(model)
     assert shortcomings(evaluator, np.array([[10.0]]))
     optimum = prb.minimize(model)
-    assert optimum.n_responses == design(model).n_points > 128
+    assert optimum.n_responses == bound_of(model).n_points > 128
     assert optimum.n_responses % 128 == 0
     assert abs(optimum.point["mu"] - np.median(data)) < optimum.stderr["mu"]
     np.testing.assert_allclose(optimum.stderr["mu"], 0.5 / 30**0.5, rtol=0.25)
@@ -566,7 +572,7 @@ def test_refine_false_leaves_the_design_alone() -> None:
         x = pm.Normal.dist(pm.Normal("mu", 0, 0.5), 0.5)
         prb.Simulator("y", same, x, metric=AREA, observed=data, propagation=prb.Reweighted(128))
     optimum = prb.minimize(model, refine=False, method="Nelder-Mead")
-    assert optimum.n_responses == design(model).n_points == 128
+    assert optimum.n_responses == bound_of(model).n_points == 128
     found = prb.diagnose(optimum, model=model)
     assert not found.ok
     assert "y: the design does not support the answer" in str(found)
@@ -585,7 +591,7 @@ def test_sample_smc_refines() -> None:
     assert bare.posterior.attrs["n_responses"] == 64
     assert not prb.diagnose(bare, model=model).ok
     idata = prb.sample_smc(100, **keywords)
-    assert idata.posterior.attrs["n_responses"] == design(model).n_points > 64
+    assert idata.posterior.attrs["n_responses"] == bound_of(model).n_points > 64
     assert prb.diagnose(idata, model=model).ok
     assert float(idata.calibration["weight_ess"].median()) > 50
 
@@ -630,7 +636,7 @@ def test_diagnose_is_silent_when_nothing_is_wrong() -> None:
     assert str(found).startswith("No problem was found.")
     assert found.support["weight_ess"].dims == ("simulator", "sample")
     assert found.support["weight_ess"].sizes == {"simulator": 1, "sample": 100}
-    expected = design(once()).support(
+    expected = bound_of(once()).support(
         [result["posterior"][n].values.ravel() for n in ("mu", "sigma")]
     )
     for key in ("weight_ess", "mean_weight", "lost_mass"):
@@ -712,19 +718,21 @@ def test_another_response_is_computed_at_the_new_points_only() -> None:
             asked.append(np.size(x))
         return 2 * x
 
-    (design,) = Evaluator.of(model).designs.values()
+    (bound,) = Evaluator.of(model).reweighted.values()
     inputs = read_inputs("later", [x], model)
     for batches in range(1, 4):
         # A new description of the same response, as each call of predict makes one.
-        found = design.values_of(Responses("later", later, inputs))
-        assert np.array_equal(found, 2 * design.values)
+        found = bound.values_of(Responses("later", later, inputs))
+        assert np.array_equal(found, 2 * bound.design.sample.values)
         assert asked == [64] * batches
-        design.add([np.array([1.0, 2.0]), np.array([0.5, 0.5])])
+        bound.add([np.array([1.0, 2.0]), np.array([0.5, 0.5])])
     # Points that are forgotten take their responses with them.
-    with design.undone():
-        design.add([np.array([1.0, 2.0]), np.array([0.5, 0.5])])
-        design.values_of(Responses("later", later, inputs))
-    assert np.array_equal(design.values_of(Responses("later", later, inputs)), 2 * design.values)
+    with designs_restored([bound]):
+        bound.add([np.array([1.0, 2.0]), np.array([0.5, 0.5])])
+        bound.values_of(Responses("later", later, inputs))
+    assert np.array_equal(
+        bound.values_of(Responses("later", later, inputs)), 2 * bound.design.sample.values
+    )
 
 
 def test_a_value_with_probability_itself_has_its_share_of_points_and_weight() -> None:
@@ -776,14 +784,14 @@ def test_data_that_were_set_anew_are_refused_where_points_are_added() -> None:
             "y", lambda x: x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
             propagation=prb.Reweighted(64),
         )  # fmt: skip
-    design = Evaluator.of(model).designs["y"]
+    bound = Evaluator.of(model).reweighted["y"]
     components = [np.linspace(-1, 1, 16)]
     model.set_data("shift", 1.0)
     with pytest.raises(prb.propagation.DesignError, match="got other values of shift, which is"):
-        design.add(components)
+        bound.add(components)
     model.set_data("shift", 0.0)
-    design.add(components)
-    assert design.n_points == 128
+    bound.add(components)
+    assert bound.n_points == 128
 
 
 @pytest.mark.parametrize("metric", [prb.ProbabilityResidual(), prb.KullbackLeibler()])
@@ -803,7 +811,7 @@ def test_where_a_basis_would_be_too_large_nothing_else_changes(
                 observed=data,
                 propagation=prb.Reweighted(64, emulator=None),
             )
-        own = design(model)
+        own = bound_of(model)
         own.add([np.array([0.9, 1.1])])
         evaluator = Evaluator.of(model)
         at = evaluator.objective(prior=False, gradient=True)(np.array([0.9]), np.ones(1))
@@ -812,7 +820,7 @@ def test_where_a_basis_would_be_too_large_nothing_else_changes(
 
     at, many, sizes = found()
     assert max(sizes) > 128 * 100
-    monkeypatch.setattr("prbayes.propagation.reweighted._MOST_NUMBERS", 100)
+    monkeypatch.setattr("prbayes.propagation.reweighted._MAX_BASIS", 100)
     monkeypatch.setattr(CompositeDiscrepancy.basis, "__defaults__", (100,))
     compact_at, compact_many, compact_sizes = found()
     assert max(compact_sizes) == 128 * 4

@@ -172,5 +172,5 @@ def test_one_output_tells_its_units_from_memory_and_from_a_result() -> None:
         section, values = data(gather(*given, None, None, None))
         assert values.text[1] == "k: 1.000, 2.000, 4.000."
         assert section.table["units"].tolist() == ["N/mm"]
-    picture = prb.plot_responses(optimum, backend="matplotlib")
+    picture = prb.plot_responses(optimum)
     assert picture.viz["plot"]["k"].item().get_xlabel() == "k (N/mm)"

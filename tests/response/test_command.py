@@ -164,8 +164,8 @@ def test_a_result_that_cannot_be_read_is_a_failure_of_that_point() -> None:
             ),
         )
     (node,) = nodes(model).values()
-    x = node.design.batches.points[0]
-    np.testing.assert_array_equal(node.bound.values, np.where(x < 1, x, np.inf))
+    x = node.reweighted.design.runs.points[0]
+    np.testing.assert_array_equal(node.bound.design.sample.values, np.where(x < 1, x, np.inf))
 
 
 def alive(pid: int) -> bool:

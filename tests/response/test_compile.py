@@ -140,7 +140,7 @@ def compilations(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         counted.append(given)
         return function(*given, **keywords)
 
-    monkeypatch.setattr(compilation, "_known", OrderedDict())
+    monkeypatch.setattr(compilation, "_cache", OrderedDict())
     monkeypatch.setattr(pytensor, "function", counting)
     return counted
 
@@ -240,7 +240,7 @@ def test_values_that_are_shared_go_with_the_last_function(compilations: list[Any
     del values, function
     gc.collect()
     assert gone() is None
-    assert len(compilation._known) == len(compilations) == 1
+    assert len(compilation._cache) == len(compilations) == 1
 
 
 @pytest.mark.parametrize("what", ["generator", "operation", "inside", "large"])
@@ -255,15 +255,15 @@ def test_what_may_be_a_users_is_not_kept(what: str, compilations: list[Any]) -> 
     for _ in range(2):
         compiled([x], [graph])
     assert len(compilations) == 2
-    assert not compilation._known
+    assert not compilation._cache
 
 
 def test_a_number_of_functions_is_kept_the_latest_used(compilations: list[Any]) -> None:
-    for slope in range(1, compilation._KEPT + 1):
+    for slope in range(1, 65):
         line(float(slope))
     line(1.0)
     line(-1.0)  # one too many: the second goes, for the first was just used
-    assert len(compilation._known) == compilation._KEPT
+    assert len(compilation._cache) == 64
     before = len(compilations)
     line(1.0)
     assert len(compilations) == before

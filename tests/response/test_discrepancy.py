@@ -1,4 +1,4 @@
-"""A model inadequacy is what it says under each condition, and says where it extrapolates."""
+"""Model discrepancies under each condition, and their warning of extrapolation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 import prbayes as prb
 from prbayes._finding import from_json
-from prbayes.response.discrepancy import corrected, findings_of
+from prbayes.response.discrepancy import findings_of, has_discrepancy
 
 TIMES = np.array([1.0, 2.0, 4.0])
 
@@ -66,7 +66,7 @@ def test_several_coefficients_are_the_last_axis(batch: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize("kind", [prb.response.Additive, prb.response.Multiplicative])
-def test_an_output_without_inadequacy_is_as_it_was(kind: Any) -> None:
+def test_an_output_without_discrepancy_is_as_it_was(kind: Any) -> None:
     found = kind(TIMES, np.sqrt).of(curve, [1.0, np.nan, 4.0])(np.ones(2), np.full(2, 7.0))
     np.testing.assert_array_equal(found[:, 1], curve(np.ones(2))[:, 1])
     assert (found[:, [0, 2]] > 7).all()
@@ -82,8 +82,8 @@ def test_a_function_of_one_specimen_stays_one() -> None:
     one = prb.scalar(lambda x: x**2 if x > 0 else 0.0)
     both = prb.response.Additive([0.0, 1.0]).of(one, 1.0)
     assert isinstance(both, prb.scalar)
-    assert corrected(both)
-    assert not corrected(one)
+    assert has_discrepancy(both)
+    assert not has_discrepancy(one)
     np.testing.assert_allclose(both([3.0, -1.0], [0.5, 0.5]), [9.5, 0.5])
 
 
@@ -100,7 +100,7 @@ def test_a_mapping_is_refused() -> None:
 def test_it_says_where_it_extrapolates(condition: Any, outside: bool) -> None:
     found = findings_of(prb.response.Additive(TIMES).of(curve, condition))
     assert bool(found) is outside
-    assert all("extrapolates its inadequacy, seen from 1 to 4" in str(f) for f in found)
+    assert all("extrapolates its model discrepancy, seen from 1 to 4" in str(f) for f in found)
 
 
 def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture) -> None:
@@ -120,7 +120,7 @@ def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture)
     assert not caplog.records
     with caplog.at_level(logging.WARNING, "prbayes"):
         beyond = prb.predict(optimum, drift.of(line, 3.0), x, b, model=model, n_samples=50)
-    said = "line at 3: extrapolates its inadequacy, seen from 0 to 2."
+    said = "line at 3: extrapolates its model discrepancy, seen from 0 to 2."
     (finding,) = from_json(beyond.attrs["findings"])
     assert (finding.code, str(finding)) == ("extrapolated-discrepancy", said)
     assert [record.message for record in caplog.records] == [said]
@@ -149,6 +149,6 @@ def test_outputs_that_are_not_those_of_the_conditions_are_refused(
         corrected(0.0, coefficients)
 
 
-def test_a_response_that_is_the_same_for_all_specimens_has_its_inadequacy_too() -> None:
+def test_a_response_that_is_the_same_for_all_specimens_has_its_discrepancy_too() -> None:
     corrected = prb.response.Additive([0.0, 2.0]).of(lambda: 5.0, 2.0)
     np.testing.assert_array_equal(corrected(np.array([1.0, 2.0])), [6.0, 7.0])

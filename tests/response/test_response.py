@@ -390,9 +390,11 @@ def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinemen
     (node,) = nodes(model).values()
     assert sum(response.asked) <= 17 + 4
     prb.refine(model, thetas=np.full((1, 1), 2.0))
-    node.design.add([np.array([0.9, 0.95])])
+    node.reweighted.add([np.array([0.9, 0.95])])
     assert sum(response.asked) <= 17 + 4
-    np.testing.assert_array_equal(node.design.values, 2.0 * node.design.batches.points[0])
+    np.testing.assert_array_equal(
+        node.reweighted.design.sample.values, 2.0 * node.reweighted.design.runs.points[0]
+    )
     optimum = prb.minimize(model, progressbar=False)
     assert optimum.search.n_computed <= 17 + 4
-    assert optimum.n_responses == node.design.n_points
+    assert optimum.n_responses == node.bound.n_points

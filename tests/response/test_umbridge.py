@@ -199,7 +199,7 @@ def model_of(response: Any, **settings: Any) -> pm.Model:
 
 def responses(response: Any, **settings: Any) -> tuple[np.ndarray[Any, Any], Any]:
     (node,) = nodes(model_of(response, **settings)).values()
-    return node.bound.values, node
+    return node.bound.design.sample.values, node
 
 
 @pytest.mark.long
@@ -256,7 +256,7 @@ def test_a_specimen_that_fails_now_and_then_is_tried_again_by_policy() -> None:
     with telling(evaluate) as server:
         retry = prb.response.Retry(1, then=prb.response.Abort())
         values, node = responses(prb.umbridge(server.url), on_failure=retry)
-    x = node.design.batches.points[0]
+    x = node.reweighted.design.runs.points[0]
     np.testing.assert_array_equal(values, np.stack([x - 4.0, x * x * 2.0], axis=1))
     assert node.bound.responses.computed == 32
 
@@ -452,15 +452,20 @@ def test_numbers_that_json_does_not_know_are_read_and_texts_are_left() -> None:
         prb.umbridge(server.url)(1.0, 2.0)
 
 
-def test_a_machine_that_is_gone_is_noticed_without_a_time_limit() -> None:
+def test_a_machine_that_is_gone_is_noticed_without_a_time_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with telling() as server:
-        prb.umbridge(server.url)(1.0, 2.0)
-        ((_, kept),) = [(k, c) for k, c in um_bridge._own.connections.items() if server.url in k]
-        assert kept.http.sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        response = prb.umbridge(server.url)
+        kept = um_bridge._pool.connection_from_url(server.url).pool
+        assert kept is not None
+        sock = kept.queue[-1].sock
+        assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
 
         # What the system says of a machine that does not answer is a loss, and not a time limit.
         def gone(*_: object) -> Any:
+            monkeypatch.undo()
             raise TimeoutError(110, "Connection timed out")
 
-        kept.exchanged = gone  # type: ignore[method-assign]
-        assert prb.umbridge(server.url)(3.0, 2.0)[1] == 18
+        monkeypatch.setattr("urllib3.connection.HTTPConnection.getresponse", gone)
+        assert response(3.0, 2.0)[1] == 18

@@ -242,12 +242,12 @@ def test_scores_of_a_model_that_was_built_again_are_those_of_the_first() -> None
     optimum = prb.minimize(first)
     there = prb.compare({"optimum": optimum}, model=first)
     again = build()
-    design = Evaluator.of(again).designs["y"]
-    before = design.contents
+    bound = Evaluator.of(again).reweighted["y"]
+    before = bound.design
     here = prb.compare({"optimum": optimum.to_datatree()}, model=again)
     for name in ("ProbabilityResidual", "KullbackLeibler", "AreaMetric"):
         np.testing.assert_allclose(here[name], there[name], rtol=0.1)
-    assert design.contents is before
+    assert bound.design is before
     # The compiled graphs read it too.
     assert prb.minimize(again).discrepancy == optimum.discrepancy
 
@@ -269,7 +269,7 @@ def test_several_outputs_are_scored_by_joint_metrics() -> None:
     names = ["ProbabilityResidual", "KullbackLeibler", "AreaMetric", "LogLikelihood"]
     assert {f"Joint({name})" for name in names} <= set(table.data_vars)
     assert float(table["Joint(AreaMetric)"][0]) == pytest.approx(optimum.discrepancy)
-    prb.plot_comparison(table, backend="none")
+    prb.plot_comparison(table)
 
 
 def test_scores_need_every_hyperparameter(model: pm.Model) -> None:

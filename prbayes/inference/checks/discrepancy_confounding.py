@@ -14,7 +14,7 @@ from prbayes.inference.asymptotics import Local
 from prbayes.inference.identifiability import named_direction
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
-from prbayes.response.discrepancy import corrected
+from prbayes.response.discrepancy import has_discrepancy
 
 Places = NDArray[np.intp]
 
@@ -83,7 +83,7 @@ def _precision(local: Local) -> Floats:
 
 def _elements(evaluator: Evaluator, node: Node) -> tuple[Places, Places]:
     """Return which elements of theta are above the coefficients only, and above other inputs."""
-    if not corrected(node.bound.responses.function):
+    if not has_discrepancy(node.bound.responses.function):
         return np.arange(0), np.arange(0)
     inputs = node.bound.inputs
     *others, coefficients = range(len(inputs.arguments))

@@ -1,4 +1,4 @@
-"""Names of elements: one rule in both directions."""
+"""Names of elements, by one rule in both directions; labels of metrics."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import prbayes as prb
 from prbayes.model.elements import element_name, split_elements, variable_of
-from prbayes.plots._names import named
+from prbayes.plots._labels import metric_label, named
 
 
 @pytest.mark.parametrize(("index", "expected"), [((), "mu"), ((1,), "mu[1]"), ((0, 2), "mu[0,2]")])
@@ -40,7 +41,7 @@ def test_a_label_of_nothing_is_refused(
     picture: str, pictures: dict[str, Callable[..., Any]]
 ) -> None:
     with pytest.raises(KeyError, match=r"labels: got 'crak', which is no name of what is shown"):
-        pictures[picture](backend="none", labels={"crak": "crack length (mm)"})
+        pictures[picture](labels={"crak": "crack length (mm)"})
 
 
 def test_one_mapping_serves_all_pictures_of_a_model(
@@ -48,6 +49,17 @@ def test_one_mapping_serves_all_pictures_of_a_model(
 ) -> None:
     labels = {"mu": "mean", "y": "response", "x": "input"}
     for picture in PICTURES:
-        pictures[picture](backend="none", labels=labels)
+        pictures[picture](labels=labels)
     with pytest.raises(KeyError, match="'nu'"):
-        pictures["responses"](backend="none", labels=labels | {"nu": "typing error"})
+        pictures["responses"](labels=labels | {"nu": "typing error"})
+
+
+def test_metrics_of_several_outputs_are_called_by_that_of_one() -> None:
+    area = prb.AreaMetric()
+    assert metric_label(repr(area)) == "area metric"
+    assert metric_label(repr(prb.Joint(area))) == "joint area metric"
+    other = prb.MarginalCorrelation(prb.KullbackLeibler())
+    assert (
+        metric_label(repr(other)) == "Kullback-Leibler divergence of marginals, with correlations"
+    )
+    assert metric_label("Mine(Other(3))") == "Mine"

@@ -1,0 +1,345 @@
+"""The design of `prb.Reweighted`: stored runs, and the sample whose weights make populations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, Protocol
+
+import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pytensor.tensor.variable import TensorVariable
+
+from prbayes._validate import IN_CACHE, Floats
+from prbayes.propagation.base import N_BLOCKS
+from prbayes.propagation.exponential_families import PointDensity, normalise
+from prbayes.propagation.importance import (
+    SIZES,
+    CoarseResponse,
+    DesignEmulator,
+    EmulatedPoints,
+    Sample,
+    fit_emulator,
+    mixture_of,
+    spread_over,
+)
+from prbayes.propagation.moving_support import averaged_log_density, cells_around, moving_inputs
+from prbayes.propagation.points import Mixture, MixtureSampler
+from prbayes.response.compile import compile_batched
+from prbayes.response.distributions import log_density
+from prbayes.response.inputs import Inputs
+from prbayes.response.response import Known, Responses, once_each
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Stored runs, and the points that represent populations by their weights.
+
+    A design that grows is a new record.
+
+    Attributes
+    ----------
+    runs : Sample
+    mixture : Mixture
+        Of the runs: their proposal density.
+    batch_sizes : tuple of int
+        Number of runs of each batch, in the order of the runs.
+    groups : tuple
+        Populations that the points are to support: the prior's, and those of interest last. Roots,
+        shapes (k, *shape), of each group.
+    sample : Sample
+        The points that have weights: the runs, or emulated points with or without the runs.
+    coarse : ndarray, shape (n, m), optional
+        A coarse response at the runs.
+    emulated : EmulatedPoints, optional
+        The first points of the sample, if their responses are emulated.
+    emulator : DesignEmulator, optional
+    n_emulated_samples : int
+        Number of times that emulated points were drawn.
+    emulated_size : int
+        Number of points of the next emulated sample.
+    moving : tuple of int
+        Positions of the inputs whose support moves with the hyperparameters.
+    on_line : bool
+        Whether a specimen is one continuous number, and the points a quadrature rule.
+    """
+
+    runs: Sample
+    mixture: Mixture
+    batch_sizes: tuple[int, ...]
+    groups: tuple[tuple[Floats, ...], ...]
+    sample: Sample
+    coarse: Floats | None = None
+    emulated: EmulatedPoints | None = None
+    emulator: DesignEmulator | None = None
+    n_emulated_samples: int = 0
+    emulated_size: int = SIZES.first
+    moving: tuple[int, ...] = ()
+    on_line: bool = False
+
+    @property
+    def n_runs(self) -> int:
+        """Number of stored responses."""
+        return len(self.runs)
+
+    @property
+    def n_points(self) -> int:
+        """Number of points that have weights."""
+        return len(self.sample)
+
+    @property
+    def n_drawn(self) -> int:
+        """Number of times that points were drawn, of runs and of emulated samples."""
+        return len(self.batch_sizes) + self.n_emulated_samples
+
+    @property
+    def is_emulated(self) -> bool:
+        """Whether responses between the runs are emulated."""
+        return self.emulated is not None
+
+    def rows(self, mask: NDArray[np.bool_]) -> Design:
+        """Return the design with some of its points only."""
+        return replace(self, sample=self.sample.rows(mask))
+
+    def runs_alone(self) -> Design:
+        """Return the design without emulated points."""
+        return replace(self, sample=self.runs, emulated=None, emulator=None)
+
+    def with_values(self, values: Floats) -> Design:
+        """Return the same points with another response, (n,) or (n, m)."""
+        sample = replace(self.sample, values=values)
+        return replace(self, sample=sample, emulated=None, emulator=None)
+
+    def without_each_block(self) -> list[Floats]:
+        """Return the responses by emulators without one block of runs each; none without one."""
+        if self.emulated is None or self.emulator is None:
+            return []
+        n_emulated = len(self.emulated)
+        at_runs = self.sample.values[n_emulated:]
+        by_block = self.emulator.without_each_block(self.emulated)
+        return [np.concatenate([values, at_runs]) for values in by_block]
+
+    @cached_property
+    def weight_arrays(self) -> list[Floats]:
+        """Points and log g of the sample, then ends of cells of inputs whose support moves."""
+        # A cell reaches 8 neighbours beside other inputs: points then pass an edge one by one, as
+        # their weights differ. On a line, the cells of neighbours meet.
+        reach = 1 if self.on_line else 8
+        arrays = [*self.sample.points, self.sample.log_density]
+        for i in self.moving:
+            cells = cells_around(self.sample.points[i], reach)
+            arrays += [cells.lower, cells.upper]
+        return arrays
+
+    def summary(self, name: str) -> str:
+        """Return the number of runs, and how responses between them are emulated, as a sentence."""
+        text = f"{name}: {self.n_runs} runs"
+        if self.emulator is None:
+            return f"{text}."
+        text += (
+            f", between which {self.n_points} points are emulated: at runs that were left out the "
+            f"emulator is off by {self.emulator.error:.2g} of the response's spread, and "
+            f"{self.emulator.run_share:.0%} of a population are runs themselves."
+        )
+        if self.coarse is None:
+            return text
+        following, outputs = self.emulator.n_following, len(self.emulator.surfaces)
+        if not following:
+            return f"{text} It does not follow the coarse response, which tells nothing more."
+        share = f" in {following} of {outputs} outputs" if following < outputs else ""
+        return f"{text} It follows the coarse response{share}."
+
+
+class DesignOptions(Protocol):
+    """Options of `prb.Reweighted` that determine the points of a design."""
+
+    @property
+    def random_seed(self) -> int:
+        """Seed of the points."""
+
+    @property
+    def emulator(self) -> Any:
+        """The surface or regressor that emulates the response between the runs, or "auto"."""
+
+    def emulates(self, inputs: Inputs) -> bool:
+        """Return whether responses between the runs are emulated."""
+
+
+class DesignSampler:
+    """Draws the points of designs: runs, and emulated points between them."""
+
+    def __init__(
+        self, name: str, inputs: Inputs, options: DesignOptions, coarse: CoarseResponse | None
+    ) -> None:
+        self.name = name
+        self.inputs = inputs
+        self.options = options
+        self.coarse = coarse
+        self.density = PointDensity(inputs)
+        self._mixtures = MixtureSampler(name, inputs, self.density)
+
+    def with_runs(
+        self, design: Design | None, components: Sequence[Floats], n: int, responses: Responses
+    ) -> Design:
+        """Return a design with n more runs at points from populations at roots, (k, *shape)."""
+        n_batches = 0 if design is None else len(design.batch_sizes)
+        # A prime: seeds 0, 1, 2, ... of a user share no batch.
+        seed = self.options.random_seed + 7919 * n_batches
+        on_line = is_line(self.inputs)
+        draw = self._mixtures.equal_mass if on_line else self._mixtures.draw
+        points, mixture = draw(components, n, seed)
+        # Before the runs: its errors then cost none.
+        coarse = None if self.coarse is None else self.coarse(points)
+        values = _responses_at(points, responses, design)
+        batch_sizes: tuple[int, ...] = (n,)
+        if design is None:
+            moving = moving_inputs(self.name, self.inputs, components, points)
+        else:
+            moving = design.moving
+            pairs = zip(design.runs.points, points, strict=True)
+            points = tuple(np.concatenate([a, b]) for a, b in pairs)
+            values = np.concatenate([design.runs.values, values])
+            if design.coarse is not None and coarse is not None:
+                coarse = np.concatenate([design.coarse, coarse])
+            mixture = design.mixture.joined(mixture)
+            batch_sizes = (*design.batch_sizes, n)
+        # The mixture is that of all batches: its density changes at the old points, too.
+        log_g = self._mixtures.log_density(mixture, points)
+        if on_line:
+            blocks = np.arange(len(log_g)) % N_BLOCKS
+        else:  # consecutive points of a Sobol sequence, each of whose stretches is a net
+            blocks = np.concatenate([np.arange(size) * N_BLOCKS // size for size in batch_sizes])
+        runs = Sample(points, values, log_g, blocks)
+        if design is None:
+            grown = Design(
+                runs, mixture, batch_sizes, (), runs, coarse, moving=moving, on_line=on_line
+            )
+        else:
+            grown = replace(
+                design, runs=runs, mixture=mixture, batch_sizes=batch_sizes, coarse=coarse
+            )
+        return self.resampled(grown, components, None)
+
+    def resampled(
+        self, design: Design, components: Sequence[Floats], emulator: DesignEmulator | None
+    ) -> Design:
+        """Return a design whose points support populations: emulated ones, where they are better.
+
+        The surfaces are those of ``emulator``, or selected for these populations.
+        """
+        runs = design.runs
+        # The prior, the populations before, and these.
+        groups = (*design.groups[:1], *design.groups[1:][-1:], tuple(components))
+        design = replace(design.runs_alone(), groups=groups)
+        if not self.options.emulates(self.inputs):
+            return design
+        # 32 populations determine the mixing weight of the emulator.
+        weights = self._weights(runs, spread_over(components, 32))
+        if emulator is None:
+            emulator = fit_emulator(self.options.emulator, runs, weights, design.coarse)
+        else:
+            emulator = emulator.for_populations(weights)
+        if emulator is None:
+            return design
+        # Another prime: no emulated sample shares points with a batch.
+        seed = self.options.random_seed + 104_729 * (1 + design.n_emulated_samples)
+        populations, shares = mixture_of(groups, design.emulated_size)
+        points, mixture = self._mixtures.draw(populations, design.emulated_size, seed, shares)
+        log_g = self._mixtures.log_density(mixture, points)
+        coarse = None
+        if self.coarse is not None and emulator.n_following:
+            coarse = self.coarse(points)
+        emulated = EmulatedPoints(points, coarse)
+        return replace(
+            design,
+            sample=emulator.joined(emulated, log_g, runs),
+            emulated=emulated,
+            emulator=emulator,
+            n_emulated_samples=design.n_emulated_samples + 1,
+        )
+
+    def _weights(self, sample: Sample, components: Sequence[Floats]) -> Floats:
+        """Return weights of a sample's points in populations, (T, n): they sum to one."""
+        logs = self.density.at(components, sample.points)(slice(None))
+        logs -= sample.log_density
+        normalise(logs)
+        return np.where(np.isnan(logs), 1 / logs.shape[1], logs)
+
+    def median_ess(self, sample: Sample, components: Sequence[Floats]) -> float:
+        """Return the median effective sample size of populations at roots, (k, *shape)."""
+        ess = []
+        step = max(1, IN_CACHE // len(sample))
+        for first in range(0, len(components[0]), step):
+            weights = self._weights(sample, [root[first : first + step] for root in components])
+            ess.append(1 / (weights**2).sum(axis=1))
+        return float(np.median(np.concatenate(ess)))
+
+
+def _responses_at(points: Sequence[Floats], responses: Responses, design: Design | None) -> Floats:
+    """Return the responses at points; those known to this or another design are reused."""
+    values = responses.runs.at(points)
+    if values is not None:
+        responses.count_reused(len(values))
+        return values
+    known = None if design is None else Known(design.runs.points, design.runs.values)
+    values = once_each(responses, points, known)
+    responses.runs.stored.append((list(points), values))
+    return values
+
+
+class WeightFunction:
+    """Log weights log p(x given theta) - log g(x) of a design's points, compiled once."""
+
+    def __init__(self, inputs: Inputs, density: PointDensity) -> None:
+        self.inputs = inputs
+        self._density = density
+        self._function: Any = None
+
+    def __call__(self, params: Sequence[Any], design: Design) -> Floats:
+        """Return log weights at roots, shapes (k, *shape) -> (k, n)."""
+        if design.moving:
+            (logs,) = self._compiled(design)(*params, *design.weight_arrays)
+            return np.array(logs)
+        logs = self._density.at(params, design.sample.points)(slice(None))
+        logs -= design.sample.log_density
+        return logs
+
+    def graph(
+        self, params: Sequence[Any], arrays: Sequence[Any], moving: Sequence[int]
+    ) -> TensorVariable:
+        """Return log weights of symbols of the roots and of `Design.weight_arrays`, shape (n,)."""
+        k = len(self.inputs.aleatory)
+        dists, _ = self.inputs.rebuilt(params)
+        averaged = {}
+        for place, i in enumerate(moving):
+            lower, upper = arrays[k + 1 + 2 * place : k + 3 + 2 * place]
+            averaged[i] = partial(averaged_log_density, lower=lower, upper=upper)
+        return log_density(self.inputs, dists, arrays[:k], averaged) - arrays[k]
+
+    def _compiled(self, design: Design) -> Any:
+        """Return the compiled log weights of inputs whose support moves."""
+        if self._function is None:
+            symbols = self.inputs.placeholders()
+            arrays = [
+                pt.tensor(dtype=a.dtype, shape=(None,) * a.ndim) for a in design.weight_arrays
+            ]
+            graph = self.graph(symbols, arrays, design.moving)
+            self._function = compile_batched(symbols, [graph], arrays)
+        return self._function
+
+
+def is_line(inputs: Inputs) -> bool:
+    """Return whether a specimen is one continuous number."""
+    x, *others = inputs.aleatory
+    return not others and x.type.ndim == 0 and x.dtype.startswith("float")
+
+
+def common_rows(first: Sequence[Floats], second: Sequence[Floats]) -> int:
+    """Return how many points two samples have in common at their beginning."""
+    n = min(len(first[0]), len(second[0]))
+    equal = np.ones(n, dtype=bool)
+    for x, y in zip(first, second, strict=True):
+        equal &= (x[:n] == y[:n]).reshape(n, -1).all(axis=1)
+    return n if equal.all() else int(equal.argmin())
