@@ -154,6 +154,17 @@ class Search:
         """Whether gradients jump, so that line searches end in ever smaller steps."""
         return any(n.metric.minimum is Minimum.ABSOLUTE for n in self.evaluator.nodes)
 
+    def refuse_random(self) -> None:
+        """Raise if a method of scipy needs gradients of random draws."""
+        random = [n.name for n in self.evaluator.nodes if n.bound.random]
+        if random and self.method.gradient and isinstance(self.method.method, str):
+            raise TypeError(
+                f"{random[0]}: prb.Fresh draws new responses at every evaluation, so the method "
+                f"{self.method.name} has no gradient to follow; pass epsilon= to prb.sample_smc, "
+                "which then needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
+                "propagation=prb.Reweighted() or prb.Resimulated()"
+            )
+
     def size(self, theta: Floats, scales: Floats) -> float:
         """Return a typical size of the objective; for a user's metric its value at theta."""
         nodes = self.evaluator.nodes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from prbayes.optimize.design_refinement import (
     temporary_samples,
 )
 from prbayes.optimize.objective import Ridge
+from prbayes.optimize.optimum import point_at
 
 # Share of the noise floor that is about the difference of the discrepancy between the fit of the
 # data and the truth; half or twice changes no optimum (docs/constants.md).
@@ -41,6 +43,15 @@ class Rival:
     value: float  # of the objective
     comparable: bool  # whether it is as good as the best up to sampling noise
     better: bool  # whether it is better than the reference
+
+    def record(self, evaluator: Evaluator) -> dict[str, Any]:
+        """Return the rival as `Optimum` has it."""
+        return {
+            "point": point_at(evaluator, self.theta),
+            "discrepancy": self.value,
+            "theta": self.theta,
+            "comparable": self.comparable,
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from prbayes.inference.checks.smoothing_bias import wide_kernels
 from prbayes.inference.resampling import SETS
 from prbayes.model.budgets import explained, kept
 from prbayes.model.coverage import shortcomings
-from prbayes.model.evaluator import Evaluator, has_other_terms, n_design_runs, only_through_prior
+from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
@@ -56,8 +56,8 @@ from prbayes.optimize.design_refinement import (
 from prbayes.optimize.local_optima import Rival, find_rivals
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
 from prbayes.optimize.methods import Method
-from prbayes.optimize.objective import Ridge
-from prbayes.optimize.optimum import Optimum, n_computed, optimum_of, point_at
+from prbayes.optimize.objective import Ridge, initial_scales
+from prbayes.optimize.optimum import Optimum, n_computed, optimum_of
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -297,8 +297,10 @@ class _Problem:
 
     search: Search
     settings: Minimisation
-    n_previous: int  # responses computed before, without those of designs
     advance: Callable[[int, str], None]  # of the progress bar: number of runs, and a note
+    n_previous: int  # responses computed before, without those of designs
+    n_screened: int  # points of the prior that were compared
+    n_approach: int  # evaluations of the area metric that led to the start
     fits: list[Fit] = field(default_factory=list)  # of each step; a spent budget reports the last
 
     @property
@@ -312,26 +314,6 @@ class _Problem:
         return fit
 
 
-@dataclass(frozen=True, eq=False)
-class _Start:
-    """Where a minimisation begins."""
-
-    theta: Floats  # (d,)
-    scales: Floats  # (k,)
-    trace: Trace  # of the area metric, if that led there
-    n_screened: int  # points of the prior that were compared
-
-    @property
-    def details(self) -> str:
-        """A sentence if the area metric led to the start."""
-        if not self.trace.count:
-            return ""
-        return (
-            " At the start hardly any simulated response was near the data: the area metric led "
-            f"from there, in {self.trace.count} evaluations."
-        )
-
-
 def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
     """Minimise as `minimize` does; raise BudgetError if it is spent before the first minimum."""
     if not evaluator.nodes:
@@ -339,7 +321,6 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
     for node in evaluator.nodes:
         node.bound.restart(settings.random_seed)
     clock = time.perf_counter()
-    _refuse_random(evaluator, settings.method)
     search = Search(
         evaluator,
         evaluator.hyperparameters.prior_sd,
@@ -348,18 +329,21 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
         settings.tolerance,
         settings.max_evaluations,
     )
+    search.refuse_random()
     n_previous = evaluator.n_responses - n_design_runs(evaluator)
     with progress("runs") as advance:
-        problem = _Problem(search, settings, n_previous, advance)
-        start = _start(search, settings)
+        scales = initial_scales(evaluator, prior=settings.prior)
+        theta, n_screened = _start(search, settings, scales)
+        theta, trace = approach(search, theta, scales, settings.random_seed, Trace())
+        problem = _Problem(search, settings, advance, n_previous, n_screened, trace.count)
         try:
-            fit, rivals = _optimise(problem, start)
-            optimum = _report(problem, start, fit, rivals)
+            fit, rivals = _optimise(problem, theta, scales, trace)
+            optimum = _report(problem, fit, rivals)
         except BudgetError as spent:
             if not problem.fits:
                 raise
             with unlimited():
-                optimum = _report_stopped(problem, start, problem.fits[-1], str(spent))
+                optimum = _report(problem, problem.fits[-1], [], stopped=str(spent))
     record = replace(
         optimum.search,
         seconds=time.perf_counter() - clock,
@@ -375,9 +359,11 @@ def require_finished(optimum: Optimum) -> Optimum:
     return optimum
 
 
-def _optimise(problem: _Problem, start: _Start) -> tuple[Fit, list[Rival]]:
+def _optimise(
+    problem: _Problem, theta: Floats, scales: Floats, trace: Trace
+) -> tuple[Fit, list[Rival]]:
     """Minimise on designs that grow until they support the minimum, then compare local optima."""
-    fit = _fit(problem, start.theta, start.scales, start.trace)
+    fit = _fit(problem, theta, scales, trace)
     if problem.settings.refine:
         for round_ in count():
             fit, restart = refine_designs(
@@ -392,69 +378,16 @@ def _optimise(problem: _Problem, start: _Start) -> tuple[Fit, list[Rival]]:
     return problem.keep(_settle(problem, problem.keep(fit))), rivals
 
 
-# -- start -----------------------------------------------------------------------------------------
-
-
-def _refuse_random(evaluator: Evaluator, method: Method) -> None:
-    """Raise if a method of scipy needs gradients of random draws."""
-    random = [n.name for n in evaluator.nodes if n.bound.random]
-    if random and method.gradient and isinstance(method.method, str):
-        raise TypeError(
-            f"{random[0]}: prb.Fresh draws new responses at every evaluation, so the method "
-            f"{method.name} has no gradient to follow; pass epsilon= to prb.sample_smc, which then "
-            "needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
-            "propagation=prb.Reweighted() or prb.Resimulated()"
-        )
-
-
-def _start(search: Search, settings: Minimisation) -> _Start:
-    """Return a start where simulated responses overlap with the data."""
-    evaluator, seed = search.evaluator, settings.random_seed
-    hyperparameters = evaluator.hyperparameters
-    scales = np.ones(1)
-    is_log_density = _require_epsilons(evaluator, prior=settings.prior)
-    if len(evaluator.nodes) > 1 or is_log_density:
-        sizes = np.array([n.target.scale for n in evaluator.nodes])
-        scales = np.where(np.isnan(evaluator.epsilon), sizes, evaluator.epsilon)
-    theta, n_screened = hyperparameters.initial, 0
+def _start(search: Search, settings: Minimisation, scales: Floats) -> tuple[Floats, int]:
+    """Return a starting point, and the number of points of the prior that were compared."""
+    hyperparameters = search.evaluator.hyperparameters
     if settings.start is not None:
-        theta = hyperparameters.unconstrained(settings.start)
-    elif not evaluator.responses_per_theta:
-        points = hyperparameters.prior_points(THETAS, seed)
-        candidates = np.concatenate([theta[None], points])
-        theta, n_screened = search.best_of(candidates, scales), len(candidates)
-    theta, trace = approach(search, theta, scales, seed, Trace())
-    return _Start(theta, scales, trace, n_screened)
-
-
-def _require_epsilons(evaluator: Evaluator, *, prior: bool) -> bool:
-    """Return whether log-densities are added to discrepancies; raise without an epsilon of each."""
-    if prior:
-        terms = "minus the log prior (prior=True)"
-    elif _has_varying_terms(evaluator):
-        terms = "other likelihood terms or potentials"
-    else:
-        return False
-    unset = [node.name for node in evaluator.nodes if np.isnan(node.epsilon_value)]
-    if unset:
-        raise ValueError(
-            f"prb.minimize: got {terms} beside simulators without epsilon, {unset}, expected an "
-            "epsilon of each, without which a discrepancy has no weight against a log-density; "
-            "pass epsilon= to prb.Simulator, or calibrate one on the simulators alone, in a model "
-            "without other terms and with prior=False: "
-            "prb.set_epsilon(model, dict(prb.calibrate_epsilon(prb.minimize(alone))))"
-        )
-    return True
-
-
-def _has_varying_terms(evaluator: Evaluator) -> bool:
-    """Return whether other terms do more than exclude hyperparameters."""
-    if not has_other_terms(evaluator):
-        return False
-    # A power of two, as Sobol points are then balanced.
-    values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))
-    finite = values[np.isfinite(values)]
-    return finite.size > 0 and bool(np.ptp(finite) > 0)
+        return hyperparameters.unconstrained(settings.start), 0
+    if search.evaluator.responses_per_theta:
+        return hyperparameters.initial, 0
+    points = hyperparameters.prior_points(THETAS, settings.random_seed)
+    candidates = np.concatenate([hyperparameters.initial[None], points])
+    return search.best_of(candidates, scales), len(candidates)
 
 
 # -- minimisation ----------------------------------------------------------------------------------
@@ -558,12 +491,15 @@ def _settle(problem: _Problem, fit: Fit) -> Fit:
 # -- report ----------------------------------------------------------------------------------------
 
 
-def _report(problem: _Problem, start: _Start, fit: Fit, rivals: list[Rival]) -> Optimum:
-    """Return the optimum of the last fit, and log its findings."""
+def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = "") -> Optimum:
+    """Return the optimum of the last fit, and log its findings.
+
+    No response is computed if a budget has ``stopped`` the minimisation.
+    """
     evaluator, search = problem.evaluator, problem.search
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()
-    if fit.sampling is not None:
+    if fit.sampling is not None and not stopped:
         at_edge = elements_at_edge(
             evaluator,
             fit.theta,
@@ -578,12 +514,22 @@ def _report(problem: _Problem, start: _Start, fit: Fit, rivals: list[Rival]) -> 
     optimum = optimum_of(
         search,
         fit,
-        details=start.details + _details(search, fit, at_edge),
-        n_screened=start.n_screened,
+        details=_details(problem, fit, at_edge, stopped),
+        n_screened=problem.n_screened,
         n_previous=problem.n_previous,
+        stopped=stopped,
         at_edge=at_edge,
         at_jump=at_jump,
     )
+    if stopped:
+        finding = Finding(
+            "budget-spent",
+            f"{stopped} before the minimisation was finished, so that this is no answer yet; "
+            f"{kept(evaluator.model)}; call prb.minimize with a larger budget, on a model that is "
+            "built again, to go on.",
+            "expensive.md#a-night-is-not-enough",
+        )
+        return replace(optimum, findings=report(finding))
     refuse_lost(evaluator, {name: each["lost_mass"] for name, each in optimum.support.items()})
     findings = report(
         *breakdown(at_edge, at_jump),
@@ -592,27 +538,28 @@ def _report(problem: _Problem, start: _Start, fit: Fit, rivals: list[Rival]) -> 
         *wide_kernels(evaluator, fit.theta, fit.scales, fit.local),
         *caveats(evaluator, fit.sampling, rivals, fit.design_error),
     )
-    records = tuple(
-        {
-            "point": point_at(evaluator, rival.theta),
-            "discrepancy": rival.value,
-            "theta": rival.theta,
-            "comparable": rival.comparable,
-        }
-        for rival in rivals
-    )
+    records = tuple(rival.record(evaluator) for rival in rivals)
     return replace(optimum, design_error=fit.design_error, rivals=records, findings=findings)
 
 
-def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> str:
-    """Return sentences about edges, designs and directions that are not identified."""
-    evaluator = search.evaluator
+def _details(problem: _Problem, fit: Fit, at_edge: tuple[str, ...], stopped: str) -> str:
+    """Return sentences about start, edges, designs and directions that are not identified."""
+    evaluator = problem.evaluator
+    sentences = []
+    if problem.n_approach:
+        sentences.append(
+            "At the start hardly any simulated response was near the data: the area metric led "
+            f"from there, in {problem.n_approach} evaluations."
+        )
+    if stopped:
+        return " ".join([*sentences, f"{stopped} before the minimisation was finished."])
+    if at_edge:
+        sentences.append(f"{', '.join(at_edge)} ran to the edge of the support.")
     designs = [
         bound.design.summary(name)
         for name, bound in evaluator.reweighted.items()
         if bound.design.is_emulated
     ]
-    sentences = [f"{', '.join(at_edge)} ran to the edge of the support."] if at_edge else []
     sentences += designs
     if designs and np.isfinite(fit.design_error):
         sentences.append(
@@ -624,29 +571,9 @@ def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> str:
         )
     names = np.array(evaluator.hyperparameters.readable_names)
     indirect = names[only_through_prior(evaluator)]
-    if indirect.size and not search.prior:
+    if indirect.size and not problem.search.prior:
         sentences.append(
             f"The data inform {', '.join(indirect)} only through other hyperparameters and the "
             "prior, which is not minimised: their values are arbitrary; use prb.sample_smc."
         )
-    return "".join(f" {sentence}" for sentence in sentences)
-
-
-def _report_stopped(problem: _Problem, start: _Start, fit: Fit, reason: str) -> Optimum:
-    """Return the optimum of the last fit before a budget was spent; compute no response."""
-    optimum = optimum_of(
-        problem.search,
-        fit,
-        details=f"{start.details} {reason} before the minimisation was finished.",
-        n_screened=start.n_screened,
-        n_previous=problem.n_previous,
-        stopped=reason,
-    )
-    finding = Finding(
-        "budget-spent",
-        f"{reason} before the minimisation was finished, so that this is no answer yet; "
-        f"{kept(problem.evaluator.model)}; call prb.minimize with a larger budget, on a model that "
-        "is built again, to go on.",
-        "expensive.md#a-night-is-not-enough",
-    )
-    return replace(optimum, findings=report(finding))
+    return " ".join(sentences)

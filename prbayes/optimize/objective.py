@@ -1,4 +1,4 @@
-"""Standardised objective of one minimisation, which records its evaluations."""
+"""Objective of a minimisation: scales, penalty, standardised units, record of evaluations."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._validate import Floats
+from prbayes.model.evaluator import Evaluator, has_other_terms
 
 # Theta (d,) -> value, gradient (d,) or None, number of evaluations.
 type Function = Callable[[Floats], tuple[float, Floats | None, int]]
@@ -111,3 +112,39 @@ class Objective:
             return self.center
         values = np.nan_to_num(self.values, nan=np.inf, posinf=np.inf)
         return self.thetas[int(np.argmin(values))]
+
+
+def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
+    """Return the first divisors of the discrepancies, (k,): epsilons, or typical sizes.
+
+    One for a simulator alone. Raises ValueError if log-densities are added to discrepancies
+    without an epsilon of each.
+    """
+    terms = ""
+    if prior:
+        terms = "minus the log prior (prior=True)"
+    elif _has_varying_terms(evaluator):
+        terms = "other likelihood terms or potentials"
+    elif len(evaluator.nodes) == 1:
+        return np.ones(1)
+    unset = [node.name for node in evaluator.nodes if np.isnan(node.epsilon_value)]
+    if terms and unset:
+        raise ValueError(
+            f"prb.minimize: got {terms} beside simulators without epsilon, {unset}, expected an "
+            "epsilon of each, without which a discrepancy has no weight against a log-density; "
+            "pass epsilon= to prb.Simulator, or calibrate one on the simulators alone, in a model "
+            "without other terms and with prior=False: "
+            "prb.set_epsilon(model, dict(prb.calibrate_epsilon(prb.minimize(alone))))"
+        )
+    sizes = np.array([node.target.scale for node in evaluator.nodes])
+    return np.where(np.isnan(evaluator.epsilon), sizes, evaluator.epsilon)
+
+
+def _has_varying_terms(evaluator: Evaluator) -> bool:
+    """Return whether other terms do more than exclude hyperparameters."""
+    if not has_other_terms(evaluator):
+        return False
+    # A power of two, as Sobol points are then balanced.
+    values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))
+    finite = values[np.isfinite(values)]
+    return finite.size > 0 and bool(np.ptp(finite) > 0)

@@ -361,7 +361,7 @@ def optimum_of(
         support=support,
         search=SearchRecord(
             result=result,
-            details=f"{run.details}{details}".strip(),
+            details=f"{run.details} {details}".strip(),
             n_evaluations=run.trace.count,
             n_screened=n_screened,
             trace=trace_arrays(run.trace, theta.size),
