@@ -23,7 +23,7 @@ from benchmarks import record
 from benchmarks.metrics import BY_NAME
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.sample import draw_posterior
-from prbayes.posterior.smc import Sampling
+from prbayes.posterior.smc import SamplingSettings
 
 SIZE = 50
 SHARE = 0.05
@@ -47,7 +47,9 @@ def evaluator_of(metric: str) -> Evaluator:
 
 def posterior(evaluator: Evaluator, data: Any) -> Any:
     """Return means and standard deviations of mu and sigma."""
-    tree = draw_posterior(evaluator.observing({"y": data}), Sampling(chains=4, random_seed=1))
+    tree = draw_posterior(
+        evaluator.observing({"y": data}), SamplingSettings(chains=4, random_seed=1)
+    )
     draws = tree["posterior"].dataset
     return np.array([[float(draws[n].mean()), float(draws[n].std())] for n in ("mu", "sigma")])
 

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from prbayes.model.specimen_preparation import prepared
+
 OF_EMULATOR = 10  # products whose specimens place the runs
 BLOCK = 50  # products whose points are drawn at once
 DRAWS = 256
@@ -36,7 +38,7 @@ def fleet(products: int, size: int = 20) -> dict[str, Any]:
     observed = np.concatenate(data[:OF_EMULATOR])
     evaluator = Evaluator.of(likelihood_model(Task(problem, observed, response, 0)))
     (likelihood,) = evaluator.likelihoods
-    emulation, coordinates = likelihood.emulation, likelihood.coordinates
+    emulation, coordinates = prepared(likelihood).emulation, likelihood.coordinates
     fitted = time.process_time()
     x, log_a = [], []
     for first in range(0, products, BLOCK):

@@ -283,13 +283,13 @@ class Cell:
         """Calibrate one data set; return estimate, posterior and what it cost."""
         from prbayes.optimize.minimize import Minimisation, find_optimum
         from prbayes.posterior.sample import draw_posterior
-        from prbayes.posterior.smc import Sampling
+        from prbayes.posterior.smc import SamplingSettings
 
         evaluator = self._observing(method, self.problem.response(x))
         free = {rv.name for rv in evaluator.model.free_RVs}
         truth = {k: value[0] for k, value in self._values_of_truth().items() if k in free}
         optimum = find_optimum(evaluator, Minimisation(starts=0, refine=False, start=truth))
-        asked = Sampling(draws=1000, chains=4, optimum=optimum)
+        asked = SamplingSettings(draws=1000, chains=4, optimum=optimum)
         tree = draw_posterior(evaluator, asked)
         draws = np.asarray(tree["calibration"]["theta"]).reshape(-1, evaluator.hyperparameters.size)
         return self._row(evaluator, optimum.theta, draws, len(draws))

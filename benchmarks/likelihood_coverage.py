@@ -37,7 +37,9 @@ from benchmarks.scoreboard.problem import (
     truncated,
 )
 from benchmarks.scoreboard.problem import Problem as Population
-from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.base import DesignError
 
 OUT = record.RESULTS / "likelihood_coverage.json"
@@ -333,10 +335,10 @@ def data_set(problem: Problem, likelihood: SpecimenLikelihood, number: int) -> d
     # Coordinates are those of the prior, whatever the data.
     other.__dict__["coordinates"] = likelihood.coordinates
     try:
-        points = other.points
+        points = prepared(other).points
     except DesignError as error:
         return row | {"error": str(error)}
-    row["runs"] = len(other.emulation.z)
+    row["runs"] = len(prepared(other).emulation.z)
     x = np.concatenate(
         [a.reshape(*a.shape[:2], -1) for a in likelihood.coordinates.inputs(points.z)], axis=2
     )

@@ -23,8 +23,10 @@ from benchmarks import record
 from benchmarks.likelihood_coverage import PROBLEMS, Problem, likelihood_of, thetas_of
 from benchmarks.scoreboard.problem import Input, normal, truncated
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.population_draws import Populations
-from prbayes.model.specimen_likelihood import SpecimenLikelihood
+from prbayes.model.specimen_likelihood import arrays
+from prbayes.model.specimen_preparation import prepared
 from prbayes.results.likelihood_checks import check_draws
 
 OUT = record.RESULTS / "likelihood_guards.json"
@@ -50,16 +52,17 @@ def observe(likelihood: SpecimenLikelihood, base: SpecimenLikelihood, y: Any) ->
 
     Its compiled graphs stay.
     """
-    points, log_a = likelihood.arrays
+    points, log_a = arrays(likelihood)
     other = base.observing({base.name: y})
     vars(other)["coordinates"] = base.coordinates  # those of the prior, whatever the data
-    prepared = other._prepared
-    new_points, new_log_a = other.arrays
+    preparation = prepared(other)
+    new_points, new_log_a = arrays(other)
     for old, new in zip((*points, log_a), (*new_points, new_log_a), strict=True):
         old.set_value(new.get_value())
     # The observed values stay, as the model has them: others would be other points.
-    vars(likelihood).update(stacked=other.stacked, _prepared=prepared)
-    return [finding.code for finding in other.findings]
+    vars(likelihood).update(stacked=other.stacked)
+    likelihood.cache["preparation"] = preparation
+    return [finding.code for finding in prepared(other).findings]
 
 
 def readings(problem: Problem, number: int) -> Any:
@@ -84,7 +87,7 @@ def before_the_fit(
 def of_draws(evaluator: Evaluator, populations: Populations) -> dict[str, Any]:
     """Return the codes of the findings of posterior draws, and the tests that were not run."""
     (likelihood,) = evaluator.likelihoods
-    points = likelihood.points
+    points = prepared(likelihood).points
     draws = populations.posterior(points.z, points.log_a).thetas
     result = xr.DataTree.from_dict({"posterior": xr.Dataset()})
     checked = check_draws(evaluator, result, draws.reshape(2, -1, evaluator.hyperparameters.size))
@@ -126,7 +129,7 @@ def main() -> None:
         model, _ = likelihood_of(problem)
         evaluator = Evaluator.of(model)
         (likelihood,) = evaluator.likelihoods
-        populations = likelihood.populations
+        populations = Populations(likelihood)
         rows = found["rows"].setdefault(name, [])
         for number in range(arguments.data_sets):
             if number < len(rows) and (number >= arguments.tested or "codes" in rows[number]):

@@ -25,7 +25,8 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.responses import RESPONSES
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.population_draws import PopulationDraws
+from prbayes.model.population_draws import PopulationDraws, Populations
+from prbayes.model.specimen_preparation import Runs, prepared
 from prbayes.propagation.fibre import ReferencePopulation
 from prbayes.propagation.fibre_points import FibreProposals
 from prbayes.propagation.specimen_points import DifferencedResponse
@@ -64,20 +65,20 @@ def measured(seed: int, sets: int = SETS, points: int = POINTS) -> dict[str, Any
     thetas = evaluator.hyperparameters.thetas_of(
         [idata.posterior[rv.name].values.reshape(-1) for rv in model.free_RVs]
     )
-    populations = likelihood.populations
+    populations = Populations(likelihood)
     reference = ReferencePopulation.from_sample(
-        PopulationDraws(populations, thetas[::8], N).specimens()
+        PopulationDraws(populations, thetas[::8]).specimens()
     )
     exact = replace(
-        likelihood.emulation,
-        surface=DifferencedResponse(likelihood.run),
-        y=np.zeros_like(likelihood.emulation.y),
+        prepared(likelihood).emulation,
+        surface=DifferencedResponse(Runs(likelihood)),
+        y=np.zeros_like(prepared(likelihood).emulation.y),
     )
     logs = []
     for s in range(sets):
         drawn = FibreProposals.fitted(exact, likelihood.readings, reference, 700 + s).draw(points)
         logs.append(populations.log_likelihoods(thetas, drawn.z, drawn.log_a).sum(axis=1))
-    stored = likelihood.points
+    stored = prepared(likelihood).points
     own = populations.log_likelihoods(thetas, stored.z, stored.log_a).sum(axis=1)
     log_weights = logsumexp(logs, axis=0) - own
     weights = np.exp(log_weights - logsumexp(log_weights))
@@ -86,7 +87,7 @@ def measured(seed: int, sets: int = SETS, points: int = POINTS) -> dict[str, Any
     bias = (thetas.mean(axis=0) - mean) / sd
     return {
         "data": seed,
-        "runs": len(likelihood.emulation.z),
+        "runs": len(prepared(likelihood).emulation.z),
         "points": stored.z.shape[1],
         "sampler": idata.posterior.attrs["sampler"],
         "seconds": round(seconds, 1),

@@ -206,7 +206,7 @@ def analyse(evaluator: Any, problem: Problem, seed: list[int]) -> dict[str, Any]
     """Draw a truth and its data, calibrate them, and return the posterior's place and width."""
     from prbayes.optimize.minimize import Minimisation, find_optimum
     from prbayes.posterior.sample import draw_posterior
-    from prbayes.posterior.smc import Sampling
+    from prbayes.posterior.smc import SamplingSettings
 
     rng = np.random.default_rng(seed)
     truth = evaluator.hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
@@ -220,7 +220,7 @@ def analyse(evaluator: Any, problem: Problem, seed: list[int]) -> dict[str, Any]
     begun = time.process_time()
     optimum = find_optimum(ev, Minimisation())
     middle = time.process_time()
-    asked = Sampling(draws=DRAWS, chains=4, optimum=optimum)
+    asked = SamplingSettings(draws=DRAWS, chains=4, optimum=optimum)
     tree = draw_posterior(ev, asked)
     ended = time.process_time()
     thetas = np.asarray(tree["calibration"]["theta"]).reshape(-1, ev.size)

@@ -32,7 +32,9 @@ from benchmarks.likelihood_coverage import (
     thetas_of,
 )
 from benchmarks.scoreboard.problem import Input, Prior, half_normal, normal, truncated
-from prbayes.model.specimen_likelihood import SpecimenLikelihood
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.specimen_likelihood import log_likelihood_graph
+from prbayes.model.specimen_preparation import prepared
 
 OUT = record.RESULTS / "readings_coverage.json"
 SIZE = 20
@@ -294,7 +296,7 @@ def _blocks(theta: Any, size: int = 2000) -> int:
 
 def log_likelihood(likelihood: SpecimenLikelihood) -> Functions:
     """Return the log-likelihood (S,) of populations (S, q) from the points, in NumPy."""
-    points = likelihood.points
+    points = prepared(likelihood).points
     x = likelihood.coordinates.inputs(points.z)[0]
     (measurement,) = likelihood.measurements
     estimated = not likelihood.error_is_known
@@ -308,7 +310,7 @@ def log_likelihood(likelihood: SpecimenLikelihood) -> Functions:
         terms = log_a - 0.5 * ((x - mu) / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2 * np.pi)
         if estimated:
             sd = theta[:, 2, None, None, None] * size
-            variance = likelihood.emulation.error**2 + sd**2
+            variance = prepared(likelihood).emulation.error ** 2 + sd**2
             terms = terms + likelihood.readings.symbolic_log_density(outputs, variance, np)
         values = logsumexp(terms, axis=2)
         if "gross_errors" in measurement.extras:
@@ -328,7 +330,7 @@ def check(case: Case, likelihood: SpecimenLikelihood, function: Functions, theta
     """Raise if the log-likelihood in NumPy differs from the graph of the package."""
     values = dict(zip(case.problem.priors, theta, strict=True))
     params = {v: pt.as_tensor(values[str(v.name)]) for v in likelihood.variables()}
-    expected = likelihood.log_likelihood(params).sum().eval()
+    expected = log_likelihood_graph(likelihood, params).sum().eval()
     np.testing.assert_allclose(function(theta[None]), expected, rtol=1e-8)
 
 
@@ -350,10 +352,10 @@ def data_set(case: Case, likelihood: SpecimenLikelihood, number: int) -> dict[st
     # Coordinates are those of the prior, whatever the data.
     other.__dict__["coordinates"] = likelihood.coordinates
     try:
-        row["points"] = other.points.z.shape[1]
+        row["points"] = prepared(other).points.z.shape[1]
     except prb.propagation.DesignError as error:
         return row | {"error": str(error)}
-    row["runs"] = len(other.emulation.z)
+    row["runs"] = len(prepared(other).emulation.z)
     functions = {"prbayes": log_likelihood(other), "exact": exact_log_likelihood(case, y)}
     if number == 0:
         check(case, other, functions["prbayes"], truth)

@@ -51,7 +51,7 @@ from prbayes.posterior.estimate_likelihood import (
 )
 from prbayes.posterior.importance import importance_sample, laplace
 from prbayes.posterior.refit_likelihood import RefitLikelihood, refit_likelihood
-from prbayes.posterior.sample import _modes
+from prbayes.posterior.sample import modes_of
 from prbayes.posterior.target import Target
 
 OUT = record.RESULTS / "saddlepoint.json"
@@ -236,7 +236,7 @@ def estimate_log_likelihood(y: Any) -> Callable[[Any, Any], Any]:
 
 def posterior(likelihood: Likelihood, starts: Any = None) -> Target:
     """Return the posterior of a likelihood, which begins at its point by default."""
-    places = (likelihood.point,) if starts is None else tuple(starts)
+    places = likelihood.point[None] if starts is None else np.array(starts)
     return Target(likelihood.evaluator, likelihood.log_likelihood, places, likelihood.scale)
 
 
@@ -336,7 +336,7 @@ def modes_row(name: str, size: int, number: int) -> dict[str, Any]:
     optimum = prb.minimize(model=model, progressbar=False)
     likelihood = refit_likelihood(optimum.evaluator, optimum)
     target = posterior(likelihood, likelihood.starts)
-    sample = importance_sample(target.log_posterior, _modes(target) or [], DRAWS, seed=0)
+    sample = importance_sample(target.log_posterior, modes_of(target) or [], DRAWS, seed=0)
     mu = likelihood.evaluator.hyperparameters.constrained(sample.draws)["mu"]
     means, log_sds = np.linspace(-3, 5, 401)[:, None, None], np.linspace(-2, 1, 150)[None, :, None]
     root, sds = np.sqrt(y), np.exp(log_sds)

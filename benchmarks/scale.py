@@ -139,7 +139,7 @@ def tasks(size: int) -> dict[str, float]:
     )
     with cluster, distributed.Client(cluster) as client:
         executor = _Untold(client.get_executor(pure=False))
-        how = chunks.Calling("y", function, executor)  # type: ignore[arg-type]
+        how = chunks.CallSettings("y", function, executor)  # type: ignore[arg-type]
         points = call.Points(list(numbers.T), [True] * 5)
         chunks.respond(how, points.at(np.arange(10)), chunks.Tally())  # the workers are up
         chunks.chunk_size = lambda *_: 1

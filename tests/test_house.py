@@ -529,13 +529,16 @@ INNER = {
     },
     "model.simulator": {"pytensor.graph.basic.Variable", "pytensor.tensor.variable.TensorVariable"},
     "model.specimen_likelihood": {
+        "pytensor.graph.replace.graph_replace",
+        "pytensor.graph.replace.vectorize_graph",
+        "pytensor.tensor.variable.TensorVariable",
+    },
+    "model.specimen_variable": {
         "pymc.logprob.abstract.ValuedRV",
         "pymc.logprob.abstract._logprob",
-        "pymc.logprob.utils.CheckParameterValue",
         "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Constant",
         "pytensor.graph.replace.graph_replace",
-        "pytensor.graph.replace.vectorize_graph",
         "pytensor.graph.traversal.ancestors",
         "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",
@@ -546,7 +549,7 @@ INNER = {
         "pymc.smc.kernels.SMC_KERNEL",
         "pymc.smc.kernels.systematic_resampling",
     },
-    "posterior.trees": {"arviz_stats.ecdf_utils.ecdf_pit"},
+    "posterior.sbc": {"arviz_stats.ecdf_utils.ecdf_pit"},
     "propagation.base": {
         "pytensor.graph.replace.graph_replace",
         "pytensor.tensor.variable.TensorVariable",

@@ -17,6 +17,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes.model.evaluator import specimen_log_likelihoods, specimen_params
+from prbayes.model.specimen_likelihood import arrays
 from prbayes.optimize.specimen_refits import other_specimens, specimen_pool, specimen_refits
 from prbayes.results import likelihood_checks as _specimen_checks
 from prbayes.results.likelihood_checks import influence, separate_modes
@@ -288,7 +289,7 @@ def test_scores_of_the_population_test_are_those_of_the_inputs(
 ) -> None:
     evaluator = optimum.evaluator
     (likelihood,) = evaluator.likelihoods
-    (points,), log_a = likelihood.arrays
+    (points,), log_a = arrays(likelihood)
     data = [([points.get_value()], log_a.get_value())]
     scores = [_specimen_checks._Scores.of(likelihood.inputs)]
     ((z, weights),) = _specimen_checks._points(evaluator, scores, optimum.theta, data)

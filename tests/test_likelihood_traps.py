@@ -24,7 +24,9 @@ from prbayes.inference.checks.population_test import population_statistics, popu
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.data_checks import data_findings
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
-from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.specimen_points import PointOptions
 from prbayes.response.failures import ResponseError
@@ -120,7 +122,7 @@ def outcome(monkeypatch: pytest.MonkeyPatch) -> Callable[[pm.Model], list[str]]:
     def run(model: pm.Model, *, optimum: bool) -> list[str]:
         codes.clear()
         try:
-            _ = likelihood_of(model).points
+            _ = prepared(likelihood_of(model)).points
             if optimum:
                 prb.minimize(model, progressbar=False, starts=1)
         except tuple(BAD) as error:
@@ -334,9 +336,11 @@ def test_errors_come_before_further_runs() -> None:
         return line(x)
 
     with pytest.raises(DesignError, match="check the units"):
-        _ = likelihood_of(
-            model_of(counted, normal_input, 1000 * line(sample(np.random.default_rng(0))))
-        ).points
+        prepared(
+            likelihood_of(
+                model_of(counted, normal_input, 1000 * line(sample(np.random.default_rng(0))))
+            )
+        )
     assert sum(runs) <= 64 + 2  # two single ones: a specimen by itself has the same response
 
 
@@ -476,7 +480,7 @@ def folded_shift(seed: int, starts: int) -> tuple[float, int]:
 
     bounds = np.array([[-1.1, np.log(0.2)], [1.1, np.log(1.2)]])
     shifted = shift(model, *over_box(bounds), exact)
-    return shifted, int(likelihood.points.n_roots.sum())
+    return shifted, int(prepared(likelihood).points.n_roots.sum())
 
 
 @pytest.mark.long
@@ -488,7 +492,7 @@ def test_a_start_in_each_basin_finds_nearly_all_roots() -> None:
     _, count = folded_shift(1, 1)
     assert 90 <= count < 100
     straight = model_of(line, normal_input, line(sample(np.random.default_rng(0))))
-    points = with_few_starts(straight, 1).points
+    points = prepared(with_few_starts(straight, 1)).points
     np.testing.assert_array_equal(points.n_roots, 1)
 
 
@@ -526,7 +530,7 @@ def test_a_mirror_root_that_is_nearly_as_good() -> None:
     # Without the third output both roots are kept.
     y = frame.data(20, 0)[:, :2]
     model = model_of(lambda a, b: frame_response(a, b)[..., :2], frame_inputs, y)
-    assert np.mean(likelihood_of(model).points.n_roots == 2) >= 0.9
+    assert np.mean(prepared(likelihood_of(model)).points.n_roots == 2) >= 0.9
 
 
 @pytest.mark.slow
@@ -829,12 +833,12 @@ def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
     data = [line(sample(np.random.default_rng([seed, 16]))) for seed in range(200)]
     # One model, whose runs serve all data sets.
     base = likelihood_of(model_of(line, normal_input, data[0]))
-    _ = base.points
-    flagged = [bool(base.observing({base.name: y}).findings) for y in data]
+    _ = prepared(base).points
+    flagged = [bool(prepared(base.observing({base.name: y})).findings) for y in data]
     assert np.mean(flagged) <= 0.07
 
 
 def test_both_roots_beside_an_output_with_a_large_reading_error() -> None:
     observed = frame.data(20, 0)
     model = model_of(frame_response, frame_inputs, observed, error=[0.002, 0.002, 0.2])
-    assert (likelihood_of(model).points.n_roots == 2).all()
+    assert (prepared(likelihood_of(model)).points.n_roots == 2).all()

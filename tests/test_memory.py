@@ -19,7 +19,9 @@ import prbayes as prb
 from prbayes.metrics.density import twice_silverman
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_likelihood import arrays
+from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_variable import specimen_likelihoods
 
 MIB = 1 << 20
 GROWTH = """
@@ -171,7 +173,7 @@ def minimize_by_specimen(made: list[pm.Model] = []) -> None:  # noqa: B006 (one 
 
 def build_by_specimen() -> None:
     model = by_specimen()
-    specimen_likelihoods(model)[model["y"]].arrays  # noqa: B018 (draws the points)
+    arrays(specimen_likelihoods(model)[model["y"]])  # draws the points
 
 
 @pytest.mark.long
@@ -180,7 +182,7 @@ def test_points_go_with_their_model_and_stay_with_what_was_compiled() -> None:
     prb.minimize(model, progressbar=False)
     log_density = model.compile_logp()
     (likelihood,) = specimen_likelihoods(model).values()
-    points = weakref.ref(likelihood.points)
+    points = weakref.ref(prepared(likelihood).points)
     start = model.initial_point()
     del model, likelihood
     gc.collect()
@@ -196,10 +198,12 @@ def test_shared_variables_of_points_go_with_their_optimum() -> None:
     model = by_specimen()
     prb.minimize(model, progressbar=False)
     (likelihood,) = specimen_likelihoods(model).values()
-    arrays = [weakref.ref(array) for array in (*likelihood.arrays[0], likelihood.arrays[1])]
+    points, log_a = arrays(likelihood)
+    references = [weakref.ref(array) for array in (*points, log_a)]
+    del points, log_a
     del model, likelihood
     gc.collect()
-    assert [array() for array in arrays] == [None, None]
+    assert [array() for array in references] == [None, None]
 
 
 @pytest.mark.long
@@ -210,7 +214,7 @@ def test_points_of_other_data_replace_those_before() -> None:
         prb.Simulator("y", line, x, observed=data)
     prb.minimize(model, progressbar=False)
     (likelihood,) = specimen_likelihoods(model).values()
-    before = weakref.ref(likelihood.points)
+    before = weakref.ref(prepared(likelihood).points)
     del likelihood
     with model:
         pm.set_data({"data": OBSERVED + 0.1})
@@ -222,7 +226,7 @@ def test_points_of_other_data_replace_those_before() -> None:
 def test_points_of_a_model_that_was_never_compiled_go() -> None:
     model = by_specimen()
     (likelihood,) = specimen_likelihoods(model).values()
-    points = weakref.ref(likelihood.points)
+    points = weakref.ref(prepared(likelihood).points)
     del model, likelihood
     gc.collect()
     assert points() is None

@@ -22,7 +22,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=120)
     monkeypatch.setattr(prbayes._progress, "CONSOLE", console)
-    monkeypatch.setattr("prbayes.posterior.chains.CONSOLE", console)
+    monkeypatch.setattr("prbayes.posterior.smc.CONSOLE", console)
     monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.01)
     return text
 

@@ -30,7 +30,7 @@ from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.groups import refuse_groups
 from prbayes.response.inputs import Inputs, read_inputs
-from prbayes.response.outputs import Outputs, lacking
+from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses
 from prbayes.results.predict import (
     known_outputs,
@@ -222,7 +222,7 @@ class ResponseSample:
         else:
             self.design.refuse_unsupported(self.responses.name, roots)
         _, weights = self.design.populations(roots)
-        lost = float(np.nanmedian(weights[:, lacking(self.outputs)].sum(axis=1)))
+        lost = float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
         if lost > self.design.max_lost:
             raise DesignError(
                 f"{self.responses.name}: lost mass: got {lost:.1%} of a population's weight on "

@@ -29,31 +29,15 @@ from prbayes.numerics.threads import one_thread
 
 @dataclass(frozen=True, eq=False)
 class Interpolant:
-    """A smooth surface through the outputs of runs.
+    """A smooth surface through the outputs of runs."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (n, d)
-        Points of the runs.
-    weights : ndarray, shape (n, m)
-        Of the radial functions.
-    coefficients : ndarray, shape (terms, m)
-        Of the polynomial.
-    center, half_width : ndarray, shape (d,)
-        Of the box in which the polynomial's variables are scaled to [-1, 1].
-    powers : ndarray, shape (terms, d)
-        Degrees of the Legendre polynomials of each term.
-    left_out : ndarray, shape (n, m)
-        Error at each run of the interpolant of all others.
-    """
-
-    z: Floats
-    weights: Floats
-    coefficients: Floats
-    center: Floats
-    half_width: Floats
-    powers: NDArray[np.intp]
-    left_out: Floats
+    z: Floats  # (n, d): points of the runs
+    weights: Floats  # (n, m): of the radial functions
+    coefficients: Floats  # (terms, m): of the polynomial
+    center: Floats  # (d,): of the box in which variables are scaled to [-1, 1]
+    half_width: Floats  # (d,)
+    powers: NDArray[np.intp]  # (terms, d): degrees of the Legendre polynomials of each term
+    left_out: Floats  # (n, m): error at each run of the interpolant of all others
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
@@ -192,10 +176,6 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
         Outputs, finite.
     near : ndarray of bool, shape (n,), optional
         Runs whose left-out errors select the degree; all by default.
-
-    Returns
-    -------
-    Interpolant
 
     Raises
     ------

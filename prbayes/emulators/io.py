@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from os import PathLike
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -15,8 +15,8 @@ from prbayes.emulators.cross_validation import CrossValidation
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
-from prbayes.response.failures import Abort, OnFailure, Replace
-from prbayes.response.outputs import Outputs, outputs_of_keys
+from prbayes.response.failures import Abort, Replace
+from prbayes.response.outputs import outputs_of_keys
 from prbayes.response.store import StoreError
 
 _SHIPPED = (RadialBasis, Polynomial, GaussianProcess)
@@ -41,46 +41,40 @@ def shipped(kind: str, settings: dict[str, Any]) -> Surface | None:
 class SavedSurrogate:
     """The contents of a file."""
 
-    ranges: Ranges
-    points: Floats  # (n, columns)
-    responses: Floats  # (n,) or (n, m)
-    error: CrossValidation
+    fields: dict[str, Any]  # of the surrogate
     kind: str  # name of the surface's class
-    settings: dict[str, Any]  # of a surface that ships with prbayes
-    outside: OnFailure
-    noise: int | None
-    n_runs: int
+    model: Surface | None  # the surface, if it ships with prbayes
+    joined: bool | None  # how a coarse response is followed; None if none is
     probes: Floats  # (k,) or (k, m): values of the surface at fixed points, which identify it
-    joined: bool | None = None  # how a coarse response is followed; None if none is
-    outputs: Outputs | None = None  # names in a mapping; None without names
 
 
-def write(path: str | PathLike[str], record: SavedSurrogate) -> None:
-    """Write netCDF."""
-    output = ["output"] if record.responses.ndim > 1 else []
-    # As text: JSON has no NaN.
-    is_abort = isinstance(record.outside, Abort)
+def write(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
+    """Write a surrogate and its values at fixed points as netCDF."""
+    responses = surrogate.responses
+    output = ["output"] if responses.ndim > 1 else []
+    names = surrogate._named
     configuration = {
         "inputs": [
             {"name": r.name, "shape": list(r.event), "constant": r.constant}
-            for r in record.ranges.inputs
+            for r in surrogate.domain.inputs
         ],
-        "model": {"kind": record.kind, **record.settings},
-        "outside": None if is_abort else str(cast(Replace, record.outside).value),
-        "noise": record.noise,
-        "n_runs": record.n_runs,
-        "joined": record.joined,
-        "outputs": None if record.outputs is None else record.outputs.keys,
+        "model": {"kind": type(surrogate.model).__name__, **settings_of(surrogate.model)},
+        # As text: JSON has no NaN.
+        "outside": str(surrogate.outside.value) if hasattr(surrogate.outside, "value") else None,
+        "noise": surrogate.noise,
+        "n_runs": surrogate.n_runs,
+        "joined": None if surrogate.coarse is None else surrogate._joined,
+        "outputs": None if names is None else names.keys,
     }
     data = xr.Dataset(
         {
-            "points": (["point", "column"], record.points),
-            "responses": (["point", *output], record.responses),
-            "residuals": (["point", *output], record.error.residuals),
-            "low": ("column", record.ranges.low),
-            "high": ("column", record.ranges.high),
-            "population_sd": (output, record.error.population_sd),
-            "probes": (["probe", *output], record.probes),
+            "points": (["point", "column"], surrogate.points),
+            "responses": (["point", *output], responses),
+            "residuals": (["point", *output], surrogate.error.residuals),
+            "low": ("column", surrogate.domain.low),
+            "high": ("column", surrogate.domain.high),
+            "population_sd": (output, surrogate.error.population_sd),
+            "probes": (["probe", *output], probes),
         },
         attrs={"prbayes_surrogate": 1, "configuration": json.dumps(configuration)},
     )
@@ -101,20 +95,19 @@ def read(path: str | PathLike[str]) -> SavedSurrogate:
         if outputs is not None:
             keys = [(str(key), None if size is None else int(size)) for key, size in outputs]
             outputs = outputs_of_keys(keys)
-        return SavedSurrogate(
-            ranges=_ranges(config["inputs"], data["low"].values, data["high"].values),
-            points=data["points"].values,
-            responses=data["responses"].values,
-            error=CrossValidation(data["residuals"].values, sd if sd.ndim else float(sd)),
-            kind=kind,
-            settings=settings,
-            outside=Abort() if outside is None else Replace(float(outside)),
-            noise=config["noise"],
-            n_runs=config["n_runs"],
-            probes=data["probes"].values,
-            joined=config.get("joined"),
-            outputs=outputs,
-        )
+        joined = config.get("joined")
+        fields = {
+            "domain": _ranges(config["inputs"], data["low"].values, data["high"].values),
+            "points": data["points"].values,
+            "responses": data["responses"].values,
+            "error": CrossValidation(data["residuals"].values, sd if sd.ndim else float(sd)),
+            "outside": Abort() if outside is None else Replace(float(outside)),
+            "noise": config["noise"],
+            "n_runs": config["n_runs"],
+            "_joined": bool(joined),
+            "_named": outputs,
+        }
+        return SavedSurrogate(fields, kind, shipped(kind, settings), joined, data["probes"].values)
     # Damaged files raise any error of the library that meets the damage.
     except Exception as error:
         raise StoreError(

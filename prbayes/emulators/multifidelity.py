@@ -21,40 +21,20 @@ from prbayes.emulators.surfaces import Predict, Surface, fitted, least_squares
 
 @dataclass(frozen=True)
 class Following:
-    """The model of an output that follows a coarse response.
+    """The model of an output that follows a coarse response."""
 
-    Attributes
-    ----------
-    model : Surface or regressor
-        Of the remainder beside the coarse response.
-    otherwise : Surface or regressor
-        Of the response itself, where there is no coarse one.
-    joined : bool
-        Whether the coarse response is also an input of the remainder.
-    """
-
-    model: Any
-    otherwise: Any
-    joined: bool
+    model: Any  # of the remainder beside the coarse response
+    otherwise: Any  # of the response itself, where there is no coarse one
+    joined: bool  # whether the coarse response is also an input of the remainder
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A response as rho times a coarse one and a surface; a class, so that it can be pickled.
-
-    Attributes
-    ----------
-    rho : float
-        Factor of the coarse response.
-    scaling : tuple of float, optional
-        Center and unit of a coarse response that is also an input.
-    rest : callable
-        Surface of the remainder, from points to responses, shape (k,).
-    """
+    """A response as rho times a coarse one and a surface; a class, so that it can be pickled."""
 
     rho: float
-    scaling: tuple[float, float] | None
-    rest: Predict
+    scaling: tuple[float, float] | None  # center and unit of a coarse response that is an input
+    rest: Predict  # surface of the remainder
 
     def __call__(self, at: Floats, coarse: Floats) -> Floats:
         """Return responses, (k,), at points, (k, d), given the coarse ones."""

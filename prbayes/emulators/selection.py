@@ -24,27 +24,13 @@ MOST_RUNS = 2000
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Runs that an emulator is fitted on.
+    """Runs that an emulator is fitted on."""
 
-    Attributes
-    ----------
-    x : ndarray, shape (n, d)
-        Inputs.
-    y : ndarray, shape (n, m)
-        Outputs; a run that is not finite in one of them has none.
-    importance : ndarray, shape (n,)
-        Mean weight of each run in the relevant populations; they sum to one.
-    blocks : ndarray, shape (n,)
-        Block of each run; each block is spread over all runs.
-    coarse : ndarray, shape (n, m), optional
-        The same outputs by a coarse response; a run without one of them has none.
-    """
-
-    x: Floats
-    y: Floats
-    importance: Floats
-    blocks: NDArray[np.intp]
-    coarse: Floats | None = None
+    x: Floats  # (n, d): inputs
+    y: Floats  # (n, m): outputs; a run that is not finite in one of them has none
+    importance: Floats  # (n,): mean weights in the relevant populations; they sum to one
+    blocks: NDArray[np.intp]  # (n,): block of each run; each block is spread over all runs
+    coarse: Floats | None = None  # (n, m): outputs of a coarse response; as y, if not finite
 
     @cached_property
     def good(self) -> NDArray[np.bool_]:
@@ -122,21 +108,11 @@ def emulated(
     mask: NDArray[np.bool_] | None = None,
     coarse: Floats | None = None,
 ) -> Floats:
-    """Return predicted outputs at points, (k, m).
+    """Return outputs at points, (k, d) -> (k, m), predicted by a model of each output.
 
     Where the nearest run failed, the outputs are those of that run. Predictions are at most one
-    range of the runs' outputs beyond them.
-
-    Parameters
-    ----------
-    models : sequence of Following, Surface or regressor
-        Of each output.
-    runs : Runs
-    at : ndarray, shape (k, d)
-    mask : ndarray of bool, shape (n,), optional
-        The runs of the fit; all by default.
-    coarse : ndarray, shape (k, m), optional
-        The coarse response at the points, where there is one.
+    range of the runs' outputs beyond them. ``mask``, (n,), selects the runs of the fit; ``coarse``,
+    (k, m), is a coarse response at the points.
     """
     mask = np.ones(len(runs.x), dtype=bool) if mask is None else mask
     rows = runs.among(mask)
@@ -235,21 +211,11 @@ class _Selection:
 
 
 def chosen(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
-    """Return the surface with the smallest left-out errors for each output, and its predictions.
+    """Return the model of each output with the smallest left-out errors, and its predictions.
 
-    Errors are squared, and weighted by importance. A coarse response adds surfaces that follow it.
-
-    Returns
-    -------
-    models : tuple of Following, Surface or regressor
-        Of each output.
-    predictions : ndarray, shape (n, m)
-        At runs that were left out.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If none can be fitted.
+    The predictions, (n, m), are at runs that were left out; errors are squared, and weighted by
+    importance. A coarse response adds models that follow it. Raises numpy.linalg.LinAlgError if no
+    surface can be fitted.
     """
     rows = runs.among(np.ones(len(runs.y), dtype=bool))
     m = runs.y.shape[1]
@@ -325,15 +291,8 @@ def share_of_runs(
     of weighted runs have a variance. A mixture has the least squared error where the runs' share is
     bias^2 / (bias^2 + variance). The bias is estimated without its variance.
 
-    Parameters
-    ----------
-    weights : ndarray, shape (T, n)
-        Of the runs in the relevant populations; each row sums to one.
-    y : ndarray, shape (n, m)
-        Outputs of the runs; not finite where they failed.
-    predictions : ndarray, shape (n, m)
-        Of an emulator without the block of each run.
-    blocks : ndarray, shape (n,)
+    Weights of the runs in T populations, (T, n), have rows of sum one; outputs y, (n, m), are not
+    finite where they failed; predictions, (n, m), are without the block of each run.
     """
 
     def variance_of_sum(parts: Floats) -> Floats:  # over independent blocks, (T, B, L) -> (T, L)

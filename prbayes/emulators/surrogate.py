@@ -25,16 +25,16 @@ from prbayes._validate import (
     share,
 )
 from prbayes.emulators.cross_validation import CrossValidation, cross_validated, points_needed
-from prbayes.emulators.io import SavedSurrogate, read, settings_of, shipped, write
+from prbayes.emulators.io import read, write
 from prbayes.emulators.multifidelity import Followed, Following, followed
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.numerics.points import sobol
 from prbayes.response.call import Points, compute
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
-from prbayes.response.outputs import Outputs, lacking
-from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
+from prbayes.response.outputs import Outputs, is_missing
+from prbayes.response.response import check_call_settings, refuse_coarse, refuse_misfit
 from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
@@ -67,8 +67,7 @@ class Surrogate:
     noise : int or None
         The seed of residual noise, see `with_error`.
     coarse : callable or None
-        The coarse response that it follows. It is called wherever the surrogate is, and travels
-        with it by pickle, if it can.
+        The coarse response that it follows, and calls; pickled with it, if possible.
 
     See Also
     --------
@@ -132,8 +131,8 @@ class Surrogate:
     ) -> Surrogate:
         """Compute the response on a scrambled Sobol design, and fit a surface.
 
-        The populations of many inputs are far from nearly all corners of their ranges: the design
-        is then better where they are, ``points="predictive"``, and the surface a process.
+        With many inputs nearly all corners of the ranges are far from the populations: prefer
+        ``points="predictive"`` and a `GaussianProcess`.
 
         Parameters
         ----------
@@ -150,21 +149,19 @@ class Surrogate:
         model : object, optional
             `RadialBasis` (default), `Polynomial`, `GaussianProcess`, which is better with many
             inputs, or any regressor with ``fit(X, y)`` and ``predict(X)``, as those of
-            scikit-learn; it gets inputs scaled to [0, 1] and responses
-            of mean 0 and spread 1, and is left as it is.
+            scikit-learn. A copy is fitted to inputs in [0, 1], responses of mean 0 and spread 1.
         coarse : callable, optional
-            A cheap response of the same inputs that is about the expensive one, such as that of a
-            coarser mesh. The surrogate follows it if its cross-validated error is smaller then; it
-            calls it wherever it is called. Where it raises, or is not finite, the surface goes on
-            without it, and the log says so. For a response of one output; several follow one under
-            ``prb.Reweighted(coarse=)``.
+            A cheap approximation of a response of one output, such as that of a coarser mesh. The
+            surrogate follows, and calls, it if that reduces the cross-validated error. Where it
+            raises, or is not finite, the surface continues without it, with a warning. Several
+            outputs follow one under ``prb.Reweighted(coarse=)``.
         outside : OnFailure, optional
-            `Replace` (default): points outside the ranges give its value, NaN, with a warning in
-            the log. A simulator with `Reweighted` reports them as lost mass, and refuses an answer
-            that rests on them. `Abort`: they raise; take that with `Resimulated`.
+            `Replace` (default): points outside the ranges give its value, NaN, with a warning. A
+            simulator with `Reweighted` reports them as lost mass, and refuses an answer that
+            depends on them. `Abort`: they raise, for `Resimulated`.
         points : {"even", "predictive"}
-            Where the design is: evenly in all ranges, or each input by its own prior predictive
-            distribution, inside its range; those that are given as a range evenly.
+            The design: even in all ranges, or with each random input distributed as its prior
+            predictive distribution inside its range.
         prob : float
         name : str
             For messages, and of the store.
@@ -197,7 +194,7 @@ class Surrogate:
         outside = Replace() if outside is None else outside
         policy = Abort() if on_failure is None else on_failure
         _refuse_wrong(name, response, model, outside, points)
-        refuse_calling(executor, store, version, policy)
+        check_call_settings(executor, store, version, policy)
         flag(retry_failed, f"{name}: retry_failed")
         share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
@@ -220,24 +217,13 @@ class Surrogate:
         database = None
         if store is not None:
             database = Store(store, name, columns=design.shape[1], version=version)
-        calling = Calling(name, response, executor, database, policy, retry_failed, outputs=None)
-        tally = Tally()
-        rows = Points(domain.arguments(design), domain.varying)
+        settings = CallSettings(
+            name, response, executor, database, policy, retry_failed, outputs=None
+        )
         with shown(progressbar):
-            _learn_names(calling, rows, tally)
-            responses = respond(calling, rows, tally)
+            responses, tally = _computed(settings, Points(domain.arguments(design), domain.varying))
         usable = _usable(responses)
-        if usable.sum() < n_needed:
-            raise ResponseError(
-                f"{name}: got {usable.sum()} numbers from {len(responses)} responses, too few for "
-                "a surface"
-            )
-        if coarse is not None and responses.ndim > 1:
-            raise ResponseError(
-                f"{name}: coarse: got one number a point beside a response of "
-                f"{responses.shape[1]} outputs, expected a response of one; leave coarse= out, or "
-                "use prb.Reweighted(n, coarse=)"
-            )
+        _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
         # Estimate the error, then fit the surface.
         x, y = domain.scaled(design)[usable], responses[usable]
@@ -366,21 +352,7 @@ class Surrogate:
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        record = SavedSurrogate(
-            ranges=self.domain,
-            points=self.points,
-            responses=self.responses,
-            error=self.error,
-            kind=type(self.model).__name__,
-            settings=settings_of(self.model),
-            outside=self.outside,
-            noise=self.noise,
-            n_runs=self.n_runs,
-            probes=self._probes(),
-            joined=None if self.coarse is None else self._joined,
-            outputs=self._named,
-        )
-        write(path, record)
+        write(path, self, self._probes())
 
     @classmethod
     def load(
@@ -412,8 +384,7 @@ class Surrogate:
             If a regressor is needed, or the surface is not that which was saved.
         """
         record = read(file_path(path, "path"))
-        if model is None:
-            model = shipped(record.kind, record.settings)
+        model = record.model if model is None else model
         if model is None:
             raise TypeError(
                 f"Surrogate.load: got no model, expected the {record.kind} it was fitted with; "
@@ -424,20 +395,10 @@ class Surrogate:
                 "Surrogate.load: got no coarse response, expected the one that the surrogate "
                 "follows: a file does not keep it; pass coarse="
             )
-        surrogate = cls(
-            domain=record.ranges,
-            points=record.points,
-            responses=record.responses,
-            model=model,
-            outside=record.outside,
-            n_runs=record.n_runs,
-            error=record.error,
-            noise=record.noise,
-            coarse=None if record.joined is None else coarse,
-            _joined=bool(record.joined),
-            _named=record.outputs,
-        )._completed()
-        spread = np.asarray(_spread(record.responses[_usable(record.responses)]))
+        coarse = None if record.joined is None else coarse
+        surrogate = cls(**record.fields, model=model, coarse=coarse)._completed()
+        responses = surrogate.responses
+        spread = np.asarray(_spread(responses[_usable(responses)]))
         size = np.where(spread > 0, spread, 1.0)
         probes, saved = surrogate._probes() / size, record.probes / size
         # The tolerance is above rounding on another processor, below the effect of a setting.
@@ -544,7 +505,7 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:
     """Return which runs have only finite outputs, (n,)."""
-    return ~lacking(np.where(np.isfinite(responses), responses, np.nan))
+    return ~is_missing(np.where(np.isfinite(responses), responses, np.nan))
 
 
 def _spread(values: Floats) -> Any:
@@ -570,13 +531,13 @@ def _surfaces(model: Any, x: Floats, y: Floats) -> Predict:
     return _OutputSurfaces(tuple(fitted(model, x, output) for output in y.T))
 
 
-def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
+def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
     """Learn the names of several stored outputs before any other run.
 
     A store contains numbers only: with a version, one of its runs is computed again, and refused if
     its outputs have changed places.
     """
-    store = calling.store
+    store = settings.store
     if store is None or store.version is None:
         return
     keys, values = store.known()
@@ -585,13 +546,35 @@ def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
     usable = np.flatnonzero(_usable(values) & points.have_same_constants(keys))[:1]
     if not usable.size:
         return
-    (again,) = respond(replace(calling, store=None), points.from_keys(keys[usable]), tally)
+    (again,) = respond(replace(settings, store=None), points.from_keys(keys[usable]), tally)
     (stored,) = values[usable]
     moved = np.allclose(np.sort(again), np.sort(stored)) and not np.allclose(again, stored)
     if tally.named is not None and moved:
         raise StoreError(
-            f"{calling.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
+            f"{settings.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
             "numbers are stored in another order, expected the same one; pass another version="
+        )
+
+
+def _computed(settings: CallSettings, points: Points) -> tuple[Floats, Tally]:
+    """Return the responses at points, and the count of runs."""
+    tally = Tally()
+    _learn_names(settings, points, tally)
+    return respond(settings, points, tally), tally
+
+
+def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool) -> None:
+    """Raise if too few runs have a response, or several outputs would follow a coarse one."""
+    n_usable = _usable(responses).sum()
+    if n_usable < needed:
+        raise ResponseError(
+            f"{name}: got {n_usable} numbers from {len(responses)} responses, too few for a surface"
+        )
+    if has_coarse and responses.ndim > 1:
+        raise ResponseError(
+            f"{name}: coarse: got one number a point beside a response of {responses.shape[1]} "
+            "outputs, expected a response of one; leave coarse= out, or use "
+            "prb.Reweighted(n, coarse=)"
         )
 
 

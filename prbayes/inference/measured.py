@@ -20,7 +20,7 @@ from prbayes.inference.identifiability import oriented
 from prbayes.inference.resampling import SETS, simulated_sets
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.batched_simplex import descend_by_simplex
-from prbayes.numerics.stencils import second_differences
+from prbayes.numerics.derivatives import second_differences
 
 # Largest steps, in prior standard deviations, over which it is looked whether the discrepancy
 # rises.

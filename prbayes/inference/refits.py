@@ -21,7 +21,7 @@ from prbayes.inference.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.batched_bfgs import Descent
 from prbayes.numerics.batched_simplex import descend_by_simplex
-from prbayes.numerics.stencils import second_differences
+from prbayes.numerics.derivatives import second_differences
 from prbayes.propagation.base import N_BLOCKS
 from prbayes.propagation.reweighted import designs_restored
 

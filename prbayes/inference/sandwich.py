@@ -28,8 +28,7 @@ from prbayes.metrics.base import Discrepancy, is_additive
 from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
-from prbayes.numerics.derivatives import slopes
-from prbayes.numerics.stencils import hessian_of, stencil
+from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
 # Step of differences of densities, which are twice differentiable, in prior standard deviations.
 _NARROW_STEP = 1e-3

@@ -56,48 +56,27 @@ class Minimum(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One component of a discrepancy: ``share`` times the discrepancy ``target`` of a projection.
+    """A component of a discrepancy: ``share`` times the discrepancy ``target`` of a projection."""
 
-    Attributes
-    ----------
-    target : Discrepancy
-        Of one number of each specimen, or of several where ``target.event`` is not empty.
-    share : float
-        Factor in the sum.
-    label : str
-        Name for messages and plots.
-    view : View
-        Projection of a response.
-    """
-
-    target: Discrepancy
-    share: float
-    label: str
-    view: View = field(default_factory=View)
+    target: Discrepancy  # of one number of each specimen, unless its event is not empty
+    share: float  # factor in the sum
+    label: str  # name for messages and plots
+    view: View = field(default_factory=View)  # projection of a response
 
     def of(self, simulated: Any, xp: Any = np) -> Any:
         """Return the projection, (..., n, m) -> (..., n); NaN where an output is NaN."""
         return self.view.of(simulated, xp)
 
     def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return the projection of observed values, (n, m) -> (n',), and their rows, (n',).
-
-        Rows that lack a necessary output are left out.
-        """
+        """Return the projection of observed values, (n, m) -> (n',), and the rows that have it."""
         return self.view.observed_of(values)
 
 
 @dataclass(frozen=True, eq=False)
 class Basis(ABC):
-    """The linear map from weights of stored responses to the features of a discrepancy.
+    """The linear map from weights of stored responses to the features of a discrepancy."""
 
-    Attributes
-    ----------
-    arrays : tuple
-        The numbers of the map. A compiled graph replaces them by shared variables.
-    """
-
-    arrays: tuple[Any, ...]
+    arrays: tuple[Any, ...]  # the numbers of the map; shared variables in a compiled graph
 
     @abstractmethod
     def features(self, weights: Any, xp: Any = np) -> Features:
@@ -160,14 +139,10 @@ class Discrepancy(ABC):
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights",)
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
-        """Return the same metric, on the same cells, against other values; for resampling.
+        """Return the same metric, on the same cells, against other values (n,), for resampling.
 
-        Parameters
-        ----------
-        observed : ndarray, shape (n,)
-        weights : ndarray, shape (n,) or (..., n), optional
-            Equal by default. With several rows, each a data set, `outer` broadcasts the data sets
-            against the features.
+        Weights are equal by default. Of shape (..., n) they are several data sets, which `outer`
+        broadcasts against the features.
         """
         return replace(self, observed=observed, weights=sample_weights(weights, len(observed)))
 
@@ -221,22 +196,16 @@ class Discrepancy(ABC):
         """
 
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
-        """Return the map from weights of stored responses, shape (n,), to features.
+        """Return the map from weights of stored responses, (n,) or (n, m), to features.
 
-        By default the responses themselves. A metric with features that are linear in the weights
-        returns a map that is computed once for the responses, and is equal to `features` up to
-        rounding.
-
-        Parameters
-        ----------
-        simulated : ndarray, shape (n,) or (n, m)
-        most : float
-            Largest size of a matrix where a smaller form exists.
+        By default the responses themselves. A metric whose features are linear in the weights
+        returns a map that is computed once, equal to `features` up to rounding. ``most`` is the
+        largest size of a matrix where a smaller form exists.
         """
         return StoredBasis((simulated,), self)
 
     def together(self, parts: tuple[Part, ...]) -> PartSum:
-        """Return components of this kind as terms that are evaluated together."""
+        """Return components of this kind in a form that evaluates them together."""
         return PartSum(parts)
 
     def of(self, simulated: Floats, weights: Floats) -> Any:
@@ -277,7 +246,7 @@ def is_likelihood(target: Discrepancy) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PartSum:
-    """Components of a sum that are evaluated together: here each with features of its own."""
+    """Components of a sum that are evaluated together: here one after another."""
 
     parts: tuple[Part, ...]
 
@@ -349,9 +318,8 @@ class Metric(ABC):
     """A calibration metric; ``against`` prepares the observed side once.
 
     A metric of your own is a frozen dataclass that derives from this class. It defines
-    ``_prepare(observed, weights)``, which gets checked values, shape (N,), and weights that sum to
-    one, and returns a `Discrepancy`. It declares what calibration may assume of it, as class
-    attributes or properties:
+    ``_prepare(observed, weights)``, which returns a `Discrepancy` for checked values, shape (N,),
+    and weights that sum to one. Class attributes or properties declare assumptions of calibration:
 
     Attributes
     ----------
@@ -367,17 +335,15 @@ class Metric(ABC):
     takes_weights : bool
         Whether simulated responses may have unequal weights, as under `Reweighted`.
     counts_failures : bool
-        Whether observed values may be +inf, specimens that failed, as simulated ones may. Data sets
-        of its sampling distribution then have failures as well.
+        Whether observed values may be +inf, specimens that failed, as simulated ones may.
     tail_responses : int
-        Simulated responses for each observation, all of equal weight, below which the metric sees
-        too little of the population's tails; zero where that does not matter.
+        Least number of simulated responses of equal weight for each observation, which the tails
+        of the population need; zero for any number.
     likelihood : bool
         Whether N times the discrepancy is on the scale of a log-likelihood, so that epsilon is 1/N.
     distance : bool
         Whether equal samples have a discrepancy of zero, so that its size between a population and
-        data drawn from it is sampling noise. Only a likelihood may do without: its size depends on
-        the unit of the response.
+        data drawn from it is sampling noise. Only a likelihood may have another value.
     """
 
     minimum: ClassVar[Minimum] = Minimum.UNKNOWN
@@ -412,10 +378,9 @@ class Metric(ABC):
         return metric
 
     def beside(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
-        """Return the discrepancy after the first simulated responses of a design are computed.
+        """Return the discrepancy with projections of the data and a design of responses together.
 
-        Itself, unless the metric chooses its projections by the data and the design together, or by
-        the number of a specimen's inputs.
+        By default they are those of the data alone.
         """
         return target
 
@@ -424,10 +389,7 @@ class Metric(ABC):
         """Return the discrepancy from these observed values, both of shape (N,) and checked."""
 
     def on_one_scale(self, slices: Sequence[Discrepancy]) -> Sequence[Discrepancy]:
-        """Return discrepancies of slices of one sample in units that allow their mean.
-
-        Unchanged, unless the metric takes a factor from the data.
-        """
+        """Return discrepancies of projections of one sample in units that allow their mean."""
         return slices
 
     def against(self, observed: ArrayLike, weights: ArrayLike | None = None) -> Discrepancy:

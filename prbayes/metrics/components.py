@@ -1,4 +1,4 @@
-"""Principal components of outputs that are too many to be compared one with the other: curves."""
+"""Principal components of many outputs, such as curves."""
 
 from __future__ import annotations
 
@@ -9,54 +9,45 @@ import numpy as np
 from prbayes._stats import quantile
 from prbayes._validate import Floats
 
-# More outputs than this are compared by their principal components; of as many the directions that
-# are enough are seventy.
+# More outputs than this are compared by their principal components: eight need seventy directions.
 MOST_OUTPUTS = 8
-# Correlation of neighbouring outputs in what is left out from which it is no noise: white noise of
-# ten curves of twelve outputs has .1, what one more component would explain has .5 to 1.
-_NO_NOISE = 0.5
-# Share of the variance, of the data and of the design, that components may leave out. By judgement:
-# a tenth of a standard deviation.
+# Share of the variance, of the data and of the design, that components may leave out.
 LEFT_OUT = 0.01
-# Specimens for each component: scatters of fewer are hardly known.
-_SPECIMENS = 5
-# Specimens from which two components can be had.
-FEWEST = 2 * _SPECIMENS
+# Fewest specimens for two components, five each: scatters of fewer are uncertain.
+FEWEST = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """Scores ``(y - center) @ axes`` of outputs y, and what they leave out."""
+    """Scores ``(y - center) @ axes`` of outputs y, and the variance that they leave out."""
 
     center: Floats  # (m,)
     axes: Floats  # (m, r): orthonormal
     left_out: float  # share of the observed variance
-    design_left_out: float  # share of the design's variance; NaN where none was looked at
-    # Correlation of what is left out of the observed outputs, between neighbours: near zero, or
-    # below, if it is noise.
-    rest_correlation: float
+    design_left_out: float  # share of the design's variance; NaN without a design
+    rest_correlation: float  # of neighbours in the remainder of the data: near zero for noise
 
     @property
     def number(self) -> int:
-        """How many there are."""
+        """The number of components."""
         return int(self.axes.shape[1])
 
     @property
     def summary(self) -> str:
-        """How many there are, what they leave out, and whether that is noise."""
-        of = f"{self.left_out:.2g} of the variance of the data"
+        """The number of components, and the variance that they leave out."""
+        left_out = f"{self.left_out:.2g} of the variance of the data"
         if not np.isnan(self.design_left_out):
-            of += f" and {self.design_left_out:.2g} of that of the design"
+            left_out += f" and {self.design_left_out:.2g} of that of the design"
         return (
             f"{len(self.axes)} outputs are compared by {self.number} principal component(s), which "
-            f"leave out {of}; neighbours in what is left out of the data are correlated by "
+            f"leave out {left_out}; neighbours in what is left out of the data are correlated by "
             f"{self.rest_correlation:.2f}"
         )
 
     @property
     def missed(self) -> str:
-        """What is left out of the data and is no noise, as a clause; empty if there is no such."""
-        if self.left_out <= LEFT_OUT or self.rest_correlation < _NO_NOISE:
+        """A clause about structure of the data that is left out; empty if it is noise."""
+        if self.left_out <= LEFT_OUT or self.rest_correlation < 0.5:  # white noise has .1
             return ""
         return (
             f"{self.summary}, so that it is no noise: the metric does not see it; pass more "
@@ -69,16 +60,16 @@ def principal_components(
 ) -> Components:
     """Return principal components of observed outputs and of a design together.
 
-    Of both scatters, each in units of its own variance, the mean: so the components span what the
-    data vary in, and what populations like them could vary in and they do not. Specimens count the
-    less the farther they are from the middle of the data, in units of the data's own distances.
+    They are those of the mean of both scatters, each in units of its variance, and so span what the
+    data vary in, and what similar populations could vary in. The weight of a specimen falls with
+    its distance from the middle of the data.
 
     Parameters
     ----------
     sample, weights : ndarray, shapes (n, m), (n,)
         Finite, of outputs in one unit.
     number : int, optional
-        As many as leave out a hundredth of either variance, by default, and at most eight, or one
+        By default the fewest that leave out a hundredth of either variance, at most eight, or one
         for five specimens.
     design : ndarray, shape (k, m), optional
         Simulated outputs, finite.
@@ -87,71 +78,52 @@ def principal_components(
     middle = np.array([quantile(y, weights, 0.5) for y in sample.T])
     squares = ((sample - middle) ** 2).sum(axis=1)
     typical = float(quantile(squares, weights, 0.5))
-    center, scatter = _scatter(sample, weights, middle, typical)
+    center, scatter = _robust_moments(sample, weights, middle, typical)
     scatters = [scatter]
     if design is not None and len(design) > 1:
         equal = np.full(len(design), 1 / len(design))
-        _, simulated = _scatter(design, equal, middle, typical)
-        scatters.append(simulated)
-    unit = []
-    for scatter in scatters:
-        variance = max(float(np.trace(scatter)), np.finfo(float).tiny)
-        unit.append(scatter / variance)
-    _, vectors = np.linalg.eigh(np.mean(unit, axis=0))
+        scatters.append(_robust_moments(design, equal, middle, typical)[1])
+    scaled = [s / max(float(np.trace(s)), np.finfo(float).tiny) for s in scatters]
+    _, vectors = np.linalg.eigh(np.mean(scaled, axis=0))
     axes = vectors[:, ::-1]
-    # What the first components explain of each.
-    shares = [np.einsum("ij,ik,kj->j", axes, scatter, axes) for scatter in unit]
+    # The variance that the first components explain of each.
+    shares = [np.einsum("ij,ik,kj->j", axes, s, axes) for s in scaled]
     explained = np.array([np.cumsum(share) for share in shares])
     if number is None:
-        most = min(m, MOST_OUTPUTS, n // _SPECIMENS)
-        number = min(_enough(explained), max(1, most))
-    # Signs that do not hang on the algorithm.
+        is_sufficient = (explained >= 1 - LEFT_OUT).all(axis=0)
+        sufficient = int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m
+        number = min(sufficient, max(1, min(m, MOST_OUTPUTS, n // 5)))
+    # Signs that do not depend on the algorithm.
     largest = np.abs(axes).argmax(axis=0)
     signs = np.sign(axes[largest, np.arange(m)])
     axes = (axes * signs)[:, :number]
-    # What is left out: as a share of either variance, and of the data themselves.
     left_out = 1 - explained[:, number - 1].clip(0, 1)
-    of_data = float(left_out[0])
-    of_design = float(left_out[1]) if len(left_out) > 1 else np.nan
     centered = sample - center
-    scores = centered @ axes
-    rest = centered - scores @ axes.T
+    rest = centered - centered @ axes @ axes.T
     rest = rest - rest.mean(axis=0)
+    variance = float((rest**2).mean())
+    correlation = 0.0
+    if m > 1 and variance > 0:
+        correlation = float((rest[:, 1:] * rest[:, :-1]).mean()) / variance
     return Components(
         center=center,
         axes=axes,
-        left_out=of_data,
-        design_left_out=of_design,
-        rest_correlation=_between_neighbours(rest),
+        left_out=float(left_out[0]),
+        design_left_out=float(left_out[1]) if len(left_out) > 1 else np.nan,
+        rest_correlation=correlation,
     )
 
 
-def _scatter(
+def _robust_moments(
     sample: Floats, weights: Floats, middle: Floats, typical: float
 ) -> tuple[Floats, Floats]:
-    """Return the mean and the scatter of a sample in which specimens far out hardly count.
+    """Return the mean and the scatter of a sample with weights that fall with the fourth power.
 
-    Far from a middle, in units of a typical squared distance: a weight falls with the fourth power.
+    Distances are from a middle, in units of a typical squared distance.
     """
     squares = ((sample - middle) ** 2).sum(axis=1)
     w = weights / (1 + squares / typical) ** 2 if typical > 0 else weights
     w = w / w.sum()
     center = w @ sample
-    away = sample - center
-    return center, (w[:, None] * away).T @ away
-
-
-def _enough(explained: Floats) -> int:
-    """Return how many components explain enough of each variance, from sums of shares, (k, m)."""
-    enough = (explained >= 1 - LEFT_OUT).all(axis=0)
-    if not enough.any():
-        return len(enough)
-    return int(np.argmax(enough)) + 1
-
-
-def _between_neighbours(rest: Floats) -> float:
-    """Return the correlation of neighbouring outputs in what is left, shape (n, m)."""
-    size = float((rest**2).mean())
-    if rest.shape[1] < 2 or not size > 0:
-        return 0.0
-    return float((rest[:, 1:] * rest[:, :-1]).mean()) / size
+    deviations = sample - center
+    return center, (w[:, None] * deviations).T @ deviations

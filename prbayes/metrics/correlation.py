@@ -15,8 +15,7 @@ from prbayes.metrics.multivariate import CompositeDiscrepancy, LiftedMetric, fai
 from prbayes.metrics.views import Centered, Projection, Standardized
 from prbayes.metrics.whitening import units
 
-# Least variance, in units of an observed output's spread squared: a population that is one number
-# has no correlations. Any value does that is far below one, and far above rounding.
+# Least variance, in squared spreads of an observed output: a constant has no correlations.
 _LEAST_VARIANCE = 1e-10
 
 
@@ -28,14 +27,12 @@ class MarginalCorrelation(LiftedMetric):
     metric of output j in units of its observed spread, :math:`s_j` its typical size
     (``Discrepancy.scale``: for the probability residual its value without any density, for the area
     metric the observed mean deviation, or else one), and :math:`\rho` and :math:`r` the simulated
-    and observed Pearson correlations. The idea is that of [1]_: a joint distribution is told by its
-    marginals and correlations, and each is given a residual that is normalised. This is a reading
-    of it from the paper's summary: the paper's own norms of the two residuals, which are for its
-    probability residual, are not claimed here.
+    and observed Pearson correlations. The idea is that of [1]_: normalised residuals of the
+    marginals and of the correlations describe a joint distribution. It follows the paper's summary;
+    the paper's norms of the two residuals may differ.
 
-    Only correlations tie the outputs together: dependence of other kinds is not seen, and moments
-    are not robust. Under the area metric estimates of strong correlations scatter more than with
-    `Joint`.
+    Dependence other than correlation is not compared, and moments are not robust. Under the area
+    metric estimates of strong correlations scatter more than with `Joint`.
 
     Parameters
     ----------
@@ -46,9 +43,9 @@ class MarginalCorrelation(LiftedMetric):
 
     Notes
     -----
-    A specimen that failed (+inf) counts as the largest observed value of that output, and the
-    range of them beyond it. Missing outputs (NaN): each marginal has the specimens that have the
-    output, each correlation those that have both.
+    A specimen that failed (+inf) counts as the largest observed value of that output plus the
+    range. Missing outputs (NaN): each marginal has the specimens with the output, each correlation
+    those with both.
 
     References
     ----------
@@ -61,8 +58,8 @@ class MarginalCorrelation(LiftedMetric):
     >>> import numpy as np
     >>> from prbayes import ProbabilityResidual
     >>> x = np.random.default_rng(0).normal(size=(50, 2))
-    >>> found = MarginalCorrelation(ProbabilityResidual()).against(x)
-    >>> found(x) < 1e-20 < found(x @ [[1.0, 0.5], [0.5, 1.0]])
+    >>> residual = MarginalCorrelation(ProbabilityResidual()).against(x)
+    >>> residual(x) < 1e-20 < residual(x @ [[1.0, 0.5], [0.5, 1.0]])
     True
     """
 
@@ -81,7 +78,7 @@ class MarginalCorrelation(LiftedMetric):
 
     @property
     def minimum(self) -> Minimum:  # type: ignore[override]
-        """Quadratic if the metric's is, or else nothing is known: correlations have squares."""
+        """Quadratic if the metric's is, else unknown: correlations have squares."""
         quadratic = self.metric.minimum is Minimum.QUADRATIC
         return Minimum.QUADRATIC if quadratic else Minimum.UNKNOWN
 
@@ -148,17 +145,15 @@ class CorrelationDiscrepancy(Discrepancy):
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the moments: of order zero, one and two, (..., n, m) -> (..., M)."""
-        known = xp.abs(simulated.sum(axis=-1)) < np.inf
-        values = xp.where(known[..., None], simulated, 0.0)
-        counted = xp.where(known, weights, 0.0)
-        weighted = values * counted[..., None]
-        total = counted.sum(axis=-1)[..., None]
+        is_finite = xp.abs(simulated.sum(axis=-1)) < np.inf
+        values = xp.where(is_finite[..., None], simulated, 0.0)
+        weights = xp.where(is_finite, weights, 0.0)
+        weighted = values * weights[..., None]
+        total = weights.sum(axis=-1)[..., None]
         first = weighted.sum(axis=-2)
         products = xp.swapaxes(weighted, -1, -2) @ values
         i, j = np.tril_indices(self.event[0])
-        second = products[..., i, j]
-        moments = xp.concatenate([total, first, second], axis=-1)
-        return (moments,)
+        return (xp.concatenate([total, first, products[..., i, j]], axis=-1),)
 
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
         """Return the powers of the values whose weighted sums are moments, (n, M)."""
@@ -167,9 +162,9 @@ class CorrelationDiscrepancy(Discrepancy):
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum of squared residuals of the correlations."""
         (moments,) = features
-        known = ~np.isnan(self.correlations)
-        observed = np.where(known, self.correlations, 0.0)
-        residual = (_correlations(moments, self.event[0], xp) - observed) * known
+        is_observed = ~np.isnan(self.correlations)
+        observed = np.where(is_observed, self.correlations, 0.0)
+        residual = (_correlations(moments, self.event[0], xp) - observed) * is_observed
         return (residual**2).sum(axis=-1)
 
 
@@ -180,11 +175,11 @@ def _pairs(m: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def _powers(values: Floats) -> Floats:
     """Return 1, the values and their products, (n, m) -> (n, M); zero where one is NaN."""
-    known = ~np.isnan(values).any(axis=-1, keepdims=True)
-    values = np.where(known, values, 0.0)
+    is_complete = ~np.isnan(values).any(axis=-1, keepdims=True)
+    values = np.where(is_complete, values, 0.0)
     i, j = np.tril_indices(values.shape[-1])
     products = values[:, i] * values[:, j]
-    return np.concatenate([known, values, products], axis=-1, dtype=np.float64)
+    return np.concatenate([is_complete, values, products], axis=-1, dtype=np.float64)
 
 
 def _correlations(moments: Any, m: int, xp: Any) -> Any:
@@ -192,37 +187,25 @@ def _correlations(moments: Any, m: int, xp: Any) -> Any:
     rows, columns = np.tril_indices(m)
     place = np.zeros((m, m), dtype=int)
     place[rows, columns] = np.arange(rows.size)
-    of_squares = np.diag(place)
-    of_products = place[_pairs(m)]
-    total = xp.maximum(moments[..., 0], 1e-300)
-    unit = total[..., None]
+    i, j = _pairs(m)
+    unit = xp.maximum(moments[..., 0], 1e-300)[..., None]
     mean = moments[..., 1 : m + 1] / unit
     second = moments[..., m + 1 :] / unit
-    variance = second[..., of_squares] - mean**2
+    variance = second[..., np.diag(place)] - mean**2
     sd = xp.sqrt(xp.maximum(variance, _LEAST_VARIANCE))
-    covariance = second[..., of_products] - _by_pair(mean, m)
-    correlations = covariance / _by_pair(sd, m)
-    return xp.clip(correlations, -1.0, 1.0)
-
-
-def _by_pair(values: Any, m: int) -> Any:
-    """Return the products of pairs, (..., m) -> (..., pairs)."""
-    i, j = _pairs(m)
-    return values[..., i] * values[..., j]
+    covariance = second[..., place[i, j]] - mean[..., i] * mean[..., j]
+    return xp.clip(covariance / (sd[..., i] * sd[..., j]), -1.0, 1.0)
 
 
 def _observed_correlations(values: Floats, weights: Floats) -> Floats:
-    """Return the correlation of each pair, of the rows that have both; NaN where there is none."""
+    """Return the correlation of each pair, of the rows that have both; NaN without variance."""
     i, j = _pairs(values.shape[-1])
-    found = np.full((*weights.shape[:-1], i.size), np.nan)
+    correlations = np.full((*weights.shape[:-1], i.size), np.nan)
     for k, pair in enumerate(zip(i, j, strict=True)):
-        powers = _powers(values[:, pair])
-        moments = product(weights, powers)
+        moments = product(weights, _powers(values[:, pair]))
         total = moments[..., :1]
         mean = moments[..., 1:3] / np.where(total > 0, total, 1.0)
-        squares = moments[..., [3, 5]]
-        variance = squares - total * mean**2
-        known = (variance > _LEAST_VARIANCE).all(axis=-1)
-        correlations = _correlations(moments[known], 2, np)
-        found[known, k] = correlations[..., 0]
-    return found
+        variance = moments[..., [3, 5]] - total * mean**2
+        has_variance = (variance > _LEAST_VARIANCE).all(axis=-1)
+        correlations[has_variance, k] = _correlations(moments[has_variance], 2, np)[..., 0]
+    return correlations

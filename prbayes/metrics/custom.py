@@ -69,8 +69,8 @@ class FunctionMetric(Metric):
 class FunctionDiscrepancy(Discrepancy):
     """A user's metric against fixed observed values.
 
-    The function takes observed values without weights: a data set that is given by weights of
-    values is handed to it as a sample, in which each value is repeated by its count.
+    The function takes observed values without weights: a data set in the form of weights becomes a
+    sample in which each value is repeated by its count.
     """
 
     metric: FunctionMetric
@@ -78,31 +78,35 @@ class FunctionDiscrepancy(Discrepancy):
 
     @property
     def scale(self) -> float:
-        """One: nothing is known about the function."""
+        """One: the size of the function is unknown."""
         return 1.0
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the value of the function; the values for several data sets, (B, ...)."""
-        if self.weights.ndim > 1:
-            return (self._of_each(simulated, weights),)
-        observed = repeated(self.observed, self.weights, self.size)
-        return (self._checked(simulated, observed, weights),)
-
-    def _of_each(self, simulated: Floats, weights: Floats) -> Floats:
-        """Return values for B data sets, from populations (B, ..., n) or (1, ..., n)."""
+        if self.weights.ndim == 1:
+            return (self._value(simulated, self.weights, weights),)
+        # Populations of shape (B, ..., n) or (1, ..., n).
         n_sets = len(self.weights)
         simulated = np.broadcast_to(simulated, (n_sets, *simulated.shape[1:]))
         weights = np.broadcast_to(weights, (n_sets, *weights.shape[1:]))
-        found = np.empty(simulated.shape[:-1])
-        own_weights = self.weights.reshape(n_sets, -1)
-        for i, own in enumerate(own_weights):
-            observed = repeated(self.observed, own, self.size)
-            found[i] = self._checked(simulated[i], observed, weights[i])
-        return found
+        values = np.empty(simulated.shape[:-1])
+        for i, observed_weights in enumerate(self.weights.reshape(n_sets, -1)):
+            values[i] = self._value(simulated[i], observed_weights, weights[i])
+        return (values,)
 
-    def _checked(self, simulated: Floats, observed: Floats, weights: Floats) -> Floats:
-        """Call the function for one data set, and check what it returns."""
-        value = np.asarray(self._called(simulated, observed, weights), dtype=np.float64)
+    def _value(self, simulated: Floats, observed_weights: Floats, weights: Floats) -> Floats:
+        """Return the checked value of the function for one data set."""
+        observed = repeated(self.observed, observed_weights, self.size)
+        arguments: tuple[Floats, ...] = (simulated, observed)
+        if self.metric.weighted:
+            arguments += (np.broadcast_to(weights, simulated.shape),)
+        elif not np.allclose(weights, np.asarray(weights)[..., :1]):
+            raise ValueError(
+                "weights: got unequal ones for a FunctionMetric whose function takes none; "
+                "write function(simulated, observed, weights) and pass weighted=True, "
+                "or use prb.Resimulated"
+            )
+        value = np.asarray(self.metric.function(*arguments), dtype=np.float64)
         expected = simulated.shape[:-1]
         if value.shape != expected:
             raise ValueError(
@@ -111,42 +115,21 @@ class FunctionDiscrepancy(Discrepancy):
             )
         return value
 
-    def _called(self, simulated: Floats, observed: Floats, weights: Floats) -> Any:
-        """Call the function, with weights if it takes them; equal ones it need not know."""
-        function = self.metric.function
-        if self.metric.weighted:
-            return function(simulated, observed, np.broadcast_to(weights, simulated.shape))
-        if not np.allclose(weights, np.asarray(weights)[..., :1]):
-            raise ValueError(
-                "weights: got unequal ones for a FunctionMetric whose function takes none; "
-                "write function(simulated, observed, weights) and pass weighted=True, "
-                "or use prb.Resimulated"
-            )
-        return function(simulated, observed)
-
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the value of the function."""
         return features[0]
 
 
 def repeated(values: Floats, weights: Floats, size: int) -> Floats:
-    """Return a sample in which each value occurs as often as its weight says.
+    """Return a sample in which each value, (n,), is repeated in proportion to its weight.
 
-    Parameters
-    ----------
-    values, weights : ndarray, shape (n,)
-    size : int
-        Number of values in the sample, if the weights are multiples of its inverse. If they are
-        not, the value of smallest weight occurs once, as where some were left out.
-
-    Raises
-    ------
-    ValueError
-        If the weights are no counts, as those of the loss-likelihood bootstrap.
+    It has ``size`` values if the weights are multiples of its inverse; else the value of smallest
+    weight occurs once, as in a subset. Raises ValueError if the weights are not counts, as those of
+    the loss-likelihood bootstrap.
     """
     for counts in (weights * size, weights / weights[weights > 0].min()):
         whole = np.round(counts)
-        # Weights that are no counts differ from such by far more.
+        # Weights that are not counts differ from integers by far more.
         if np.abs(counts - whole).max() < 1e-6:
             return np.repeat(values, whole.astype(int))
     raise ValueError(

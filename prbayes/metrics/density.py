@@ -35,18 +35,13 @@ BandwidthRule = Callable[[Floats, Floats], float]
 
 
 def spread(sample: Floats, weights: Floats) -> float:
-    """Return min(standard deviation, IQR / 1.34) of a weighted sample.
+    """Return min(standard deviation, IQR / 1.34) of a weighted sample; the former if IQR is zero.
 
-    1.34 is the interquartile range of the standard normal distribution. Where the IQR is zero, it
-    is the standard deviation alone.
+    1.34 is the interquartile range of the standard normal distribution.
     """
     sample = sample - sample.min()  # equal values give exactly zero
-    mean = weights @ sample
-    variance = weights @ (sample - mean) ** 2
-    sd = float(np.sqrt(variance))
-    upper = quantile(sample, weights, 0.75)
-    lower = quantile(sample, weights, 0.25)
-    iqr = float(upper - lower)
+    sd = float(np.sqrt(weights @ (sample - weights @ sample) ** 2))
+    iqr = float(quantile(sample, weights, 0.75) - quantile(sample, weights, 0.25))
     return min(sd, iqr / 1.34) if iqr > 0 else sd
 
 
@@ -68,8 +63,7 @@ def silverman(sample: Floats, weights: Floats) -> float:
     >>> round(silverman(np.arange(32.0), np.full(32, 1 / 32)), 3)
     4.155
     """
-    inverse_n = (weights**2).sum()
-    return float(0.9 * spread(sample, weights) * inverse_n**0.2)
+    return float(0.9 * spread(sample, weights) * (weights**2).sum() ** 0.2)
 
 
 def twice_silverman(sample: Floats, weights: Floats) -> float:
@@ -80,16 +74,14 @@ def twice_silverman(sample: Floats, weights: Floats) -> float:
 def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:
     """Return 0.35 min(sd, IQR/1.34) n^(-1/4), the default of the kernel log-likelihood.
 
-    Only the simulated side is smoothed there, which makes the fitted population too narrow by about
-    h^2 / (2 sd^2); with this rule that is at most a tenth of the sampling error sd / sqrt(2 n) for
-    every n.
+    It smooths the simulated side only, so that the fitted population is too narrow by about
+    h^2 / (2 sd^2), which is at most a tenth of the sampling error sd / sqrt(2 n).
     """
-    inverse_n = (weights**2).sum()
-    return float(0.35 * spread(sample, weights) * inverse_n**0.25)
+    return float(0.35 * spread(sample, weights) * (weights**2).sum() ** 0.25)
 
 
 class DensityEstimator(ABC):
-    """How densities are estimated; ``cells(observed, weights)`` lays out the cells once."""
+    """A density estimator; ``cells(observed, weights)`` lays out its cells once."""
 
     @abstractmethod
     def cells(self, observed: Floats, weights: Floats) -> Cells:
@@ -183,13 +175,9 @@ def _grid(observed: Floats, h: float, step: float) -> tuple[float, int]:
 def _narrowed_kernel(h: float, step: float) -> Floats:
     """Return a Gaussian kernel at the nodes, less the variance step^2 / 3 of a cubic B-spline."""
     s = np.sqrt(h**2 - step**2 / 3)
-    # The kernel ends where it is 2e-11 of its peak.
-    reach = int(np.ceil(7 * s / step))
-    nodes = np.arange(-reach, reach + 1)
-    u = step * nodes / s
-    height = np.exp(-0.5 * u**2)
-    area = s * np.sqrt(2 * np.pi)
-    return np.asarray(height / area)
+    reach = int(np.ceil(7 * s / step))  # where the kernel is 2e-11 of its peak
+    u = step * np.arange(-reach, reach + 1) / s
+    return np.asarray(np.exp(-0.5 * u**2) / (s * np.sqrt(2 * np.pi)))
 
 
 @dataclass(frozen=True)
@@ -247,13 +235,7 @@ class Histogram(DensityEstimator):
 def density_estimator(
     density: object, bandwidth: BandwidthRule = twice_silverman
 ) -> DensityEstimator:
-    """Return a metric's density estimator, where a kernel without bandwidth has the metric's rule.
-
-    Raises
-    ------
-    TypeError
-        If it is not a density estimator.
-    """
+    """Return a density estimator with the metric's bandwidth rule, or raise TypeError."""
     if isinstance(density, GaussianKDE) and density.bandwidth is None:
         return replace(density, bandwidth=bandwidth)
     if isinstance(density, DensityEstimator):
@@ -480,8 +462,8 @@ def is_differentiable(target: Discrepancy) -> bool:
 def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
     """Return the smallest cosine of a simulated and an observed density, (..., n) -> (...).
 
-    One if they are equal, zero if disjoint. Mass outside the inner cells counts in neither. One for
-    components that compare no densities.
+    One if they are equal, or components compare no densities; zero if they are disjoint. Mass
+    outside the inner cells does not count.
     """
     batch = np.shape(simulated)[: np.ndim(simulated) - 1 - len(target.event)]
     smallest = np.ones(batch)

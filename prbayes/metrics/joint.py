@@ -32,10 +32,10 @@ class Joint(LiftedMetric):
     r"""Several outputs of a specimen: the mean of a metric of one output over directions.
 
     The outputs are whitened: robust location and scatter of the observed values, t distribution
-    with one degree of freedom, and invariant coordinates. Both sides are projected on fixed
-    directions that are well spread there, and the metric compares the projections. So correlations
-    and all else that outputs have in common are seen, and nothing depends on the units of the
-    outputs, or on any other affine map of them. The minimiser has the robustness of the metric.
+    with one degree of freedom, and invariant coordinates. The metric compares projections of both
+    sides on fixed, well-spread directions. It thus compares correlations and all other dependence,
+    and is invariant under affine maps of the outputs, such as changes of units. The minimiser has
+    the robustness of the metric.
 
     With the energy distance as metric, :math:`2 \int (F - S_N)^2`, the mean over all directions is
     a multiple of the energy distance of several outputs [1]_; with the area metric it is the sliced
@@ -48,29 +48,27 @@ class Joint(LiftedMetric):
     directions : int, optional
         Their number, (m - 1) (m + 2) for m outputs by default: errors of estimated means, standard
         deviations and correlations are then those of ten times as many, to 3%
-        (``benchmarks/directions.py``). Below m (m + 1) / 2 they do not tell all correlations.
+        (``benchmarks/directions.py``). Fewer than m (m + 1) / 2 miss some correlations.
     components : int, optional
         More than eight outputs, such as curves, are replaced by their scores on principal
-        components of data and design together: as many as leave out a hundredth of the variance of
-        either. Fewer outputs are if a number is given. All are then to be in one unit.
+        components of data and design together: the fewest that leave out a hundredth of the
+        variance of either. With a number this holds for fewer outputs as well. All outputs must
+        have one unit.
     random_seed : int
-        Of the directions; those of two outputs do without.
+        Of the directions of three or more outputs.
 
     Notes
     -----
-    Outputs of fewer inputs lie on a surface, or a curve. Beside a simulator's inputs only as many
-    coordinates are compared as it has dimensions, where these leave out less than a hundredth of
-    the outputs' variance, each in units of its spread; what is left out is how it is bent, of which
-    whitening would make as much as of all else. Nothing depends on the outputs' units still.
+    Outputs of fewer inputs are on a surface, or a curve. Only as many coordinates are compared as
+    it has dimensions, if these leave out less than a hundredth of the outputs' variance, each in
+    units of its spread; whitening would give the bend of the surface the same weight as the rest.
 
-    A specimen that failed (+inf) counts as the largest observed value of that output, and the
-    range of them beyond it. Where outputs are missing (NaN), specimens are taken together by the
-    outputs that they have: each set of outputs is compared with all specimens that have them, with
-    a share as large as that of the specimens that have no others. More than eight sets, and sets
-    that few specimens have, are replaced by what they have in common with others.
+    A specimen that failed (+inf) counts as the largest observed value of that output plus the
+    range. Where outputs are missing (NaN), each set of outputs that specimens have is compared with
+    all specimens that have them, with the share of the specimens that have no others. More than
+    eight sets, and sets of few specimens, are replaced by their intersections with others.
 
-    Data that are symmetric have several frames of invariant coordinates, among which rounding
-    decides.
+    Symmetric data have several frames of invariant coordinates, among which rounding decides.
 
     References
     ----------
@@ -84,10 +82,10 @@ class Joint(LiftedMetric):
     >>> import numpy as np
     >>> from prbayes import AreaMetric
     >>> x = np.random.default_rng(0).normal(size=(50, 2))
-    >>> turned = np.stack([x[:, 0], -x[:, 1]], axis=-1)  # the same marginals, if x is symmetric
+    >>> mirrored = np.stack([x[:, 0], -x[:, 1]], axis=-1)  # the same marginals
     >>> mixed = x @ [[1.0, 0.9], [0.0, 0.4]]
-    >>> found = Joint(AreaMetric()).against(mixed)
-    >>> found(mixed) < found(turned @ [[1.0, 0.9], [0.0, 0.4]]) < found(mixed * [1, -1])
+    >>> distance = Joint(AreaMetric()).against(mixed)
+    >>> distance(mixed) < distance(mirrored @ [[1.0, 0.9], [0.0, 0.4]]) < distance(mixed * [1, -1])
     True
     """
 

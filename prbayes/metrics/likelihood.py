@@ -52,7 +52,7 @@ class LogLikelihood(Metric):
         each output. True adds the variable ``{name}_gross_errors`` with a Beta(1, 9) prior.
     censored : tuple of (lower, upper), optional
         Limits of the readings, numbers or arrays as for ``error``, None for no limit: a value at or
-        beyond a limit says only that the output lies there.
+        beyond a limit means only that the output is there.
     rounded : float or array_like, optional
         Width to which values were rounded, as for ``error``. Also the width of an interval whose
         middle is the reading.
@@ -114,20 +114,20 @@ class LogLikelihood(Metric):
             object.__setattr__(self, name, value)
         if self.density is None:
             return
-        given = [name for name, value in measurement.items() if value is not None]
-        given += ["gross_errors"] if gross is not False else []
-        if given:
+        unused = [name for name, value in measurement.items() if value is not None]
+        unused += ["gross_errors"] if gross is not False else []
+        if unused:
             raise ValueError(
-                f"LogLikelihood: got density= with {given}, expected one of them: a kernel density "
-                "knows nothing of single readings; leave density= out"
+                f"LogLikelihood: got density= with {unused}, expected one of them: a kernel "
+                "density has no single readings; leave density= out"
             )
         density = density_estimator(self.density, likelihood_bandwidth)
         object.__setattr__(self, "density", density)
 
     def __repr__(self) -> str:
         """Show the arguments that differ from their defaults."""
-        given = [f for f in fields(self) if getattr(self, f.name) != f.default]
-        arguments = ", ".join(f"{f.name}={getattr(self, f.name)!r}" for f in given)
+        changed = [f.name for f in fields(self) if getattr(self, f.name) != f.default]
+        arguments = ", ".join(f"{name}={getattr(self, name)!r}" for name in changed)
         return f"LogLikelihood({arguments})"
 
     @property
@@ -136,20 +136,10 @@ class LogLikelihood(Metric):
         return self.density is None
 
     def readings(self, values: Floats, error: Any = None, event: tuple[int, ...] = ()) -> Readings:
-        """Return measured outputs, (N, m), with what is known of their measurement.
+        """Return measured outputs, (N, m), with their errors, limits and rounding.
 
-        Parameters
-        ----------
-        values : ndarray, shape (N, m)
-        error : float or array_like, optional
-            In place of an error that is a model variable.
-        event : tuple of int
-            () for one output without an axis of its own, else (m,).
-
-        Raises
-        ------
-        ValueError
-            If an argument does not fit the shape of the values.
+        ``error`` replaces an error that is a model variable; ``event`` is () for one output without
+        an axis, else (m,). Raises ValueError if an argument does not fit the shape of the values.
         """
         error = self.error if error is None else error
 
@@ -166,9 +156,10 @@ class LogLikelihood(Metric):
                     + (f", or {event}, one for each output" if event else "")
                 ) from None
 
-        sd = np.zeros(values.shape) if error is None else full(error, "error")
-        step = np.zeros(values.shape) if self.rounded is None else full(self.rounded, "rounded")
-        lower, upper = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
+        readings = Readings.exact(values)
+        sd = readings.error if error is None else full(error, "error")
+        step = readings.step if self.rounded is None else full(self.rounded, "rounded")
+        lower, upper = readings.lower.copy(), readings.upper.copy()
         if self.censored is not None:
             low, high = self.censored
             is_low = values <= (full(low, "censored") if low is not None else -np.inf)
@@ -178,10 +169,9 @@ class LogLikelihood(Metric):
             if high is not None:
                 lower[is_high], upper[is_high] = full(high, "censored")[is_high], np.inf
             values = np.where(is_low | is_high, np.nan, values)
-        sd = np.where(np.isfinite(sd), sd, 0.0)
         return Readings(
             values=values,
-            error=sd,
+            error=np.where(np.isfinite(sd), sd, 0.0),
             step=step,
             lower=lower,
             upper=upper,
@@ -200,7 +190,7 @@ class LogLikelihood(Metric):
 
 
 def _hashable(value: Any, name: str) -> Any:
-    """Return a number, nested tuples of an array, or a variable of a model, as it is."""
+    """Return a number, nested tuples of a positive array, or a variable of a model."""
     if value is None or hasattr(value, "owner"):
         return value
     array = real_array(value, f"LogLikelihood: {name}")
@@ -234,8 +224,7 @@ def _as_tuples(array: Floats) -> Any:
 class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     """The mean log-likelihood of fixed observed values."""
 
-    # (m,) or (..., m): ``reading @ g`` is the weighted mean of g, given on the cells, at the
-    # observed values.
+    # (m,) or (..., m): ``reading @ g`` is the mean at the observed values of g, given on the cells.
     reading: Floats
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
 
@@ -248,20 +237,18 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
         """Return the same metric, on the same cells, against other values; for resampling."""
-        other = super().with_observed(observed, weights)
-        reading = self.cells.reading(other.observed, other.weights)
-        return replace(other, reading=reading)
+        target = super().with_observed(observed, weights)
+        return replace(target, reading=self.cells.reading(target.observed, target.weights))
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """The floor of the density, and how it is read at the observed values."""
+        """The floor of the density, and the reading at the observed values."""
         return self.floor, self.reading
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
-        """Return what each cell adds to minus the weighted mean of log p at the observed values."""
+        """Return the terms of minus the weighted mean of log p at the observed values."""
         floor, reading = constants
-        logs = xp.log(floored(density, floor))
-        return -(logs * reading)
+        return -(xp.log(floored(density, floor)) * reading)
 
 
 def kernel_width(target: Discrepancy) -> float:

@@ -62,15 +62,10 @@ class CompositeDiscrepancy(Discrepancy):
         return float(sum(part.share * part.target.scale for part in self.members))
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
-        """Return the same metric, on the same cells and projections, against other values.
+        """Return the same metric, on the same cells and projections, against other values (n, m).
 
-        Parameters
-        ----------
-        observed : ndarray, shape (n, m)
-            NaN is an output that was not measured.
-        weights : ndarray, shape (n,) or (..., n), optional
-            Equal by default. A component sees the rows that have its outputs. If none of these has
-            weight in a data set, the other components take its share there.
+        A component sees the rows that have its outputs. If none of these has weight in a data set,
+        the other components take its share there.
         """
         w = sample_weights(weights, len(observed))
         batch = w.shape[:-1]
@@ -247,7 +242,7 @@ class LiftedMetric(Metric):
 
 
 def failure_caps(observed: Floats) -> Floats:
-    """Return the value of a failure in each output: the largest one, and the range beyond."""
+    """Return the value of a failure in each output: the largest one plus the range."""
     finite = np.where(np.isfinite(observed), observed, np.nan)
     highest = np.nanmax(finite, axis=0)
     lowest = np.nanmin(finite, axis=0)

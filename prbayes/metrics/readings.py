@@ -1,4 +1,4 @@
-"""Measured outputs with what is known of the measurement: error, rounding, censoring, gaps."""
+"""Measured outputs with their errors, rounding, censoring and gaps."""
 
 from __future__ import annotations
 
@@ -15,28 +15,14 @@ from prbayes._validate import Floats
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Readings of m outputs of N specimens.
+    """Readings of m outputs of N specimens; all arrays have the shape (N, m)."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (N, m)
-        NaN where an output was not measured, or is censored.
-    error : ndarray, shape (N, m)
-        Standard deviation of the reading's normal error; zero if it is exact.
-    step : ndarray, shape (N, m)
-        Width to which the reading was rounded; zero if it was not.
-    lower, upper : ndarray, shape (N, m)
-        Bounds of a censored reading, perhaps infinite; NaN where the reading is not censored.
-    is_relative : ndarray of bool, shape (N, m)
-        Where the error is a share of the output.
-    """
-
-    values: Floats
-    error: Floats
-    step: Floats
-    lower: Floats
+    values: Floats  # NaN where an output was not measured, or is censored
+    error: Floats  # standard deviation of the normal error; zero if the reading is exact
+    step: Floats  # width to which the reading was rounded; zero if it was not
+    lower: Floats  # bound of a censored reading, perhaps infinite; NaN if not censored
     upper: Floats
-    is_relative: NDArray[np.bool_]
+    is_relative: NDArray[np.bool_]  # whether the error is a share of the output
 
     @classmethod
     def exact(cls, values: Floats) -> Readings:
@@ -55,13 +41,8 @@ class Readings:
         return len(self.values)
 
     def rows(self, index: NDArray[np.intp]) -> Readings:
-        """Return the readings of some specimens."""
+        """Return the readings of selected specimens."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
-
-    @classmethod
-    def beside(cls, parts: Sequence[Readings]) -> Readings:
-        """Return the readings of different outputs of the same specimens as one."""
-        return cls(**_beside(cls, parts))
 
     @property
     def is_measured(self) -> NDArray[np.bool_]:
@@ -70,7 +51,7 @@ class Readings:
 
     @property
     def is_censored(self) -> NDArray[np.bool_]:
-        """Which readings are known to an interval alone, (N, m)."""
+        """Which readings are intervals, (N, m)."""
         return ~np.isnan(self.lower)
 
     def error_sd(self, outputs: Any) -> Any:
@@ -79,19 +60,18 @@ class Readings:
 
     def spread(self) -> Floats:
         """Return the standard deviation of each output over specimens, (m,); one if it is zero."""
-        measured = self.is_measured
-        count = np.maximum(measured.sum(axis=0), 1)
-        values = np.where(measured, self.values, 0.0)
+        count = np.maximum(self.is_measured.sum(axis=0), 1)
+        values = np.where(self.is_measured, self.values, 0.0)
         mean = values.sum(axis=0) / count
-        away = np.where(measured, values - mean, 0.0)
-        sd = np.sqrt((away**2).sum(axis=0) / count)
+        deviations = np.where(self.is_measured, values - mean, 0.0)
+        sd = np.sqrt((deviations**2).sum(axis=0) / count)
         return np.where(sd > 0, sd, 1.0)
 
     def robust_spread(self) -> Floats:
         """Return the standard deviation of each output by its quartiles, (m,).
 
-        Specimens near a pole of the response decide the ordinary one. Where the quartiles are
-        equal, it is the ordinary one.
+        Specimens near a pole of the response dominate `spread`, which replaces it where the
+        quartiles are equal.
         """
         columns = [v[k] for v, k in zip(self.values.T, self.is_measured.T, strict=True)]
         widths = [np.subtract(*np.quantile(v, [0.75, 0.25])) if v.size else 0.0 for v in columns]
@@ -126,26 +106,19 @@ class Readings:
         return np.where(np.isnan(result), -np.inf, result)
 
     def symbolic_log_density(self, outputs: Floats, variance: Any, xp: Any) -> Any:
-        """Return the same as an array or a graph of the comparison's variance.
+        """Return the log-density, (N, K), as an array or a graph of the comparison's variance.
 
         A censored reading has the probability of its interval, a rounded one the mean density over
-        its step.
-
-        Parameters
-        ----------
-        outputs : ndarray, shape (N, K, m)
-        variance : array or graph that broadcasts against it
-        xp : module
-            ``numpy`` or ``pytensor.tensor``.
+        its step. The variance broadcasts against the outputs, (N, K, m).
         """
         sd = xp.sqrt(variance)
         values = np.where(self.is_measured, self.values, 0.0)[:, None]
-        away = (values - outputs) / sd
-        normal = -0.5 * away**2 - 0.5 * xp.log(2 * np.pi * variance)
+        z = (values - outputs) / sd
+        normal = -0.5 * z**2 - 0.5 * xp.log(2 * np.pi * variance)
         terms = xp.where(self.is_measured[:, None], normal, 0.0)
         if (self.step > 0).any():
             step = np.where(self.step > 0, self.step, 1.0)[:, None]
-            inside = log_interval_probability(away - step / (2 * sd), away + step / (2 * sd), xp)
+            inside = log_interval_probability(z - step / (2 * sd), z + step / (2 * sd), xp)
             is_rounded = ((self.step > 0) & self.is_measured)[:, None]
             terms = xp.where(is_rounded, inside - np.log(step), terms)
         if self.is_censored.any():
@@ -155,13 +128,13 @@ class Readings:
             upper = np.where(self.is_censored, np.minimum(self.upper, far), 1.0)[:, None]
             inside = log_interval_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
             terms = xp.where(self.is_censored[:, None], inside, terms)
-        # The sum over a short axis takes five times as long.
+        # With NumPy a sum over a short axis takes five times as long.
         return terms @ np.ones(terms.shape[-1]) if xp is np else terms.sum(axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    r"""What repeated readings add to the log-density of their weighted mean.
+    r"""The remainder of the log-density of repeated readings beside that of their weighted mean.
 
     Readings :math:`y_r` with standard deviations :math:`e c_r` have the mean :math:`\bar y` with
     :math:`e c`, :math:`c^{-2} = \sum c_r^{-2}`, and
@@ -169,24 +142,11 @@ class Repeats:
     .. math:: \prod_r N(y_r;\, f,\, e^2 c_r^2) = N(\bar y;\, f,\, e^2 c^2)\,
         \frac{c}{(2 \pi e^2)^{(R-1)/2} \prod_r c_r}
         \exp\Bigl(-\frac{1}{2 e^2} \sum_r \frac{(y_r - \bar y)^2}{c_r^2}\Bigr).
-
-    Attributes
-    ----------
-    count : ndarray, shape (N, m)
-        Number of readings less one.
-    within : ndarray, shape (N, m)
-        Sum of squares around the mean.
-    constant : ndarray, shape (N, m)
     """
 
-    count: Floats
-    within: Floats
-    constant: Floats
-
-    @classmethod
-    def beside(cls, parts: Sequence[Repeats]) -> Repeats:
-        """Return the repeats of different outputs of the same specimens as one."""
-        return cls(**_beside(cls, parts))
+    count: Floats  # (N, m): number of readings less one
+    within: Floats  # (N, m): sum of squares around the mean
+    constant: Floats  # (N, m)
 
     def log_density(self, error: Any, xp: Any) -> Any:
         """Return the sum over outputs, (N,), as an array or a graph of the error e, (m,)."""
@@ -194,16 +154,18 @@ class Repeats:
         return terms.sum(axis=-1)
 
 
-def _beside(kind: Any, parts: Sequence[Any]) -> dict[str, Any]:
-    """Return the arrays of records by name, joined along the axis of the outputs."""
-    names = [f.name for f in fields(kind)]
-    return {name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in names}
+def side_by_side[Record: (Readings, Repeats)](records: Sequence[Record]) -> Record:
+    """Return the records of different outputs of the same specimens as one."""
+    first = records[0]
+    names = [f.name for f in fields(first)]
+    arrays = {name: np.concatenate([getattr(r, name) for r in records], axis=1) for name in names}
+    return replace(first, **arrays)
 
 
 def averaged(
     readings: Readings, scale: Floats, numbers: NDArray[np.intp], count: NDArray[np.intp]
 ) -> tuple[Readings, Floats, Repeats]:
-    """Return the readings of S specimens, repeated ones by their weighted mean.
+    """Return the readings of S specimens with their scale, (S, m); the mean of repeated readings.
 
     Parameters
     ----------
@@ -215,13 +177,6 @@ def averaged(
         Specimen of each row.
     count : ndarray of int, shape (S, m)
         Number of readings of each output.
-
-    Returns
-    -------
-    readings : Readings
-        S rows.
-    scale : ndarray, shape (S, m)
-    repeats : Repeats
     """
     present = np.nonzero(readings.is_measured | readings.is_censored)
     places = numbers[present[0]], present[1]
@@ -229,7 +184,7 @@ def averaged(
     def by_specimen(values: Floats, missing: Any) -> Floats:
         result = np.empty(count.shape)
         result[:] = missing
-        result[numbers] = values  # outputs that were not measured keep what was given
+        result[numbers] = values  # of outputs that were not measured
         result[places] = values[present]
         return result
 
@@ -240,36 +195,35 @@ def averaged(
         arrays[name] = by_specimen(values, np.median(values, axis=0))
     arrays["is_relative"] = np.broadcast_to(readings.is_relative[:1], count.shape)
     combined = by_specimen(scale, np.median(scale, axis=0))
-    repeated = count > 1
+    is_repeated = count > 1
     zero = np.zeros(count.shape)
-    if not repeated.any():
+    if not is_repeated.any():
         return Readings(**arrays), combined, Repeats(zero, zero, zero)
 
     def total(values: Floats) -> Floats:
         result = np.zeros(count.shape)
-        np.add.at(result, places, np.where(repeated[places], values, 0.0))
-        return np.where(repeated, result, 0.0)
+        np.add.at(result, places, np.where(is_repeated[places], values, 0.0))
+        return np.where(is_repeated, result, 0.0)
 
     with np.errstate(divide="ignore", invalid="ignore"):
         c, y = scale[present], readings.values[present]
         precision = total(c**-2.0)
         mean = total(y / c**2) / precision
         within = total(((y - mean[places]) / c) ** 2)
-        new = precision**-0.5
+        mean_scale = precision**-0.5
         error = arrays["error"]
-        arrays["error"] = np.where(repeated, error / combined * new, error)
+        arrays["error"] = np.where(is_repeated, error / combined * mean_scale, error)
         normal = (count - 1) / 2 * np.log(2 * np.pi)
-        constant = np.log(new) - total(np.log(c)) - normal
-    arrays["values"] = np.where(repeated, mean, arrays["values"])
-    repeats = Repeats(
-        np.where(repeated, count - 1.0, 0.0), within, np.where(repeated, constant, 0.0)
-    )
-    return Readings(**arrays), np.where(repeated, new, combined), repeats
+        constant = np.log(mean_scale) - total(np.log(c)) - normal
+    arrays["values"] = np.where(is_repeated, mean, arrays["values"])
+    n_extra = np.where(is_repeated, count - 1.0, 0.0)
+    repeats = Repeats(n_extra, within, np.where(is_repeated, constant, 0.0))
+    return Readings(**arrays), np.where(is_repeated, mean_scale, combined), repeats
 
 
 def log_interval_probability(low: Any, high: Any, xp: Any = np) -> Any:
     """Return log(Phi(high) - Phi(low)) of a standard normal variable, in the tails too."""
-    # In the upper tail both ends are mirrored, so that no digits are lost.
+    # In the upper tail both ends are mirrored, which loses no digits.
     is_upper = low > 0
     a = xp.where(is_upper, -high, low)
     b = xp.where(is_upper, -low, high)
@@ -282,7 +236,7 @@ def _log_distribution(x: Any, xp: Any) -> Any:
     if xp is np:
         return log_ndtr(x)
     scaled = x / np.sqrt(2)
-    # Each branch is finite where the other one is chosen, so that gradients are.
+    # Both branches are finite everywhere, as gradients need.
     lower = xp.log(xp.erfcx(-xp.minimum(scaled, 0.0)) / 2) - xp.minimum(scaled, 0.0) ** 2
     upper = xp.log1p(-xp.erfc(xp.maximum(scaled, 0.0)) / 2)
     return xp.where(x < 0, lower, upper)

@@ -26,9 +26,9 @@ class ScoreOptions:
     Attributes
     ----------
     reach : float
-        Default bandwidths of the data beyond their ends from which on the score of a log-density is
-        constant. It would grow without bound there, and the tail of the population would decide on
-        the posterior. The extremes expected of all specimens of the model count as data.
+        Default bandwidths beyond the ends of the data, farther than which the score of a
+        log-density is constant. It would grow without bound, and the tail of the population would
+        decide on the posterior. The extremes expected of all specimens of the model count as data.
     step : float
         Relative step of central differences.
     block : int
@@ -48,34 +48,22 @@ class ScoreOptions:
 
 @dataclass(frozen=True, eq=False)
 class WeightSlopes:
-    """Stored responses with their weights at one theta, and the derivatives of the weights.
+    """Stored responses with their weights at one theta, and the derivatives of the weights."""
 
-    Attributes
-    ----------
-    responses : ndarray, shape (M,) or (M, m)
-    weights : ndarray, shape (M,)
-    slopes : ndarray, shape (d, M)
-        Derivatives with respect to the elements of theta.
-    """
-
-    responses: Floats
-    weights: Floats
-    slopes: Floats
+    responses: Floats  # (M,) or (M, m)
+    weights: Floats  # (M,)
+    slopes: Floats  # (d, M): derivatives with respect to the elements of theta
 
     @property
     def spread(self) -> Floats:
         """Standard deviations of the derivatives of the log weights, (d,)."""
-        # Where an edge of the support passes, weights are zero and their derivatives are not.
-        smallest = 1e-3 * self.weights.mean()
-        positive = np.maximum(self.weights, smallest)
-        squares = self.slopes**2 / positive
-        variances = squares.sum(axis=1)
-        return np.asarray(np.sqrt(variances))
+        # At an edge of the support weights are zero and their derivatives are not.
+        positive = np.maximum(self.weights, 1e-3 * self.weights.mean())
+        return np.asarray(np.sqrt((self.slopes**2 / positive).sum(axis=1)))
 
     def neighbours(self, part: Part, options: ScoreOptions) -> tuple[list[Floats], list[Floats]]:
         """Return features of a part at theta plus and minus a step, (d, ...) each."""
-        target = part.target
-        basis = target.basis(part.of(self.responses))
+        basis = part.target.basis(part.of(self.responses))
         features = basis.features(self.weights[None])
         slopes = basis.features(self.slopes)
         column = self.steps(options)[:, None]
@@ -88,27 +76,17 @@ class WeightSlopes:
 
     def steps(self, options: ScoreOptions) -> Floats:
         """Return the steps of the elements, (d,)."""
-        smallest = np.finfo(float).tiny
-        return np.asarray(options.step / np.maximum(self.spread, smallest))
+        return np.asarray(options.step / np.maximum(self.spread, np.finfo(float).tiny))
 
 
 @dataclass(frozen=True, eq=False)
 class ShiftedResponses:
-    """Responses at theta plus and minus a step along each element, from common random numbers.
+    """Responses at theta plus and minus a step along each element, from common random numbers."""
 
-    Attributes
-    ----------
-    responses : ndarray, shape (M,) or (M, m)
-        At theta itself.
-    upper, lower : ndarray, shape (d, M) or (d, M, m)
-    lengths : ndarray, shape (d,)
-        The steps.
-    """
-
-    responses: Floats
-    upper: Floats
+    responses: Floats  # (M,) or (M, m): at theta itself
+    upper: Floats  # (d, M) or (d, M, m)
     lower: Floats
-    lengths: Floats
+    lengths: Floats  # (d,): the steps
 
     @property
     def weights(self) -> Floats:
@@ -132,15 +110,8 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
 
     The whitening by few data depends on them, and the minimiser with it. That of the population at
     an estimate is about the same for all data sets with this estimate. The bandwidth is that of as
-    many specimens as are observed. Data with gaps keep their own whitening.
-
-    Parameters
-    ----------
-    target : Discrepancy
-        Of several outputs.
-    responses : ndarray, shape (M, m)
-        Rows that lack a number are left out.
-    weights : ndarray, shape (M,)
+    many specimens as are observed. Data with gaps keep their whitening. Responses, (M, m), that
+    lack a number are left out.
     """
     if np.isnan(target.observed).any():
         # Outputs that no specimen has together may depend on each other linearly.
@@ -149,23 +120,19 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
     inner: Any = getattr(metric, "metric", metric)
     density = getattr(inner, "density", None)
     if isinstance(density, GaussianKDE) and callable(density.bandwidth):
-        rule = partial(
-            _bandwidth_of_fewer,
-            rule=density.bandwidth,
-            size=len(target.observed),
-        )
+        rule = partial(_bandwidth_of_fewer, rule=density.bandwidth, size=len(target.observed))
         inner = replace(inner, density=GaussianKDE(rule))
-    table = responses.reshape(len(responses), -1)
-    # Far away responses of no weight would stretch the grid.
-    is_finite = np.isfinite(table).all(axis=1) & (weights > 1e-8 * weights.max())
-    shares = weights[is_finite]
-    shares = shares / shares.sum()
-    prepared = metric.like(inner).against(responses[is_finite], shares)
+    rows = responses.reshape(len(responses), -1)
+    # Remote responses without weight would stretch the grid.
+    is_used = np.isfinite(rows).all(axis=1) & (weights > 1e-8 * weights.max())
+    used_weights = weights[is_used]
+    used_weights = used_weights / used_weights.sum()
+    prepared = metric.like(inner).against(responses[is_used], used_weights)
     return prepared.with_observed(target.observed)
 
 
 def _bandwidth_of_fewer(sample: Floats, weights: Floats, rule: BandwidthRule, size: int) -> float:
-    """Return the bandwidth of so many specimens, by a rule in proportion to n^(-1/5)."""
+    """Return the bandwidth of a number of specimens, by a rule in proportion to n^(-1/5)."""
     squares = (weights**2).sum()
     factor = (squares * size) ** -0.2
     return float(factor * rule(sample, weights))
@@ -178,20 +145,11 @@ def specimen_scores(
     options: ScoreOptions = ScoreOptions(),
     total: int = 0,
 ) -> Floats:
-    """Return the score of each specimen, (n, d).
+    """Return the score of each specimen, (n,) or (n, m) -> (n, d).
 
-    Bandwidths, grids and whitening are those of the target. Each specimen is a data set of its own,
-    whose discrepancy is differentiated by central differences.
-
-    Parameters
-    ----------
-    target : Discrepancy
-        With ``additive``.
-    population : WeightSlopes or ShiftedResponses
-    specimens : ndarray, shape (n,) or (n, m)
-    options : ScoreOptions
-    total : int
-        Number of observed specimens of all simulators.
+    Bandwidths, grids and whitening are those of the target, which is additive. Each specimen is a
+    data set, whose discrepancy is differentiated by central differences. ``total`` is the number of
+    observed specimens of all simulators.
     """
     if not is_additive(target):
         raise TypeError(
@@ -200,8 +158,8 @@ def specimen_scores(
         )
     scores: Any = 0.0
     for part in target.parts:
-        terms = _part_scores(part, population, part.of(specimens), options, total)
-        scores = scores + part.share * terms
+        part_scores = _part_scores(part, population, part.of(specimens), options, total)
+        scores = scores + part.share * part_scores
     return np.asarray(scores)
 
 
@@ -212,30 +170,18 @@ def tabulated_scores(
     options: ScoreOptions = ScoreOptions(),
     total: int = 0,
 ) -> Callable[[Floats], Floats]:
-    """Return a function of responses, (..., n) or (..., n, m) -> (..., n, d), by interpolation.
+    """Return the scores as a function of responses, (..., n) or (..., n, m) -> (..., n, d).
 
-    A score is a smooth function of the one number that a part compares.
-
-    Parameters
-    ----------
-    target : Discrepancy
-        With ``additive``.
-    population : ShiftedResponses
-    specimens : ndarray, shape (n,) or (n, m)
-        Observed responses.
-    options : ScoreOptions
-    total : int
-        Number of observed specimens of all simulators.
+    A score is a smooth function of the number that a part compares: it is interpolated. Arguments
+    are those of `specimen_scores`.
     """
     from scipy.interpolate import CubicSpline
 
     tables = []
     for part in target.parts:
-        known = [np.ravel(part.of(x)) for x in (specimens, population.responses)]
-        values = np.concatenate(known)
+        values = np.concatenate([np.ravel(part.of(x)) for x in (specimens, population.responses)])
         values = values[np.isfinite(values)]
-        inner = part.target
-        observed, weights = finite_sample(inner.observed, inner.weights)
+        observed, weights = finite_sample(part.target.observed, part.target.weights)
         margin = options.margin * twice_silverman(observed, weights)
         nodes = np.linspace(values.min() - margin, values.max() + margin, options.nodes)
         scores = part.share * _part_scores(part, population, nodes, options, total)
@@ -243,15 +189,14 @@ def tabulated_scores(
         tables.append((part, CubicSpline(nodes, scores), failed[0]))
 
     def function(responses: Floats) -> Floats:
-        total: Any = 0.0
+        scores: Any = 0.0
         for part, spline, failed in tables:
             values = np.asarray(part.of(responses))
             first, last = spline.x[[0, -1]]
-            inside = np.clip(np.nan_to_num(values), first, last)
-            terms = spline(inside)
-            terms[np.isposinf(values)] = failed
-            total = total + terms
-        return np.asarray(total)
+            part_scores = spline(np.clip(np.nan_to_num(values), first, last))
+            part_scores[np.isposinf(values)] = failed
+            scores = scores + part_scores
+        return np.asarray(scores)
 
     return function
 
@@ -259,24 +204,21 @@ def tabulated_scores(
 def _part_scores(
     part: Part,
     population: WeightSlopes | ShiftedResponses,
-    compared: Floats,
+    values: Floats,
     options: ScoreOptions,
     total: int,
 ) -> Floats:
     """Return the scores, (n, d), of values that a part compares, (n,)."""
     target = part.target
     upper, lower = population.neighbours(part, options)
-    values = _within_reach(part, population, compared, options, total)
+    if target.metric.likelihood:
+        values = _within_reach(part, population, values, options, total)
     blocks = []
-    for first in range(0, len(values), options.block):
-        block = values[first : first + options.block]
-        one_each = np.eye(len(block))
-        single = target.with_observed(block, one_each[:, None])
-        up = single.outer(*upper, xp=np)
-        down = single.outer(*lower, xp=np)
-        blocks.append(up - down)
-    differences = np.concatenate(blocks)
-    return np.asarray(differences / (2 * population.steps(options)))
+    for start in range(0, len(values), options.block):
+        block = values[start : start + options.block]
+        single = target.with_observed(block, np.eye(len(block))[:, None])
+        blocks.append(single.outer(*upper, xp=np) - single.outer(*lower, xp=np))
+    return np.asarray(np.concatenate(blocks) / (2 * population.steps(options)))
 
 
 def _within_reach(
@@ -288,17 +230,13 @@ def _within_reach(
 ) -> Floats:
     """Return values of a log-density's part limited to the reach of the data, (n,)."""
     target = part.target
-    if not target.metric.likelihood:
-        return values
     observed, weights = finite_sample(target.observed, target.weights)
     lower, upper = observed.min(), observed.max()
     if total > len(target.observed):
         simulated = np.asarray(part.of(population.responses))
-        is_known = np.isfinite(simulated)
-        level = 1 / (total + 1)
-        low, high = quantile(simulated[is_known], population.weights[is_known], [level, 1 - level])
-        lower, upper = min(lower, low), max(upper, high)
+        is_finite = np.isfinite(simulated)
+        prob = 1 / (total + 1)
+        extremes = quantile(simulated[is_finite], population.weights[is_finite], [prob, 1 - prob])
+        lower, upper = min(lower, extremes[0]), max(upper, extremes[1])
     margin = options.reach * twice_silverman(observed, weights)
-    clipped = np.clip(values, lower - margin, upper + margin)
-    is_finite = np.isfinite(values)
-    return np.where(is_finite, clipped, values)
+    return np.where(np.isfinite(values), np.clip(values, lower - margin, upper + margin), values)

@@ -12,22 +12,9 @@ from prbayes._stats import quantile
 from prbayes._validate import Floats
 from prbayes.metrics.density import spread
 
-# Degrees of freedom of the t distribution whose scatter it is. One is the most robust: it bears a
-# share of 1 / (m + 1) of gross outliers, but does not exist where many specimens have equal
-# outputs. Infinitely many are mean and covariance.
+# Degrees of freedom of the t distribution of the scatter. One is the most robust, up to a share of
+# 1 / (m + 1) of gross outliers, but does not exist where many specimens have equal outputs.
 _DEGREES = (1.0, 3.0, np.inf)
-
-# From 50 values of 2 to 8 outputs 40 to 150 steps reach the bound below, which leaves coordinates
-# the same to 1e-8 after an affine map (test); more steps than that mean that there is no scatter.
-_MOST_STEPS = 2000
-_CONVERGED = 1e-9
-
-# A ratio of singular values that is made of rounding errors alone.
-_SINGULAR = 1e-13
-
-# Least variance of a combination of outputs, each in units of its own spread. Below it two sides
-# would be told apart by 1e-5 of an output's spread, which measurement and rounding make.
-_DEPENDENT = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,33 +25,16 @@ class Whitening:
     axes: Floats  # (m, m): a coordinate a column
 
 
-class _NoScatterError(Exception):
-    """There is no scatter; ``along`` is the combination of outputs that has none."""
-
-    def __init__(self, along: Floats) -> None:
-        super().__init__()
-        self.along = along
-
-
 def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whitening:
     """Return invariant coordinates of a weighted sample.
 
-    They are the same, to rounding, after any affine map of the outputs that can be undone: location
-    and scatter are maximum likelihood of a t distribution [1]_, axes and signs are those of another
-    scatter and of a third moment relative to it [2]_. All of them bear gross outliers.
+    They are the same, to rounding, after any invertible affine map of the outputs: location and
+    scatter are maximum likelihood of a t distribution [1]_, axes and signs are those of another
+    scatter and of a third moment relative to it [2]_. All of them are robust to gross outliers.
 
-    Parameters
-    ----------
-    sample, weights : ndarray, shapes (n, m), (n,)
-        All finite.
-    outputs : ndarray of int, shape (m,)
-        What messages call the outputs.
-
-    Raises
-    ------
-    ValueError
-        If an output has equal values, outputs depend on each other linearly, or the specimens are
-        fewer than m + 2.
+    The sample, (n, m), and weights are finite; messages use the numbers of the outputs, (m,).
+    Raises ValueError if an output has equal values, outputs depend on each other linearly, or the
+    specimens are fewer than m + 2.
 
     References
     ----------
@@ -73,28 +43,43 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     .. [2] Tyler, D. E., F. Critchley, L. Duembgen and H. Oja (2009), Invariant co-ordinate
        selection, J. R. Statist. Soc. B 71, 549-592, doi:10.1111/j.1467-9868.2009.00706.x.
     """
-    seen = weights > 0
-    sample = sample[seen]
-    weights = weights[seen]
+    has_weight = weights > 0
+    sample = sample[has_weight]
+    weights = weights[has_weight]
     weights = weights / weights.sum()
     n, m = sample.shape
     if n < m + 2:
-        turned = "" if n > max(m, 3) else "; rows are specimens: is it transposed?"
+        transposed = "" if n > max(m, 3) else "; rows are specimens: is it transposed?"
         raise ValueError(
             f"observed: got {n} specimens with finite outputs {_listed(outputs)} (counted from 0), "
             f"expected at least {m + 2} for {m} outputs; leave outputs out, or compare them by "
-            f"prb.MarginalCorrelation(metric){turned}"
+            f"prb.MarginalCorrelation(metric){transposed}"
         )
     center, unit = units(sample, weights, outputs)
     z = (sample - center) / unit
-    middle, root = _robust_scatter(z, weights, outputs)
-    turn = _turn((z - middle) @ root, weights)
-    root = root @ turn
-    white = (z - middle) @ root
+    for degrees in _DEGREES:
+        location, root, dependent = _scatter(z, weights, degrees)
+        if dependent is None:
+            break
+    if dependent is not None:
+        dependent = np.abs(dependent)
+        which = outputs[dependent > 0.1 * dependent.max()]
+        raise ValueError(
+            f"observed: got outputs {_listed(which)} (counted from 0) that depend on each other "
+            "linearly, to 1e-5 of their spread, expected outputs of which none follows from the "
+            "others; leave one of them out"
+        )
+    # Rotate to the axes of a second scatter, with signs by a third moment.
+    x = (z - location) @ root
+    squares = (x**2).sum(axis=-1)
+    _, axes = _singular(x, weights / (1 + squares) ** 2)
+    third = (weights / (1 + squares) ** 1.5) @ (x @ axes.T) ** 3
+    root = root @ (axes.T * np.where(third < 0, -1.0, 1.0))
+    white = (z - location) @ root
     squares = (white**2).sum(axis=-1)
     size = quantile(squares, weights, 0.5) / (2 * gammaincinv(m / 2, 0.5))
     axes = root / np.sqrt(size)
-    return Whitening(center + middle * unit, axes / unit[:, None])
+    return Whitening(center + location * unit, axes / unit[:, None])
 
 
 def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -103,7 +88,7 @@ def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[F
     Arguments are those of `whitening`.
     """
     center = np.array([quantile(y, weights, 0.5) for y in sample.T])
-    # In parts of the range, whose squares are numbers in any unit.
+    # In parts of the range, whose squares do not overflow in any unit.
     length = np.ptp(sample, axis=0)
     constant = outputs[~(length > 0)]
     if constant.size:
@@ -111,74 +96,48 @@ def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[F
             f"observed: got equal values of output {_listed(constant)} (counted from 0) for all "
             "specimens, expected values that differ; leave that output out"
         )
-    parts = (sample - center) / length
-    unit = length * [spread(part, weights) for part in parts.T]
-    return center, unit
+    scaled = (sample - center) / length
+    return center, length * [spread(x, weights) for x in scaled.T]
 
 
-def _robust_scatter(z: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Return location and a root of the inverse scatter, of as few degrees as there is one for."""
-    for degrees in _DEGREES:
-        try:
-            return _scatter(z, weights, degrees)
-        except _NoScatterError as error:
-            along = np.abs(error.along)
-    several = outputs[along > 0.1 * along.max()]
-    raise ValueError(
-        f"observed: got outputs {_listed(several)} (counted from 0) that depend on each other "
-        "linearly, to 1e-5 of their spread, expected outputs of which none follows from the "
-        "others; leave one of them out"
-    )
+def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats, Floats | None]:
+    """Return location and a root of the inverse scatter of a t distribution, by iteration.
 
-
-def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats]:
-    """Return location and a root of the inverse scatter, of a t distribution, by iteration.
-
-    It starts with mean and covariance, so that an affine map changes no step.
+    It starts with mean and covariance, so that an affine map changes no step. Last comes a linear
+    combination of outputs without scatter, or None.
     """
-    middle = np.zeros(z.shape[1])
+    location = np.zeros(z.shape[1])
     root = np.eye(z.shape[1])
     w = weights
-    for _ in range(_MOST_STEPS):
-        x = (z - middle) @ root
+    # 40 to 150 steps converge for 50 values of 2 to 8 outputs, unless there is no scatter.
+    for _ in range(2000):
+        x = (z - location) @ root
         shift = w @ x
         size, axes = _singular(x - shift, w)
         largest = max(size[0], np.abs(root).max())
-        if not size[-1] > _SINGULAR * largest:
-            raise _NoScatterError(root @ axes[-1])
-        middle = middle + np.linalg.solve(root.T, shift)
+        if not size[-1] > 1e-13 * largest:  # rounding alone
+            return location, root, root @ axes[-1]
+        location = location + np.linalg.solve(root.T, shift)
         root = root @ (axes.T / size)
         stretch = np.abs(size - 1).max()
-        if max(stretch, np.abs(shift).max()) < _CONVERGED:
+        if max(stretch, np.abs(shift).max()) < 1e-9:
             break
-        white = (z - middle) @ root
+        white = (z - location) @ root
         squares = (white**2).sum(axis=-1)
         w = weights / (1 + squares / degrees)
         w = w / w.sum()
-    # The least variance of a combination of outputs in units of their own spread.
-    back = np.linalg.inv(root)
-    own = np.sqrt((back**2).sum(axis=0))
-    _, least, combinations = np.linalg.svd(back / own)
-    dependent = least[-1] ** 2 < _DEPENDENT
-    if dependent or stretch > _CONVERGED:
-        raise _NoScatterError(combinations[-1])
-    return middle, root
+    # The least variance of a combination of outputs in units of their spread: below 1e-10, the
+    # rounding of measurements decides.
+    inverse = np.linalg.inv(root)
+    _, least, combinations = np.linalg.svd(inverse / np.sqrt((inverse**2).sum(axis=0)))
+    is_dependent = least[-1] ** 2 < 1e-10 or stretch > 1e-9
+    return location, root, combinations[-1] if is_dependent else None
 
 
 def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
     """Return the roots of the eigenvalues of a second moment, and its eigenvectors as rows."""
     _, size, axes = np.linalg.svd(x * np.sqrt(weights)[:, None], full_matrices=False)
     return size, axes
-
-
-def _turn(x: Floats, weights: Floats) -> Floats:
-    """Return the rotation to the axes of a second scatter, with signs by a third moment."""
-    squares = (x**2).sum(axis=-1)
-    _, axes = _singular(x, weights / (1 + squares) ** 2)
-    cubes = (x @ axes.T) ** 3
-    third = (weights / (1 + squares) ** 1.5) @ cubes
-    signs = np.where(third < 0, -1.0, 1.0)
-    return np.asarray(axes.T * signs)
 
 
 def _listed(outputs: NDArray[np.intp]) -> str:

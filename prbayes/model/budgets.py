@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pymc as pm
 
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.random_variable import simulators
+from prbayes.model.random_variable import computed_node, simulators
 from prbayes.response.budget import BudgetError
 
 
@@ -55,7 +55,7 @@ def kept(model: pm.Model, *also: str) -> str:
     parts = list(also)
     if folders:
         parts.append(f"all responses ({', '.join(sorted(folders))})")
-    elif any(s.is_computed and s.node.reweighted is not None for s in used):
+    elif any(node and node.reweighted for node in map(computed_node, used)):
         parts.append("the responses of the model's designs")
     if not parts:
         return "nothing is kept: give the propagation a store="

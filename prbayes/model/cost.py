@@ -9,14 +9,10 @@ import pymc as pm
 
 from prbayes._validate import called
 from prbayes.model.description import without_addresses
-from prbayes.model.measurement import Measurement
-from prbayes.model.random_variable import simulators
-from prbayes.model.specimen_likelihood import (
-    SpecimenLikelihood,
-    measurements_of,
-    require_simulator,
-    specimen_likelihoods,
-)
+from prbayes.model.measurement import Measurement, SpecimenLikelihood
+from prbayes.model.random_variable import computed_node, simulators
+from prbayes.model.specimen_preparation import first_run_count, is_prepared, prepared
+from prbayes.model.specimen_variable import measurements_of, require_simulator, specimen_likelihoods
 from prbayes.propagation.specimen_points import first_runs
 from prbayes.response.budget import Cost, RunCost, SimulatorCost
 from prbayes.response.inputs import model_on_context
@@ -91,7 +87,7 @@ def cost(model: pm.Model | Callable[[], pm.Model] | None = None) -> Cost:
         if shared != responses.name:
             propagation = f"{propagation}, with the runs of {shared}"
             needed = replace(needed, first=0)
-        computed = needed.first if simulator.is_computed else 0
+        computed = needed.first if computed_node(simulator) else 0
         costs.append(
             SimulatorCost(responses.name, propagation, needed, computed, responses.workers)
         )
@@ -103,9 +99,9 @@ def cost(model: pm.Model | Callable[[], pm.Model] | None = None) -> Cost:
 
 def _emulator_cost(likelihood: SpecimenLikelihood, measurement: Measurement) -> SimulatorCost:
     """Return the runs for the emulator of a log-likelihood by specimen."""
-    first = likelihood.first_runs or first_runs(likelihood.coordinates.size)
+    first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     batch = max(first // 2, likelihood.options.fresh)
-    computed = len(likelihood.emulation.z) if "_prepared" in vars(likelihood) else 0
+    computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
     most = first + 5 * batch
     growth = (
         f"up to {most} in all, {batch} at a time at the roots of the specimens, until the emulator "

@@ -1,23 +1,97 @@
-"""Checks of measured data before any run: rounding, censoring and repeated specimens.
+"""Checks of measured data, and of the first runs, before a fit.
 
-The log-likelihood by specimen takes measured values as exact. Each check names the argument of
-`LogLikelihood` that describes the data instead. Size is the share of flagged data sets when nothing
-is wrong, power the share when the error is there; the study is likelihood_guards, sections 2.6 to
-2.9, unless another is named.
+The log-likelihood by specimen takes measured values as exact. Checks of rounding, censoring and
+repeated specimens name the argument of `LogLikelihood` that describes the data instead. Checks of
+runs raise where further runs would be useless. The study of size (share of flagged data sets when
+nothing is wrong) and power is likelihood_guards, sections 2.6 to 2.9.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtrc
 
-from prbayes._finding import Finding
+from prbayes._finding import Finding, report
 from prbayes._validate import Floats
+from prbayes.emulators.interpolant import fit_interpolant
+from prbayes.metrics.readings import Readings
 from prbayes.numerics.min_p import adjusted_p_values
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.roots import Response, Roots
+from prbayes.response.failures import ResponseError
+
+# Data beside the first responses, for all metrics.
+
+
+def warn_out_of_range(
+    name: str, observed: Floats, responses: Floats, outputs: Sequence[str]
+) -> None:
+    """Warn if all observed values of an output lie outside all simulated responses."""
+    if not responses.size:  # a user's own propagation may store none
+        return
+    columns = observed.reshape(len(observed), -1).T
+    simulated = responses.reshape(len(responses), -1).T
+    if len(columns) != len(simulated):
+        return
+    labels = [f"{name}[{output}]" for output in outputs] or [name]
+    for label, column, values in zip(labels, columns, simulated, strict=True):
+        measured, finite = column[np.isfinite(column)], values[np.isfinite(values)]
+        if not measured.size or finite.size < 16:  # few responses do not show the range
+            continue
+        low, high = measured.min(), measured.max()
+        lowest, highest = finite.min(), finite.max()
+        if high < lowest or low > highest:
+            side = "below" if high < lowest else "above"
+            report(
+                Finding(
+                    "data-out-of-reach",
+                    f"{label}: got observed values from {low:.4g} to {high:.4g}, all {side} "
+                    f"the first {finite.size} responses, from {lowest:.4g} to {highest:.4g}: "
+                    "look at the units, and at whether the priors reach that far, before more "
+                    "runs are made.",
+                )
+            )
+            return
+
+
+def warn_duplicates(name: str, observed: Floats) -> None:
+    """Warn if each specimen without a label occurs at least twice.
+
+    Counts, and readings on a scale of few steps, have duplicates by chance.
+    """
+    rows = observed.reshape(len(observed), -1)
+    distinct, counts = np.unique(rows, axis=0, return_counts=True)
+    # Of six specimens, duplicates of all are no chance.
+    if len(rows) < 6 or counts.min() < 2 or all(map(_has_few_steps, rows.T)):
+        return
+    report(
+        Finding(
+            "duplicated-data",
+            f"{name}: got {len(rows)} observed values of which only {len(distinct)} are "
+            "different, each at least twice: if these are repeated readings of a specimen, say "
+            "so by specimens=, and leave out what is there twice by mistake; else every "
+            "specimen counts, and the uncertainty is too small.",
+        )
+    )
+
+
+def _has_few_steps(column: Floats) -> bool:
+    """Return whether n values, (n,), are on a decimal scale of less than n steps."""
+    values = column[np.isfinite(column)]
+    for unit in 10.0 ** np.arange(-3, 7):
+        scaled = values * unit
+        is_whole = np.abs(scaled - np.round(scaled)).max(initial=0.0) < 1e-6
+        if is_whole and np.ptp(values) * unit < len(column):
+            return True
+    return False
+
+
+# Rounding, censoring and repeats.
 
 
 @dataclass(frozen=True)
@@ -27,12 +101,12 @@ class DataCheckOptions:
     Parameters
     ----------
     step : float
-        Largest step of rounded values, in standard deviations, that a monotone response allows.
-        At .25 the standard deviation is .03 posterior standard deviations too large with 50
-        specimens and .05 with 200; at .5 it is .10 and .21 too large.
+        Largest step of rounded values, in standard deviations, that a monotone response allows. At
+        .25 the standard deviation is .05 posterior standard deviations too large with 200
+        specimens, at .5 .21.
     step_at_turning_point : float
         The same where the response has a turning point. At .02 the bias is .02 posterior standard
-        deviations with 200 specimens, at .05 .08, at .1 .24 (folded response, 1000 data sets).
+        deviations with 200 specimens, at .05 .08 (folded response).
     censored : float
         Largest p-value of a pile at an end.
     repeated : float
@@ -53,16 +127,8 @@ class DataCheckOptions:
 def resolution(y: Floats, tolerance: float = 1e-6) -> float:
     """Return the step between possible values of rounded data, or 0 for continuous data.
 
-    All values are multiples of the step, up to an offset. Size 0 of 8000 data sets, power 1.00 for
-    steps of .1 to 1 standard deviation and 20 to 200 specimens. A nonlinear function of rounded
-    readings has no step.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N,)
-        Finite values.
-    tolerance : float
-        Largest deviation from a multiple, relative to the largest multiple of the step.
+    All values are multiples of the step, up to an offset, with a relative tolerance. A nonlinear
+    function of rounded readings has no step.
     """
     if len(y) < 3:
         return 0.0
@@ -86,14 +152,9 @@ def resolution(y: Floats, tolerance: float = 1e-6) -> float:
 
 @dataclass(frozen=True)
 class Ends:
-    """Values at the largest and at the smallest value of a sample.
+    """Numbers of values at the largest and at the smallest value of a sample, with p-values.
 
-    Parameters
-    ----------
-    counts : (int, int)
-        Number of values that equal the largest, and the smallest.
-    p_values : (float, float)
-        Each p-value is adjusted for both ends.
+    Each p-value is adjusted for both ends.
     """
 
     counts: tuple[int, int]
@@ -103,29 +164,14 @@ class Ends:
 def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0) -> Ends:
     """Count the values at either end, and return p-values of the hypothesis of no censoring.
 
-    The null distribution of the counts is a bootstrap of normal values that are rounded as the data
-    are. Two exact values are never equal, so that two values at an end suffice without rounding:
-    size 0, power .60 and .98 (10 % censored, 20 and 50 specimens), .99 and 1.00 (30 %).
+    Two exact values are never equal, so that two values at an end suffice without rounding: size 0,
+    power .98 for 10 % censored of 50 specimens.
 
-    Rounded values of a population that is not normal pile up at an end by themselves: the bootstrap
-    alone flags .58 of the folded and .48 of the lognormal data sets with 50 specimens and a step of
-    .1 standard deviations. Therefore the density at the end also has to exceed the density within
-    half a standard deviation of it (binomial test); the larger of the two p-values counts. Size and
-    power with 20 and 50 specimens (300 data sets, ``slow`` test of this module):
-
-    ================================  ==========  ==========  ==========
-    step in standard deviations       .1          .25         .5
-    ================================  ==========  ==========  ==========
-    normal                            .01, .01    .01, .00    .00, .00
-    folded, lognormal, exponential    .03, .04    .02, .01    .00, .00
-    beta (1/2, 1/2)                   .27, .52    .20, .40    .04, .05
-    10 % censored                     .25, .61    .06, .20    .01, .01
-    30 % censored                     .89, 1.00   .47, .86    .24, .51
-    ================================  ==========  ==========  ==========
-
-    At a step of 1 the lognormal population is flagged in .15 and .36, and 30 % censored in .01 and
-    .02. The bootstrap alone has power .75 and 1.00 for 30 % at a step of .5. Limits that differ
-    between specimens leave no pile and are not detected.
+    For rounded values the null distribution is a bootstrap of normal values with the same step. A
+    population that is not normal piles up at an end by itself. Therefore the density at the end
+    also has to exceed the density within half a standard deviation of it (binomial test); the
+    larger of the two p-values counts. Limits that differ between specimens leave no pile. A test
+    has the table of size and power by population and step.
 
     Parameters
     ----------
@@ -138,15 +184,13 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
     seed : int
     """
     n, high, low = len(y), y.max(), y.min()
-    at_high = np.sum(y > high - step / 2)
-    at_low = np.sum(y < low + step / 2)
-    at_end = np.array([at_high, at_low])
     if not step:
         at_end = np.array([np.sum(y == high), np.sum(y == low)])
         # Copies of specimens repeat values between the ends, too.
         _, repeats = np.unique(y[(y > low) & (y < high)], return_counts=True)
         p_values = np.where(at_end > repeats.max(initial=1), 1 / (draws + 1), 1.0)
     else:
+        at_end = np.array([np.sum(y > high - step / 2), np.sum(y < low + step / 2)])
         rng = np.random.default_rng(seed)
         null = np.empty((draws, 2))
         for draw in null:
@@ -156,9 +200,7 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
         bootstrap = adjusted_p_values(at_end.astype(np.float64), null)
         cells = max(1, int(0.5 * y.std() / step))
         width = (cells + 0.5) * step
-        near_high = np.sum(y > high - width)
-        near_low = np.sum(y < low + width)
-        near = np.array([near_high, near_low])
+        near = np.array([np.sum(y > high - width), np.sum(y < low + width)])
         p_values = np.maximum(bootstrap, bdtrc(at_end - 1, near, 1 / (1 + cells)))
     top, bottom = at_end.tolist()
     p_top, p_bottom = p_values.tolist()
@@ -168,12 +210,7 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
 def identical_specimens(y: Floats) -> tuple[tuple[int, ...], ...]:
     """Return groups of specimens that are identical in all measured outputs, by their indices.
 
-    Size 0, power 1.00 for exact repeats. Repeats with a new reading error are not identical.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N, m)
-        NaN where an output was not measured. Specimens without any output are ignored.
+    Outputs (N, m) are NaN where they were not measured. Specimens without any output are ignored.
     """
     measured = np.flatnonzero(np.isfinite(y).any(axis=1))
     rows = np.where(np.isfinite(y[measured]), y[measured], np.inf)
@@ -189,9 +226,8 @@ def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0)
     outputs with steps of at most a quarter standard deviation move, as more would widen their
     distribution. Without such an output repeats by chance are frequent, and the p-value is 1.
 
-    With p <= .01 the size is 0 to .03 (one to three outputs, correlation .7, steps 0 to 1 standard
-    deviation). Power for 20 % copies of 20 specimens is .98 to 1.00 with two or three outputs and
-    steps of .01 and .1, and .06 with one output, whose repeats look like chance (100 data sets).
+    With p <= .01 the size is 0 to .03. Power for 20 % copies of 20 specimens is .98 and more with
+    two or three outputs, and .06 with one output, whose repeats look like chance.
 
     Parameters
     ----------
@@ -199,12 +235,13 @@ def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0)
         NaN where an output was not measured.
     steps : ndarray, shape (m,)
         Step of each output, 0 for exact ones. Specimens do not agree in an exact output by chance.
+    draws, seed : int
     """
-    repeats = _repeats(y)
+    repeats = _count_repeats(y)
     if not repeats:
         return 1.0
     measured = np.isfinite(y)
-    sd = np.array([y[kept, j].std() if kept.any() else 0.0 for j, kept in enumerate(measured.T)])
+    sd = np.array([y[rows, j].std() if rows.any() else 0.0 for j, rows in enumerate(measured.T)])
     fine = steps <= 0.25 * sd
     if not fine.any():
         return 1.0
@@ -213,11 +250,11 @@ def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0)
     null = []
     for _ in range(draws):
         move = np.where(steps > 0, fine * rng.integers(-1, 2, y.shape), rng.random(y.shape))
-        null.append(_repeats(cells + move))
+        null.append(_count_repeats(cells + move))
     return (np.sum(np.array(null) >= repeats) + 1) / (draws + 1)
 
 
-def _repeats(y: Floats) -> int:
+def _count_repeats(y: Floats) -> int:
     """Return the number of specimens that repeat an earlier one."""
     return sum(len(group) - 1 for group in identical_specimens(y))
 
@@ -227,8 +264,7 @@ def data_findings(
     *,
     labels: Sequence[str] | None = None,
     several_roots: bool = False,
-    rounded: ArrayLike | None = None,
-    censored: ArrayLike | None = None,
+    rounded: ArrayLike = np.nan,
     options: DataCheckOptions | None = None,
 ) -> tuple[Finding, ...]:
     """Return findings of rounded, censored and repeated data.
@@ -242,17 +278,15 @@ def data_findings(
     several_roots : bool
         Whether several inputs have the same response, as beside a turning point. There rounding is
         never harmless.
-    rounded : array_like, shape () or (m,), optional
+    rounded : array_like, shape () or (m,)
         Steps that the user stated. NaN where none was.
-    censored : array_like, shape () or (m,), optional
-        Limits that the user stated. NaN where none was.
     options : DataCheckOptions, optional
 
     Returns
     -------
     tuple of Finding
-        Codes ``rounded-data``, ``censored-data`` and ``identical-specimens``. A check is silent for
-        an output where the user stated the argument that describes it.
+        Codes ``rounded-data``, ``censored-data`` and ``identical-specimens``. An output with a
+        stated step has no finding of rounding.
 
     Examples
     --------
@@ -267,10 +301,8 @@ def data_findings(
     y = np.asarray(y, dtype=np.float64)
     y = np.where(np.isfinite(y), y, np.nan).reshape(len(y), -1)
     m = y.shape[1]
-    if labels is None:
-        labels = ["observed"] if m == 1 else [f"observed[{j}]" for j in range(m)]
-    stated_steps = _by_output(rounded, m, "rounded")
-    stated_limits = _by_output(censored, m, "censored")
+    labels = [f"observed[{j}]" for j in range(m)] if labels is None else labels
+    stated_steps = np.broadcast_to(rounded, m)
     largest_step = options.step_at_turning_point if several_roots else options.step
     # Copies of a specimen would pile up at the ends of its outputs.
     copies = [i for group in identical_specimens(y) for i in group[1:]]
@@ -283,37 +315,22 @@ def data_findings(
         values = y[np.isfinite(y[:, j]), j]
         if len(values) < 3:
             continue
-        steps[j] = resolution(values) if np.isnan(stated_steps[j]) else stated_steps[j]
-        if np.isnan(stated_steps[j]) and steps[j] > largest_step * values.std(ddof=1):
-            findings.append(_rounded(label, values, float(steps[j]), largest_step))
-        limits = [stated_limits[j]]
-        if np.isnan(stated_limits[j]):
-            sample = y[counted & np.isfinite(y[:, j]), j]
-            ends = count_at_ends(sample, float(steps[j]), options.draws, options.seed)
-            limits = []
-            for side, count, p_value in zip(
-                ("largest", "smallest"), ends.counts, ends.p_values, strict=True
-            ):
-                if p_value <= options.censored:
-                    limits.append(sample.max() if side == "largest" else sample.min())
-                    findings.append(_censored(label, side, count, len(sample), limits[-1]))
-        for limit in limits:
-            at_limit = np.abs(y[:, j] - limit) <= steps[j] / 2
-            exact[at_limit, j] = np.nan
+        is_stated = not np.isnan(stated_steps[j])
+        steps[j] = step = float(stated_steps[j] if is_stated else resolution(values))
+        if not is_stated and step > largest_step * values.std(ddof=1):
+            findings.append(_rounded(label, values, step, largest_step))
+        sample = y[counted & np.isfinite(y[:, j]), j]
+        ends = count_at_ends(sample, step, options.draws, options.seed)
+        limits = {"largest": sample.max(), "smallest": sample.min()}
+        for (side, limit), count, p_value in zip(
+            limits.items(), ends.counts, ends.p_values, strict=True
+        ):
+            if p_value <= options.censored:
+                findings.append(_censored(label, side, count, len(sample), limit))
+                exact[np.abs(y[:, j] - limit) <= step / 2, j] = np.nan
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:
         findings.append(_identical(identical_specimens(exact)))
     return tuple(findings)
-
-
-def _by_output(values: ArrayLike | None, m: int, name: str) -> Floats:
-    """Return what the user stated by output, (m,), NaN where nothing was stated."""
-    array = np.asarray(np.nan if values is None else values, dtype=np.float64)
-    if array.shape not in ((), (1,), (m,)):
-        raise ValueError(
-            f"{name}: got shape {array.shape}, expected one value or one by output, ({m},); "
-            "pass NaN for an output without"
-        )
-    return np.broadcast_to(array, (m,))
 
 
 def _rounded(label: str, values: Floats, step: float, largest: float) -> Finding:
@@ -348,3 +365,247 @@ def _identical(groups: tuple[tuple[int, ...], ...]) -> Finding:
         "readings, or rounded= for coarse ones.",
         "likelihood.md#identical-specimens",
     )
+
+
+# Runs of a response, for the log-likelihood by specimen.
+
+
+def refuse_scatter(
+    name: str,
+    outputs: Floats,
+    alone: Callable[[int], Floats],
+    *,
+    rounding: float = 1e-6,
+    one_system: float = 0.01,
+) -> None:
+    """Raise if the last good run differs when it is computed again: noise, or a hidden state.
+
+    Parameters
+    ----------
+    name : str
+    outputs : ndarray, shape (n, m)
+        Of the first runs.
+    alone : callable
+        Row -> outputs of this run computed by itself, (m,).
+    rounding : float
+        Largest relative difference of two runs of one specimen.
+    one_system : float
+        Largest difference of a specimen by itself from the same in a batch, in standard deviations
+        of the runs: the tolerance of a solver that takes the batch as one system.
+    """
+    finite = np.isfinite(outputs).all(axis=1)
+    if finite.sum() < 2:
+        return
+    row = int(np.flatnonzero(finite)[-1])
+    last, again = outputs[row], alone(row)
+    accuracy = rounding * np.abs(outputs[finite]).max(axis=0)
+    if not (np.abs(again - last) > accuracy).any():
+        return
+    differs = (np.abs(alone(row) - again) > accuracy).any()
+    if not differs and not (np.abs(again - last) > one_system * outputs[finite].std(axis=0)).any():
+        return
+    j = int(np.nanargmax(np.abs(again - last) / np.where(accuracy > 0, accuracy, 1.0)))
+    raise ResponseError(
+        f"{name}: got outputs {last[j]:.6g} and {again[j]:.6g} of the same inputs, expected the "
+        "same for prb.LogLikelihood(): the response has scatter of its own, or a state from one "
+        "specimen to the next; fix its random seed or state, or use "
+        "metric=prb.ProbabilityResidual() with propagation=prb.Resimulated()"
+    )
+
+
+def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
+    """Raise if the response is constant, or all readings are far outside the range of the runs.
+
+    Far is more than the width of the range of the runs, outputs (n, m), over all populations of the
+    prior.
+    """
+    finite = outputs[np.isfinite(outputs).all(axis=1)]
+    if len(finite) < 2:
+        return
+    low, high = finite.min(axis=0), finite.max(axis=0)
+    size = np.abs(finite).max(axis=0)
+    for j, width in enumerate(high - low):
+        output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
+        if width <= 1e-9 * size[j]:
+            raise DesignError(
+                f"{name}: got {high[j]:.6g} for {output} at all {len(finite)} runs, expected a "
+                "response that depends on its inputs; check the response, or leave the output out"
+            )
+        values = readings.values[np.isfinite(readings.values[:, j]), j]
+        if not values.size and readings.is_censored[:, j].any():
+            raise DesignError(
+                f"{name}: got no reading of {output} within the limits of censored=, expected at "
+                "least one; leave the output out, or check the limits"
+            )
+        beyond = np.maximum(values - high[j], low[j] - values)
+        if values.size and (beyond > width).all():
+            raise DesignError(
+                f"{name}: got readings from {values.min():.4g} to {values.max():.4g}, but "
+                f"{low[j]:.4g} to {high[j]:.4g} for {output} at {len(finite)} runs over the range "
+                "of the priors, expected ranges that overlap; check the units of the readings, "
+                "the response and the priors"
+            )
+
+
+def unreached(outputs: Floats, readings: Readings) -> str:
+    """Return a sentence about readings outside the range of the runs; empty if most are inside."""
+    finite = outputs[np.isfinite(outputs).all(axis=1)]
+    if not len(finite):
+        return ""
+    with np.errstate(invalid="ignore"):
+        outside = (readings.values < finite.min(axis=0)) | (readings.values > finite.max(axis=0))
+    count = int(outside.any(axis=1).sum())
+    if 2 * count <= len(readings):
+        return ""
+    return (
+        f". The readings of {count} of {len(readings)} specimens are outside the range of all "
+        "runs over the priors: check the response, the priors and the units, or pass "
+        "prb.LogLikelihood(error=...)"
+    )
+
+
+def refuse_undetermined(
+    name: str, emulation: Any, roots: Roots, inputs: Sequence[str], smallest: float = 3.0
+) -> None:
+    """Raise if readings leave a direction of the inputs open, although there are enough outputs.
+
+    Along such a direction the outputs change over half the prior's range by less than a few errors
+    of the emulator.
+
+    Parameters
+    ----------
+    name : str
+    emulation : Emulation
+    roots : Roots
+    inputs : sequence of str
+        Names of the coordinates.
+    smallest : float
+        Change in errors of the emulator, at the median root. Responses without such a direction
+        have 97 and more, those with one less than .01.
+    """
+    if len(inputs) < 2 or not len(roots.z):
+        return
+    response: Response = emulation
+    _, jacobian = response(roots.z)
+    scaled = jacobian / emulation.error[:, None]
+    values, directions = _singular(scaled)
+    if len(values) and np.median(values[:, -1]) < smallest:
+        raise _undetermined(name, scaled.shape[1], directions, inputs)
+
+
+def refuse_unused_inputs(
+    name: str, z: Floats, outputs: Floats, inputs: Sequence[str], smallest: float = 1e-3
+) -> None:
+    """Raise if the first runs show a direction of the inputs without influence.
+
+    Parameters
+    ----------
+    name : str
+    z : ndarray, shape (n, d)
+        Coordinates of the first runs.
+    outputs : ndarray, shape (n, m)
+    inputs : sequence of str
+        Names of the coordinates.
+    smallest : float
+        Influence relative to the direction with the largest, at the median run. Responses whose
+        inputs all matter have .05 and more, others 1e-4 and less.
+    """
+    is_finite = np.isfinite(outputs).all(axis=1)
+    d, m = len(inputs), outputs.shape[1]
+    if d < 2 or m < d or is_finite.sum() < 4 * d:
+        return
+    z, outputs = z[is_finite], outputs[is_finite]
+    surface = fit_interpolant(z, outputs, np.ones(len(z), dtype=bool))
+    _, jacobian = surface(z)
+    values, directions = _singular(jacobian / outputs.std(axis=0)[:, None])
+    if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
+        raise _undetermined(name, m, directions, inputs)
+
+
+def _singular(jacobian: Floats) -> tuple[Floats, Floats]:
+    """Return singular values, (k, d), and right singular vectors, (k, d, d)."""
+    finite = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
+    if finite.shape[1] < finite.shape[2]:
+        return np.empty((0, 0)), np.empty((0, 0, 0))
+    _, values, directions = np.linalg.svd(finite)
+    return values, directions
+
+
+def _undetermined(name: str, m: int, directions: Floats, inputs: Sequence[str]) -> DesignError:
+    weights = np.median(directions[:, -1] ** 2, axis=0)
+    is_named = weights > 0.05 * weights.max()
+    involved = ", ".join(x for x, is_shown in zip(inputs, is_named, strict=True) if is_shown)
+    return DesignError(
+        f"{name}: got {m} outputs that leave a direction of {involved} open, expected outputs that "
+        f"determine the {len(inputs)} inputs of a specimen; make an input without influence a "
+        "constant, replace inputs that enter only through their sum or product by it, or pass "
+        "independent outputs alone"
+    )
+
+
+# The emulator of a response.
+
+
+def misfit_findings(
+    name: str, readings: Readings, roots: Roots, error: Floats, largest: float = 50.0
+) -> list[Finding]:
+    """Report specimens whose readings no inputs reproduce.
+
+    Parameters
+    ----------
+    name : str
+    readings : Readings
+    roots : Roots
+    error : ndarray, shape (m,)
+        Standard deviation of the emulator's error.
+    largest : float
+        Misfit in nats that is still an error of the emulator: ten standard deviations.
+    """
+    best = np.full(len(readings), np.inf)
+    np.minimum.at(best, roots.specimen, roots.misfit)
+    has_root = np.isfinite(best)
+    poor: NDArray[np.intp] = np.flatnonzero(has_root & (best > largest))
+    if not poor.size:
+        return []
+    rows = [
+        int(np.flatnonzero(roots.specimen == i)[np.argmin(roots.misfit[roots.specimen == i])])
+        for i in poor
+    ]
+    sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
+    off = np.sqrt(np.mean((roots.residual[rows] * sd) ** 2, axis=0))
+    outputs = ", ".join(f"{value:.2g}" for value in off)
+    return [
+        Finding(
+            "readings-misfit",
+            f"{name}: no inputs in the range of the priors reproduce the readings of "
+            f"{poor.size} of {int(has_root.sum())} specimens, which are off by {outputs} (root "
+            "mean square, by output), expected less than the error of the readings; pass "
+            "prb.LogLikelihood(error=...) with its standard deviation, or gross_errors=True for "
+            "single specimens, or look at the response and the priors.",
+            "likelihood.md#readings-that-no-inputs-reproduce",
+        )
+    ]
+
+
+def emulator_findings(
+    name: str, readings: Readings, error: Floats, largest: float = 0.03
+) -> list[Finding]:
+    """Report an emulator whose error, (m,), is not small beside the scatter of the readings.
+
+    The largest error is in robust standard deviations of the readings. Jumps, poles and crossing
+    modes with less have posterior means within .1 standard deviations (32 of 33 data sets).
+    """
+    share = error / readings.robust_spread()
+    if not (share > largest).any():
+        return []
+    return [
+        Finding(
+            "emulator-error",
+            f"{name}: the emulator's error is up to {share.max():.2g} standard deviations of the "
+            f"readings, expected at most {largest}: the response has a pole, a jump or a kink "
+            "in the range of the priors, or more detail than the runs; posterior means may be off "
+            "by more than .1 standard deviations. Narrow the priors, give more first runs with "
+            "propagation=prb.Reweighted(n), or use metric=prb.ProbabilityResidual().",
+            "likelihood.md#emulator-error",
+        )
+    ]

@@ -14,13 +14,10 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
-from prbayes.model.measurement import Measurement
+from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.model.random_variable import Node, nodes, response_name
-from prbayes.model.specimen_likelihood import (
-    SpecimenLikelihood,
-    measurements_of,
-    specimen_likelihoods,
-)
+from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_variable import measurements_of, specimen_likelihoods
 from prbayes.response.inputs import Inputs, is_random
 
 # What is told of a variable and of a simulator.
@@ -122,8 +119,8 @@ def _specimen_simulator(
         "response": response_name(measurement.responses.function),
         "inputs": _arguments(measurement.inputs, known),
         "metric": without_addresses(measurement.metric),
-        "propagation": f"emulator of {len(likelihood.emulation.z)} runs",
-        "n_points": str(len(likelihood.emulation.z)),
+        "propagation": f"emulator of {len(prepared(likelihood).emulation.z)} runs",
+        "n_points": str(len(prepared(likelihood).emulation.z)),
         "specimens": _specimens(measurement.specimens),
     }
 

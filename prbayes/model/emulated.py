@@ -20,13 +20,10 @@ from scipy.special import logsumexp
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.base import Metric
-from prbayes.model.measurement import Measurement
+from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
 from prbayes.model.random_variable import Node, nodes
-from prbayes.model.specimen_likelihood import (
-    SpecimenLikelihood,
-    measurements_of,
-    specimen_likelihoods,
-)
+from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_variable import measurements_of, specimen_likelihoods
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import new_specimens
@@ -110,8 +107,8 @@ class EmulatedResponse:
         cls, likelihood: SpecimenLikelihood, measurement: Measurement
     ) -> EmulatedResponse:
         """Return the emulator of a simulator's outputs; its first use computes the runs."""
-        emulation = likelihood.emulation
-        columns = likelihood.columns(measurement)
+        emulation = prepared(likelihood).emulation
+        columns = output_columns(likelihood, measurement)
         return cls(
             likelihood.coordinates,
             emulation.z,
@@ -130,7 +127,7 @@ class EmulatedResponse:
         DesignError
             If fewer than eight runs have a finite response.
         """
-        runs = likelihood.coordinates.inputs(likelihood.emulation.z)
+        runs = likelihood.coordinates.inputs(prepared(likelihood).emulation.z)
         points = values_of(runs, likelihood.inputs, responses.inputs)
         values = responses(points, [])
         coordinates = Coordinates.of_prior(responses.inputs)
@@ -185,10 +182,10 @@ def values_of(values: Sequence[Floats], inputs: Inputs, wanted: Inputs) -> list[
 
 def _near_specimens(likelihood: SpecimenLikelihood) -> NDArray[np.bool_]:
     """Return which runs are within the range of the specimens' roots, (n,)."""
-    specimens = likelihood.points
+    specimens = prepared(likelihood).points
     roots = specimens.z[np.isfinite(specimens.log_a)]
     low, high = np.quantile(roots, [0.01, 0.99], axis=0)
-    run_z = likelihood.emulation.z
+    run_z = prepared(likelihood).emulation.z
     near = ((run_z >= low) & (run_z <= high)).all(axis=1)
     return near if near.sum() >= 16 else np.ones(len(run_z), dtype=bool)
 
@@ -302,7 +299,7 @@ class EmulatedSimulator:
     @property
     def n_runs(self) -> int:
         """Runs of the emulator."""
-        return len(self.likelihood.emulation.z)
+        return len(prepared(self.likelihood).emulation.z)
 
     @cached_property
     def _emulated(self) -> EmulatedResponse:

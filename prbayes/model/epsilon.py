@@ -13,7 +13,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, identity_of, require_same
 from prbayes.model.locking import locked
 from prbayes.model.random_variable import AnySimulator, required_simulators, simulators
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_variable import specimen_likelihoods
 
 _log = logging.getLogger("prbayes")
 

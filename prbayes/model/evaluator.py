@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
-from prbayes.model.measurement import Measurement
+from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.model.parameters import Hyperparameters, roots_of
 from prbayes.model.random_variable import (
     Node,
@@ -24,12 +25,9 @@ from prbayes.model.random_variable import (
     priors_alone,
     without_epsilon_warning,
 )
-from prbayes.model.specimen_likelihood import (
-    SpecimenLikelihood,
-    measurements_of,
-    require_simulator,
-    specimen_likelihoods,
-)
+from prbayes.model.specimen_likelihood import log_likelihoods
+from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_variable import measurements_of, require_simulator, specimen_likelihoods
 from prbayes.propagation.base import Bound
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
@@ -100,7 +98,7 @@ class Evaluator:
         computed = tuple(nodes(model).values())
         likelihoods = tuple(dict.fromkeys(specimen_likelihoods(model).values()))
         for likelihood in likelihoods:
-            likelihood.evaluated_by(hyperparameters)
+            likelihood.cache["hyperparameters"] = weakref.ref(hyperparameters)
         return cls(
             model,
             hyperparameters,
@@ -143,8 +141,8 @@ class Evaluator:
         """Number of scalar responses that one theta costs."""
         return sum(node.bound.n_per_theta for node in self.nodes)
 
-    def function(self, key: Any, compile_function: Callable[[], Any]) -> Any:
-        """Return a compiled function by its key; the first call compiles it."""
+    def cached(self, key: Any, compile_function: Callable[[], Any]) -> Any:
+        """Return compiled functions by their key; the first call compiles them."""
         if key not in self.functions:
             self.functions[key] = compile_function()
         return self.functions[key]
@@ -155,12 +153,12 @@ class Evaluator:
         evaluated = set()
         for k, likelihood in enumerate(self.likelihoods):
             if not likelihood.needs_graph:
-                values = likelihood.log_likelihoods(specimen_params(self, thetas, k))
+                values = log_likelihoods(likelihood, specimen_params(self, thetas, k))
                 total += values.sum(axis=1)
                 evaluated |= {m.name for m in likelihood.measurements}
         ordinary = [rv for rv in _other_variables(self.model) if rv.name not in evaluated]
         if ordinary or self.model.potentials:
-            function = self.function(
+            function = self.cached(
                 "log_other",
                 lambda: self.hyperparameters.compile([_log_other(self.model, ordinary)]),
             )
@@ -170,7 +168,7 @@ class Evaluator:
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
-        budget().go_on()
+        budget().check()
         node = self.nodes[k]
         return node.bound.discrepancies(self.roots(thetas, k), target or node.target)
 
@@ -179,7 +177,7 @@ class Evaluator:
         size = len(thetas)
         rows_at_once = [AT_ONCE // max(1, node.bound.n_points) for node in self.nodes]
         rows_at_once += [
-            IN_CACHE // likelihood.points.log_a.size
+            IN_CACHE // prepared(likelihood).points.log_a.size
             for likelihood in self.likelihoods
             if likelihood.needs_graph
         ]
@@ -230,14 +228,14 @@ class Evaluator:
             if prior or gradient:
                 raise NotImplementedError("on other data the objective is evaluated, not compiled")
             return lambda theta, scales: (self.total(theta[None], scales)[0],)
-        function = self.function(
+        function = self.cached(
             ("objective", prior, gradient),
             lambda: _compile_objective(self, prior=prior, gradient=gradient),
         )
         symbolic = [node.bound for node in self.nodes if node.bound.symbolic]
 
         def counted(theta: Floats, scales: Floats) -> Any:
-            budget().go_on()
+            budget().check()
             for bound in symbolic:
                 bound.responses.count_symbolic(bound.n_per_theta)
             return function(theta, scales)
@@ -289,7 +287,7 @@ class Evaluator:
             simulator = self.emulated[k - len(self.nodes)]
             return roots_of(self.hyperparameters, thetas, simulator.inputs, simulator.place)
         key = ("roots", *(node.name for node in self.nodes))
-        function, ends = self.function(key, lambda: _compile_roots(self))
+        function, ends = self.cached(key, lambda: _compile_roots(self))
         values = function(np.ascontiguousarray(thetas))[ends[k] : ends[k + 1]]
         return [np.broadcast_to(value, (len(thetas), *np.shape(value)[1:])) for value in values]
 
@@ -420,17 +418,17 @@ def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, 
     result = {m.name: np.empty((len(thetas), 0)) for m in evaluator.measurements}
     for k, likelihood in enumerate(evaluator.likelihoods):
         if likelihood.needs_graph:
-            functions = evaluator.function(
+            functions = evaluator.cached(
                 "specimens",
                 lambda: [
                     evaluator.hyperparameters.compile([g]) for g in specimen_graphs(evaluator)
                 ],
             )
-            rows = max(1, IN_CACHE // likelihood.points.log_a.size)
+            rows = max(1, IN_CACHE // prepared(likelihood).points.log_a.size)
             blocks = np.split(np.ascontiguousarray(thetas), range(rows, len(thetas), rows))
             values = np.concatenate([functions[k](block)[0] for block in blocks])
         else:
-            values = likelihood.log_likelihoods(specimen_params(evaluator, thetas, k))
+            values = log_likelihoods(likelihood, specimen_params(evaluator, thetas, k))
         result[likelihood.measurements[-1].name] = values
     return result
 

@@ -1,4 +1,4 @@
-"""Readings of one simulator, and the readings of all simulators stacked by specimen.
+"""Measured specimens: readings of one simulator, readings of all, and the record of a likelihood.
 
 A specimen has one row: the outputs of all simulators side by side, NaN where one was not measured.
 Repeated readings of an output are one reading, their weighted mean.
@@ -6,7 +6,8 @@ Repeated readings of an output are one reading, their weighted mean.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import weakref
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -17,8 +18,12 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.metrics.readings import Readings, Repeats, averaged
+from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
+from prbayes.model.parameters import Hyperparameters
 from prbayes.propagation.base import Propagation
+from prbayes.propagation.coordinates import Coordinates
+from prbayes.propagation.population_density import PopulationDensity
+from prbayes.propagation.specimen_points import Emulation, PointOptions
 from prbayes.response.distributions import prior_draws
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
@@ -27,7 +32,7 @@ from prbayes.response.response import Responses
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What one simulator with a log-likelihood by specimen was given.
+    """The arguments of one simulator with a log-likelihood by specimen.
 
     Attributes
     ----------
@@ -77,8 +82,12 @@ class Measurement:
 
     @cached_property
     def readings(self) -> Readings:
-        """Observed values with what is known of the measurement."""
-        return self.metric.readings(self.rows, reference_error(self.extras), self.event)
+        """Observed values and their errors; an unknown error has its prior's 84 % quantile."""
+        error = None
+        if "error" in self.extras:
+            (draws,) = prior_draws([self.extras["error"]], 512, seed=0)
+            error = np.asarray(np.quantile(draws, 0.84, axis=0))
+        return self.metric.readings(self.rows, error, self.event)
 
     @property
     def scale(self) -> Floats:
@@ -90,31 +99,26 @@ class Measurement:
         """Smallest and largest observed value of each output, (2, m)."""
         return np.stack([np.nanmin(self.rows, axis=0), np.nanmax(self.rows, axis=0)])
 
-    def observing(self, values: Floats) -> Measurement:
-        """Return the measurement with other observed values."""
-        values = np.asarray(values, dtype=np.float64)
+    def observing(self, data: Any) -> Measurement:
+        """Return the measurement with other observed values; the same object for equal ones."""
+        values = np.asarray(data, dtype=np.float64)
+        if values.shape == self.observed.shape and np.array_equal(
+            values, self.observed, equal_nan=True
+        ):
+            return self
         if values.ndim != self.observed.ndim or values.shape[1:] != self.event:
             raise ValueError(
                 f"{self.name}: observed: got shape {values.shape}, expected "
                 f"{('N', *self.event)}, as when the simulator was made"
             )
-        if len(values) != len(self.observed) and not (
-            self.groups is None and self.weights is None and self.specimens is None
-        ):
+        is_plain = self.groups is None and self.weights is None and self.specimens is None
+        if len(values) != len(self.observed) and not is_plain:
             raise ValueError(
                 f"{self.name}: observed: got {len(values)} specimens, expected "
                 f"{len(self.observed)}, as many as there are groups, weights= or specimens=; build "
                 "the model again with those of the new ones"
             )
         return replace(self, observed=values)
-
-
-def reference_error(extras: Mapping[str, TensorVariable]) -> Floats | None:
-    """Return a plausible value of an unknown reading error: its prior's 84 % quantile."""
-    if "error" not in extras:
-        return None
-    (draws,) = prior_draws([extras["error"]], 512, seed=0)
-    return np.asarray(np.quantile(draws, 0.84, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,11 +166,11 @@ class StackedReadings:
             logs = np.where(np.isnan(measurement.rows), 0.0, logs).sum(axis=1)
             np.subtract.at(log_gross, index, logs)
         return cls(
-            Readings.beside(readings),
+            side_by_side(readings),
             np.concatenate(scales, axis=1),
-            Repeats.beside(repeats) if any(part.count.any() for part in repeats) else None,
+            side_by_side(repeats) if any(part.count.any() for part in repeats) else None,
             tuple(numbers),
-            _groups(measurements, numbers, size),
+            _specimen_groups(measurements, numbers, size),
             log_gross,
         )
 
@@ -189,37 +193,37 @@ def _averaged(
     measurement: Measurement, numbers: NDArray[np.intp], size: int
 ) -> tuple[Readings, Floats, Repeats]:
     """Return the readings of one simulator by specimen, their scale and their repeats."""
-
-    def text(row: int) -> str:
-        labels = measurement.specimens
-        return repr(int(numbers[row]) if labels is None else labels.tolist()[row])
-
     readings = measurement.readings
     present = readings.is_measured | readings.is_censored
     count = np.zeros((size, present.shape[1]), dtype=np.intp)
     np.add.at(count, numbers, present)
-    repeated = present & (count > 1)[numbers]
-    exact = repeated & (measurement.scale == 0)
+    is_repeated = present & (count > 1)[numbers]
     is_normal = (readings.step == 0) & ~readings.is_censored & ~readings.is_relative
-    coarse = repeated & ~is_normal
-    name = measurement.name
-    if coarse.any():
-        raise ValueError(
-            f"{name}: specimens: got the label {text(int(np.argmax(coarse.any(axis=1))))} several "
-            "times with rounded or censored readings or a relative error, expected repeated "
+    problems = (
+        (
+            is_repeated & ~is_normal,
+            "with rounded or censored readings or a relative error, expected repeated "
             "readings with a normal error; leave rounded=, censored= and relative= out, and pass "
-            "an error= that covers them"
-        )
-    if exact.any():
-        raise ValueError(
-            f"{name}: specimens: got the label {text(int(np.argmax(exact.any(axis=1))))} several "
-            "times without error=, expected it once: exact readings of one specimen would be "
-            "equal; pass metric=prb.LogLikelihood(error=...) with their standard deviation"
-        )
+            "an error= that covers them",
+        ),
+        (
+            is_repeated & (measurement.scale == 0),
+            "without error=, expected it once: exact readings of one specimen would be "
+            "equal; pass metric=prb.LogLikelihood(error=...) with their standard deviation",
+        ),
+    )
+    for where, problem in problems:
+        if where.any():
+            row = int(np.argmax(where.any(axis=1)))
+            labels = measurement.specimens
+            label = int(numbers[row]) if labels is None else labels.tolist()[row]
+            raise ValueError(
+                f"{measurement.name}: specimens: got the label {label!r} several times {problem}"
+            )
     return averaged(readings, measurement.scale, numbers, count)
 
 
-def _groups(
+def _specimen_groups(
     measurements: Sequence[Measurement], numbers: Sequence[NDArray[np.intp]], size: int
 ) -> NDArray[np.intp] | None:
     """Return the group of each specimen, None without groups."""
@@ -237,3 +241,153 @@ def _groups(
                 "each specimen in one group; write labels that are different"
             )
     return result
+
+
+@dataclass(frozen=True, eq=False)
+class SpecimenLikelihood:
+    """Data and settings of a log-likelihood of specimens, measured by one simulator or several.
+
+    Attributes
+    ----------
+    measurements : tuple of Measurement
+        Of simulators with the same inputs, in the order of the model.
+    model : weak reference to a pymc.Model
+    known : Emulation or None
+        Of the same responses, for other data.
+    options : PointOptions
+    cache : dict
+        Values that are computed at their first use, such as the points of the specimens.
+    """
+
+    measurements: tuple[Measurement, ...]
+    model: Any = None
+    known: Emulation | None = None
+    options: PointOptions = field(default_factory=PointOptions)
+    cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Replace the weak reference to the model, which has no pickle, by the model."""
+        cache = {key: value for key, value in self.cache.items() if key != "hyperparameters"}
+        model = None if self.model is None else self.model()
+        return {**vars(self), "model": model, "cache": cache}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the weak reference."""
+        model = state["model"]
+        vars(self).update({**state, "model": None if model is None else weakref.ref(model)})
+
+    @property
+    def name(self) -> str:
+        """Names of the simulators."""
+        return " and ".join(m.name for m in self.measurements)
+
+    @property
+    def inputs(self) -> Inputs:
+        """The inputs of the responses."""
+        return self.measurements[0].inputs
+
+    @cached_property
+    def stacked(self) -> StackedReadings:
+        """The readings of all simulators, by specimen."""
+        return StackedReadings.of(self.measurements)
+
+    @property
+    def readings(self) -> Readings:
+        """The readings of S specimens in M outputs."""
+        return self.stacked.readings
+
+    def variables(self, names: Collection[str] | None = None) -> tuple[TensorVariable, ...]:
+        """Return the model variables of the log-density: roots of the inputs, then extras.
+
+        Extras are those of the simulators with these names, by default of all.
+        """
+        measurements = [m for m in self.measurements if names is None or m.name in names]
+        extras = [v for m in measurements for v in m.extras.values()]
+        return tuple(dict.fromkeys([*self.inputs.roots, *extras]))
+
+    @property
+    def error_is_known(self) -> bool:
+        """Whether no error of a reading is a variable of the model."""
+        return not any("error" in m.extras for m in self.measurements)
+
+    @property
+    def needs_graph(self) -> bool:
+        """Whether only a graph computes the log-likelihood: with an unknown error, or repeats."""
+        return not self.error_is_known or self.stacked.repeats is not None
+
+    @property
+    def calls_response(self) -> bool:
+        """Whether the response itself takes the place of an emulator."""
+        return self.measurements[0].propagation.calls_response
+
+    @cached_property
+    def density(self) -> PopulationDensity:
+        """The density of the inputs in a population."""
+        return PopulationDensity(self.inputs)
+
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        """Coordinates of the inputs."""
+        return Coordinates.of_prior(self.inputs, len(self.readings), sampler=self.density.sampler)
+
+    @property
+    def by_group(self) -> list[tuple[int | None, NDArray[np.intp]]]:
+        """The index of each group, None without groups, and its specimens."""
+        groups = self.stacked.groups
+        if groups is None:
+            return [(None, np.arange(len(self.readings)))]
+        return [(group, np.flatnonzero(groups == group)) for group in np.unique(groups).tolist()]
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        """The hyperparameters of the model, those of its evaluator where one was made."""
+        evaluated = self.cache.get("hyperparameters", lambda: None)()
+        if evaluated is not None:
+            return evaluated  # type: ignore[no-any-return]
+        model = self.model()
+        if model is None:
+            raise RuntimeError("got a simulator whose model is gone; build the model again")
+        return Hyperparameters.of(model)
+
+    def cached(self, key: str, compute: Callable[[], Any]) -> Any:
+        """Return a value of the cache, which the first call computes."""
+        if key not in self.cache:
+            self.cache[key] = compute()
+        return self.cache[key]
+
+    def observing(self, data: Mapping[str, Any]) -> SpecimenLikelihood:
+        """Return the likelihood of other observed values by simulator, with the same runs.
+
+        It is the same object where the values are the same.
+        """
+        changed = tuple(
+            m if data.get(m.name) is None else m.observing(data[m.name]) for m in self.measurements
+        )
+        if all(a is b for a, b in zip(changed, self.measurements, strict=True)):
+            return self
+        preparation = self.cache.get("preparation")
+        known = self.known if preparation is None else preparation.emulation
+        return replace(self, measurements=changed, known=known)
+
+
+def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> NDArray[np.intp]:
+    """Return the specimen of each row of a simulator, (N,)."""
+    return likelihood.stacked.numbers[likelihood.measurements.index(measurement)]
+
+
+def specimen_labels(likelihood: SpecimenLikelihood) -> NDArray[Any] | None:
+    """Return labels of the specimens, (S,); None if these are the rows of a single simulator."""
+    measurements = likelihood.measurements
+    if len(measurements) == 1 and len(likelihood.readings) == len(measurements[0].observed):
+        return None
+    labels = np.concatenate([np.asarray(m.specimens) for m in measurements])
+    _, first = np.unique(np.concatenate(likelihood.stacked.numbers), return_index=True)
+    return labels[first]
+
+
+def output_columns(likelihood: SpecimenLikelihood, measurement: Measurement) -> slice:
+    """Return which of all outputs are those of a simulator."""
+    widths = [m.rows.shape[1] for m in likelihood.measurements]
+    place = likelihood.measurements.index(measurement)
+    first = sum(widths[:place])
+    return slice(first, first + widths[place])

@@ -1,77 +1,37 @@
-"""Draws of the hyperparameters given importance points of the specimens.
+"""Posterior draws of the hyperparameters, given importance points of the specimens.
 
-The draws need no gradient: adaptive importance sampling with a multivariate t proposal. They give
-the population in which the fibres of specimens are covered, and the unit of Monte Carlo errors.
+Adaptive importance sampling with a multivariate t proposal needs no gradient. The draws give the
+population in which the fibres of specimens are covered, and the unit of Monte Carlo errors.
 """
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import pymc as pm
-from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
 from prbayes._validate import IN_CACHE, Floats
-from prbayes.model.parameters import Hyperparameters
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.parameters import Hyperparameters, roots_of
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.numerics.points import sobol
-from prbayes.propagation.coordinates import Coordinates
-from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
+from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare
-from prbayes.response.groups import is_group
-from prbayes.response.inputs import Inputs
 
 
 @dataclass(frozen=True, eq=False)
 class Populations:
-    """Populations of a model's hyperparameters, evaluated at points of specimens.
+    """Populations of a model's hyperparameters, evaluated at points of its specimens."""
 
-    Attributes
-    ----------
-    model : weak reference to a pymc.Model
-    inputs : Inputs
-    coordinates : Coordinates
-    groups : ndarray of int, shape (N,), or None
-    density : PopulationDensity, optional
-        Of the same inputs, as far as it is compiled.
-    evaluated : weak reference to Hyperparameters, optional
-        Those of the model, where an evaluator has compiled them.
-    """
-
-    model: weakref.ref[pm.Model]
-    inputs: Inputs
-    coordinates: Coordinates
-    groups: NDArray[np.intp] | None
-    density: PopulationDensity | None = None
-    evaluated: weakref.ref[Hyperparameters] | None = None
-
-    @cached_property
-    def _density(self) -> PopulationDensity:
-        return PopulationDensity(self.inputs) if self.density is None else self.density
+    likelihood: SpecimenLikelihood
 
     @cached_property
     def hyperparameters(self) -> Hyperparameters:
         """The hyperparameters of the model."""
-        evaluated = None if self.evaluated is None else self.evaluated()
-        if evaluated is not None:
-            return evaluated
-        model = self.model()
-        if model is None:
-            raise RuntimeError("got a simulator whose model is gone; build the model again")
-        return Hyperparameters.of(model)
-
-    def _roots(self, thetas: Floats, group: int) -> list[Floats]:
-        """Return the roots of the inputs at thetas, shapes (S, *shape)."""
-        values = self.hyperparameters.constrained(thetas)
-        return [
-            np.full(len(thetas), group) if is_group(root) else values[str(root.name)]
-            for root in self.inputs.roots
-        ]
+        return self.likelihood.hyperparameters
 
     def log_likelihoods(
         self, thetas: Floats, z: Floats, log_a: Floats, smoothing: Floats | None = None
@@ -79,51 +39,50 @@ class Populations:
         """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
 
         With `smoothing`, a covariance (d, d), populations are normal with the moments of the
-        coordinates z, and wider by it: points that lie farther apart than a population is wide
-        have a smooth log-likelihood.
+        coordinates z, and wider by it: the log-likelihood is then smooth where points lie farther
+        apart than a population is wide.
         """
         n, count, d = z.shape
-        x = self.coordinates.inputs(z)
-        weights = log_a if smoothing is not None else log_a + self.coordinates.log_jacobian(z)
+        likelihood = self.likelihood
         result = np.empty((len(thetas), n))
-        groups = np.zeros(n, dtype=np.intp) if self.groups is None else self.groups
-        for group in np.unique(groups):
-            rows = np.flatnonzero(groups == group)
-            of_rows = [v[rows] for v in x]
+        x = likelihood.coordinates.inputs(z)
+        weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
+        for group, rows in likelihood.by_group:
             if smoothing is None:
-                roots = self._roots(thetas, int(group))
-                points = WeightedPoints.of(self.inputs, of_rows, weights[rows])
-                result[:, rows] = self._density.log_likelihoods(roots, points)
+                roots = roots_of(self.hyperparameters, thetas, likelihood.inputs, group)
+                points = WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], weights[rows])
+                result[:, rows] = likelihood.density.log_likelihoods(roots, points)
                 continue
             step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):
-                some = slice(first, first + step)
-                roots = self._roots(thetas[some], int(group))
+                block = slice(first, first + step)
+                roots = roots_of(self.hyperparameters, thetas[block], likelihood.inputs, group)
                 logs = self._normal_log_density(roots, z[rows].reshape(-1, d), smoothing)
                 logs = np.where(np.isnan(logs), -np.inf, logs)
                 logs = logs.reshape(-1, len(rows), count)
-                result[some, rows] = log_sum_exp(logs + weights[rows])
+                result[block, rows] = log_sum_exp(logs + weights[rows])
         return result
 
     def prior_specimens(self) -> Floats:
         """Return coordinates of specimens of the prior predictive population, (n, d)."""
         return specimens_of(self, self.hyperparameters.prior_thetas(2048, 0), 1)
 
-    def log_share(self, thetas: Floats, share: ResponseShare, size: int) -> Floats:
-        """Return log S of the population of each of N specimens, summed over them, (S,)."""
-        groups = np.zeros(size, dtype=np.intp) if self.groups is None else self.groups
+    def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
+        """Return log S of the population of each specimen, summed over the specimens, (S,)."""
+        likelihood = self.likelihood
         result = np.zeros(len(thetas))
-        for group, count in zip(*np.unique(groups, return_counts=True), strict=True):
-            roots = self._roots(thetas, int(group))
-            result += count * share.of_populations(self._density, roots, self.coordinates)
+        for group, rows in likelihood.by_group:
+            roots = roots_of(self.hyperparameters, thetas, likelihood.inputs, group)
+            log_share = share.of_populations(likelihood.density, roots, likelihood.coordinates)
+            result += len(rows) * log_share
         return result
 
     def _normal_log_density(
         self, roots: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
     ) -> Floats:
         """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
-        drawn, _ = self._density.sampler(roots, specimens, np.random.default_rng(0))
-        sample = self.coordinates.of(drawn, 2)
+        sampler, rng = self.likelihood.density.sampler, np.random.default_rng(0)
+        sample = self.likelihood.coordinates.of(sampler(roots, specimens, rng)[0], 2)
         mean = sample.mean(axis=1, keepdims=True)
         centred = sample - mean
         root = np.linalg.cholesky(centred.swapaxes(1, 2) @ centred / specimens + smoothing)
@@ -166,7 +125,7 @@ class Populations:
 
         def log_likelihood(thetas: Floats) -> Floats:
             total = self.log_likelihoods(thetas, z, log_a, smoothing).sum(axis=1)
-            return total if share is None else total - self.log_share(thetas, share, len(z))
+            return total if share is None else total - self.log_share(thetas, share)
 
         thetas = names.prior_points(2048, seed)
         log_weights = names.log_posterior(thetas, log_likelihood) - names.log_prior(thetas)
@@ -186,8 +145,7 @@ class Populations:
             if temper == 1.0 and attempt >= 2 and 1 / (weights**2).sum() > 200:
                 break
         rng = np.random.default_rng([seed, 5])
-        chosen = thetas[rng.choice(len(thetas), 256, p=weights)]
-        return PopulationDraws(self, chosen, len(z))
+        return PopulationDraws(self, thetas[rng.choice(len(thetas), 256, p=weights)])
 
 
 def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
@@ -209,19 +167,10 @@ def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
 
 @dataclass(frozen=True, eq=False)
 class PopulationDraws:
-    """Draws of the hyperparameters.
-
-    Attributes
-    ----------
-    populations : Populations
-    thetas : ndarray, shape (S, d)
-    size : int
-        Number of measured specimens.
-    """
+    """Draws of the hyperparameters, (S, d)."""
 
     populations: Populations
     thetas: Floats
-    size: int
 
     def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
         """Return log p(y_i | theta) at the draws, (S, N)."""
@@ -229,23 +178,22 @@ class PopulationDraws:
 
     def log_share(self, share: ResponseShare) -> Floats:
         """Return the sum over the specimens of log S, the log share with a response, (S,)."""
-        return self.populations.log_share(self.thetas, share, self.size)
+        return self.populations.log_share(self.thetas, share)
 
-    def specimens(self, each: int = 16, seed: int = 0) -> Floats:
+    def specimens(self, n_of_each: int = 16, seed: int = 0) -> Floats:
         """Return coordinates of specimens of all groups and draws, (n, d)."""
-        return specimens_of(self.populations, self.thetas, each, seed)
+        return specimens_of(self.populations, self.thetas, n_of_each, seed)
 
 
-def specimens_of(populations: Populations, thetas: Floats, each: int, seed: int = 0) -> Floats:
+def specimens_of(populations: Populations, thetas: Floats, n_of_each: int, seed: int = 0) -> Floats:
     """Return coordinates of specimens of the populations at thetas, (n, d)."""
     rng = np.random.default_rng([seed, 3])
-    groups: Sequence[int] = [0]
-    if populations.groups is not None:
-        groups = np.unique(populations.groups).tolist()
+    likelihood = populations.likelihood
     parts = []
-    for group in groups:
-        drawn, _ = populations._density.sampler(populations._roots(thetas, group), each, rng)
-        z = populations.coordinates.of(drawn, 2)
+    for group, _ in likelihood.by_group:
+        roots = roots_of(populations.hyperparameters, thetas, likelihood.inputs, group)
+        specimens, _ = likelihood.density.sampler(roots, n_of_each, rng)
+        z = likelihood.coordinates.of(specimens, 2)
         parts.append(z.reshape(-1, z.shape[-1]))
     z = np.concatenate(parts)
     return z[np.isfinite(z).all(axis=1)]

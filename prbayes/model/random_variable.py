@@ -1,11 +1,8 @@
-"""What a simulator is inside a PyMC model.
+"""The observed variable of a simulator with a metric of distributions, as PyMC evaluates it.
 
-A `Specification`, carried by the operation of an observed variable, and from the first use on a
-`Node`, whose first responses are computed.
-
-The operation is an instance of one class, `SimulatorRV`, whose log-density is registered once: a
-model that is pickled, cloned, conditioned or sent to another process needs nothing else than this
-module.
+Its operation carries a `Specification`, and from the first use on a `Node`, whose first responses
+are computed. The operation is an instance of one class, whose log-density is registered once: a
+model that is pickled, cloned, conditioned or sent to another process needs this module alone.
 """
 
 from __future__ import annotations
@@ -14,7 +11,7 @@ import logging
 import sys
 import weakref
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -42,14 +39,14 @@ from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
-from prbayes.model.first_look import tell_far_data
+from prbayes.model.data_checks import warn_out_of_range
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
 from prbayes.response.budget import duration
 from prbayes.response.compile import PLAIN
 from prbayes.response.inputs import Inputs
-from prbayes.response.outputs import ONE, Outputs
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
@@ -57,19 +54,18 @@ _log = logging.getLogger("prbayes")
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One simulator of a model."""
+    """One simulator of a model, with its first responses."""
 
     name: str
     target: Discrepancy  # the metric, prepared against the observed responses
     bound: Bound  # the propagation at work
     propagation: Propagation  # its configuration
-    epsilon: Any  # scalar; NaN while it is not set
-    # (N,), or None: labels of the specimens that the observed responses were measured on.
-    specimens: NDArray[Any] | None
+    epsilon: Any  # shared scalar; NaN while it is not set
+    specimens: NDArray[Any] | None  # (N,): labels of the specimens
     # Names of the simulators before it in the model that have a ``.dist()`` of its inputs.
     same_inputs: tuple[str, ...] = ()
-    outputs: Outputs = ONE  # of a run
-    group: str = ""  # the name of the group whose specimens it has, if it is of one
+    outputs: Outputs = SINGLE_OUTPUT  # of a run
+    group: str = ""  # name of the group of its specimens
 
     is_emulated: ClassVar[Literal[False]] = False
 
@@ -77,16 +73,6 @@ class Node:
     def metric(self) -> Metric:
         """The calibration metric."""
         return self.target.metric
-
-    @property
-    def node(self) -> Node:
-        """The simulator itself, as `Specification.node` is."""
-        return self
-
-    @property
-    def is_computed(self) -> bool:
-        """Whether the first responses are computed."""
-        return True
 
     @property
     def responses(self) -> Responses:
@@ -110,13 +96,8 @@ class Node:
 
     @property
     def has_specimens(self) -> bool:
-        """Whether specimens of all populations are there without a run."""
+        """Whether a population has specimens without a run."""
         return self.bound.stored
-
-    @property
-    def runs_per_theta(self) -> int:
-        """Runs that a population costs."""
-        return self.bound.n_per_theta
 
     @property
     def max_lost(self) -> float:
@@ -138,17 +119,14 @@ class Node:
         return float(self.epsilon.get_value())
 
     @property
-    def epsilon_is_default(self) -> bool:
-        """Whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
-        return has_default_epsilon(self)
-
-    @property
     def n_specimens(self) -> float:
-        """Effective number of specimens: repeated observations of one are no further ones."""
+        """Effective number of specimens: repeated observations of a specimen count once."""
         return effective_specimens(self.target, self.specimens)
 
-    def observing(self, values: Floats) -> Node:
-        """Return the same simulator with other observed responses; it computes nothing anew.
+    def observing(self, data: Any) -> Node:
+        """Return the same simulator with other observed responses; it computes no response.
+
+        It is the same object where the values are the same.
 
         Raises
         ------
@@ -156,7 +134,10 @@ class Node:
             If the metric does not take them, or weights or labels go with as many as before.
         """
         before = self.target
-        values = np.asarray(values, dtype=np.float64)
+        data = np.asarray(data)
+        if np.array_equal(data, before.observed.astype(data.dtype), equal_nan=True):
+            return self
+        values = np.asarray(data, dtype=np.float64)
         if values.shape[1:] != before.event or values.ndim != before.observed.ndim:
             raise ValueError(
                 f"{self.name}: observed: got shape {values.shape}, expected "
@@ -165,7 +146,7 @@ class Node:
         weights: Floats | None = before.weights
         n = len(before.weights)
         if len(values) != n:
-            # What goes with the values before has no counterpart.
+            # Weights and labels belong to the values before.
             if self.specimens is not None or np.ptp(before.weights) > 0:
                 raise ValueError(
                     f"{self.name}: observed: got {len(values)} specimens, expected "
@@ -180,10 +161,10 @@ class Node:
         bound = self.bound.copied()
         dimensions = bound.inputs.dimensions
         bound.target = target.metric.beside(target, bound.first_responses, dimensions)
-        other = replace(self, target=bound.target, bound=bound)
-        if self.epsilon_is_default:
-            other.epsilon.set_value(np.asarray(1 / other.n_specimens))
-        return other
+        changed = replace(self, target=bound.target, bound=bound)
+        if has_default_epsilon(self):
+            changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
+        return changed
 
     def copied(self) -> Node:
         """Return the same simulator with its own design, count of responses and epsilon."""
@@ -197,12 +178,12 @@ class Specification:
 
     name: str
     target: Discrepancy  # the metric, prepared against the observed responses
-    responses: Responses  # which stay as they are
+    responses: Responses
     propagation: Propagation
-    epsilon: Any  # scalar; NaN while it is not set
+    epsilon: Any  # shared scalar; NaN while it is not set
     specimens: NDArray[Any] | None  # (N,): labels
     same_inputs: tuple[str, ...] = ()
-    outputs: Outputs = ONE
+    outputs: Outputs = SINGLE_OUTPUT
     group: str = ""
     progressbar: bool = True
     original: Specification | None = None  # of a clone, which takes the runs of the original
@@ -223,16 +204,11 @@ class Specification:
         with lock(self):
             return self._node
 
-    @property
-    def is_computed(self) -> bool:
-        """Whether the first responses are computed."""
-        return "_node" in vars(self.original or self)
-
     @cached_property
     def _node(self) -> Node:
         if self.original is not None:
             return replace(self.original.node.copied(), epsilon=self.epsilon)
-        # What an attempt that fails counts and notes is dropped with it.
+        # Counts and notes of an attempt that fails are dropped with the copy.
         responses = self.responses.copied()
         responses.runs = self.responses.runs
         responses.on_start = partial(_log_first_runs, self.propagation, responses)
@@ -242,7 +218,9 @@ class Specification:
             metric = self.target.metric
             bound.target = metric.beside(self.target, bound.first_responses, dimensions)
         responses.on_start = None
-        tell_far_data(self.name, self.target.observed, bound.first_responses, self.outputs.names)
+        warn_out_of_range(
+            self.name, self.target.observed, bound.first_responses, self.outputs.names
+        )
         return Node(
             self.name,
             bound.target,
@@ -264,12 +242,19 @@ class Specification:
 type AnySimulator = Specification | Node
 
 
+def computed_node(simulator: AnySimulator) -> Node | None:
+    """Return a simulator with its first responses; None if they are not computed yet."""
+    if isinstance(simulator, Node):
+        return simulator
+    return simulator.node if "_node" in vars(simulator.original or simulator) else None
+
+
 def _log_first_runs(
     propagation: Propagation, responses: Responses, runs: int, seconds: float
 ) -> None:
     """Log how many runs there are, and how long they take, from the time of one run, or NaN."""
     cost = propagation.cost
-    if cost.each and np.isnan(seconds):
+    if cost.per_theta and np.isnan(seconds):
         return  # known after the first call
     responses.on_start = None
 
@@ -287,14 +272,17 @@ def _log_first_runs(
         "another number in propagation=%s; more: %s",
         responses.name,
         with_duration(runs),
-        with_duration(cost.each),
+        with_duration(cost.per_theta),
         setting,
         cost.growth,
     )
 
 
+# Epsilon.
+
+
 def has_default_epsilon(simulator: AnySimulator) -> bool:
-    """Return whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
+    """Return whether epsilon is the default, the 1/N of a metric on a likelihood's scale."""
     target = simulator.target
     epsilon = float(simulator.epsilon.get_value())
     # Weights that were normalised again differ by rounding.
@@ -315,7 +303,7 @@ def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> flo
 
 
 def shared_epsilon(name: str, value: float) -> Any:
-    """Return the shared scalar that holds a simulator's epsilon."""
+    """Return the shared scalar of a simulator's epsilon."""
     return pytensor.shared(np.asarray(value, dtype=np.float64), name=f"{name}_epsilon")
 
 
@@ -327,20 +315,23 @@ def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
     return -discrepancy / epsilon
 
 
+# The operation.
+
+
 class SimulatorRV(RandomVariable):
     """The operation of an observed variable: draws data sets, and carries its simulator.
 
-    Two of them are equal if they carry the same simulator, so that no rewrite of a graph takes one
-    for another.
+    Two operations are equal if they carry the same simulator, so that no rewrite of a graph takes
+    one for another.
 
-    PyTensor's rewriters remember every operation that they have met, as long as the process lasts.
-    So the simulator, with all stored responses, is held by the applications of the operation, which
-    live as long as a model or a compiled function, and not by the operation itself.
+    PyTensor's rewriters keep every operation that they have met. The simulator with all stored
+    responses is therefore referenced by applications of the operation, which live as long as a
+    model or a compiled function, and weakly by the operation itself.
 
     Attributes
     ----------
     simulator : Specification or Node
-        No response is computed for it; a specification before `nodes` was asked for it.
+        A specification until `nodes` computes its first responses.
     node : Node
         The first access computes its first responses.
     """
@@ -356,17 +347,16 @@ class SimulatorRV(RandomVariable):
         *,
         simulator: AnySimulator,
     ) -> None:
-        # What pictures of the model show.
         response = response_name(simulator.responses.function)
-        told = f"Simulator of {response} by {type(simulator.target.metric).__name__}"
-        super().__init__(name=name or told, signature=signature, dtype=dtype, inplace=inplace)
+        label = f"Simulator of {response} by {type(simulator.target.metric).__name__}"
+        super().__init__(name=name or label, signature=signature, dtype=dtype, inplace=inplace)
         self._simulator = weakref.ref(simulator)
         self._owner: weakref.ref[Any] | None = None
         self._warned = False
 
     @property
     def simulator(self) -> AnySimulator:
-        """The simulator, as far as it is computed."""
+        """The simulator, with its first responses once these are computed."""
         simulator = self._simulator()
         if simulator is None:
             raise RuntimeError(f"{self}: got an operation of a model that is gone")
@@ -375,52 +365,49 @@ class SimulatorRV(RandomVariable):
     @property
     def node(self) -> Node:
         """The simulator with its first responses."""
-        return self.simulator.node
+        simulator = self.simulator
+        return simulator if isinstance(simulator, Node) else simulator.node
 
     def __eq__(self, other: object) -> bool:
         """Return whether it is of the same simulator, and applied alike."""
-        return type(self) is type(other) and self._told() == other._told()
+        keys = ("name", "signature", "dtype", "inplace", "_simulator")
+        return type(self) is type(other) and all(
+            getattr(self, key) == getattr(other, key) for key in keys
+        )
 
     def __hash__(self) -> int:
         """Return a number that stays when the simulator is gone."""
         return hash((type(self), self.name, self.signature, self.dtype, self.inplace))
 
-    def _told(self) -> tuple[Any, ...]:
-        return self.name, self.signature, self.dtype, self.inplace, self._simulator
-
     def make_node(self, *inputs: Any, **keywords: Any) -> Apply[Any, Any]:
-        """Apply the operation; copies of the application hold the simulator as well."""
+        """Apply the operation; the application, and its copies, reference the simulator."""
         apply = super().make_node(*inputs, **keywords)
         apply.tag.simulator = self.simulator
         return apply
 
     def __str__(self) -> str:
-        """Show the name and the signature, without what the simulator holds."""
+        """Show the name and the signature, without the simulator."""
         return f'prbayes_Simulator_rv{{"{self.signature}"}}'
 
     @property
     def _print_name(self) -> tuple[str, str]:
-        """What PyMC prints for the distribution, as text and as LaTeX."""
-        response = response_name(self.simulator.responses.function)
-        told = f"{response}, {type(self.simulator.target.metric).__name__}"
-        latex = told.replace("_", "\\_")
-        return f"Simulator[{told}]", f"\\operatorname{{Simulator}}[\\text{{{latex}}}]"
+        simulator = self.simulator
+        return printed_names(simulator.responses.function, type(simulator.target.metric).__name__)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the owner: a copy that is unpickled belongs to a model of its own."""
         return {**self.__dict__, "_owner": None, "_simulator": self.simulator}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take what was left in."""
+        """Restore the weak reference; the application references the simulator."""
         self.__dict__.update(state)
         self._simulator = weakref.ref(state["_simulator"])
 
     def own_simulator(self, apply: Apply[Any, Any]) -> AnySimulator:
         """Return the simulator that belongs to an application of this operation in a model.
 
-        Clones of a model share the operation with the original. Each is then given one of its own,
-        whose design, count and epsilon are copies: what is refined or set there leaves the original
-        alone.
+        Clones of a model share the operation with the original. Each is then given an operation
+        with copies of design, count and epsilon, which leave the original unchanged.
         """
         if self._owner is None:
             self._owner = weakref.ref(apply)
@@ -432,106 +419,93 @@ class SimulatorRV(RandomVariable):
 
     def assign(self, apply: Apply[Any, Any], simulator: AnySimulator) -> None:
         """Give an application in a model an operation of its own, which carries a simulator."""
-        own = SimulatorRV(**{**self._props_dict(), "simulator": simulator})
-        own._owner = weakref.ref(apply)
-        apply.op = own
+        operation = SimulatorRV(**{**self._props_dict(), "simulator": simulator})
+        operation._owner = weakref.ref(apply)
+        apply.op = operation
         apply.tag.simulator = simulator
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
         """Draw responses of specimens; their shape is the last of the arguments."""
-        self._warn_of_independence()
+        if self.simulator.same_inputs and not self._warned:
+            self._warned = True
+            others = ", ".join(self.simulator.same_inputs)
+            report(
+                Finding(
+                    "independent-draws",
+                    f"{self.simulator.name} has inputs that {others} has too, the same "
+                    "specimens; PyMC's predictive sampling draws each variable by itself, and so "
+                    "as independent of the others: use prb.predict for responses of the same "
+                    "specimens.",
+                )
+            )
         *params, size = arguments
         bound = self.node.bound
         event = self.node.target.event
-        batches = []
-        for root, param in zip(bound.inputs.roots, params, strict=True):
-            leading = param.ndim - root.type.ndim
-            batches.append(param.shape[:leading])
+        batches = [
+            param.shape[: param.ndim - root.type.ndim]
+            for root, param in zip(bound.inputs.roots, params, strict=True)
+        ]
         batch = np.broadcast_shapes(*batches)
         values = np.empty((*(batch if size is None else size), *event))
         # One population for each element of a batch of parameters: commonly there is one.
         for index in np.ndindex(batch):
-            pairs = zip(params, batches, strict=True)
-            at = [param[_own_index(index, own)] for param, own in pairs]
-            places = _places(index, batch)
-            there = values[places]
-            n = there.size // int(np.prod(event, dtype=int))
-            drawn = bound.draw(rng, n, at)
-            values[places] = drawn.reshape(there.shape)
+            roots = []
+            for param, leading in zip(params, batches, strict=True):
+                last = index[len(index) - len(leading) :]
+                at = tuple(0 if n == 1 else i for i, n in zip(last, leading, strict=True))
+                roots.append(param[at])
+            # The specimens of a population are along axes of length one.
+            places = tuple(slice(None) if n == 1 else i for i, n in zip(index, batch, strict=True))
+            shape = values[places].shape
+            n_specimens = int(np.prod(shape, dtype=int)) // int(np.prod(event, dtype=int))
+            values[places] = bound.draw(rng, n_specimens, roots).reshape(shape)
         return values
 
     def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
-        """Return how many outputs a specimen has."""
+        """Return the number of outputs of a specimen."""
         return [pt.constant(n, dtype="int64") for n in self.simulator.target.event]
-
-    def _warn_of_independence(self) -> None:
-        """Say once that PyMC draws each variable by itself."""
-        others = self.simulator.same_inputs
-        if not others or self._warned:
-            return
-        self._warned = True
-        report(
-            Finding(
-                "independent-draws",
-                f"{self.simulator.name} has inputs that {', '.join(others)} has too, the same "
-                "specimens; PyMC's predictive sampling draws each variable by itself, and so "
-                "as independent of the others: use prb.predict for responses of the same "
-                "specimens.",
-            )
-        )
 
 
 def response_name(function: Any) -> str:
-    """Return what a response is called, or else what it is of."""
-    inner = getattr(function, "function", function)  # of what `scalar` wraps
+    """Return the name of a response, or the arguments of a lambda function."""
+    inner = getattr(function, "function", function)  # of `scalar`
     name = str(getattr(inner, "__name__", type(inner).__name__))
     if name != "<lambda>":
         return name
     return f"lambda({', '.join(signature(inner).parameters)})"
 
 
-def _own_index(index: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return where an array of this leading shape is read, for an index after broadcasting."""
-    last = index[len(index) - len(shape) :]
-    pairs = zip(last, shape, strict=True)
-    return tuple(0 if n == 1 else i for i, n in pairs)
+def printed_names(function: Any, metric: str) -> tuple[str, str]:
+    """Return the name that PyMC prints for a distribution, as text and as LaTeX."""
+    text = f"{response_name(function)}, {metric}"
+    latex = text.replace("_", "\\_")
+    return f"Simulator[{text}]", f"\\operatorname{{Simulator}}[\\text{{{latex}}}]"
 
 
-def _places(index: tuple[int, ...], batch: tuple[int, ...]) -> tuple[int | slice, ...]:
-    """Return where the values for an index of a batch stand: all along its axes of length one."""
-    pairs = zip(index, batch, strict=True)
-    return tuple(slice(None) if n == 1 else i for i, n in pairs)
+# The log-density.
 
-
-# PyMC builds the log-densities of all variables, also where a part of them is asked for.
-_QUIET: ContextVar[bool] = ContextVar("no warning of epsilon", default=False)
-_PRIORS_ALONE: ContextVar[bool] = ContextVar("densities of hyperparameters alone", default=False)
+# The terms for which densities are built: PyMC builds those of all variables, also for a part.
+_TERMS: ContextVar[str] = ContextVar("terms that are built", default="all")
 
 
 @contextmanager
-def without_epsilon_warning() -> Iterator[None]:
-    """Log nothing of an unset epsilon, which the terms that are built do without."""
-    token = _QUIET.set(True)
+def without_epsilon_warning(terms: str = "ordinary") -> Iterator[None]:
+    """Build terms that contain no epsilon: log no warning if it is not set."""
+    token = _TERMS.set(terms)
     try:
         yield
     finally:
-        _QUIET.reset(token)
+        _TERMS.reset(token)
 
 
-@contextmanager
-def priors_alone() -> Iterator[None]:
+def priors_alone() -> AbstractContextManager[None]:
     """Build the densities of hyperparameters: likelihoods by specimen are left out."""
-    token = _PRIORS_ALONE.set(True)
-    try:
-        with without_epsilon_warning():
-            yield
-    finally:
-        _PRIORS_ALONE.reset(token)
+    return without_epsilon_warning("priors")
 
 
 def builds_priors_alone() -> bool:
     """Return whether the densities of hyperparameters alone are built."""
-    return _PRIORS_ALONE.get()
+    return _TERMS.get() == "priors"
 
 
 @_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
@@ -540,8 +514,8 @@ def _log_density(
 ) -> TensorVariable:
     """Return the log-density of the observed data: a graph of the roots and of epsilon."""
     (value,) = values
-    known = known_value(value)
-    node = op.node if known is None else _observing(op.node, known)
+    data = known_value(value)
+    node = op.node if data is None else op.node.observing(data)
     unset = Finding(
         "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
@@ -550,27 +524,38 @@ def _log_density(
         "choose.md#epsilon-and-the-width-of-the-posterior",
     )
     if np.isnan(node.epsilon_value):
-        # nutpie tells no more of an error than its number; nobody else has to be told who may yet
-        # calibrate it
-        blunt = "nutpie" in sys.modules and not _QUIET.get()
-        report(unset, level=logging.WARNING if blunt else logging.DEBUG)
-    check = CheckParameterValue(str(unset))
-    epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
-    inputs = node.bound.inputs
-    density = log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)
+        # nutpie shows only the number of an error; other samplers show the message themselves.
+        is_hidden = "nutpie" in sys.modules and _TERMS.get() == "all"
+        report(unset, level=logging.WARNING if is_hidden else logging.DEBUG)
+    epsilon = CheckParameterValue(str(unset))(node.epsilon, pt.gt(node.epsilon, 0.0))
+    density = log_kernel(node.bound.discrepancy(node.bound.inputs.core(params)), epsilon)
     if isinstance(value, Constant):
         return density
-    observed = node.target.observed.astype(value.dtype)
-    first = value[: len(observed)]
-    equal = pt.eq(first, observed)
-    if np.isnan(observed).any():
-        equal = equal | (pt.isnan(first) & np.isnan(observed))
-    same = pt.eq(value.shape[0], len(observed)) & pt.all(equal)
+    return require_data(
+        node.name,
+        "against which its metric is prepared",
+        density,
+        equal_data(value, node.target.observed),
+    )
+
+
+def equal_data(value: Any, observed: Floats) -> Any:
+    """Return the graph of whether values are the observed ones."""
+    data = observed.astype(value.dtype)
+    first = value[: len(data)]
+    equal = pt.eq(first, data)
+    if np.isnan(data).any():
+        equal = equal | (pt.isnan(first) & np.isnan(data))
+    return pt.eq(value.shape[0], len(data)) & pt.all(equal)
+
+
+def require_data(name: str, use: str, density: Any, condition: Any) -> TensorVariable:
+    """Return a density that raises where the data are not those that it was prepared for."""
     return CheckParameterValue(
-        f"{node.name}: got other observed values than when this was compiled, expected the same "
-        "ones, against which its metric is prepared; compile it again, as pm.sample, prb.minimize "
+        f"{name}: got other observed values than when this was compiled, expected "
+        f"the same ones, {use}; compile it again, as pm.sample, prb.minimize "
         "and prb.sample_smc do"
-    )(density, same)
+    )(density, condition)
 
 
 def known_value(value: Any) -> Any:
@@ -583,13 +568,6 @@ def known_value(value: Any) -> Any:
     if all(isinstance(leaf, Constant | SharedVariable) for leaf in leaves):
         return value.eval(mode=PLAIN)  # as whole numbers that became real ones
     return None
-
-
-def _observing(node: Node, values: Any) -> Node:
-    """Return a simulator with these observed responses: the same one, where it has them."""
-    given = np.asarray(values)
-    own = node.target.observed.astype(given.dtype)
-    return node if np.array_equal(given, own, equal_nan=True) else node.observing(given)
 
 
 @node_rewriter([Shape])  # type: ignore[untyped-decorator]
@@ -608,7 +586,7 @@ optdb.register("prbayes_shape", out2in(shape_without_draw), "minimum_compile", p
 
 
 class SimulatorDistribution(pm.Distribution):
-    """The distribution of an observed variable, as PyMC makes variables from."""
+    """The distribution that PyMC makes the observed variable from."""
 
     rv_type = SimulatorRV
 
@@ -646,7 +624,7 @@ def rv_signature(ndims: Sequence[int], ndim_supp: int) -> str:
 def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
     """Return the simulators of a model as far as they are computed, by their observed variables.
 
-    In a clone they are copies, made when they are first asked for.
+    In a clone they are copies, which the first call makes.
 
     Raises
     ------
@@ -662,9 +640,9 @@ def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
 def nodes(model: pm.Model) -> dict[Any, Node]:
     """Return the simulators of a model, keyed by their observed variables, in the model's order.
 
-    The first call computes their first responses. In a clone they are copies, made when they are
-    first asked for, which its compiled functions follow from then on. Where `pymc.set_data` or
-    `pymc.observe` gave one other data, its metric is prepared anew, and the responses are the same.
+    The first call computes their first responses. In a clone it makes copies, which compiled
+    functions of the clone follow. Where `pymc.set_data` or `pymc.observe` changed the data, the
+    metric is prepared again, and the responses are the same.
 
     Raises
     ------
@@ -675,7 +653,8 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
     """
     computed = {}
     for rv, simulator in simulators(model).items():
-        node = _observing(simulator.node, known_value(model.rvs_to_values[rv]))
+        node = simulator if isinstance(simulator, Node) else simulator.node
+        node = node.observing(known_value(model.rvs_to_values[rv]))
         if node is not simulator:
             rv.owner.op.assign(rv.owner, node)
         computed[rv] = node

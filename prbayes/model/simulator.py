@@ -5,7 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pymc as pm
@@ -29,8 +29,8 @@ from prbayes._validate import (
 )
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.model.first_look import tell_copies
-from prbayes.model.measurement import Measurement
+from prbayes.model.data_checks import warn_duplicates
+from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
     AnySimulator,
     SimulatorDistribution,
@@ -41,9 +41,8 @@ from prbayes.model.random_variable import (
     shared_epsilon,
     simulators,
 )
-from prbayes.model.specimen_likelihood import (
+from prbayes.model.specimen_variable import (
     SpecimenDistribution,
-    SpecimenLikelihood,
     measurements_of,
     set_likelihood,
     specimen_likelihoods,
@@ -52,9 +51,9 @@ from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compile import PLAIN
 from prbayes.response.distributions import refuse_without_density
-from prbayes.response.groups import Groups, is_group, places_of
+from prbayes.response.groups import Groups, group_indices, is_group
 from prbayes.response.inputs import Inputs, is_labelled, model_on_context, read_inputs
-from prbayes.response.outputs import ONE, Outputs, read_observed
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
 
@@ -166,123 +165,98 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     model = model_on_context(None, caller)
     # A model within another one puts its own name before those of its variables.
     name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
-    _refuse_name(name, model)
+    if model.name_for(name) in model.named_vars:
+        raise ValueError(
+            f"prb.Simulator: name: got {name!r}, which is in the model already, expected a new "
+            "name; to run this again, run `with pm.Model():` and all below it again"
+        )
     refuse_uncallable(name, response)
-    sorted_inputs = read_inputs(name, inputs, model)
-    _refuse_simulators(name, sorted_inputs, model)
-    for root in sorted_inputs.roots:
+    arguments = read_inputs(name, inputs, model)
+    for rv in simulators(model):
+        if rv in arguments.roots:
+            raise TypeError(
+                f"{name}: got inputs that depend on the simulator {rv.name}, expected "
+                "hyperparameters; let one response call the other, or return the outputs of both "
+                "from one response, with prb.Joint(metric)"
+            )
+    for root in arguments.roots:
         refuse_single_precision(f"{name}: {root.name}", root.dtype)
-    places, measured = _grouped(name, sorted_inputs, observed)
-    values, outputs = read_observed(name, _data(name, measured))
+    groups, measured = None, observed
+    if arguments.groups is not None:
+        groups, measured = group_indices(name, observed, arguments.groups)
+    values, outputs = read_observed(name, _numbers(name, measured))
     metric = LogLikelihood() if metric is None else metric
     if isinstance(metric, Metric) and metric.by_specimen:
-        return _by_specimen(
-            name, model, response, sorted_inputs, metric, values, outputs, observed, places,
-            epsilon=epsilon, weights=weights, specimens=specimens, dims=dims,
-            propagation=propagation,
+        _refuse_by_specimen(name, arguments, epsilon, propagation)
+        values = checked_specimens(name, values)
+        settings = _checked_propagation(name, propagation)
+        settings.check_likelihood(name)
+        factors = None
+        labels = _labels(name, specimens, len(values))
+        partners = _with_common_specimens(name, labels, model)
+        arguments = _inputs_of_partners(name, arguments, partners)
+        if weights is not None:
+            factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)
+        responses = _responses(name, response, arguments, settings, outputs)
+        extras = _measurement_variables(name, model, metric, partners)
+        measurement = Measurement(
+            name, cast(LogLikelihood, metric), values, factors, labels, arguments, responses,
+            settings, outputs, groups, extras,
         )  # fmt: skip
-    target = _target(name, metric, values, weights)
-    propagation = _propagation(name, propagation)
-    size = len(target.observed)
-    labels = None if specimens is None else sample_labels(specimens, size, f"{name}: specimens")
+        return _add_measurement(model, measurement, partners, observed, dims)
+    target = _prepared_metric(name, metric, values, weights)
+    settings = _checked_propagation(name, propagation)
+    labels = _labels(name, specimens, len(target.observed))
     if labels is not None:
-        _refuse_alike_labels(name, labels, list(simulators(model).values()))
+        _refuse_ambiguous_labels(name, labels, list(simulators(model).values()))
     dims = _checked_dims(name, dims, target.observed.shape, model)
     if epsilon is not None:
         positive_number(epsilon, f"{name}: epsilon")
     flag(progressbar, "progressbar")
-    # As a constant, in which PyMC does not look for missing values to impute.
-    data: Any = target.observed
-    if isinstance(observed, Variable):
-        data = observed
-    elif np.isnan(target.observed).any():
-        data = pt.constant(target.observed)
-    whole = _Term(
-        name=name,
-        target=target,
-        labels=labels,
-        data=data,
-        dims=dims,
-    )
-    terms = [whole]
-    groups = sorted_inputs.groups
-    if groups is not None and places is not None:
-        _refuse_dims_of_groups(name, dims, groups)
-        terms = _of_groups(whole, groups, places)
-    made = []
+    terms = [_Term(name, target, labels)]
+    if arguments.groups is not None and groups is not None:
+        terms = _terms_by_group(terms[0], arguments.groups, groups, dims)
+    variables = []
     for term in terms:
-        responses = _responses(term.name, response, sorted_inputs, propagation, outputs)
-        made.append(_observed_term(term, model, responses, propagation, epsilon, progressbar))
-    return made[0] if groups is None else tuple(made)
+        responses = _responses(term.name, response, arguments, settings, outputs)
+        data = observed if arguments.groups is None else term.target.observed
+        variables.append(
+            _add_term(term, model, responses, settings, epsilon, progressbar, data, dims)
+        )
+    return variables[0] if arguments.groups is None else tuple(variables)
 
 
-def _by_specimen(
-    name: str,
+# The log-likelihood by specimen.
+
+
+def _add_measurement(
     model: pm.Model,
-    response: Callable[..., Any],
-    inputs: Inputs,
-    metric: Any,
-    values: Floats,
-    outputs: Outputs,
+    measurement: Measurement,
+    partners: Sequence[SpecimenLikelihood],
     observed: Any,
-    groups: NDArray[np.intp] | None,
-    *,
-    epsilon: float | None,
-    weights: ArrayLike | None,
-    specimens: ArrayLike | None,
     dims: str | Sequence[str] | None,
-    propagation: Propagation | None,
 ) -> TensorVariable:
     """Add an observed variable whose log-density is the log-likelihood by specimen."""
-    _refuse_by_specimen(name, inputs, epsilon, propagation)
-    values = checked_specimens(name, values)
-    settings = _propagation(name, propagation)
-    settings.check_likelihood(name)
-    labels = (
-        None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
-    )
-    partners = _with_common_specimens(name, labels, model)
-    inputs = _inputs_of_partners(name, inputs, partners)
-    factors = None
-    if weights is not None:
-        factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)
-    measurement = Measurement(
-        name,
-        metric,
-        values,
-        factors,
-        labels,
-        inputs,
-        _responses(name, response, inputs, settings, outputs),
-        settings,
-        outputs,
-        groups,
-        _measurement_variables(name, model, metric, partners),
-    )
-    likelihood = _likelihood(measurement, partners, model)
-    data: Any = values
-    if isinstance(observed, Variable):
-        data = observed
-    elif np.isnan(values).any():
-        # As a constant, in which PyMC does not look for missing values to impute.
-        data = pt.constant(values)
+    name = measurement.name
+    likelihood = _joint_likelihood(measurement, partners, model)
     joined = [rv for rv, joint in specimen_likelihoods(model).items() if joint in partners]
-    simulators = tuple(m.name for m in likelihood.measurements)
-    named = [rv.name for rv in joined if model.named_vars_to_dims.get(rv.name)]
-    if likelihood.labels is not None and (named or dims is not None):
+    names = tuple(m.name for m in likelihood.measurements)
+    with_dims = [rv.name for rv in joined if model.named_vars_to_dims.get(rv.name)]
+    if specimen_labels(likelihood) is not None and (with_dims or dims is not None):
         raise ValueError(
-            f"{name}: dims: got dimensions of {(named or [name])[0]}, whose specimens have several "
-            "readings, expected none: log-likelihoods are by specimen; leave dims= out"
+            f"{name}: dims: got dimensions of {(with_dims or [name])[0]}, whose specimens have "
+            "several readings, expected none: log-likelihoods are by specimen; leave dims= out"
         )
-    params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables(simulators)]
+    groups = measurement.groups
+    params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables(names)]
     rv = SpecimenDistribution(
         name,
         *params,
         *joined,
         likelihood=likelihood,
-        simulators=simulators,
-        observed=data,
-        dims=_checked_dims(name, dims, values.shape, model),
+        simulators=names,
+        observed=_pymc_data(observed, measurement.observed),
+        dims=_checked_dims(name, dims, measurement.observed.shape, model),
     )
     for partner in joined:
         set_likelihood(partner, likelihood)
@@ -297,12 +271,12 @@ def _with_common_specimens(
         return []
     by_metric = list(simulators(model).values())
     measurements = list(measurements_of(model).values())
-    _refuse_alike_labels(name, labels, [*by_metric, *measurements])
+    _refuse_ambiguous_labels(name, labels, [*by_metric, *measurements])
 
     def common(simulator: AnySimulator | Measurement) -> list[str]:
         if simulator.specimens is None:
             return []
-        return sorted(map(_read, set(labels.tolist()) & set(simulator.specimens.tolist())))
+        return sorted(map(_label_text, set(labels.tolist()) & set(simulator.specimens.tolist())))
 
     for simulator in by_metric:
         if common(simulator):
@@ -335,15 +309,12 @@ def _inputs_of_partners(
     return inputs.ordered_as(partners[0].inputs) if partners else inputs
 
 
-def _likelihood(
+def _joint_likelihood(
     measurement: Measurement, partners: Sequence[SpecimenLikelihood], model: pm.Model
 ) -> SpecimenLikelihood:
     """Return the likelihood of a simulator and of those with the same specimens.
 
-    Raises
-    ------
-    ValueError
-        If their measurements cannot be combined.
+    Raises a ValueError if their measurements cannot be combined.
     """
     name = measurement.name
     try:
@@ -379,7 +350,7 @@ def _likelihood(
 
 
 def _measurement_variables(
-    name: str, model: pm.Model, metric: LogLikelihood, partners: Sequence[SpecimenLikelihood]
+    name: str, model: pm.Model, metric: Any, partners: Sequence[SpecimenLikelihood]
 ) -> dict[str, TensorVariable]:
     """Return the model variables of the measurement by their role; adds the one of gross errors.
 
@@ -389,8 +360,7 @@ def _measurement_variables(
     for role in ("error", "gross_errors"):
         value = getattr(metric, role)
         if role == "gross_errors" and value is True:
-            earlier = [p.measurements[0].extras.get(role) for p in partners]
-            value = next(iter(earlier), None)
+            value = partners[0].measurements[0].extras.get(role) if partners else None
             value = pm.Beta(f"{name}_gross_errors", 1, 9) if value is None else value
         if not isinstance(value, Variable):
             continue
@@ -458,41 +428,43 @@ def checked_specimens(name: str, observed: Floats) -> Floats:
     return values
 
 
+# Metrics of distributions.
+
+
 @dataclass(frozen=True, eq=False)
 class _Term:
-    """What is compared with one population: all that was observed, or that of a group."""
+    """Observed responses that are compared with one population: all, or those of a group."""
 
     name: str
     target: Discrepancy
     labels: NDArray[Any] | None  # of specimens
-    data: Any  # what PyMC is to hold as observed
-    dims: tuple[str, ...] | None
     group: str = ""
     place: int = 0  # of the group
 
 
-def _observed_term(
+def _add_term(
     term: _Term,
     model: pm.Model,
     responses: Responses,
     propagation: Propagation,
     epsilon: float | None,
     progressbar: bool,
+    observed: Any,
+    dims: tuple[str, ...] | None,
 ) -> TensorVariable:
-    """Add an observed variable to a model."""
-    name = term.name
-    target = term.target
-    inputs = responses.inputs
+    """Add an observed variable with a metric of distributions to a model."""
+    name, target, inputs = term.name, term.target, responses.inputs
     earlier = list(simulators(model).values())
     propagation.check_simulator(name, inputs, target)
-    for other in earlier:
-        if other.propagation == propagation and responses.same_as(other.responses):
-            responses.share(other.responses)
+    for simulator in earlier:
+        if simulator.propagation == propagation and responses.same_as(simulator.responses):
+            responses.share(simulator.responses)
             break
     if term.labels is None:
-        tell_copies(name, target.observed)
+        warn_duplicates(name, target.observed)
     if epsilon is None:
         epsilon = 1 / effective_specimens(target, term.labels) if is_likelihood(target) else np.nan
+    aleatory = set(inputs.aleatory)
     specification = Specification(
         name,
         target,
@@ -500,128 +472,64 @@ def _observed_term(
         propagation,
         shared_epsilon(name, epsilon),
         term.labels,
-        _with_inputs(inputs, earlier, term.group),
-        responses.outputs or ONE,
+        tuple(
+            simulator.name
+            for simulator in earlier
+            if simulator.group == term.group
+            and not aleatory.isdisjoint(simulator.responses.inputs.aleatory)
+        ),
+        responses.outputs or SINGLE_OUTPUT,
         term.group,
         progressbar,
     )
-    _warn_of_shared_specimens(specification, earlier)
+    _warn_shared_specimens(specification, earlier)
     place = pt.constant(term.place, dtype="int64")
-    params = [place if is_group(v) else v for v in inputs.roots]
-    given = {"simulator": specification, "observed": term.data, "dims": term.dims}
-    rv = SimulatorDistribution(name, *params, **given)
+    rv = SimulatorDistribution(
+        name,
+        *(place if is_group(v) else v for v in inputs.roots),
+        simulator=specification,
+        observed=_pymc_data(observed, target.observed),
+        dims=dims,
+    )
     rv.owner.op.own_simulator(rv.owner)
     return rv
 
 
-def _grouped(name: str, inputs: Inputs, observed: Any) -> tuple[NDArray[np.intp] | None, Any]:
-    """Return the place of each specimen's group, if inputs have groups, and what was observed."""
-    groups = inputs.groups
-    return (None, observed) if groups is None else places_of(name, observed, groups)
-
-
-def _refuse_dims_of_groups(name: str, dims: tuple[str, ...] | None, groups: Groups) -> None:
-    """Raise if dimensions are given, which would be those of each group."""
+def _terms_by_group(
+    whole: _Term, groups: Groups, places: NDArray[np.intp], dims: tuple[str, ...] | None
+) -> list[_Term]:
+    """Return the term of each group; places are the groups of the specimens."""
+    name, target = whole.name, whole.target
     if dims is not None:
         raise ValueError(
             f"{name}: dims: got {list(dims)}, expected none: specimens are divided into the groups "
             f"{groups.names}, each with observed values of its own; leave dims= out"
         )
-
-
-def _of_groups(whole: _Term, groups: Groups, places: NDArray[np.intp]) -> list[_Term]:
-    """Return the term of each group."""
-    target = whole.target
-    if whole.labels is not None:
-        _refuse_label_of_two_groups(whole.name, whole.labels, places, groups)
-    terms = []
-    for place, label in enumerate(groups.names):
-        own = places == place
-        name = groups.name(whole.name, place)
-        weights = target.weights[own] if np.ptp(target.weights) > 0 else None
-        part = _target(name, target.metric, target.observed[own], weights)
-        data = pt.constant(part.observed) if np.isnan(part.observed).any() else part.observed
-        labels = None if whole.labels is None else whole.labels[own]
-        terms.append(
-            _Term(
-                name=name,
-                target=part,
-                labels=labels,
-                data=data,
-                dims=None,
-                group=label,
-                place=place,
-            )
-        )
-    return terms
-
-
-def _refuse_label_of_two_groups(
-    name: str, labels: NDArray[Any], places: NDArray[np.intp], groups: Groups
-) -> None:
-    """Raise if a specimen is of two groups."""
-    seen: dict[object, int] = {}
-    for label, place in zip(labels.tolist(), places.tolist(), strict=True):
-        first = seen.setdefault(label, place)
+    place_of: dict[object, int] = {}
+    labels = [] if whole.labels is None else whole.labels.tolist()
+    for label, place in zip(labels, places.tolist(), strict=False):
+        first = place_of.setdefault(label, place)
         if first != place:
             raise ValueError(
                 f"{name}: specimens: got the label {label!r} in {groups.names[first]} and in "
                 f"{groups.names[place]}, expected each specimen in one group; write labels that "
                 "are different"
             )
+    terms = []
+    for place, group in enumerate(groups.names):
+        rows = places == place
+        weights = target.weights[rows] if np.ptp(target.weights) > 0 else None
+        group_name = groups.name(name, place)
+        part = _prepared_metric(group_name, target.metric, target.observed[rows], weights)
+        group_labels = None if whole.labels is None else whole.labels[rows]
+        terms.append(_Term(group_name, part, group_labels, group, place))
+    return terms
 
 
-def _data(name: str, observed: Any) -> Any:
-    """Return observed responses as they were given; of `pymc.Data` the present numbers."""
-    if not isinstance(observed, Variable):
-        return observed
-    values = None if is_labelled(observed) else known_value(observed)
-    if values is None:
-        raise TypeError(
-            f"{name}: observed: got {observed} of type {observed.type}, expected numbers or pm.Data"
-        )
-    return values
-
-
-def _propagation(name: str, propagation: Propagation | None) -> Propagation:
-    """Return the propagation, which is `Reweighted` by default."""
-    if propagation is None:
-        return Reweighted()
-    if not isinstance(propagation, Propagation):
-        raise TypeError(
-            f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
-            "prb.Resimulated(n) or prb.Fresh(n)"
-        )
-    return propagation
-
-
-def _responses(
-    name: str,
-    response: Callable[..., Any],
-    inputs: Inputs,
-    propagation: Propagation,
-    outputs: Outputs,
-) -> Responses:
-    """Return the response as the propagation's settings say."""
-    return Responses(
-        name,
-        response,
-        inputs,
-        executor=propagation.executor,
-        store=propagation.store,
-        version=propagation.version,
-        on_failure=propagation.on_failure,
-        retry_failed=propagation.retry_failed,
-        timeout=propagation.timeout,
-        outputs=outputs,
-    )
-
-
-def _target(name: str, metric: Metric, observed: Floats, weights: ArrayLike | None) -> Discrepancy:
-    """Return the metric, prepared against the observed responses.
-
-    Mistakes are told with the name.
-    """
+def _prepared_metric(
+    name: str, metric: Metric, observed: Floats, weights: ArrayLike | None
+) -> Discrepancy:
+    """Return the metric, prepared against the observed responses; errors begin with the name."""
     if not isinstance(metric, Metric):
         raise TypeError(
             f"{name}: metric: got {called(metric)}, expected a metric object such as "
@@ -640,24 +548,94 @@ def _target(name: str, metric: Metric, observed: Floats, weights: ArrayLike | No
         raise type(error)(f"{name}: {error}") from None
 
 
-def _refuse_name(name: object, model: pm.Model) -> None:
-    """Raise if a name is no text, or one that the model has already."""
-    full = model.name_for(plain_text(name, "prb.Simulator: name"))
-    if full in model.named_vars:
-        raise ValueError(
-            f"prb.Simulator: name: got {name!r}, which is in the model already, expected a new "
-            "name; to run this again, run `with pm.Model():` and all below it again"
+def _warn_shared_specimens(simulator: AnySimulator, earlier: list[AnySimulator]) -> None:
+    """Warn if default epsilons count specimens more than once."""
+    if simulator.specimens is None:
+        return
+    labels = set(simulator.specimens.tolist())
+    for other in earlier:
+        if other.specimens is None or labels.isdisjoint(other.specimens.tolist()):
+            continue
+        if has_default_epsilon(simulator) or has_default_epsilon(other):
+            report(
+                Finding(
+                    "shared-specimens",
+                    f"{other.name} and {simulator.name} share specimens, and each epsilon "
+                    "counts them: under pm.sample they count twice, and the posterior comes "
+                    "out too narrow; call "
+                    "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) "
+                    "before, or use prb.sample, whose posterior counts them once.",
+                )
+            )
+
+
+# Arguments of both kinds.
+
+
+def _numbers(name: str, observed: Any) -> Any:
+    """Return observed responses as they were passed; of `pymc.Data` the present numbers."""
+    if not isinstance(observed, Variable):
+        return observed
+    values = None if is_labelled(observed) else known_value(observed)
+    if values is None:
+        raise TypeError(
+            f"{name}: observed: got {observed} of type {observed.type}, expected numbers or pm.Data"
         )
+    return values
+
+
+def _pymc_data(observed: Any, values: Floats) -> Any:
+    """Return the data of an observed variable: `pymc.Data` as it is, else the values.
+
+    Values with NaN are a constant, in which PyMC does not look for missing values to impute.
+    """
+    if isinstance(observed, Variable):
+        return observed
+    return pt.constant(values) if np.isnan(values).any() else values
+
+
+def _checked_propagation(name: str, propagation: Propagation | None) -> Propagation:
+    """Return the propagation, which is `Reweighted` by default."""
+    if propagation is None:
+        return Reweighted()
+    if not isinstance(propagation, Propagation):
+        raise TypeError(
+            f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
+            "prb.Resimulated(n) or prb.Fresh(n)"
+        )
+    return propagation
+
+
+def _responses(
+    name: str,
+    response: Callable[..., Any],
+    inputs: Inputs,
+    propagation: Propagation,
+    outputs: Outputs,
+) -> Responses:
+    """Return the response with the propagation's settings of its calls."""
+    return Responses(
+        name,
+        response,
+        inputs,
+        executor=propagation.executor,
+        store=propagation.store,
+        version=propagation.version,
+        on_failure=propagation.on_failure,
+        retry_failed=propagation.retry_failed,
+        timeout=propagation.timeout,
+        outputs=outputs,
+    )
 
 
 def _checked_dims(
     name: str, dims: object, shape: tuple[int, ...], model: pm.Model
 ) -> tuple[str, ...] | None:
-    """Return names of the observed dimensions, the model's own ones, as long as the data."""
+    """Return names of the observed dimensions, which the model has in the lengths of the data."""
     if dims is None:
         return None
     names = [dims] if isinstance(dims, str) else dims
-    if not isinstance(names, list | tuple) or {type(one) for one in names} != {str}:
+    if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:
         raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
     if len(names) != len(shape):
         raise ValueError(
@@ -680,71 +658,32 @@ def _checked_dims(
     return tuple(names)
 
 
-def _with_inputs(inputs: Inputs, others: list[AnySimulator], group: str) -> tuple[str, ...]:
-    """Return the names of the simulators that have an aleatory input of this one.
-
-    Specimens of another group are others.
-    """
-    own = {id(dist) for dist in inputs.aleatory}
-    alike = [other for other in others if other.group == group]
-    theirs = {other.name: map(id, other.responses.inputs.aleatory) for other in alike}
-    return tuple(name for name, dists in theirs.items() if not own.isdisjoint(dists))
+def _labels(name: str, specimens: ArrayLike | None, size: int) -> NDArray[Any] | None:
+    """Return the labels of the specimens, (N,), or None."""
+    return None if specimens is None else sample_labels(specimens, size, f"{name}: specimens")
 
 
-def _refuse_simulators(name: str, inputs: Inputs, model: pm.Model) -> None:
-    """Refuse a simulator above another one: its value is measured data, and no hyperparameter."""
-    for other in simulators(model):
-        if other in inputs.roots:
-            raise TypeError(
-                f"{name}: got inputs that depend on the simulator {other.name}, expected "
-                "hyperparameters; let one response call the other, or return the outputs of both "
-                "from one response, with prb.Joint(metric)"
-            )
-
-
-def _refuse_alike_labels(
-    name: str, labels: NDArray[Any], others: Sequence[AnySimulator | Measurement]
+def _refuse_ambiguous_labels(
+    name: str, labels: NDArray[Any], earlier: Sequence[AnySimulator | Measurement]
 ) -> None:
-    """Raise where labels look the same and are not, as 1 and "1": they would be two specimens."""
-    seen: dict[str, tuple[str, object]] = {}
-    labelled = [(other.name, other.specimens) for other in others]
-    for simulator, own in [*labelled, (name, labels)]:
-        for label in [] if own is None else own.tolist():
-            first, known = seen.setdefault(_read(label), (simulator, label))
-            if known != label:
+    """Raise where labels look alike and differ, as 1 and "1": they would be two specimens."""
+    first_use: dict[str, tuple[str, object]] = {}
+    labels_of = [(simulator.name, simulator.specimens) for simulator in earlier]
+    for simulator, specimens in [*labels_of, (name, labels)]:
+        for label in [] if specimens is None else specimens.tolist():
+            first, first_label = first_use.setdefault(_label_text(label), (simulator, label))
+            if first_label != label:
                 raise TypeError(
-                    f"{name}: specimens: got the label {label!r} and, in {first}, {known!r}, "
-                    "expected labels of one type, since these would count as two specimens; "
-                    "pass numbers, or strings, in all simulators"
+                    f"{name}: specimens: got the label {label!r} and, in {first}, "
+                    f"{first_label!r}, expected labels of one type, since these would count as "
+                    "two specimens; pass numbers, or strings, in all simulators"
                 )
 
 
-def _read(label: object) -> str:
-    """Return how a label reads."""
+def _label_text(label: object) -> str:
+    """Return a label as a reader sees it."""
     if isinstance(label, bytes):
         return label.decode(errors="replace").strip()
     if isinstance(label, float) and label.is_integer():
         return str(int(label))
     return str(label).strip()
-
-
-def _warn_of_shared_specimens(simulator: AnySimulator, others: list[AnySimulator]) -> None:
-    """Say so where default epsilons count specimens more than once."""
-    if simulator.specimens is None:
-        return
-    own = set(simulator.specimens.tolist())
-    for other in others:
-        theirs = other.specimens
-        if theirs is None or own.isdisjoint(theirs.tolist()):
-            continue
-        if has_default_epsilon(simulator) or has_default_epsilon(other):
-            report(
-                Finding(
-                    "shared-specimens",
-                    f"{other.name} and {simulator.name} share specimens, and each epsilon "
-                    "counts them: under pm.sample they count twice, and the posterior comes "
-                    "out too narrow; call "
-                    "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) "
-                    "before, or use prb.sample, whose posterior counts them once.",
-                )
-            )

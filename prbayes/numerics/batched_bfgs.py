@@ -1,9 +1,7 @@
-"""Many small minimisations at once: BFGS on rows that share an objective's form but not its data.
+"""BFGS for many small minimisations at once.
 
-Single minimisations run scipy's methods. Those of hundreds of data sets are small and alike, and
-what they cost is calls of NumPy, so that all of them go in step: one call evaluates every row. No
-library at hand does that, which is why the package has this minimiser of its own, and beside it
-`batch_simplex` for functions without slopes.
+The minimisations of hundreds of data sets are small and alike, and calls of NumPy dominate their
+cost: one call evaluates every row. `batched_simplex` does so for functions without slopes.
 """
 
 from __future__ import annotations
@@ -24,9 +22,9 @@ class _Differences:
 
     value: Callable[[Floats, Any], Floats]
     step: float
-    stencil: Floats  # (1 + r, r): here, and beside; of central differences (1 + 2 r, r)
-    back: Floats  # (r, r): slopes along the stencil's axes -> gradients
-    bend: float  # excess of one-sided differences for a function of typical curvature
+    stencil: Floats  # (1 + r, r): center and neighbours; of central differences (1 + 2 r, r)
+    to_gradient: Floats  # (r, r): slopes along the stencil's axes -> gradients
+    bias: float  # of one-sided differences for a function of typical curvature
 
     @classmethod
     def of(
@@ -37,61 +35,35 @@ class _Differences:
         is_central: bool,
     ) -> _Differences:
         r = len(curvature)
-        # Axes along which a typical function is bent alike, of a mean length of one: along others a
-        # function of coordinates that hang together is bent by much more than it is across them,
-        # and a difference to one side would move its minimum by as much.
+        # Axes, of a mean length of one, along which a typical function has equal curvature: along
+        # the coordinates of correlated parameters it is larger, and a one-sided difference would
+        # move the minimum by as much.
         axes = np.linalg.inv(np.linalg.cholesky(curvature))
         axes *= np.sqrt(r) / np.linalg.norm(axes)
-        bent = float(np.trace(axes @ curvature @ axes.T)) / r
+        mean_curvature = float(np.trace(axes @ curvature @ axes.T)) / r
         sides = [step * axes, -step * axes] if is_central else [step * axes]
         return cls(
             value=value,
             step=step,
             stencil=np.concatenate([np.zeros((1, r)), *sides]),
-            back=np.linalg.inv(axes).T,
-            bend=step * bent / 2,
+            to_gradient=np.linalg.inv(axes).T,
+            bias=step * mean_curvature / 2,
         )
 
     def __call__(self, x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        """Return values (A,) and gradients (A, r) of some rows at one point each, (A, r)."""
-        points = x[:, None] + self.stencil
-        values = self.value(points, rows)
-        here, up, down = np.split(values, [1, 1 + x.shape[-1]], axis=1)
+        """Return values (A,) and gradients (A, r) of selected rows at a point each, (A, r)."""
+        values = self.value(x[:, None] + self.stencil, rows)
+        center, up, down = np.split(values, [1, 1 + x.shape[-1]], axis=1)
         with np.errstate(invalid="ignore"):
             if down.size:
                 slopes = (up - down) / (2 * self.step)
             else:
-                slopes = (up - here) / self.step - self.bend
-            return here[:, 0], slopes @ self.back
-
-
-@dataclass(frozen=True, eq=False)
-class _Steps:
-    """What some of the rows are to do next."""
-
-    rows: NDArray[np.intp]  # (A,)
-    steps: Floats  # (A, r)
-    promise: Floats  # (A,): twice the gain that a quadratic model promises
-
-    def only(self, these: NDArray[np.bool_]) -> _Steps:
-        """Return those of some rows."""
-        rows = self.rows[these]
-        steps = self.steps[these]
-        return _Steps(rows, steps, self.promise[these])
-
-
-@dataclass(frozen=True, eq=False)
-class _Accepted:
-    """Where a line search arrived: points, values and gradients, and which rows gained nothing."""
-
-    x: Floats
-    f: Floats
-    g: Floats
-    stuck: NDArray[np.intp]
+                slopes = (up - center) / self.step - self.bias
+            return center[:, 0], slopes @ self.to_gradient
 
 
 class Minima(NamedTuple):
-    """Where descents ended."""
+    """Ends of descents."""
 
     x: Floats  # (B, r)
     values: Floats  # (B,)
@@ -108,12 +80,12 @@ def descend(
     max_iterations: int = 40,
     is_central: bool = False,
 ) -> Minima:
-    """Minimise B functions of r parameters of order one, each from its own start, all in step.
+    """Minimise B functions of r parameters of order one, each from its start, all in step.
 
-    Gradients are one-sided differences, along axes that ``curvature`` makes alike, and freed of
-    what it bends them by: minima are off by half a step, times the relative deviation of a
-    function's Hessian. A row has converged when its next step promises to gain less than
-    ``tolerance``, or when no shorter step gains anything.
+    Gradients are one-sided differences, along axes of equal ``curvature``, less their bias for it:
+    minima are off by half a step, times the relative deviation of a function's Hessian. A row has
+    converged when its next step is predicted to gain less than ``tolerance``, or when no shorter
+    step gains anything.
 
     Parameters
     ----------
@@ -141,55 +113,47 @@ def descend(
     >>> import numpy as np
     >>> centers = np.array([[0.0], [2.0]])
     >>> value = lambda x, rows: ((x - centers[rows, None]) ** 2).sum(-1)
-    >>> found = descend(value, np.zeros((2, 1)), 2 * np.eye(1), step=1e-3, tolerance=1e-9)
-    >>> np.abs(found.x - centers).max() < 1e-4
+    >>> minima = descend(value, np.zeros((2, 1)), 2 * np.eye(1), step=1e-3, tolerance=1e-9)
+    >>> np.abs(minima.x - centers).max() < 1e-4
     np.True_
     """
     size, r = start.shape
     problem = _Differences.of(value, step, curvature, is_central)
     x = start.copy()
     inverse = np.broadcast_to(np.linalg.inv(curvature), (size, r, r)).copy()
-    active = np.arange(size)
-    f, g = problem(x, active)
+    rows = np.arange(size)
+    f, g = problem(x, rows)
     converged = np.zeros(size, dtype=bool)
-    # Where nothing is known at the start, nothing can be done.
-    sound = np.isfinite(f)
-    sound &= np.isfinite(g).all(axis=-1)
-    active = active[sound]
+    # Rows without a finite value and gradient at the start stay there.
+    rows = rows[np.isfinite(f) & np.isfinite(g).all(axis=-1)]
     for iteration in range(max_iterations):
-        # Rows whose step is no number stop; those that promise next to nothing have converged.
-        plan = _planned(active, inverse, g)
-        done = plan.promise < 2 * tolerance
-        converged[plan.rows[done]] = True
-        plan = plan.only(~done)
-        active = plan.rows
-        if not active.size:
+        steps, gain, is_finite = _quasi_newton_steps(inverse[rows], g[rows])
+        is_flat = is_finite & (gain < 2 * tolerance)
+        converged[rows[is_flat]] = True
+        moves = is_finite & ~is_flat
+        rows, steps, gain = rows[moves], steps[moves], gain[moves]
+        if not rows.size:
             break
-        # Make the step, and learn from it.
-        accepted = _line_search(problem, plan, x, f, g)
-        motion = accepted.x - x[active]
-        change = accepted.g - g[active]
-        known = inverse[active]
-        if iteration == 0:  # a first guess may be of the wrong size, if of the right form
-            known = _scaled(known, motion, change)
-        inverse[active] = _updated(known, motion, change)
-        # Book-keeping.
-        x[active] = accepted.x
-        f[active] = accepted.f
-        g[active] = accepted.g
-        # Rows that no shorter step helped stay where they are.
-        stuck = accepted.stuck
-        converged[active[stuck]] = True
-        active = np.delete(active, stuck)
+        new_x, new_f, new_g, stuck = _line_search(problem, rows, steps, gain, x, f, g)
+        motion = new_x - x[rows]
+        change = new_g - g[rows]
+        estimate = inverse[rows]
+        if iteration == 0:  # the form of a first guess may be better than its size
+            estimate = _scaled(estimate, motion, change)
+        inverse[rows] = _updated(estimate, motion, change)
+        x[rows], f[rows], g[rows] = new_x, new_f, new_g
+        # No shorter step helps these rows.
+        converged[rows[stuck]] = True
+        rows = np.delete(rows, stuck)
     return Minima(x, f, converged)
 
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """How functions of coordinates are minimised, many at once."""
+    """A minimiser of many functions of coordinates at once."""
 
     curvature: Floats  # (r, r): the Hessian of a typical function
-    tolerance: float  # gain that is left on the table
+    tolerance: float  # gain that a minimum may miss
     step: float  # of the differences
 
     def __call__(self, value: Callable[[Floats, Any], Floats], start: Floats) -> Minima:
@@ -197,90 +161,80 @@ class Descent:
         return descend(value, start, self.curvature, step=self.step, tolerance=self.tolerance)
 
 
-def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:
-    """Return quasi-Newton steps of the active rows, none too long."""
-    slopes = g[active]
+def _quasi_newton_steps(inverse: Floats, g: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return steps of limited length, twice their predicted gain, and which are finite."""
     with np.errstate(over="ignore", invalid="ignore"):
-        steps = -np.einsum("bij,bj->bi", inverse[active], slopes)
-        promise = -(steps * slopes).sum(axis=-1)
+        steps = -np.einsum("bij,bj->bi", inverse, g)
+        gain = -(steps * g).sum(axis=-1)
         length = np.abs(steps).max(axis=-1)
-        # Beyond a few standard errors, or prior standard deviations, a quadratic model says
-        # nothing.
+        # A quadratic model is wrong beyond a few standard errors, or prior standard deviations.
         longest = 3.0
-        shorter = longest / np.maximum(length, longest)
-        steps = steps * shorter[:, None]
-    sound = np.isfinite(promise) & np.isfinite(length)
-    plan = _Steps(active, steps, promise)
-    return plan.only(sound)
+        steps = steps * (longest / np.maximum(length, longest))[:, None]
+    return steps, gain, np.isfinite(gain) & np.isfinite(length)
 
 
-def _line_search(problem: _Differences, plan: _Steps, x: Floats, f: Floats, g: Floats) -> _Accepted:
-    """Halve the steps until they keep enough of what they promise."""
-    rows = plan.rows
-    new_x = x[rows].copy()
-    new_f = f[rows].copy()
-    new_g = g[rows].copy()
+def _line_search(
+    problem: _Differences,
+    rows: NDArray[np.intp],
+    steps: Floats,
+    gain: Floats,
+    x: Floats,
+    f: Floats,
+    g: Floats,
+) -> tuple[Floats, Floats, Floats, NDArray[np.intp]]:
+    """Halve the steps of rows until they gain enough; last come the rows that gain nothing."""
+    new_x, new_f, new_g = x[rows].copy(), f[rows].copy(), g[rows].copy()
     waiting = np.arange(rows.size)
-    share = 1.0
+    factor = 1.0
     # A 1/256 of a step is no worse than none.
     for _ in range(8):
-        these = rows[waiting]
-        steps = plan.steps[waiting]
-        trial = x[these] + share * steps
-        trial_f, trial_g = problem(trial, these)
-        finite = np.isfinite(trial_g).all(-1)
+        waiting_rows = rows[waiting]
+        trial = x[waiting_rows] + factor * steps[waiting]
+        trial_f, trial_g = problem(trial, waiting_rows)
         with np.errstate(invalid="ignore"):
-            # Of the promised gain, that a step has to keep: Nocedal and Wright, eq. 3.4.
-            promised = 1e-4 * share * plan.promise[waiting]
-            enough = trial_f <= f[these] - promised
-        # Rows that keep the step are done; the others wait for half of it.
-        kept = enough & finite
-        at = waiting[kept]
-        new_x[at] = trial[kept]
-        new_f[at] = trial_f[kept]
-        new_g[at] = trial_g[kept]
-        waiting = waiting[~kept]
-        share = share / 2
+            # Sufficient decrease: Nocedal and Wright, eq. 3.4.
+            decreases = trial_f <= f[waiting_rows] - 1e-4 * factor * gain[waiting]
+        accepted = decreases & np.isfinite(trial_g).all(-1)
+        places = waiting[accepted]
+        new_x[places] = trial[accepted]
+        new_f[places] = trial_f[accepted]
+        new_g[places] = trial_g[accepted]
+        waiting = waiting[~accepted]
+        factor = factor / 2
         if not waiting.size:
             break
-    return _Accepted(new_x, new_f, new_g, waiting)
+    return new_x, new_f, new_g, waiting
 
 
 def _scaled(inverse: Floats, s: Floats, y: Floats) -> Floats:
-    """Return first guesses of inverse Hessians, (B, r, r), in the size that a first step found.
+    """Return first guesses of inverse Hessians, (B, r, r), in the size of a first step.
 
     Nocedal and Wright, eq. 6.20, with the guess in place of the identity.
     """
-    sy, good = _curved(s, y)
+    sy, is_curved = _curvature(s, y)
     expected = np.einsum("bi,bij,bj->b", y, inverse, y)
-    factors = np.where(good, sy, 1.0) / np.where(good, expected, 1.0)
+    factors = np.where(is_curved, sy, 1.0) / np.where(is_curved, expected, 1.0)
     return np.asarray(factors[:, None, None] * inverse)
 
 
 def _updated(inverse: Floats, s: Floats, y: Floats) -> Floats:
-    """Return the BFGS update of inverse Hessians, (B, r, r), where it keeps them positive definite.
+    """Return the BFGS update of inverse Hessians, (B, r, r), if they stay positive definite.
 
     Nocedal and Wright, eq. 6.17.
     """
-    sy, good = _curved(s, y)
-    # The others have rho = 0, which leaves them as they are.
-    safe = np.where(good, sy, 1.0)
-    inverted = np.where(good, 1 / safe, 0.0)
-    rho = inverted[:, None, None]
-    # The products s y' and s s' of each row.
-    column = rho * s[:, :, None]
-    across = column * y[:, None, :]
-    along = column * s[:, None, :]
-    left = np.eye(s.shape[-1]) - across
+    sy, is_curved = _curvature(s, y)
+    # rho = 0 leaves the matrix as it is.
+    reciprocal = np.where(is_curved, 1 / np.where(is_curved, sy, 1.0), 0.0)
+    column = reciprocal[:, None, None] * s[:, :, None]
+    left = np.eye(s.shape[-1]) - column * y[:, None, :]
     right = np.swapaxes(left, -1, -2)
-    turned = left @ inverse @ right
-    return np.asarray(turned + along)
+    return np.asarray(left @ inverse @ right + column * s[:, None, :])
 
 
-def _curved(s: Floats, y: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the products of steps and changes of slopes, and which tell of a curvature, (B,)."""
+def _curvature(s: Floats, y: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the products of steps and changes of slopes, and which show a curvature, (B,)."""
     sy = (s * y).sum(axis=-1)
+    # Nearly orthogonal steps and changes would spoil the inverse Hessian.
     lengths = np.linalg.norm(s, axis=-1)
     changes = np.linalg.norm(y, axis=-1)
-    # Steps and changes that are nearly orthogonal would spoil the inverse Hessian.
     return sy, sy > 1e-4 * lengths * changes

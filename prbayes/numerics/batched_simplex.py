@@ -1,15 +1,12 @@
-"""Many small minimisations at once where nothing is known of the functions.
+"""Nelder and Mead's simplex for many small minimisations at once.
 
-Nelder and Mead's simplex.
-
-`batch_bfgs` needs slopes. A user's own discrepancy may have kinks, as the largest difference of two
-distribution functions, or flat pieces; a simplex only asks which of two values is the smaller.
+`batched_bfgs` needs slopes. A user's discrepancy may have kinks, as the largest difference of two
+distribution functions, or flat pieces; a simplex only compares values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,42 +14,15 @@ from numpy.typing import NDArray
 
 from prbayes._validate import Floats
 
-# Range of values over a simplex, as a share of what the minimisations have gained on average, from
-# which it is small enough. At a parabola's minimum a thousandth of the gain is 3% of the way.
-_LEVEL = 1e-3
-# Length of a simplex, as a share of its first, from which it is small enough whatever the values.
-_SMALL = 1e-3
-# Iterations for each parameter, in which a simplex shrinks about a millionfold.
-_PATIENCE = 60
-
-
-@dataclass(frozen=True)
-class Moves:
-    """How far a simplex goes beyond its centre, for r parameters (Gao and Han's choice)."""
-
-    expand: float
-    contract: float
-    shrink: float
-
-    @classmethod
-    def of(cls, r: int) -> Moves:
-        """Return the moves; from two parameters on they depend on their number."""
-        n = max(r, 2)
-        return cls(
-            expand=1 + 2 / n,
-            contract=0.75 - 1 / (2 * n),
-            shrink=1 - 1 / n,
-        )
-
 
 def descend_by_simplex(
     value: Callable[[Floats, Any], Floats], start: Floats, *, sizes: Sequence[float]
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Minimise B functions of r parameters, each from its own start, all in step.
+    """Minimise B functions of r parameters, each from its start, all in step.
 
     A row has converged when the values over its simplex are about equal, or the simplex is small.
-    It may end with equal values on both sides of a minimum: another one, turned round and smaller,
-    then goes on from the best point.
+    It may end with equal values on both sides of a minimum: a smaller simplex with reversed edges
+    then continues from the best point.
 
     Parameters
     ----------
@@ -60,7 +30,7 @@ def descend_by_simplex(
         ``value(x, rows)``, shapes (A, s, r), (A,) -> (A, s): function ``rows[a]`` at s points each.
     start : ndarray, shape (B, r)
     sizes : sequence of float
-        Lengths of the first edges of one simplex after the other; negative ones are turned round.
+        Lengths of the first edges of one simplex after the other; negative ones are reversed.
 
     Returns
     -------
@@ -83,8 +53,7 @@ def descend_by_simplex(
     np.True_
     """
     n_rows, r = start.shape
-    rows = np.arange(n_rows)
-    first = value(start[:, None], rows)[:, 0]
+    first = value(start[:, None], np.arange(n_rows))[:, 0]
     x = start
     values = first
     converged = np.ones(n_rows, dtype=bool)
@@ -98,108 +67,48 @@ def descend_by_simplex(
 def _one_descent(
     value: Callable[[Floats, Any], Floats], start: Floats, first: Floats, size: float
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Let one simplex per row converge; ``first`` has the values before all descents."""
+    """Return the ends of a simplex per row; ``first`` has the values at the first start."""
     n_rows, r = start.shape
-    moves = Moves.of(r)
     # Points and values of the simplices, (B, r + 1, r) and (B, r + 1), the best point first.
-    edges = size * np.eye(r)
-    here = np.zeros((1, r))
-    corners = np.concatenate([here, edges])
-    points = start[:, None] + corners
-    values = value(points, np.arange(n_rows))
-    points, values = _sorted(points, values)
+    points = start[:, None] + np.concatenate([np.zeros((1, r)), size * np.eye(r)])
+    points, values = _sorted(points, value(points, np.arange(n_rows)))
     converged = np.zeros(n_rows, dtype=bool)
-    for _ in range(_PATIENCE * r):
-        # Rows that have converged are left alone from then on.
+    # In 60 iterations for each parameter a simplex shrinks about a millionfold.
+    for _ in range(60 * r):
+        # Rows that have converged stay as they are.
         gain = _mean_gain(first, values[:, 0])
-        converged |= _small(points, values, gain, abs(size))
+        converged |= _is_small(points, values, gain, abs(size))
         rows = np.flatnonzero(~converged)
         if not rows.size:
             break
-        # Make the step.
-        stepped = _step(
-            value,
-            points[rows],
-            values[rows],
-            rows,
-            moves,
-        )
-        ordered = _sorted(*stepped)
-        points[rows], values[rows] = ordered
+        points[rows], values[rows] = _sorted(*_step(value, points[rows], values[rows], rows))
     return points[:, 0], values[:, 0], converged
 
 
-def _small(points: Floats, values: Floats, gain: float, size: float) -> NDArray[np.bool_]:
-    """Return which simplices, (B,), are short, or have about equal values."""
+def _is_small(points: Floats, values: Floats, gain: float, size: float) -> NDArray[np.bool_]:
+    """Return which simplices, (B,), are short, or have about equal values.
+
+    At a parabola's minimum a thousandth of the gain is 3% of the distance.
+    """
     with np.errstate(invalid="ignore"):
-        spread = values[:, -1] - values[:, 0]
-        level = spread <= _LEVEL * gain
-    best = points[:, :1]
-    edges = np.abs(points - best)
-    length = edges.max(axis=(1, 2))
-    short = length <= _SMALL * size
-    return np.asarray(level | short)
+        is_level = values[:, -1] - values[:, 0] <= 1e-3 * gain
+    length = np.abs(points - points[:, :1]).max(axis=(1, 2))
+    return np.asarray(is_level | (length <= 1e-3 * size))
 
 
 def _sorted(points: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Return simplices with their best point first."""
     order = np.argsort(values, axis=1, kind="stable")
     ordered = np.take_along_axis(values, order, axis=1)
-    places = order[..., None]
-    return np.take_along_axis(points, places, axis=1), ordered
-
-
-def _trials(points: Floats, moves: Moves) -> Floats:
-    """Return the four points, (A, 4, r), that may replace the worst one of each simplex.
-
-    Reflected at the centre of the others, farther than that, nearer, and nearer on its own side.
-    """
-    center = points[:, :-1].mean(axis=1)
-    worst = points[:, -1]
-    away = center - worst
-    farther = moves.expand
-    nearer = moves.contract
-    lengths = np.array([1.0, farther, nearer, -nearer])
-    steps = lengths[:, None] * away[:, None]
-    return np.asarray(center[:, None] + steps)
-
-
-def _choice(found: Floats, values: Floats) -> tuple[NDArray[np.intp], Floats, NDArray[np.bool_]]:
-    """Return which trial each simplex takes, its value, and whether it is good enough, (A,) each.
-
-    Parameters
-    ----------
-    found : ndarray, shape (A, 4)
-        Values of the trials.
-    values : ndarray, shape (A, r + 1)
-        Of the simplices, sorted.
-    """
-    reflected = found[:, 0]
-    expanded = found[:, 1]
-    best = values[:, 0]
-    second = values[:, -2]
-    last = values[:, -1]
-    # The reflected point, a farther one if that is better still, a nearer one on either side if it
-    # is not.
-    chosen = np.where(reflected < second, 0, 2)
-    farther = (reflected < best) & (expanded < reflected)
-    chosen = np.where(farther, 1, chosen)
-    chosen = np.where(reflected >= last, 3, chosen)
-    every = np.arange(len(found))
-    taken = found[every, chosen]
-    # A nearer point has to beat the reflected one, or the worst where that was not better either.
-    to_beat = np.where(chosen == 2, reflected, np.inf)
-    to_beat = np.where(chosen == 3, last, to_beat)
-    accepted = (taken <= to_beat) & (taken < last)
-    return chosen, taken, accepted
+    return np.take_along_axis(points, order[..., None], axis=1), ordered
 
 
 def _mean_gain(first: Floats, values: Floats) -> float:
-    """Return by how much values are better than the first ones on average; none where not known."""
-    known = np.isfinite(first)
-    before = np.where(known, first, values)
+    """Return the mean gain over the first values; zero where these are not finite."""
+    start = np.where(np.isfinite(first), first, values)
     # Infinite less infinite counts as nothing.
     with np.errstate(invalid="ignore"):
-        gains = before - values
+        gains = start - values
     return float(np.nan_to_num(gains).mean())
 
 
@@ -208,25 +117,50 @@ def _step(
     points: Floats,
     values: Floats,
     rows: NDArray[np.intp],
-    moves: Moves,
 ) -> tuple[Floats, Floats]:
-    """Replace the worst point of each simplex, or shrink it towards the best."""
+    """Replace the worst point of each simplex, or shrink it towards the best.
+
+    The factors are those of Gao and Han (2012) for r parameters, at least two.
+    """
     points = points.copy()
     values = values.copy()
-    # All four trials are looked at in one call, which costs less than four for some rows each.
-    trials = _trials(points, moves)
-    found = value(trials, rows)
-    chosen, taken, accepted = _choice(found, values)
-    every = np.arange(len(points))
-    best = trials[every, chosen]
-    points[accepted, -1] = best[accepted]
-    values[accepted, -1] = taken[accepted]
-    # Where no trial helps, the simplex shrinks.
-    stuck = ~accepted
-    if stuck.any():
-        first = points[stuck, :1]
-        others = points[stuck, 1:]
-        nearer = first + moves.shrink * (others - first)
-        points[stuck, 1:] = nearer
-        values[stuck, 1:] = value(nearer, rows[stuck])
+    n = max(points.shape[-1], 2)
+    expansion = 1 + 2 / n
+    contraction = 0.75 - 1 / (2 * n)
+    # Four trials, (A, 4, r), in one call: the worst point reflected at the centre of the others,
+    # farther, nearer, and nearer on its side.
+    center = points[:, :-1].mean(axis=1)
+    lengths = np.array([1.0, expansion, contraction, -contraction])
+    steps = lengths[:, None] * (center - points[:, -1])[:, None]
+    trials = np.asarray(center[:, None] + steps)
+    trial, trial_values, is_accepted = _choice(value(trials, rows), values)
+    best = trials[np.arange(len(points)), trial]
+    points[is_accepted, -1] = best[is_accepted]
+    values[is_accepted, -1] = trial_values[is_accepted]
+    shrinks = ~is_accepted
+    if shrinks.any():
+        vertex = points[shrinks, :1]
+        nearer = vertex + (1 - 1 / n) * (points[shrinks, 1:] - vertex)
+        points[shrinks, 1:] = nearer
+        values[shrinks, 1:] = value(nearer, rows[shrinks])
     return points, values
+
+
+def _choice(
+    trial_values: Floats, values: Floats
+) -> tuple[NDArray[np.intp], Floats, NDArray[np.bool_]]:
+    """Return the trial of each simplex, its value, and whether it is good enough, (A,) each.
+
+    From values of the trials, (A, 4), and sorted ones of the simplices, (A, r + 1).
+    """
+    reflected, expanded = trial_values[:, 0], trial_values[:, 1]
+    best, second, last = values[:, 0], values[:, -2], values[:, -1]
+    # The reflected point, a farther one if that is better still, else a nearer one on either side.
+    trial = np.where(reflected < second, 0, 2)
+    trial = np.where((reflected < best) & (expanded < reflected), 1, trial)
+    trial = np.where(reflected >= last, 3, trial)
+    taken = trial_values[np.arange(len(trial_values)), trial]
+    # A nearer point has to beat the reflected one, or the worst where that was not better either.
+    limit = np.where(trial == 2, reflected, np.inf)
+    limit = np.where(trial == 3, last, limit)
+    return trial, taken, (taken <= limit) & (taken < last)

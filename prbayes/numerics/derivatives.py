@@ -1,7 +1,4 @@
-"""Derivatives by differences.
-
-The points of a stencil, evaluated in one batch, and what they tell.
-"""
+"""First and second derivatives by differences at the points of a stencil."""
 
 from __future__ import annotations
 
@@ -13,64 +10,32 @@ from prbayes._validate import Floats
 
 
 def cross(theta: Floats, step: Floats) -> Floats:
-    """Return theta, and its neighbours a step up and a step down along each element.
-
-    Parameters
-    ----------
-    theta, step : ndarray, shape (d,)
-
-    Returns
-    -------
-    ndarray, shape (1 + 2 d, d)
-        Theta, the neighbours up, the neighbours down.
-    """
+    """Return theta, (d,), its neighbours up, and its neighbours down, (1 + 2 d, d)."""
     along = np.diag(step)
-    up = theta + along
-    down = theta - along
-    return np.vstack([theta, up, down])
+    return np.vstack([theta, theta + along, theta - along])
 
 
 def slopes(values: Floats, step: Floats) -> Floats:
-    """Return central differences of values at a cross.
+    """Return central differences of values at a cross, (1 + 2 d, ...) -> (..., d).
 
     Where one of two neighbours is not finite, as at the edge of a support, they are one-sided.
-
-    Parameters
-    ----------
-    values : ndarray, shape (1 + 2 d, ...)
-        At the points of `cross`.
-    step : ndarray, shape (d,)
-
-    Returns
-    -------
-    ndarray, shape (..., d)
-        The derivative along each element, last.
     """
-    # Elements last, so that steps divide them.
-    last = np.moveaxis(values, 0, -1)
-    middle, up, down = np.split(last, [1, 1 + step.size], axis=-1)
+    center, up, down = np.split(np.moveaxis(values, 0, -1), [1, 1 + step.size], axis=-1)
     with np.errstate(invalid="ignore"):
-        forward = (up - middle) / step
-        backward = (middle - down) / step
-        both = (up - down) / (2 * step)
-    # Both neighbours where there are both, or the one that there is.
-    above = np.isfinite(up)
-    below = np.isfinite(down)
-    upwards = np.where(below, both, forward)
-    found: Floats = np.where(above, upwards, backward)
-    return found
+        forward = (up - center) / step
+        backward = (center - down) / step
+        central = (up - down) / (2 * step)
+    upwards = np.where(np.isfinite(down), central, forward)
+    derivatives: Floats = np.where(np.isfinite(up), upwards, backward)
+    return derivatives
 
 
 def differences(
     values: Callable[[Floats], Floats], step: Floats
 ) -> Callable[[Floats], tuple[float, Floats, int]]:
-    """Return a function of theta that gives value, gradient by differences, and evaluations.
+    """Return a function of theta that returns value, gradient by differences, and evaluations.
 
-    Parameters
-    ----------
-    values : callable
-        Thetas (P, d) -> values (P,).
-    step : ndarray, shape (d,)
+    ``values`` maps thetas (P, d) to values (P,); ``step`` has shape (d,).
 
     Examples
     --------
@@ -82,9 +47,37 @@ def differences(
     """
 
     def function(theta: Floats) -> tuple[float, Floats, int]:
-        points = cross(theta, step)
-        found = values(points)
-        gradient = slopes(found, step)
-        return found[0], gradient, len(found)
+        at_points = values(cross(theta, step))
+        return at_points[0], slopes(at_points, step), len(at_points)
 
     return function
+
+
+def stencil(r: int) -> Floats:
+    """Return the cross of unit steps around zero, then the four corners of each pair of axes.
+
+    Shape (1 + 2 r + 2 r (r - 1), r).
+    """
+    unit = np.eye(r)
+    rows = list(cross(np.zeros(r), np.ones(r)))
+    for i, j in zip(*np.tril_indices(r, -1), strict=True):
+        a, b = unit[i], unit[j]
+        rows += [a + b, a - b, b - a, -a - b]
+    return np.array(rows)
+
+
+def hessian_of(values: Floats, r: int) -> Floats:
+    """Return the Hessian, (r, r), from values at the points of `stencil`, by unit differences."""
+    _, up, down, corners = np.split(values, [1, 1 + r, 1 + 2 * r])
+    # Values that are not finite give NaN, which callers judge.
+    with np.errstate(invalid="ignore"):
+        hessian = np.diag(up - 2 * values[0] + down)
+        pairs = zip(*np.tril_indices(r, -1), corners.reshape(-1, 4), strict=True)
+        for i, j, (pp, pm, mp, mm) in pairs:
+            hessian[i, j] = hessian[j, i] = (pp - pm - mp + mm) / 4
+    return hessian
+
+
+def second_differences(value: Callable[[Floats], Floats], r: int) -> Floats:
+    """Return the Hessian at zero, (r, r), of ``value(x)``, (1, s, r) -> (s,)."""
+    return hessian_of(value(stencil(r)[None]), r)

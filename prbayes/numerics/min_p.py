@@ -8,14 +8,9 @@ from prbayes._validate import Floats
 
 
 def upper_p_values(statistics: Floats, null: Floats) -> Floats:
-    """Return p-values of statistics that reject by large values, (S, C).
+    """Return p-values of C statistics of S data sets, (S, C), large values rejecting.
 
-    Parameters
-    ----------
-    statistics : ndarray, shape (S, C)
-        C statistics of S data sets.
-    null : ndarray, shape (B, C)
-        Statistics of B bootstrap samples.
+    ``null``, (B, C), has the statistics of bootstrap samples.
     """
     sorted_null = np.sort(null, axis=0)
     smaller = [
@@ -30,11 +25,6 @@ def adjusted_p_values(observed: Floats, null: Floats) -> Floats:
 
     The smallest is the p-value of the combined test: the share of bootstrap samples whose smallest
     p-value is as small.
-
-    Parameters
-    ----------
-    observed : ndarray, shape (C,)
-    null : ndarray, shape (B, C)
     """
     p_values = upper_p_values(observed[None], null)[0]
     smallest = np.sort(upper_p_values(null, null).min(axis=1))

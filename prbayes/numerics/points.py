@@ -1,4 +1,4 @@
-"""Points of the unit cube, from which populations and designs are made."""
+"""Points of the unit cube for populations and designs."""
 
 from __future__ import annotations
 
@@ -11,20 +11,12 @@ from prbayes._validate import Floats
 
 
 def inside(points: Floats) -> Floats:
-    """Return points of the unit cube that keep off 0 and 1, where quantiles may be infinite.
-
-    A point of 10^11 is ever closer; any distance from 1e-16 to 1e-9 moves only specimens that are
-    rarer than one in 1e9.
-    """
+    """Return points of the unit cube away from 0 and 1, where quantiles may be infinite."""
     return np.clip(points, 1e-12, 1 - 1e-12)
 
 
 def sobol(n: int, dimensions: int, seed: int) -> Floats:
     """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions).
-
-    Parameters
-    ----------
-    n, dimensions, seed : int
 
     References
     ----------
@@ -40,21 +32,12 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
 
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
     if n == 1:
-        points = engine.random(1)
-    else:
-        power = int(np.ceil(np.log2(n)))
-        points = engine.random_base2(power)[:n]
-    return inside(points)
+        return inside(engine.random(1))
+    return inside(engine.random_base2(int(np.ceil(np.log2(n))))[:n])
 
 
 def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
     """Return n independent random points in the open unit cube, shape (n, dimensions).
-
-    For `Resimulated`.
-
-    Parameters
-    ----------
-    n, dimensions, seed : int
 
     References
     ----------
@@ -65,31 +48,19 @@ def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
     >>> monte_carlo(4, 1, 0).shape
     (4, 1)
     """
-    points = np.random.default_rng(seed).random((n, dimensions))
-    return inside(points)
+    return inside(np.random.default_rng(seed).random((n, dimensions)))
 
 
 def points_from(points: object) -> Callable[[int, int, int], Floats]:
-    """Return the function that makes points, from its name or from itself.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is neither.
-    """
-    named = {"sobol": sobol, "monte_carlo": monte_carlo}
+    """Return the function of points, from its name or itself; raise if it is neither."""
+    by_name = {"sobol": sobol, "monte_carlo": monte_carlo}
+    expected = 'expected "sobol", "monte_carlo" or a function (n, dimensions, seed) -> points'
     if isinstance(points, str):
-        if points not in named:
-            raise ValueError(
-                f'points: got {points!r:.60}, expected "sobol", "monte_carlo" or a function '
-                "(n, dimensions, seed) -> points"
-            )
-        return named[points]
+        if points not in by_name:
+            raise ValueError(f"points: got {points!r:.60}, {expected}")
+        return by_name[points]
     if not callable(points):
-        raise TypeError(
-            f'points: got {type(points).__name__}, expected "sobol", "monte_carlo" or a function '
-            "(n, dimensions, seed) -> points"
-        )
+        raise TypeError(f"points: got {type(points).__name__}, {expected}")
     return points
 
 
@@ -103,10 +74,8 @@ def base_points(
     sizes = [int(np.prod(s, dtype=int)) for s in shapes]
     u = points(n, 1 + sum(sizes), seed)
     edges = np.cumsum([1, *sizes])
-    by_input = []
-    for (start, end), shape in zip(pairwise(edges), shapes, strict=True):
-        own = u[:, start:end]
-        own = own.reshape(n, *shape)
-        by_input.append(own.copy())
-    spare = u[:, 0]
-    return spare.copy(), by_input
+    by_input = [
+        u[:, start:end].reshape(n, *shape).copy()
+        for (start, end), shape in zip(pairwise(edges), shapes, strict=True)
+    ]
+    return u[:, 0].copy(), by_input

@@ -1,4 +1,4 @@
-"""Linear algebra in one thread, where several would wait for each other."""
+"""Linear algebra in one thread."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 from threading import Lock
 from typing import Any
 
-# The number of threads is one for the whole process: whoever comes second leaves it alone.
+# The number of threads is global: a second caller does not change it.
 _setting = Lock()
 
 
@@ -23,8 +23,8 @@ def _algebra() -> Any:
 def one_thread() -> Iterator[None]:
     """Do linear algebra in one thread, inside or in the function that this decorates.
 
-    Several gain little on matrices of a few hundred rows, and take ten times as long where
-    something else computes as well.
+    Several gain little on matrices of a few hundred rows, and take ten times as long on a busy
+    machine.
     """
     if not _setting.acquire(blocking=False):
         yield

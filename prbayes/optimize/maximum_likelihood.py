@@ -20,6 +20,7 @@ from prbayes.inference.checks.prior_ends import PriorEnd, end_of_range, prior_en
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.parameters import THETAS
+from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.convergence import Result
 from prbayes.optimize.optimum import (
     Optimum,
@@ -58,7 +59,9 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         if objective.count > settings.max_evaluations:
             break
     # Points of specimens have a Monte Carlo error, with which a ridge has ripples.
-    errors = [max(x.points.difference, x.options.half_difference) for x in evaluator.likelihoods]
+    errors = [
+        max(prepared(x).points.difference, x.options.half_difference) for x in evaluator.likelihoods
+    ]
     modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
     best = modes[0]
     point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
@@ -69,7 +72,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         thetas = np.stack([mode.theta for mode in modes])
         log_prior = evaluator.hyperparameters.log_prior(thetas)
         weights = mode_weights(modes, log_prior, evaluator.hyperparameters.prior_sd)
-    findings = [f for likelihood in evaluator.likelihoods for f in likelihood.findings]
+    findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
     findings += report(*_findings(evaluator, modes, weights, ends))
     rivals = tuple(
         {

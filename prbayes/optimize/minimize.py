@@ -34,7 +34,7 @@ from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.optimize.caveats import (
     between_runs,
     breakdown,

@@ -37,6 +37,7 @@ from prbayes.model.fingerprint import (
 from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
+from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.caveats import breakdown, no_information
 from prbayes.optimize.convergence import Fit, Result, Search, Trace, apart_from_data
@@ -536,7 +537,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     discrepancies = {name: -float(v.sum()) for name, v in likelihoods.items()}
     discrepancies |= optimum.discrepancies
     n_runs = [node.bound.n_runs for node in nodes]
-    n_runs += [len(likelihood_of(evaluator, m).emulation.z) for m in measurements]
+    n_runs += [len(prepared(likelihood_of(evaluator, m)).emulation.z) for m in measurements]
     metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
     compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
     by_simulator: dict[str, list[Any]] = {

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_params
-from prbayes.model.specimen_likelihood import SpecimenLikelihood
+from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
+from prbayes.model.specimen_likelihood import arrays, draw_readings
+from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
 from prbayes.propagation.specimen_points import draw_points, specimen_roots
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
@@ -98,7 +100,7 @@ def specimen_pool(
     """
     n = len(likelihood.readings)
     copies = max(1, -(-size // n))
-    values = likelihood.draws(rng, params, copies * n)[0].reshape(copies * n, -1)
+    values = draw_readings(likelihood, rng, params, copies * n)[0].reshape(copies * n, -1)
     measurement = likelihood.readings
     shape = values.shape
     measured = np.resize(measurement.is_measured, shape)
@@ -114,7 +116,7 @@ def specimen_pool(
     options = likelihood.options
     # The tolerance is that of the log-likelihood of a data set, not of the pool.
     options = replace(options, half_difference=options.half_difference * np.sqrt(copies))
-    emulation = likelihood.emulation
+    emulation = prepared(likelihood).emulation
     roots = specimen_roots(emulation, readings, options)
 
     def values_alone(z: Floats) -> tuple[Floats, Floats]:
@@ -143,7 +145,7 @@ def other_specimens(
     data : sequence of tuple
         Points and numbers A, as of `SpecimenPool.data_set`.
     """
-    shared = [likelihood.arrays for likelihood in likelihoods]
+    shared = [arrays(likelihood) for likelihood in likelihoods]
     before = [([x.get_value() for x in points], log_a.get_value()) for points, log_a in shared]
     try:
         _set(shared, data)
@@ -196,7 +198,7 @@ class SpecimenRefits:
     @property
     def _function(self) -> Any:
         """The compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
-        return self.evaluator.function("weighted log-likelihood", self._compile)
+        return self.evaluator.cached("weighted log-likelihood", self._compile)
 
     def _compile(self) -> Any:
         evaluator = self.evaluator
@@ -290,7 +292,7 @@ class SpecimenRefits:
             count = np.zeros(len(likelihood.readings))
             for simulator, part in zip(emulated, weights, strict=True):
                 if simulator.likelihood is likelihood:
-                    specimens = likelihood.numbers(simulator.measurement)[simulator.rows]
+                    specimens = specimen_numbers(likelihood, simulator.measurement)[simulator.rows]
                     np.add.at(factors.T, specimens, part.T * len(specimens))
                     np.add.at(count, specimens, 1)
             factors /= count

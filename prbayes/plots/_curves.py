@@ -109,21 +109,21 @@ def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, 
 
 def axis_range(
     observed: Floats,
-    after: tuple[float, float],
-    before: tuple[float, float] | None,
+    calibrated: tuple[float, float],
+    earlier: tuple[float, float] | None,
     margin: float = 0.03,
 ) -> tuple[float, float]:
-    """Return the range of an axis: data, calibrated population, and that before unless far off.
+    """Return the range of an axis: data, calibrated population, and the earlier unless far off.
 
-    The population before widens the axis by at most half on each side.
+    The earlier population widens the axis by at most half on each side.
     """
     finite = observed[np.isfinite(observed)]
-    low = min(after[0], float(finite.min(initial=np.inf)))
-    high = max(after[1], float(finite.max(initial=-np.inf)))
-    if before is not None:
+    low = min(calibrated[0], float(finite.min(initial=np.inf)))
+    high = max(calibrated[1], float(finite.max(initial=-np.inf)))
+    if earlier is not None:
         room = 0.5 * (high - low)
-        first = max(before[0], low - room)
-        last = min(before[1], high + room)
+        first = max(earlier[0], low - room)
+        last = min(earlier[1], high + room)
         low = min(low, first)
         high = max(high, last)
     width = margin * (high - low) or 0.01 * max(abs(low), 1.0)
@@ -140,16 +140,16 @@ def histogram(observed: Floats, weights: Floats) -> tuple[Floats, Floats]:
         cells = Histogram().cells(values, w / area)
         heights = cells.density(values, w)[:-2]  # without those below and above
         half = cells.widths[0] / 2
-        left = cells.centers - half
-        right = np.append(left[1:], cells.centers[-1] + half)
+        starts = cells.centers - half
+        ends = np.append(starts[1:], cells.centers[-1] + half)
     else:  # one bar, as wide as a fiftieth of the value
         half = max(abs(values[0]), 1.0) / 100
         heights = np.array([area / (2 * half)])
-        left = values[:1] - half
-        right = values[:1] + half
+        starts = values[:1] - half
+        ends = values[:1] + half
     # Up at the left of each bar, down at its right
     zero = np.zeros(heights.size)
-    x = np.column_stack([left, left, right, right])
+    x = np.column_stack([starts, starts, ends, ends])
     y = np.column_stack([zero, heights, heights, zero])
     return x.ravel(), y.ravel()
 

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._finding import Finding, report
-from prbayes._validate import AT_ONCE, Floats
+from prbayes._validate import AT_ONCE, Floats, positive_integer
 from prbayes.model.coverage import VISIBLE, supports_each
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
@@ -69,7 +69,9 @@ def read_result(
         require_of_model(result, model, caller, Level.POPULATIONS)
         evaluator = Evaluator.of(model)
     cost = 0 if free else evaluator.responses_per_theta
-    if n_draws is None:
+    if n_draws is not None:
+        positive_integer(n_draws, "n_draws")
+    else:
         # The sides of a band are quantiles: with 200 curves the standard error of the probability
         # beyond one side of an 89% band is 1.6%, with 40 it is 3.6%.
         n_draws = max(8, min(40, AT_ONCE // cost)) if cost else 200

@@ -179,33 +179,33 @@ def draw_lines(
     panel: Panel,
     axis: Axis,
     ensemble: Ensemble,
-    after: Floats,
-    before: Floats | None,
+    lines: Floats,
+    earlier: Floats | None,
     prob: float,
     start: str,
 ) -> Limits:
     """Draw measured lines, and the median and most of the population; return the axis' range.
 
-    ``after``, (P, 3, m), are quantiles at `LEVELS` of the populations of ``ensemble.every``,
-    ``before``, (3, m), those of the population called ``start``; the band of the median contains
+    ``lines``, (P, 3, m), are quantiles at `LEVELS` of the populations of ``ensemble.every``,
+    ``earlier``, (3, m), those of the population called ``start``; the band of the median contains
     the share ``prob`` of the populations.
     """
     x = axis.places[axis.order]
     measured = axis.scaled(axis.output.node.observed)
-    after = axis.scaled(after)
-    before = None if before is None else axis.scaled(before)
-    typical = _finite_range(np.median(after, axis=0))
-    limits = axis_range(measured, typical, None if before is None else _finite_range(before))
+    lines = axis.scaled(lines)
+    earlier = None if earlier is None else axis.scaled(earlier)
+    typical = _finite_range(np.median(lines, axis=0))
+    limits = axis_range(measured, typical, None if earlier is None else _finite_range(earlier))
     # Lines leave the picture where the specimens have failed.
     low, high = limits
     room = high - low
-    after = np.clip(after, low - room, high + room)
-    lower, median, upper = (Calibrated.of(after[:, i], ensemble, prob) for i in range(3))
+    lines = np.clip(lines, low - room, high + room)
+    lower, median, upper = (Calibrated.of(lines[:, i], ensemble, prob) for i in range(3))
     text = f"{INTERVAL:.0%} of the calibrated population"
     panel.band("population", x, (lower.middle, upper.middle), BLUE, alpha=0.25, legend=text)
     panel.line("measured", *_joined(x, measured), GREY, width=0.5, legend="measured")
-    if before is not None:
-        line = _joined(x, np.clip(before, low - room, high + room))
+    if earlier is not None:
+        line = _joined(x, np.clip(earlier, low - room, high + room))
         panel.line("before", *line, VERMILION, style=DASHED, legend=f"before: {start}")
     if median.band is not None:
         text = f"{prob:.0%} band of the {ensemble.spread}"

@@ -28,13 +28,12 @@ def plot_comparison(
     comparison : xarray.Dataset
         From `compare`.
     scores : bool
-        Draw in their place the discrepancy of each result's population under each metric, one panel
-        per metric; the smaller the better, each metric in its own units.
+        Draw instead the discrepancy of each result's population under each metric, a panel per
+        metric; smaller is better, each metric in its own units.
     labels : mapping, optional
-        What a reader calls a hyperparameter, by its name, with units; also a result or a score.
+        Labels of hyperparameters, results or scores by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------

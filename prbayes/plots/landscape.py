@@ -36,21 +36,20 @@ def plot_landscape(
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the objective around the optimum over two hyperparameters, with the optimiser's path.
+    """Draw the objective around the optimum over one or two hyperparameters.
 
-    Darker is lower; contours are at even steps of the root of the objective over its lowest value,
-    so that they crowd towards the optimum; a bar has the values. With one
-    hyperparameter, or one name, it is a curve. All other hyperparameters stand at the optimum, as
-    the title says. Where stored responses do not support a population the picture is blank. Path
-    and other optima are those of all hyperparameters, projected.
+    Darker is lower. Contours are at even steps of the root of the objective above its minimum: they
+    are dense at the optimum. A bar has the values. Over one hyperparameter it is a curve. The title
+    names the hyperparameters that are fixed at the optimum. The picture is blank where stored
+    responses do not support a population. The optimiser's path and other optima are projected.
 
     Parameters
     ----------
     optimum : Optimum
         From `minimize`.
     model : pymc.Model, optional
-        That of the optimum; another one with the same hyperparameters may be given, such as one
-        with another metric.
+        That of the optimum by default; or another with the same hyperparameters, such as one with
+        another metric.
     pair : sequence of str, optional
         One or two names, such as ``("mu", "sigma")`` or ``("mu[0]", "mu[1]")``; the first two by
         default.
@@ -60,10 +59,9 @@ def plot_landscape(
         Largest number of responses that may be computed. With `Reweighted` none is; with
         `Resimulated` and `Fresh` every point of the picture costs n for each simulator.
     labels : mapping, optional
-        What a reader calls a hyperparameter, by its name, with units.
+        Labels of hyperparameters by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------
@@ -74,7 +72,7 @@ def plot_landscape(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, it would compute more responses than allowed, or the
+        If an argument is not as described, more responses would be computed than allowed, or the
         optimum is of other populations or data than the model.
 
     Examples

@@ -36,30 +36,29 @@ def plot_optimizer(
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the objective and hyperparameters that an optimiser asked for, by evaluation.
+    """Draw the objective and the hyperparameters of an optimiser's evaluations.
 
     The first panel has the objective, the sum of d_k / s_k, of each point and the lowest so far,
-    with logarithmic ticks where it falls over more than a decade; a panel for each hyperparameter
+    with logarithmic ticks if it falls over more than a decade. A panel for each hyperparameter
     follows, in the user's own units, with the optimum as a dashed line. With `Reweighted` the
-    objective is that of the final design and scales, evaluated anew without a response; elsewhere
-    it is what the optimiser saw, and with several simulators, whose scales may have changed on the
-    way, nothing says which was lowest.
+    objective is recomputed with the final design and scales, without a response. Otherwise it is
+    the one that the optimiser used; with several simulators, whose scales may have changed, the
+    lowest is not shown.
 
     Parameters
     ----------
     optimum : Optimum
         From `minimize`.
     labels : mapping, optional
-        What a reader calls a hyperparameter, by its name, with units.
+        Labels of hyperparameters by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------
     arviz.PlotCollection
         Its ``viz`` has the artists ``asked`` and ``path``, ``best`` (first panel) and ``optimum``
-        (the others).
+        (other panels).
 
     Raises
     ------

@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, positive_integer
+from prbayes._validate import Floats, called
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
@@ -51,10 +51,10 @@ def plot_outputs(
 ) -> Any:
     """Draw pairs of outputs of a simulator: measured specimens in the calibrated population.
 
-    Points are the specimens of which both outputs were measured. The solid lines hold 50% and 89%
-    of the calibrated population, in the smallest regions that do: of the posterior predictive
-    distribution, or the optimum's population. Dashed ones are those before the calibration. A
-    title has the correlation of the points' ranks, and that of the calibrated population's.
+    Points are the specimens with both outputs. Solid lines are the smallest regions with 50% and
+    89% of the calibrated population: the posterior predictive distribution, or the optimum's
+    population. Dashed lines are those before the calibration. The title has the rank correlations
+    of the points and of the calibrated population.
 
     Parameters
     ----------
@@ -65,18 +65,17 @@ def plot_outputs(
     simulator : str, optional
         Name of a simulator with several outputs; the first one by default.
     outputs : sequence, optional
-        Two to seven outputs by label, such as ``["first", "third"]``, or by number if they have no
-        names; by default all that vary, but of more than five four, from the first to the last.
+        Two to seven outputs by label, such as ``["first", "third"]``, or by number without labels;
+        by default all that vary, but of more than five four, from the first to the last.
     before : dict or bool, optional
         As in `plot_responses`.
     n_draws : int, optional
-        Number of populations of a posterior; 200 where they cost no response (`Reweighted`), 40
-        elsewhere, where each costs n responses.
+        Number of populations of a posterior; by default 200 where they cost no response
+        (`Reweighted`), otherwise 40, each of which costs n responses.
     labels : mapping, optional
-        What a reader calls an output, by its name, with units.
+        Labels of outputs by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------
@@ -87,15 +86,15 @@ def plot_outputs(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, there is no such output, or the result lacks a free
+        If an argument is not as described, an output is unknown, or the result lacks a free
         variable of the model, or is of other populations or data.
     DesignError
         If stored responses do not support the populations.
 
     Notes
     -----
-    Densities are those of a Gaussian kernel along the population's principal axes, so that strong
-    correlations stay what they are. Specimens that failed (+inf) in one of a pair are in neither.
+    Densities are those of a Gaussian kernel along the population's principal axes, which preserves
+    strong correlations. Specimens that failed (+inf) in one output of a pair are left out.
 
     Examples
     --------
@@ -116,8 +115,6 @@ def plot_outputs(
     ['life, load']
     """
     refuse_look(labels, pc_kwargs)
-    if n_draws is not None:
-        positive_integer(n_draws, "n_draws")
     ensemble = read_result(result, model, "prb.plot_outputs", n_draws)
     evaluator = ensemble.evaluator
     start, text = read_before(result, evaluator, before)
@@ -125,9 +122,9 @@ def plot_outputs(
     columns = _shown_outputs(evaluator, k, outputs)
     refuse_labels(labels, evaluator.simulators[k].outputs.names, evaluator=evaluator)
     start = if_supported(evaluator, start, f"plot_outputs: before ({text})")
-    after = _Population.of(evaluator, ensemble.mixture, k)
+    population = _Population.of(evaluator, ensemble.mixture, k)
     earlier = _Population.of(evaluator, start, k) if len(start) else None
-    limits = [_axis_limits(output, after, earlier) for output in columns]
+    limits = [_axis_limits(output, population, earlier) for output in columns]
 
     # A triangle of pairs: one column less than outputs, and one row
     size = len(columns) - 1
@@ -150,7 +147,7 @@ def plot_outputs(
         y = columns[i + 1]
         if earlier is not None:
             earlier.draw(panel, "before", (x, y), VERMILION, DASHED, f"before: {text}")
-        correlation = after.draw(panel, "after", (x, y), BLUE, SOLID, calibrated)
+        correlation = population.draw(panel, "after", (x, y), BLUE, SOLID, calibrated)
         titles = [_written(_draw_measured(panel, x, y)), _written(correlation)]
         # Names on the left and below all panels
         panel.axes(
@@ -194,8 +191,10 @@ def _shown_outputs(evaluator: Evaluator, k: int, labels: Sequence[Any] | None) -
             return columns
         # Of many outputs, such as a curve, four from the first to the last
         return [columns[round(place)] for place in np.linspace(0, len(columns) - 1, 4)]
-    known = list(node.outputs.labels)
-    listed = str(known) if len(known) <= 2 * _MOST else f"{str(known[:_MOST])[:-1]}, ...]"
+    available = list(node.outputs.labels)
+    listed = str(available)
+    if len(available) > 2 * _MOST:
+        listed = f"{str(available[:_MOST])[:-1]}, ...]"
     if isinstance(labels, str) or not isinstance(labels, Sequence):
         raise TypeError(
             f"outputs: got {called(labels)}, expected a list of two to {_MOST} of {listed}"
@@ -204,7 +203,7 @@ def _shown_outputs(evaluator: Evaluator, k: int, labels: Sequence[Any] | None) -
         raise ValueError(f"outputs: got {len(labels)} outputs, expected two to {_MOST} of {listed}")
     indices = []
     for label in labels:
-        names = [x for x in (known, list(node.outputs.names)) if label in x]
+        names = [x for x in (available, list(node.outputs.names)) if label in x]
         if not names or isinstance(label, bool):
             raise KeyError(f"outputs: got {label!r:.60}, expected some of {listed}")
         indices.append(names[0].index(label))
@@ -267,11 +266,11 @@ class _Population:
         return rank_correlation(points, weights)
 
 
-def _axis_limits(output: Output, after: _Population, earlier: _Population | None) -> Limits:
+def _axis_limits(output: Output, population: _Population, earlier: _Population | None) -> Limits:
     # A normal population's region of 89% contains all but 1.8% of one output.
-    before = None if earlier is None else earlier.range_of(output, tail=0.02)
+    widest = None if earlier is None else earlier.range_of(output, tail=0.02)
     observed, _ = output.measured()
-    return axis_range(observed, after.range_of(output, tail=0.01), before, margin=0.04)
+    return axis_range(observed, population.range_of(output, tail=0.01), widest, margin=0.04)
 
 
 def _draw_measured(panel: Panel, x: Output, y: Output) -> float:

@@ -10,7 +10,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import positive_integer, share
+from prbayes._validate import share
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, SOLID, Canvas, Panel, refuse_look
@@ -34,12 +34,10 @@ def plot_population(
 ) -> Any:
     """Draw the calibrated population of each aleatory input, with its uncertainty.
 
-    Of a multivariate input each margin has a panel, and so has each pair of its first three
-    elements: outlines of the smallest regions that hold half of the population, and the share
-    ``prob``.
-
     The curve is the posterior predictive density of the input, or its density at the optimum; the
-    band holds the share ``prob`` of the densities at each value. It computes no response.
+    band contains the share ``prob`` of the densities at each value. Each pair of the first three
+    elements of a multivariate input has a panel too, with the smallest regions that contain half
+    of the population, and the share ``prob``. No response is computed.
 
     Parameters
     ----------
@@ -48,16 +46,15 @@ def plot_population(
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     inputs : sequence, optional
-        Names, or ``.dist()`` objects; all by default. An input is called as the response's argument
-        that takes it.
+        Names, or ``.dist()`` objects; all by default. The name of an input is that of the
+        response's argument.
     prob : float
     n_draws : int, optional
         Number of populations in the band; 200 by default.
     labels : mapping, optional
-        What a reader calls an input, by its name, with units.
+        Labels of inputs by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------
@@ -67,7 +64,7 @@ def plot_population(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, there is no such input, or the result lacks a free
+        If an argument is not as described, an input is unknown, or the result lacks a free
         variable, or is of other populations or data than the model.
 
     Examples
@@ -82,8 +79,6 @@ def plot_population(
     ['load']
     """
     refuse_look(labels, pc_kwargs)
-    if n_draws is not None:
-        positive_integer(n_draws, "n_draws")
     share(prob, "prob")
     ensemble = read_result(result, model, "prb.plot_population", n_draws, free=True)
     shown = select_margins(margins(ensemble.evaluator), inputs)

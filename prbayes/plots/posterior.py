@@ -53,9 +53,9 @@ def plot_posterior(
 ) -> Any:
     """Draw the posterior of each hyperparameter against the optimum and the prior.
 
-    The bar below the posterior is its equal-tailed interval, with the mean as a dot; the bar and
-    the diamond below that are the optimum and the interval of as much probability of the normal
-    distribution with its standard error, which the dashed curve shows.
+    The bar below the posterior is its equal-tailed interval, with the mean as a dot. The bar and
+    the diamond below are the optimum and the interval of the normal distribution with its standard
+    error, which is the dashed curve.
 
     Parameters
     ----------
@@ -67,14 +67,13 @@ def plot_posterior(
         Restricts the picture to the model's variables, its deterministics among them, and adds
         their prior; by default all variables that posterior and optimum share.
     var_names : sequence of str, optional
-        Variables that are drawn, or elements of them, such as ``"mu[Adler]"``; all by default.
+        Variables, or elements of them, such as ``"mu[Adler]"``; all by default.
     prob : float
         Probability of the intervals.
     labels : mapping, optional
-        What a reader calls a hyperparameter, by its name, with units.
+        Labels of hyperparameters by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------
@@ -85,7 +84,7 @@ def plot_posterior(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, or nothing is left to draw; if the optimum is of other
+        If an argument is not as described, or no variable is left; if the optimum is of other
         populations or data than the posterior, or the model has other priors.
 
     Examples

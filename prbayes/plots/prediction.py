@@ -31,12 +31,12 @@ def plot_prediction(
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the distribution functions of measured responses and of what was predicted of them.
+    """Draw the distribution functions of measured responses and of their prediction.
 
-    The steps are those of the measured values; the curve is the predicted distribution of all
-    populations together, and the band holds the share ``prob`` of the populations at each
-    response. Steps that leave the band over a long stretch are what `area_test` tests. Specimens
-    that failed (+inf) are what the steps lack of one at the right.
+    The steps are the measured values, the curve is the predicted distribution of all populations
+    together, and the band contains the share ``prob`` of the populations at each response. Steps
+    outside the band over a long stretch are tested by `area_test`. Because of specimens that failed
+    (+inf) the steps end below one.
 
     Parameters
     ----------
@@ -47,10 +47,9 @@ def plot_prediction(
     prob : float
         Share of the populations in the band.
     labels : mapping, optional
-        What a reader calls a condition or an output, by its name, with units.
+        Labels of conditions or outputs by name, with units.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------

@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, flag, positive_integer, share
+from prbayes._validate import Floats, flag, share
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Limits, Panel, refuse_look
@@ -51,16 +51,15 @@ def plot_responses(
 ) -> Any:
     """Draw the responses before and after a calibration against the measured ones.
 
-    Measured responses are a histogram, in outline, with a mark for each, or steps. The calibrated
-    curve is the posterior predictive distribution, or the optimum's population. The band holds the
-    share ``prob`` of the populations at each response: those of the posterior's draws, or of the
-    optimum's sampling distribution where it is known.
+    Measured responses are a histogram with a mark for each, or steps. The calibrated curve is the
+    posterior predictive distribution, or the optimum's population. The band contains the share
+    ``prob`` of the populations at each response: those of the posterior's draws, or of the
+    optimum's sampling distribution if it is known.
 
-    Of several outputs each has a panel, with those that were measured. A curve, of which the
-    outputs' labels are numbers, and more than eight outputs have one panel: a line for each
-    specimen, with 89% of the calibrated population at each place, and its median in the band.
-    Those of the population before are dashed. More than eight outputs with names are in standard
-    deviations of each.
+    Each of several outputs has a panel. A curve, whose labels are numbers, and more than eight
+    outputs have one panel: a line for each specimen, 89% of the calibrated population at each
+    place, and its median in the band; dashed lines are the population before. More than eight
+    outputs with names are in standard deviations of each.
 
     Parameters
     ----------
@@ -70,28 +69,26 @@ def plot_responses(
         That of the optimum, or the one on the context, by default.
     before : dict or bool, optional
         Hyperparameters before the calibration, in the user's own units; False for none. By default
-        the optimiser's first point, if it was given a start or did not look for one, and else the
-        prior's initial point; the legend says which.
+        the optimiser's first point, if it was given a start or did not screen for one, otherwise
+        the prior's initial point; the legend names it.
     ecdf : bool
-        Draw distribution functions, which need no bandwidth, in place of densities; of no effect
+        Draw distribution functions, which need no bandwidth, instead of densities; without effect
         on lines.
     prob : float
     n_draws : int, optional
-        Number of populations in the band; 200 where they cost no response (`Reweighted`), 40
-        elsewhere, where each costs n responses per simulator.
+        Number of populations in the band; by default 200 where they cost no response
+        (`Reweighted`), otherwise 40, each of which costs n responses per simulator.
     labels : mapping, optional
-        What a reader calls a simulator, or an output, by its name, with units: ``{"crack":
-        "relative crack length"}``.
+        Labels of simulators or outputs by name, with units: ``{"crack": "relative length"}``.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------
     arviz.PlotCollection
         Its ``viz`` has the artists ``measured``, ``rug`` (densities only), ``before``, ``band`` and
-        ``after``; with lines, ``population``. The panel of an output is called as an element of the
-        simulator, ``"frame[first]"``.
+        ``after``; with lines, ``population``. The panel of an output has the name of an element of
+        the simulator, ``"frame[first]"``.
 
     Raises
     ------
@@ -103,8 +100,8 @@ def plot_responses(
 
     Notes
     -----
-    Densities of responses are Gaussian kernel densities with Silverman's bandwidth, widened where
-    weights are uneven. Specimens that failed (+inf) are missing from the area under a curve.
+    Densities of responses are Gaussian kernel densities with Silverman's bandwidth, wider where
+    weights are uneven. The area under a curve is the share of specimens that have not failed.
 
     Examples
     --------
@@ -119,8 +116,6 @@ def plot_responses(
     """
     refuse_look(labels, pc_kwargs)
     flag(ecdf, "ecdf")
-    if n_draws is not None:
-        positive_integer(n_draws, "n_draws")
     share(prob, "prob")
     ensemble = read_result(result, model, "prb.plot_responses", n_draws)
     evaluator = ensemble.evaluator
@@ -136,10 +131,10 @@ def plot_responses(
     limits: dict[str, Limits] = {}  # by axis: panels of groups have one
     contents = []
     for k, panels in enumerate(by_simulator):
-        after = evaluator.populations(ensemble.every, k)
+        populations = evaluator.populations(ensemble.every, k)
         earlier = evaluator.populations(start, k) if len(start) else None
         for output in panels:
-            sample = _Sample.of(output, after)
+            sample = _Sample.of(output, populations)
             first = None if earlier is None else _Sample.of(output, earlier)
             contents.append((output, sample, first))
             if sample.values.ndim == 2:
@@ -173,11 +168,11 @@ class _Sample:
         return function(self.values, self.weights, grid)
 
 
-def _axis_limits(output: Output, after: _Sample, earlier: _Sample | None) -> Limits:
+def _axis_limits(output: Output, sample: _Sample, earlier: _Sample | None) -> Limits:
     """Return the range of the axis; more of the population before is beyond it."""
-    before = None if earlier is None else central_range(earlier.values, earlier.weights, tail=0.05)
+    widest = None if earlier is None else central_range(earlier.values, earlier.weights, tail=0.05)
     observed, _ = output.measured()
-    return axis_range(observed, central_range(after.values, after.weights, tail=0.005), before)
+    return axis_range(observed, central_range(sample.values, sample.weights, tail=0.005), widest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,14 +189,14 @@ class _Picture:
         self,
         panel: Panel,
         output: Output,
-        after: _Sample,
+        sample: _Sample,
         earlier: _Sample | None,
         limits: Limits,
     ) -> None:
         """Draw the distribution of one output: data first, then the populations."""
         observed, weights = output.measured()
         grid = np.linspace(*limits, GRID_POINTS)
-        curves = after.curves(grid, ecdf=self.ecdf)
+        curves = sample.curves(grid, ecdf=self.ecdf)
         calibrated = Calibrated.of(curves, self.ensemble, self.prob)
         if self.ecdf:
             x, y = staircase(observed, weights, *limits)
@@ -229,13 +224,13 @@ class _Picture:
             ylim=ylim,
         )
 
-    def lines(self, panel: Panel, output: Output, after: _Sample, earlier: _Sample | None) -> None:
+    def lines(self, panel: Panel, output: Output, sample: _Sample, earlier: _Sample | None) -> None:
         """Draw all outputs, a line for each specimen."""
         axis = Axis.of(output)
         start = None
         if earlier is not None:
             (start,) = quantiles(earlier.values, earlier.weights, LEVELS)
-        lines = quantiles(after.values, after.weights, LEVELS)
+        lines = quantiles(sample.values, sample.weights, LEVELS)
         ylim = draw_lines(panel, axis, self.ensemble, lines, start, self.prob, self.start)
         observed = output.node.observed
         incomplete = np.count_nonzero(np.isnan(observed).any(axis=1))

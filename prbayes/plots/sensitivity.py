@@ -27,20 +27,19 @@ def plot_sensitivity(
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the shares of hyperparameters and inputs, a row per factor.
+    """Draw the sensitivity indices of hyperparameters and inputs, a row per factor.
 
-    A dot is the share that a factor explains by itself, a diamond the one that is left when all
-    others are known, each with two standard errors to either side.
+    A dot is the share of the variance that a factor explains by itself, a diamond the share that is
+    left when all other factors are known, each with two standard errors to either side.
 
     Parameters
     ----------
     table : xarray.Dataset
         From `sensitivity`.
     labels : mapping, optional
-        What a reader calls a factor, by its name.
+        Labels of factors by name.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------
@@ -51,7 +50,7 @@ def plot_sensitivity(
     Raises
     ------
     TypeError
-        If it is no table of shares.
+        If it is no table of `sensitivity`.
 
     Examples
     --------

@@ -32,20 +32,18 @@ def plot_stages(
 ) -> Any:
     """Draw the stages of a sequential Monte Carlo run, a line per chain, a panel per statistic.
 
-    A statistic that is known at the end only, such as the log marginal likelihood, stands against
-    the chain. Beta goes from the prior, 0, to the posterior, 1; chains that need very different
-    numbers of stages, or whose log marginal likelihoods end far apart, have not seen the same
-    posterior.
+    A statistic of the last stage alone, such as the log marginal likelihood, is drawn by chain.
+    Beta goes from the prior, 0, to the posterior, 1. Chains with very different numbers of stages
+    or log marginal likelihoods have not sampled the same posterior.
 
     Parameters
     ----------
     posterior : xarray.DataTree
         From `sample_smc`, with a ``sample_stats`` group of dims (chain, stage).
     labels : mapping, optional
-        What a reader calls a statistic or a simulator, by its name.
+        Labels of statistics or simulators by name.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------

@@ -33,19 +33,16 @@ def plot_validity(
     """Draw the ECDF of the u-values against the identity, the area between them, the verdict.
 
     The shaded area is the statistic. The title has the critical value and the verdict; the band
-    holds the whole ECDF with probability 1 - alpha if the null is true, calibration uncertainty
-    included.
-
-    Of several outputs there is a thin line for each direction in which they are seen, dotted ones
-    of ``|2u - 1|``, without a band: the statistic is the mean of their areas, and the title has it.
+    contains the whole ECDF with probability 1 - alpha if the null is true, calibration uncertainty
+    included. Several outputs have a thin line for each direction, dotted ones of ``|2u - 1|``,
+    without a band: the statistic is the mean of their areas.
 
     Parameters
     ----------
     tests : ValidityTest or mapping
         From `area_test`; several by name, one panel each.
     **pc_kwargs
-        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
-        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
+        ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``.
 
     Returns
     -------

@@ -16,7 +16,9 @@ from prbayes.model.labels import (
     labelled_responses,
     observed_dataset,
 )
-from prbayes.response.outputs import lacking
+from prbayes.model.measurement import specimen_labels
+from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.response.outputs import is_missing
 
 # The names that ArviZ's functions which want a number for each observation show when they refuse.
 _LIKELIHOOD = ("one_number_for_all_specimens", "other_terms")
@@ -89,9 +91,9 @@ def specimen_groups(
     for likelihood in evaluator.likelihoods:
         name = likelihood.measurements[-1].name
         dim = str(observed[name].dims[0])
-        if likelihood.labels is not None:  # by specimen, not by reading
+        if specimen_labels(likelihood) is not None:  # by specimen, not by reading
             dim = f"{name}_specimen"
-            coords[dim] = likelihood.labels
+            coords[dim] = specimen_labels(likelihood)
         value = values[name].reshape(chains, draws, -1)
         log_likelihood[name] = (["chain", "draw", dim], value)
     groups = {
@@ -111,7 +113,7 @@ def _emulated(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) ->
     for k, likelihood in enumerate(evaluator.likelihoods):
         params = specimen_params(evaluator, thetas.reshape(-1, d), k)
         for measurement in likelihood.measurements:
-            values = likelihood.draws(rng, params, len(measurement.observed), measurement)
+            values = draw_readings(likelihood, rng, params, len(measurement.observed), measurement)
             drawn[measurement.name] = values.reshape(chains, draws, *values.shape[1:])
     return labelled_responses(evaluator, drawn, (chains, draws))
 
@@ -203,7 +205,7 @@ def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Gene
         values, weights = node.bound.populations([root[where] for root in roots])
         # The same responses carry all populations.
         points = values[0]
-        edges = np.cumsum(np.where(lacking(points), 0.0, weights), axis=1)
+        edges = np.cumsum(np.where(is_missing(points), 0.0, weights), axis=1)
         for place, row in zip(first + where, edges, strict=True):
             total = row[-1]
             if total > 0:

@@ -1,20 +1,22 @@
-"""Bootstrap distributions of the minimiser: no epsilon and no prior."""
+"""Bootstrap distributions of the minimiser."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from prbayes._progress import shown
-from prbayes._validate import Seed, flag, positive_integer, seed_number
+from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.inference.identifiability import unidentified_directions
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
-from prbayes.posterior.trees import bootstrap_tree
+from prbayes.posterior.results import bootstrap_tree
 
 
 @locked
@@ -26,12 +28,12 @@ def bootstrap(
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    """Minimise the discrepancy once for each of many data sets that resemble the observed one.
+    """Minimise the discrepancy of each of many data sets that resemble the observed one.
 
     By default the observed specimens get Dirichlet weights: the loss-likelihood bootstrap, whose
     minimisers are draws from a posterior without prior and without epsilon. The parametric
     bootstrap draws data sets from the model at the optimum; its minimisers are the sampling
-    distribution of the optimum. Observations that share a specimen label are weighted, or drawn,
+    distribution of the optimum. Observations of one specimen label are weighted, or drawn,
     together.
 
     With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is
@@ -62,9 +64,9 @@ def bootstrap(
     TypeError
         If ``optimum`` is no Optimum.
     ValueError
-        If the data tell less than the prior about a direction, along which the minimiser is
-        anywhere; or if nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`); if
-        the prior was part of the optimum, or its model has changed since.
+        If the data do not identify a direction; if a metric or propagation does not allow refits
+        (`FunctionMetric`, `Fresh`); if the prior was part of the optimum, or its model has changed
+        since.
 
     References
     ----------
@@ -81,70 +83,64 @@ def bootstrap(
     >>> prb.bootstrap(prb.minimize(model), draws=50).posterior["mu"].shape
     (1, 50)
     """
-    if is_specimen_optimum(optimum):
-        return _by_specimen(optimum, draws, parametric=parametric, seed=seed_number(random_seed))
     clock = time.perf_counter()
-    evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
+    by_specimen = is_specimen_optimum(optimum)
+    if not by_specimen:
+        optimum = require_refits(optimum, "bootstrap", "; use prb.sample_smc")
     positive_integer(draws, "draws", minimum=2)
     flag(parametric, "parametric")
     seed = seed_number(random_seed)
-    sampling = optimum.sampling()
-    unidentified = unidentified_directions(
-        sampling.local.unidentified, evaluator.hyperparameters.readable_names
-    )
-    if unidentified:
-        raise ValueError(
-            f"bootstrap: the data tell less than the prior about {', '.join(unidentified)}, "
-            "along which the minimiser is anywhere; use prb.sample_smc, whose posterior "
-            "falls back on the prior there, or fix a hyperparameter"
-        )
-    if parametric:
-        data = simulated_sets(evaluator, optimum.theta, draws, seed)
-    else:
-        data = reweighted_sets(evaluator, draws, seed)
+    refitted = _specimen_estimates if by_specimen else _minimisers
     with shown(progressbar):
-        x, converged = sampling.refit(data)
-        if sampling.prepares:
-            x, converged = sampling.refit_prepared(data, x)
+        thetas, converged = refitted(optimum, draws, seed, parametric=parametric)
     return bootstrap_tree(
-        evaluator,
-        sampling.thetas(x)[None],
-        sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
-        converged=float(converged.mean()),
-        seed=seed,
-        n_responses=optimum.n_responses,
-        seconds=time.perf_counter() - clock,
-    )
-
-
-def _by_specimen(optimum: Optimum, draws: int, *, parametric: bool, seed: int) -> xr.DataTree:
-    """Return estimates of data sets that resemble the observed one, by maximum likelihood."""
-    clock = time.perf_counter()
-    positive_integer(draws, "draws", minimum=2)
-    flag(parametric, "parametric")
-    refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
-    unidentified = np.isinf(np.diag(optimum.covariance))
-    if unidentified.any():
-        names = [n for n, is_flat in zip(optimum.names, unidentified, strict=True) if is_flat]
-        raise ValueError(
-            f"bootstrap: the data tell less than the prior about {', '.join(names)}, along which "
-            "the estimate is arbitrary; use prb.sample_smc, whose posterior falls back on the "
-            "prior there, or fix a hyperparameter"
-        )
-    evaluator = refits.evaluator
-    if parametric:
-        estimates = list(refits.simulated(draws, seed))
-        thetas = np.array([refit.theta for refit in estimates])
-        converged = np.array([refit.converged for refit in estimates])
-    else:
-        weights = dirichlet_weights(evaluator.emulated, draws, seed)
-        thetas, converged = refits.reweighted(weights)
-    return bootstrap_tree(
-        evaluator,
+        optimum.evaluator,
         thetas[None],
         sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         converged=float(converged.mean()),
         seed=seed,
         n_responses=optimum.n_responses,
         seconds=time.perf_counter() - clock,
+    )
+
+
+def _minimisers(
+    optimum: Optimum, draws: int, seed: int, *, parametric: bool
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return minimisers of the discrepancies, (draws, d), and whether they converged."""
+    evaluator, sampling = optimum.evaluator, optimum.sampling()
+    names = evaluator.hyperparameters.readable_names
+    unidentified = unidentified_directions(sampling.local.unidentified, names)
+    if unidentified:
+        raise ValueError(_unidentified(unidentified))
+    if parametric:
+        data = simulated_sets(evaluator, optimum.theta, draws, seed)
+    else:
+        data = reweighted_sets(evaluator, draws, seed)
+    x, converged = sampling.refit(data)
+    if sampling.prepares:
+        x, converged = sampling.refit_prepared(data, x)
+    return sampling.thetas(x), converged
+
+
+def _specimen_estimates(
+    optimum: Optimum, draws: int, seed: int, *, parametric: bool
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return maximum-likelihood estimates, (draws, d), and whether they converged."""
+    refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
+    unidentified = np.array(optimum.names)[np.isinf(np.diag(optimum.covariance))]
+    if unidentified.size:
+        raise ValueError(_unidentified(unidentified.tolist()))
+    if not parametric:
+        return refits.reweighted(dirichlet_weights(refits.evaluator.emulated, draws, seed))
+    estimates = list(refits.simulated(draws, seed))
+    thetas = np.array([estimate.theta for estimate in estimates])
+    return thetas, np.array([estimate.converged for estimate in estimates])
+
+
+def _unidentified(names: Sequence[str]) -> str:
+    return (
+        f"bootstrap: the data tell less than the prior about {', '.join(names)}, along which the "
+        "estimate is arbitrary; use prb.sample_smc, whose posterior falls back on the prior there, "
+        "or fix a hyperparameter"
     )

@@ -1,7 +1,4 @@
-"""The state of a sampler on disk after every stage.
-
-A run that was killed goes on where it stopped.
-"""
+"""The state of a sampler on disk, from which a run that was killed goes on."""
 
 from __future__ import annotations
 
@@ -19,25 +16,14 @@ from prbayes._validate import Floats
 from prbayes.model.fingerprint import Identity, Level, as_text, differences, from_text
 from prbayes.response.store import StoreError
 
-_FORMAT = 3  # of what is in a file; others are refused
+_FORMAT = 4  # of the content of a file; files of other formats are refused
 
 
 class Checkpoint:
-    """Arrays and a JSON note in one netCDF file, always whole: each save replaces the file at once.
+    """Arrays and a JSON note in one netCDF file, which each save replaces at once.
 
-    Parameters
-    ----------
-    path : path-like
-    problem : Identity
-        What is sampled.
-    settings : dict
-        What the draws depend on besides; a file of another problem, or with other settings, is
-        refused.
-
-    Raises
-    ------
-    StoreError
-        If there is a file that cannot be read, or that belongs to another run; it is left as it is.
+    ``settings`` are what the draws depend on besides the problem. A file that cannot be read, or of
+    another problem or settings, raises StoreError and remains as it is.
     """
 
     def __init__(
@@ -45,7 +31,8 @@ class Checkpoint:
     ) -> None:
         self.path = Path(path)
         self.problem = problem
-        self.settings = _plain(settings)
+        # As from JSON, so that settings equal those of a file.
+        self.settings: dict[str, Any] = json.loads(json.dumps(settings))
         self.arrays: dict[str, Floats] = {}
         self.note: dict[str, Any] = {}
         if self.path.exists():
@@ -55,8 +42,16 @@ class Checkpoint:
                 f"checkpoint: got {self.path}, whose folder does not exist, expected one that does"
             )
 
+    def arrays_of(self, prefix: str) -> dict[str, Floats]:
+        """Return the arrays whose names begin with a prefix, by the rest of their names."""
+        return {
+            name.removeprefix(prefix): array
+            for name, array in self.arrays.items()
+            if name.startswith(prefix)
+        }
+
     def save(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
-        """Replace what is on disk; it is safe there when this returns."""
+        """Replace the file; it is safe on disk when this returns."""
         variables = {}
         for name, array in arrays.items():
             dims = [f"{name}_{i}" for i in range(np.ndim(array))]
@@ -68,13 +63,13 @@ class Checkpoint:
             "note": json.dumps(note),
         }
         data = xr.Dataset(variables, attrs=attributes)
-        # Written beside and then renamed, so that the file is whole whenever the process ends.
+        # Written to another file and then renamed: the file is whole whenever the process ends.
         part = self.path.with_name(self.path.name + ".part")
         # Made in memory: HDF5 may end the process where the disk is full.
-        payload = _sealed(bytes(data.to_netcdf(engine="h5netcdf")))
+        content = _sealed(bytes(data.to_netcdf(engine="h5netcdf")))
         try:
             with part.open("wb") as file:
-                file.write(payload)
+                file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
             part.replace(self.path)
@@ -101,20 +96,19 @@ class Checkpoint:
             raise StoreError(self._refusal(reason)) from error
         if written_in != _FORMAT:
             raise StoreError(self._refusal("was written by another version of prbayes"))
-        other = differences(problem, self.problem, Level.RUN)
+        reasons = differences(problem, self.problem, Level.RUN)
         for key in sorted({*settings, *self.settings}):
-            got = settings.get(key)
-            expected = self.settings.get(key)
+            got, expected = settings.get(key), self.settings.get(key)
             if got != expected:
-                other.append(f"{key}: got {got}, expected {expected}")
-        if other:
-            raise StoreError(self._refusal(f"belongs to another run: {'; '.join(other)}"))
+                reasons.append(f"{key}: got {got}, expected {expected}")
+        if reasons:
+            raise StoreError(self._refusal(f"belongs to another run: {'; '.join(reasons)}"))
         self.arrays = {str(name): a.values for name, a in data.data_vars.items()}
         self.note = note
 
-    def _refusal(self, what: str) -> str:
+    def _refusal(self, reason: str) -> str:
         return (
-            f"checkpoint: {self.path} {what}; nothing was changed: move it away, "
+            f"checkpoint: {self.path} {reason}; nothing was changed: move it away, "
             "or pass another path"
         )
 
@@ -123,30 +117,24 @@ def stored_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the settings of a checkpoint's run; empty if there is none that can be read."""
     try:
         return dict(json.loads(_loaded(path).attrs["settings"]))
-    except Exception:  # Checkpoint says what is wrong with it
+    except Exception:  # `Checkpoint` reports the reason
         return {}
 
 
 class _UnsealedError(ValueError):
-    """A file that does not end with the digest of what comes before."""
+    """A file that does not end with the digest of its content."""
 
 
 def _sealed(payload: bytes) -> bytes:
-    """Return a file's contents with their digest behind; netCDF allows of bytes behind its end."""
+    """Return content followed by its digest; netCDF allows bytes after its end."""
     return payload + hashlib.sha256(payload).digest()
 
 
 def _loaded(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Return what is in a file; HDF5, which may hang on a damaged one, sees sound ones only."""
+    """Return a file's content; HDF5, which may hang on a damaged file, reads intact ones only."""
     content = Path(path).read_bytes()
-    size = hashlib.sha256().digest_size
-    payload = content[:-size]
+    payload = content[: -hashlib.sha256().digest_size]
     if _sealed(payload) != content:
         raise _UnsealedError
     with xr.open_dataset(io.BytesIO(payload), engine="h5netcdf") as data:
         return data.load()
-
-
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Return what JSON makes of values, so that they compare equal to those that were read."""
-    return dict(json.loads(json.dumps(values)))

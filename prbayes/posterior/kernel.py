@@ -1,38 +1,65 @@
-"""The SMC kernel, which evaluates a whole population in one call."""
+"""The kernel of sequential Monte Carlo: tempering and Metropolis-Hastings steps in batches."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pymc as pm
+from numpy.typing import NDArray
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from scipy.special import logsumexp
 
-from prbayes._validate import Floats, positive_integer, share
-from prbayes.model.evaluator import Evaluation, Evaluator
+from prbayes._validate import Floats, called, positive_integer, real_array, share
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import Hyperparameters
 from prbayes.posterior.importance import LogDensity
-from prbayes.posterior.initial_particles import starting_thetas
-from prbayes.response.inputs import model_on_context
+from prbayes.response.inputs import event_shape, model_on_context
 
-# Mean absolute correlation with the particles before a stage at which they count as new draws;
-# among 500 particles that share nothing it is .036. On the way to the posterior six times as much
-# will do: later stages forget the rest. Half or twice of either moves a mean by an eighth of a
-# standard deviation, of 400 draws, as another seed does (docs/constants.md).
-_UNCORRELATED = 0.05
-_ON_THE_WAY = 6
-# Share of the particles that have to carry the weight where another evaluator weighs them, by
-# judgement: they move afterwards until they forget where they were.
-_SERVE = 0.2
+
+@dataclass(frozen=True)
+class KernelOptions:
+    """Limits of the mutation, which a study chose (docs/constants.md)."""
+
+    # Mean absolute correlation with the previous particles, below which draws are new: .036 among
+    # 500 independent ones. Half or twice moves a mean no more than another seed does.
+    correlation: float = 0.05
+    tempered_correlation: float = 0.3  # before the last stage; later stages forget the rest
+    # Beside the hard ends of a uniform population 25 steps leave posteriors a tenth too wide.
+    steps: int = 60
+    effective: float = 0.2  # smallest effective share of particles that `reweight` accepts
+
+
+_OPTIONS = KernelOptions()
+
+
+class Particles(NamedTuple):
+    """Particles with their densities."""
+
+    thetas: Floats  # (n, d)
+    log_prior: Floats  # (n,)
+    log_likelihood: Floats  # (n,)
+    discrepancies: Floats  # (n, k)
+    lost: Floats  # (n, k): share of the population without response; NaN if not known
+
+    def at(self, index: Any) -> Particles:
+        """Return particles by an index."""
+        return Particles(*(array[index] for array in self))
+
+    def replaced(self, new: Particles, where: NDArray[np.bool_]) -> Particles:
+        """Return these particles, or new ones where (n,) is true."""
+        columns = [where.reshape(-1, *[1] * (array.ndim - 1)) for array in self]
+        return Particles(*map(np.where, columns, new, self))
 
 
 class BatchedKernel(SMC_KERNEL):
     """SMC kernel that computes priors, responses and discrepancies of all particles in one call.
 
-    It mutates by independent proposals from a normal fitted to the particles, which forget the past
-    at once, in turn with random-walk proposals, which also move inside separate modes; until the
-    particles are uncorrelated with those before, or stop becoming less so. Also usable as
+    Independent proposals from a normal fitted to the particles, which forget the past at once,
+    alternate with random-walk proposals, which also move inside separate modes, until the particles
+    are uncorrelated with the previous ones, or their correlation stops falling. Also usable as
     ``pymc.sample_smc(kernel=prbayes.posterior.BatchedKernel)``.
 
     Parameters
@@ -47,7 +74,7 @@ class BatchedKernel(SMC_KERNEL):
     threshold : float
         Share of the effective sample size that a stage keeps.
     compile_kwargs : dict, optional
-        Accepted for PyMC's sake; the populations are evaluated in NumPy.
+        Ignored: PyMC passes it.
     evaluator : Evaluator, optional
         Of the model.
     log_likelihood : callable, optional
@@ -89,137 +116,119 @@ class BatchedKernel(SMC_KERNEL):
                 "which calibrates it"
             )
         self.variables = model.value_vars
-        self.var_info = {}
-        for name, shape in self.evaluator.hyperparameters.shapes.items():
-            size = int(np.prod(shape, dtype=int))
-            self.var_info[name] = (shape, size)
+        shapes = self.evaluator.hyperparameters.shapes.items()
+        self.var_info = {name: (shape, int(np.prod(shape, dtype=int))) for name, shape in shapes}
         self.rng = np.random.default_rng(random_seed)
-        # Whether the evaluator is a coarser one, that `go_over` is to follow.
-        self.roughly = False
+        self.is_coarse = False  # whether `reweight` by a finer evaluator follows
         self._reset_state()
+
+    def _take(self, particles: Particles) -> None:
+        """Take particles over, also to the attributes that PyMC reads."""
+        self.particles = particles
+        self.tempered_posterior = particles.thetas
+        self.prior_logp = particles.log_prior
+        self.likelihood_logp = particles.log_likelihood
 
     def set_rng(self, rng: np.random.Generator) -> None:
         """Take over a chain's generator."""
         self.rng = rng
 
-    def _evaluate(self, thetas: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    def _evaluate(self, thetas: Floats) -> Particles:
         if self.log_likelihood is not None:
             log_prior = self.evaluator.hyperparameters.log_prior(thetas)
             unknown = np.full((len(thetas), len(self.evaluator.nodes)), np.nan)
-            return log_prior, self.log_likelihood(thetas), unknown, unknown.copy()
-        found: Evaluation = self.evaluator(thetas)
-        likelihood = found.log_likelihood(self.evaluator.epsilon)
-        return found.log_prior, likelihood, found.discrepancies, found.lost
+            return Particles(
+                thetas, log_prior, self.log_likelihood(thetas), unknown, unknown.copy()
+            )
+        evaluation = self.evaluator(thetas)
+        log_likelihood = evaluation.log_likelihood(self.evaluator.epsilon)
+        return Particles(
+            thetas, evaluation.log_prior, log_likelihood, evaluation.discrepancies, evaluation.lost
+        )
 
     def _initialize_kernel(self) -> None:
         seed = int(self.rng.integers(2**31))
         if self.start is None:
-            self.tempered_posterior = self.evaluator.hyperparameters.prior_thetas(self.draws, seed)
+            thetas = self.evaluator.hyperparameters.prior_thetas(self.draws, seed)
+        elif isinstance(self.start, np.ndarray):
+            thetas = self.start
         else:
-            self.tempered_posterior = self._started()
-        found = self._evaluate(self.tempered_posterior)
-        self.prior_logp, self.likelihood_logp, self.discrepancies, self.lost = found
-        if not np.isfinite(self.likelihood_logp).any():
+            thetas = starting_thetas(self.evaluator.hyperparameters, self.start, self.draws)
+        self._take(self._evaluate(thetas))
+        if not np.isfinite(self.particles.log_likelihood).any():
             raise ValueError(
                 f"model: got no finite discrepancy among {self.draws} draws from the prior, "
                 "expected some; the populations of the prior are invalid or far from the design: "
                 "look at the priors"
             )
 
-    def _started(self) -> Floats:
-        """Return the particles that were given: thetas, or values by the names of variables."""
-        if isinstance(self.start, np.ndarray):
-            return self.start.copy()
-        return starting_thetas(self.evaluator.hyperparameters, self.start, self.draws)
-
     def resample(self) -> None:
         """Resample the particles in proportion to their weights."""
-        index = systematic_resampling(self.weights, self.rng)
-        self.resampling_indexes = index
-        self.tempered_posterior = self.tempered_posterior[index]
-        self.prior_logp = self.prior_logp[index]
-        self.likelihood_logp = self.likelihood_logp[index]
-        self.discrepancies = self.discrepancies[index]
-        self.lost = self.lost[index]
+        self.resampling_indexes = systematic_resampling(self.weights, self.rng)
+        self._take(self.particles.at(self.resampling_indexes))
 
-    def go_over(self, evaluator: Evaluator) -> bool:
-        """Weigh the particles by another evaluator, for the next step; return whether they serve.
-
-        They do not where few of them would carry the weight.
-        """
+    def reweight(self, evaluator: Evaluator) -> bool:
+        """Weigh the particles by another evaluator; return whether enough of them have weight."""
         self.evaluator = evaluator
-        self.roughly = False
-        before = self.likelihood_logp
-        found = self._evaluate(self.tempered_posterior)
-        self.prior_logp, self.likelihood_logp, self.discrepancies, self.lost = found
+        self.is_coarse = False
+        coarse = self.particles.log_likelihood
+        self._take(self._evaluate(self.particles.thetas))
         with np.errstate(invalid="ignore"):
-            log_weights = np.nan_to_num(self.likelihood_logp - before, nan=-np.inf)
+            log_weights = np.nan_to_num(self.particles.log_likelihood - coarse, nan=-np.inf)
         total = logsumexp(log_weights)
         if not np.isfinite(total):
             return False
         self.weights = np.exp(log_weights - total)
         self.log_marginal_likelihood += total - np.log(self.draws)
-        return bool(1 / np.square(self.weights).sum() > _SERVE * self.draws)
+        return bool(1 / np.square(self.weights).sum() > _OPTIONS.effective * self.draws)
 
     def mutate(self) -> None:
-        """Move all particles by Metropolis-Hastings steps that keep the tempered posterior."""
-        before = self.tempered_posterior.copy()
-        fitted = Normal.of(before)
-        at_the_end = self.beta == 1 and not self.roughly
-        enough = _UNCORRELATED if at_the_end else _UNCORRELATED * _ON_THE_WAY
-        # The scale that is best for normal targets, steered to an acceptance rate between those for
-        # many dimensions and for one: Roberts, Gelman and Gilks (1997),
-        # doi:10.1214/aoap/1034625254.
-        scale = 2.38 / np.sqrt(before.shape[1])
-        remembered = 1.0
-        accepted = []
-        # A bound on the cost where particles do not forget. Beside the hard ends of a uniform
-        # population 25 steps leave posteriors a tenth too wide.
-        for step in range(1, 60 + 1):
-            # In turn: new places at once, and steps from where each particle is
-            noise = self.rng.standard_normal(before.shape)
+        """Move all particles by Metropolis-Hastings steps that preserve the tempered posterior."""
+        start = self.particles.thetas
+        mean, root = fitted_normal(start)
+        is_last = self.beta == 1 and not self.is_coarse
+        limit = _OPTIONS.correlation if is_last else _OPTIONS.tempered_correlation
+        # The best scale for normal targets, steered to an acceptance rate between those for many
+        # dimensions and for one (Roberts, Gelman and Gilks 1997, doi:10.1214/aoap/1034625254).
+        scale = 2.38 / np.sqrt(start.shape[1])
+        remaining = 1.0
+        rates = []
+        for step in range(1, _OPTIONS.steps + 1):
+            noise = self.rng.standard_normal(start.shape)
             if step % 2:
-                accepted.append(self._jump(fitted, noise))
+                rates.append(self._independent_step(mean, root, noise))
                 continue
-            rate = self._walk(fitted, scale * noise)
-            accepted.append(rate)
+            rate = self._random_walk_step(root, scale * noise)
+            rates.append(rate)
             scale *= np.exp(rate - 0.3)
-
-            # Terminate when the particles have forgotten, or stop forgetting
-            last = remembered
-            remembered = correlation(before, self.tempered_posterior)
-            has_stalled = step > 20 and remembered > last - 0.001
-            if remembered < enough or has_stalled:
+            previous = remaining
+            remaining = correlation(start, self.particles.thetas)
+            has_stalled = step > 20 and remaining > previous - 0.001
+            if remaining < limit or has_stalled:
                 break
-        self.accept_rate = float(np.mean(accepted))
+        self.accept_rate = float(np.mean(rates))
         self.n_steps = step
 
-    def _jump(self, fitted: Normal, noise: Floats) -> float:
-        """Propose independent draws of the fitted normal; return the rate of acceptance."""
-        return self._accept(*fitted.independent(self.tempered_posterior, noise))
+    def _independent_step(self, mean: Floats, root: Floats, noise: Floats) -> float:
+        """Propose draws of a normal distribution; return the rate of acceptance."""
+        standard = np.linalg.solve(root, (self.particles.thetas - mean).T)
+        log_ratio = 0.5 * ((noise**2).sum(axis=1) - (standard**2).sum(axis=0))
+        return self._accept(mean + noise @ root.T, log_ratio)
 
-    def _walk(self, fitted: Normal, noise: Floats) -> float:
+    def _random_walk_step(self, root: Floats, noise: Floats) -> float:
         """Propose a step from each particle; return the rate of acceptance."""
-        proposed = self.tempered_posterior + noise @ fitted.root.T
-        return self._accept(proposed, np.zeros(len(proposed)))
+        return self._accept(self.particles.thetas + noise @ root.T, np.zeros(len(noise)))
 
-    def _accept(self, proposed: Floats, log_ratio: Floats) -> float:
-        """Accept or reject by Metropolis and Hastings.
-
-        ``log_ratio`` is that of the proposal's densities.
-        """
-        prior, likelihood, discrepancies, lost = self._evaluate(proposed)
+    def _accept(self, thetas: Floats, log_ratio: Floats) -> float:
+        """Accept or reject, given the log ratio of the proposal's densities there and back."""
+        current, proposed = self.particles, self._evaluate(thetas)
         with np.errstate(invalid="ignore"):
-            tempered = self.beta * (likelihood - self.likelihood_logp)
-            gain = prior - self.prior_logp + tempered + log_ratio
-        log_uniform = np.log(self.rng.random(len(proposed)))
-        ok = log_uniform < np.nan_to_num(gain, nan=-np.inf)
-        self.tempered_posterior[ok] = proposed[ok]
-        self.prior_logp[ok] = prior[ok]
-        self.likelihood_logp[ok] = likelihood[ok]
-        self.discrepancies[ok] = discrepancies[ok]
-        self.lost[ok] = lost[ok]
-        return float(ok.mean())
+            tempered = self.beta * (proposed.log_likelihood - current.log_likelihood)
+            gain = proposed.log_prior - current.log_prior + tempered + log_ratio
+        log_uniform = np.log(self.rng.random(len(thetas)))
+        is_accepted = log_uniform < np.nan_to_num(gain, nan=-np.inf)
+        self._take(current.replaced(proposed, is_accepted))
+        return float(is_accepted.mean())
 
     def sample_stats(self) -> dict[str, Any]:
         """Return the statistics of a stage."""
@@ -230,82 +239,103 @@ class BatchedKernel(SMC_KERNEL):
             "n_steps": self.n_steps,
         }
 
-    def state(self) -> tuple[dict[str, Floats], dict[str, Any]]:
-        """Return all that the next stage depends on: arrays, and what goes into JSON."""
-        arrays = {
-            "thetas": self.tempered_posterior,
-            "prior": self.prior_logp,
-            "likelihood": self.likelihood_logp,
-            "discrepancies": self.discrepancies,
-            "lost": self.lost,
-        }
-        note = {
-            "roughly": self.roughly,
-            "beta": self.beta,
-            "evidence": self.log_marginal_likelihood,
-            "iteration": self.iteration,
-            "generator": self.rng.bit_generator.state,
-        }
-        return arrays, note
-
-    def restore(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
-        """Take over a state."""
-        self.tempered_posterior = arrays["thetas"].copy()
-        self.prior_logp = arrays["prior"].copy()
-        self.likelihood_logp = arrays["likelihood"].copy()
-        self.discrepancies = arrays["discrepancies"].copy()
-        self.lost = arrays["lost"].copy()
-        self.roughly = note.get("roughly", False)  # of an earlier version
-        self.beta = note["beta"]
-        self.log_marginal_likelihood = note["evidence"]
-        self.iteration = note["iteration"]
-        self.rng = np.random.default_rng()
-        self.rng.bit_generator.state = note["generator"]
-
     def sample_settings(self) -> dict[str, Any]:
         """Return the settings of the run."""
         return {"_n_draws": self.draws, "threshold": self.threshold, "_n_tune": self.n_steps}
 
+    def state(self) -> tuple[dict[str, Floats], dict[str, Any]]:
+        """Return the state that the next stage depends on: arrays, and a note for JSON."""
+        note = {
+            "is_coarse": self.is_coarse,
+            "beta": self.beta,
+            "log_marginal_likelihood": self.log_marginal_likelihood,
+            "iteration": self.iteration,
+            "generator": self.rng.bit_generator.state,
+        }
+        return self.particles._asdict(), note
 
-@dataclass(frozen=True, eq=False)
-class Normal:
-    """A normal distribution fitted to particles.
+    def restore(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
+        """Take over a state."""
+        self._take(Particles(**arrays))
+        self.is_coarse = note["is_coarse"]
+        self.beta = note["beta"]
+        self.log_marginal_likelihood = note["log_marginal_likelihood"]
+        self.iteration = note["iteration"]
+        self.rng = np.random.default_rng()
+        self.rng.bit_generator.state = note["generator"]
 
-    Mean, shape (d,), and Cholesky factor, shape (d, d).
+
+def fitted_normal(particles: Floats) -> tuple[Floats, Floats]:
+    """Return mean, (d,), and Cholesky factor of the covariance, (d, d), of particles."""
+    covariance = np.atleast_2d(np.cov(particles, rowvar=False))
+    # Identical particles have a proper covariance, too.
+    jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
+    return particles.mean(axis=0), np.linalg.cholesky(covariance + jitter)
+
+
+def correlation(start: Floats, end: Floats) -> float:
+    """Return the mean absolute correlation of the coordinates of particles, (n, d) each."""
+    a = start - start.mean(axis=0)
+    b = end - end.mean(axis=0)
+    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+    correlations = np.abs((a * b).sum(axis=0)) / np.where(size > 0, size, 1.0)
+    return float(np.mean(correlations))
+
+
+def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) -> Floats:
+    """Return thetas, (draws, d), of the particles that a user passes, as for `pymc.sample_smc`.
+
+    ``start`` has for each free variable values of shape (draws, *shape): by its own name in its own
+    units, as draws of `pymc.sample_prior_predictive` are, or transformed by the name that PyMC
+    gives its value, such as ``sigma_log__``. Raises KeyError, TypeError or ValueError if it is no
+    such mapping, or a value is outside the priors' support.
     """
+    if not isinstance(start, Mapping):
+        raise TypeError(
+            f"start: got {called(start)}, expected a dict of arrays by the names of variables, or "
+            "a list of these, one for each chain"
+        )
+    model = hyperparameters.model
+    values_to_rvs = zip(hyperparameters.shapes, model.value_vars, strict=True)
+    rv_names = {name: str(model.values_to_rvs[value].name) for name, value in values_to_rvs}
+    is_complete = all(len({*pair} & set(start)) == 1 for pair in rv_names.items())
+    if not is_complete or not set(start) <= {*rv_names, *rv_names.values()}:
+        raise KeyError(
+            f"start: got {sorted(map(str, start))}, expected values for each of "
+            f"{sorted(rv_names.values())}"
+        )
+    # Variables in their own units first; the initial point stands for transformed ones.
+    initial = hyperparameters.constrained(hyperparameters.initial[None])
+    own_units = []
+    for rv in model.free_RVs:
+        shape = (draws, *event_shape(rv))
+        value = start.get(rv.name)
+        value = initial[rv.name] if value is None else _particle_values(value, rv.name, shape)
+        own_units.append(np.broadcast_to(value, shape))
+    with np.errstate(all="ignore"):  # values outside the support are refused below
+        thetas = hyperparameters.thetas_of(own_units)
+    first = 0
+    for name, shape in hyperparameters.shapes.items():
+        size = int(np.prod(shape, dtype=int))
+        if rv_names[name] not in start:
+            value = _particle_values(start[name], name, (draws, *shape))
+            thetas[:, first : first + size] = value.reshape(draws, size)
+        first += size
+    finite = np.isfinite(thetas).all(axis=1)
+    outside = ~(finite & hyperparameters.in_support(np.where(finite[:, None], thetas, 0.0)))
+    if outside.any():
+        raise ValueError(
+            f"start: got {int(outside.sum())} of {draws} points outside the support of the priors, "
+            "expected none; draw them from the prior"
+        )
+    return np.asarray(thetas)
 
-    mean: Floats
-    root: Floats
 
-    @classmethod
-    def of(cls, particles: Floats) -> Normal:
-        """Return the one with the particles' mean and covariance."""
-        covariance = np.atleast_2d(np.cov(particles, rowvar=False))
-        # Makes the covariance of identical particles a proper one.
-        jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
-        return cls(particles.mean(axis=0), np.linalg.cholesky(covariance + jitter))
-
-    def independent(self, particles: Floats, noise: Floats) -> tuple[Floats, Floats]:
-        """Return draws of it, (n, d), and the log ratio of densities that a proposal counts.
-
-        That is its log-density at the present places less that at the proposed ones, shape (n,).
-        """
-        proposed = self.mean + noise @ self.root.T
-        from_mean = particles - self.mean
-        here = np.linalg.solve(self.root, from_mean.T)
-        squared_there = (noise**2).sum(axis=1)
-        squared_here = (here**2).sum(axis=0)
-        return proposed, 0.5 * (squared_there - squared_here)
-
-
-def correlation(before: Floats, after: Floats) -> float:
-    """Return the mean absolute correlation of the particles' coordinates with those before."""
-    a = before - before.mean(axis=0)
-    b = after - after.mean(axis=0)
-    in_a = (a**2).sum(axis=0)
-    in_b = (b**2).sum(axis=0)
-    size = np.sqrt(in_a * in_b)
-    size = np.where(size > 0, size, 1.0)
-    product = (a * b).sum(axis=0)
-    each = np.abs(product) / size
-    return float(np.mean(each))
+def _particle_values(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
+    """Return values of a variable, one for each particle."""
+    array = real_array(value, f"start: {name}")
+    if array.shape != shape:
+        raise ValueError(
+            f"start: {name}: got shape {array.shape}, expected {shape}, a value for each particle"
+        )
+    return array

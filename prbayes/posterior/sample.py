@@ -1,4 +1,4 @@
-"""The posterior by importance sampling, or by the sampler of PyMC that it needs: `sample`."""
+"""The posterior by importance sampling, else NUTS or sequential Monte Carlo: `sample`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._progress import shown
-from prbayes._validate import Floats, Seed, positive_integer, seed_number
+from prbayes._validate import Seed, positive_integer, seed_number
 from prbayes.model.budgets import designs_as_before, explained
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
@@ -21,19 +21,23 @@ from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
 from prbayes.optimize.optimum import Optimum
 from prbayes.posterior.importance import (
     ImportanceOptions,
-    ImportanceSample,
     Laplace,
     Prior,
     importance_sample,
     laplace,
 )
-from prbayes.posterior.results import as_asked, checked_idata_kwargs, checked_names
-from prbayes.posterior.smc import Sampling, estimate_of, evaluator_of, result_tree, sample_posterior
+from prbayes.posterior.results import Draws, require_idata_kwargs, require_names, selected
+from prbayes.posterior.smc import (
+    SamplingSettings,
+    estimate_of,
+    evaluator_of,
+    require_optimum,
+    result_of,
+    sample_posterior,
+)
 from prbayes.posterior.target import Target, estimate_target, specimen_target
 from prbayes.response.budget import limited
 from prbayes.response.inputs import model_on_context
-
-_OPTIONS = ImportanceOptions()
 
 
 @locked
@@ -54,8 +58,8 @@ def sample(
 
     With the log-likelihood by specimen: importance sampling from Laplace approximations of the
     modes, then from mixtures fitted to the weighted points. If Pareto k stays above .7, or the
-    effective sample size below half of the draws, NUTS from the optimum; of several modes, or where
-    the likelihood jumps at the optimum, sequential Monte Carlo from the prior.
+    effective sample size below half of the draws, NUTS from the optimum; with several modes, or a
+    likelihood that jumps at the optimum, sequential Monte Carlo from the prior.
 
     With a metric, the posterior is prior times density of the metric's own estimate, by a
     saddlepoint approximation [2]_: of its score, if the gradient is a mean over specimens (PR, the
@@ -86,8 +90,8 @@ def sample(
     Returns
     -------
     xarray.DataTree
-        The groups of `sample_smc`. The attribute ``sampler`` of ``posterior`` says which sampler
-        was taken. Importance sampling has the attributes ``pareto_k``, ``efficiency`` (effective
+        The groups of `sample_smc`. The attribute ``sampler`` of ``posterior`` is the name of the
+        sampler. Importance sampling has the attributes ``pareto_k``, ``efficiency`` (effective
         sample size as a share of the points) and ``log_marginal_likelihood``, and ``lp``, the log
         posterior density in unconstrained space, in ``sample_stats`` (chain, draw).
 
@@ -120,17 +124,14 @@ def sample(
     positive_integer(draws, "draws", minimum=10)
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample")
-    if optimum is not None and not isinstance(optimum, Optimum):
-        got = type(optimum).__name__
-        raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
-    names = checked_names(var_names, model)
-    keywords = checked_idata_kwargs(idata_kwargs)
-    seed = seed_number(random_seed)
-    asked = Sampling(
+    require_optimum(optimum)
+    names = require_names(var_names, model)
+    keywords = require_idata_kwargs(idata_kwargs)
+    settings = SamplingSettings(
         draws=draws,
         chains=chains,
         optimum=optimum,
-        random_seed=seed,
+        random_seed=seed_number(random_seed),
         progressbar=progressbar,
         with_groups=True,
     )
@@ -140,76 +141,48 @@ def sample(
         limited(max_seconds, max_runs),
     ):
         evaluator = evaluator_of(model, optimum, "sample")
-        tree = draw_posterior(evaluator, asked)
-        return as_asked(tree, names, keywords)
+        return selected(draw_posterior(evaluator, settings), names, keywords)
 
 
-def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     """Return draws of the posterior by importance sampling, or else by NUTS or SMC.
 
-    Stored responses are added where they do not support the draws.
+    Responses are added to designs that do not support the draws.
     """
     clock = time.perf_counter()
-    before = evaluator.n_responses - n_design_runs(evaluator)
-    optimum = estimate_of(evaluator, asked, "sample")
-    asked = replace(asked, optimum=optimum)
-    sample, nuts = None, None
+    n_before = evaluator.n_responses - n_design_runs(evaluator)
+    optimum = estimate_of(evaluator, settings, "sample")
+    settings = replace(settings, optimum=optimum)
     with designs_as_before(evaluator):
+        draws = None
         for _ in range(MAX_ROUNDS + 1):
-            target = _target(evaluator, optimum)
-            modes = _modes(target)
+            if evaluator.nodes:
+                assert optimum is not None
+                target = estimate_target(evaluator, optimum)
+            else:
+                target = specimen_target(evaluator, optimum)
+            modes = modes_of(target)
             if modes is None:
                 break
-            size = asked.chains * asked.draws
-            seed = seed_number(asked.random_seed)
-            prior = Prior(
-                evaluator.hyperparameters.prior_thetas, evaluator.hyperparameters.log_prior
-            )
-            sample = importance_sample(target.log_posterior, modes, size, seed, _OPTIONS, prior)
-            if not sample.is_reliable(_OPTIONS):
-                sample = None
+            draws = _importance_draws(target, modes, settings)
+            if draws is None:
                 if len(modes) == 1 and not evaluator.nodes:
-                    nuts = _by_nuts(evaluator, modes[0], asked)
+                    draws = _nuts_draws(evaluator, modes[0], settings)
                 break
-            if not refine_at(evaluator, sample.draws[:THETAS]):
+            thetas = draws.thetas.reshape(-1, evaluator.hyperparameters.size)
+            if not refine_at(evaluator, thetas[:THETAS]):
                 break
-        log_likelihood = None
-        if sample is not None:
-            attrs, thetas, stats = _of_importance_sample(sample, asked)
-            if evaluator.nodes:
-                log_prior = evaluator.hyperparameters.log_prior(sample.draws)
-                log_likelihood = (sample.log_density - log_prior).reshape(thetas.shape[:2])
-        elif nuts is not None:
-            attrs, thetas, stats = nuts
-        else:
-            return sample_posterior(evaluator, asked)
-        return result_tree(
-            evaluator,
-            thetas,
-            asked,
-            optimum,
-            attrs,
-            log_likelihood=log_likelihood,
-            sample_stats=stats,
-            n_before=before,
-            clock=clock,
-        )
+        if draws is None:
+            return sample_posterior(evaluator, settings)
+        return result_of(evaluator, draws, settings, optimum, n_before=n_before, clock=clock)
 
 
-def _target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
-    """Return the posterior of a model."""
-    if not evaluator.nodes:
-        return specimen_target(evaluator, optimum)
-    assert optimum is not None
-    return estimate_target(evaluator, optimum)
-
-
-def _modes(target: Target) -> list[Laplace] | None:
+def modes_of(target: Target) -> list[Laplace] | None:
     """Return Laplace approximations of the modes, None if the density jumps at a start."""
-    starts = np.stack(target.starts)
+    starts = target.starts
     try:
         if len(starts) > 1:
-            # Starts that are on the way to the same mode go on as one.
+            # Starts on the way to the same mode continue as one.
             rough = laplace(target.log_posterior, starts, target.scale, steps=6)
             starts = np.stack([mode.mode for mode in _distinct(rough)])
         candidates = laplace(target.log_posterior, starts, target.scale)
@@ -236,42 +209,59 @@ def _distinct(modes: list[Laplace]) -> list[Laplace]:
     return distinct
 
 
-def _of_importance_sample(
-    sample: ImportanceSample, asked: Sampling
-) -> tuple[dict[str, Any], Floats, xr.Dataset]:
-    """Return attributes, draws (chains, draws, d) and statistics of a sample."""
-    attrs = {
-        "sampler": "importance sampling",
-        "pareto_k": sample.pareto_k,
-        "efficiency": sample.efficiency,
-        "log_marginal_likelihood": sample.log_evidence,
-    }
-    shape = (asked.chains, asked.draws)
-    lp = (["chain", "draw"], sample.log_density.reshape(shape))
-    coords = {"chain": np.arange(asked.chains), "draw": np.arange(asked.draws)}
-    return attrs, sample.draws.reshape(*shape, -1), xr.Dataset({"lp": lp}, coords=coords)
+def _importance_draws(
+    target: Target, modes: list[Laplace], settings: SamplingSettings
+) -> Draws | None:
+    """Return draws by importance sampling, None if they are not reliable."""
+    evaluator, (chains, draws) = target.evaluator, (settings.chains, settings.draws)
+    hyperparameters = evaluator.hyperparameters
+    prior = Prior(hyperparameters.prior_thetas, hyperparameters.log_prior)
+    seed = seed_number(settings.random_seed)
+    options = ImportanceOptions()
+    sample = importance_sample(target.log_posterior, modes, chains * draws, seed, options, prior)
+    if not sample.is_reliable(options):
+        return None
+    log_likelihood = None
+    if evaluator.nodes:
+        log_likelihood = sample.log_density - hyperparameters.log_prior(sample.draws)
+        log_likelihood = log_likelihood.reshape(chains, draws)
+    lp = sample.log_density.reshape(chains, draws)
+    coords = {"chain": np.arange(chains), "draw": np.arange(draws)}
+    return Draws(
+        sample.draws.reshape(chains, draws, -1),
+        sampler={
+            "sampler": "importance sampling",
+            "pareto_k": sample.pareto_k,
+            "efficiency": sample.efficiency,
+            "log_marginal_likelihood": sample.log_evidence,
+        },
+        log_likelihood=log_likelihood,
+        sample_stats=xr.Dataset({"lp": (["chain", "draw"], lp)}, coords=coords),
+    )
 
 
-def _by_nuts(
-    evaluator: Evaluator, mode: Laplace, asked: Sampling
-) -> tuple[dict[str, Any], Floats, xr.Dataset]:
-    """Return the same by NUTS from the mode of the posterior."""
-    values = evaluator.hyperparameters.constrained(mode.mode[None])
-    free = [str(rv.name) for rv in evaluator.model.free_RVs]
+def _nuts_draws(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings) -> Draws:
+    """Return draws by NUTS from the mode of the posterior."""
+    hyperparameters = evaluator.hyperparameters
+    values = hyperparameters.constrained(mode.mode[None])
+    names = [str(rv.name) for rv in evaluator.model.free_RVs]
     with evaluator.model:
         idata = pm.sample(
-            asked.draws,
-            chains=asked.chains,
-            initvals={name: values[name][0] for name in free},
+            settings.draws,
+            chains=settings.chains,
+            initvals={name: values[name][0] for name in names},
             init="adapt_diag",
             nuts_sampler="pymc",
             cores=1,
-            random_seed=asked.random_seed,
+            random_seed=settings.random_seed,
             progressbar=False,
             compute_convergence_checks=False,
         )
     posterior = idata["posterior"].to_dataset()
-    columns = [posterior[name].transpose("chain", "draw", ...).values for name in free]
-    flat = [x.reshape(-1, *x.shape[2:]) for x in columns]
-    thetas = evaluator.hyperparameters.thetas_of(flat).reshape(asked.chains, asked.draws, -1)
-    return {"sampler": "NUTS"}, thetas, idata["sample_stats"].to_dataset()
+    columns = [posterior[name].transpose("chain", "draw", ...).values for name in names]
+    thetas = hyperparameters.thetas_of([x.reshape(-1, *x.shape[2:]) for x in columns])
+    return Draws(
+        thetas.reshape(settings.chains, settings.draws, -1),
+        sampler={"sampler": "NUTS"},
+        sample_stats=idata["sample_stats"].to_dataset(),
+    )

@@ -1,7 +1,4 @@
-"""Simulation-based calibration.
-
-Whether the whole procedure gives posteriors of the right width for a model.
-"""
+"""Simulation-based calibration: the ranks of true hyperparameters among posterior draws."""
 
 from __future__ import annotations
 
@@ -19,7 +16,9 @@ from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
+from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator, has_other_terms, specimen_params
+from prbayes.model.labels import labelled, versions
 from prbayes.model.locking import locked
 from prbayes.optimize.specimen_refits import (
     other_specimens,
@@ -27,13 +26,11 @@ from prbayes.optimize.specimen_refits import (
     specimen_pool,
 )
 from prbayes.posterior.sample import draw_posterior
-from prbayes.posterior.smc import Adjustment, Sampling, refuse_adjustment, sample
-from prbayes.posterior.trees import calibration_tree
+from prbayes.posterior.smc import Adjustment, SamplingSettings, require_adjustment, sample
 from prbayes.propagation.reweighted import designs_restored
 from prbayes.response.inputs import model_on_context
 
-# Data sets that a worker analyses before it reports: seconds of work, against milliseconds of
-# sending the model.
+# Data sets that a worker analyses in seconds; sending the model takes milliseconds.
 _CHUNK = 10
 
 
@@ -54,8 +51,7 @@ def simulation_based_calibration(
     which the response is called; with the log-likelihood by specimen its emulator gives the
     responses, nothing is run, and the emulator itself is not checked. Then `sample`, or
     `sample_smc` with ``adjustment=None``, runs as on measurements. If posteriors have the right
-    width and place, the ranks are uniform. A wide prior asks more than one true value does: it
-    shows what happens all over the prior.
+    width and place, the ranks are uniform. The check covers the whole prior, not one true value.
 
     Parameters
     ----------
@@ -114,7 +110,7 @@ def simulation_based_calibration(
     model = model_on_context(model, "prb.simulation_based_calibration")
     positive_integer(n, "n", minimum=2)
     positive_integer(draws, "draws", minimum=10)
-    refuse_adjustment(adjustment)
+    require_adjustment(adjustment)
     executes(executor, "executor")
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
@@ -130,103 +126,144 @@ def simulation_based_calibration(
             "simulation_based_calibration: got a model with likelihood terms or potentials "
             "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"
         )
-    starts = range(0, n, _CHUNK)
-    jobs = []
-    for start in starts:
-        numbers = range(start, min(start + _CHUNK, n))
-        jobs.append(_Job(numbers, draws, adjustment, seed))
+    jobs = [
+        _Job(range(start, min(start + _CHUNK, n)), draws, adjustment, seed)
+        for start in range(0, n, _CHUNK)
+    ]
     with shown(progressbar), progress("data sets", n) as advance:
         if executor is None:
             parts = [_analyse(evaluator, job, lambda: advance(1, "")) for job in jobs]
         else:
             parts = _on_executor(executor, model, jobs, lambda size: advance(size, ""))
-    rows = list(chain.from_iterable(parts))
-    good = [row for row in rows if isinstance(row, dict)]
-    failed = [row for row in rows if isinstance(row, str)]
-    if failed:
-        text = f"{len(failed)} of {n} data sets could not be analysed; the first: {failed[0]}"
+    results = list(chain.from_iterable(parts))
+    rows = [result for result in results if isinstance(result, dict)]
+    errors = [result for result in results if isinstance(result, str)]
+    if errors:
+        text = f"{len(errors)} of {n} data sets could not be analysed; the first: {errors[0]}"
         report(Finding("data-sets-not-analysed", text))
-    if len(failed) > n / 2:
+    if len(errors) > n / 2:
         raise RuntimeError(
-            f"simulation_based_calibration: {len(failed)} of {n} data sets failed; "
-            f"first: {failed[0]}"
+            f"simulation_based_calibration: {len(errors)} of {n} data sets failed; "
+            f"first: {errors[0]}"
         )
-    return calibration_tree(
-        evaluator, good, failed=len(failed), draws=draws, adjustment=adjustment, seed=seed
+    groups = {}
+    for i, group in enumerate(("prior_sbc", "truth", "posterior_sd")):
+        values = {name: np.stack([row[name] for row in rows])[None, :, i] for name in rows[0]}
+        groups[group] = labelled(evaluator, values, {"chain": 1, "draw": len(rows)})
+    groups["envelope"], outside = _envelopes(groups["prior_sbc"])
+    groups["prior_sbc"].attrs.update(
+        {
+            "outside": ", ".join(outside),
+            "failed": len(errors),
+            "draws": draws,
+            "adjustment": str(adjustment),
+            "random_seed": str(seed),
+            **versions(),
+        }
     )
+    return xr.DataTree.from_dict(groups)
+
+
+def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
+    """Return ECDFs of ranks with ArviZ's envelope for uniform ones, and variables outside of it."""
+    from arviz_stats.ecdf_utils import ecdf_pit
+
+    prob = 0.95  # as in ArviZ's own pictures of ranks
+    ecdfs, outside = {}, []
+    values = {name: variable[0] for name, variable in ranks.data_vars.items()}
+    for name, column in split_elements(values).items():
+        x, ecdf, lower, upper = ecdf_pit(  # type: ignore[no-untyped-call]
+            column, prob, n_simulations=1000, rng=np.random.default_rng(0)
+        )
+        ecdfs[name] = ecdf
+        if ((ecdf < lower) | (ecdf > upper)).any():
+            outside.append(name)
+    envelope = xr.Dataset(
+        {
+            "ecdf": (["variable", "x"], np.array(list(ecdfs.values()))),
+            "lower": ("x", lower),
+            "upper": ("x", upper),
+        },
+        coords={"variable": list(ecdfs), "x": x},
+        attrs={"probability": prob},
+    )
+    return envelope, outside
+
+
+# Ranks, truths and standard deviations by variable; or an error message.
+_Result = dict[str, Floats] | str
 
 
 @dataclass(frozen=True)
 class _Job:
-    """Some of the data sets, by their numbers, and how they are analysed."""
+    """Data sets by their numbers, and how they are analysed."""
 
-    which: range
+    numbers: range
     draws: int
     adjustment: Adjustment
     random_seed: int
 
 
-# Ranks, truths and standard deviations by variable; or what went wrong.
-_Row = dict[str, Floats] | str
-
-
 def _on_executor(
-    executor: Executor, model: pm.Model, jobs: list[_Job], report: Callable[[int], Any]
-) -> list[list[_Row]]:
-    """Return the rows of each job; reports as they are done, in whatever order."""
+    executor: Executor, model: pm.Model, jobs: list[_Job], advance: Callable[[int], Any]
+) -> list[list[_Result]]:
+    """Return the results of each job."""
     import cloudpickle
 
-    sent = cloudpickle.dumps(model)
-    futures: list[Future[list[_Row]]] = [executor.submit(_remote, sent, job) for job in jobs]
-    for done in as_completed(futures):
-        report(len(done.result()))
+    pickled = cloudpickle.dumps(model)
+    futures: list[Future[list[_Result]]] = [
+        executor.submit(_analyse_pickled, pickled, job) for job in jobs
+    ]
+    for future in as_completed(futures):
+        advance(len(future.result()))
     return [future.result() for future in futures]
 
 
-def _remote(sent: bytes, job: _Job) -> list[_Row]:
+def _analyse_pickled(pickled: bytes, job: _Job) -> list[_Result]:
     import cloudpickle
 
-    return _analyse(Evaluator.of(cloudpickle.loads(sent)), job)
+    return _analyse(Evaluator.of(cloudpickle.loads(pickled)), job)
 
 
 def _analyse(
-    evaluator: Evaluator, job: _Job, report: Callable[[], Any] = lambda: None
-) -> list[_Row]:
-    """Analyse some data sets, each on the designs as they were before."""
-    rows: list[_Row] = []
-    for i in job.which:
+    evaluator: Evaluator, job: _Job, advance: Callable[[], Any] = lambda: None
+) -> list[_Result]:
+    """Analyse data sets, each on the original designs."""
+    results: list[_Result] = []
+    for i in job.numbers:
         rng = np.random.default_rng([job.random_seed, i])
         with shown(False), designs_restored(evaluator.reweighted.values()):
             try:
-                rows.append(_one(evaluator, job, rng))
+                results.append(_ranks(evaluator, job, rng))
             except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
-                rows.append(f"{type(error).__name__}: {error}")
-        report()
-    return rows
+                results.append(f"{type(error).__name__}: {error}")
+        advance()
+    return results
 
 
-def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str, Floats]:
+def _ranks(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str, Floats]:
     """Draw hyperparameters, and data from their population, and rank them among the draws."""
-    theta_seed = int(rng.integers(2**31))
-    theta = evaluator.hyperparameters.prior_thetas(1, theta_seed)[0]
-    # Of a likelihood by specimen the emulator is the response.
-    pools, data = [], {}
-    if evaluator.nodes:
-        data = fresh_data(evaluator, theta, rng)
-    for k, likelihood in enumerate(evaluator.likelihoods):
-        params = specimen_params(evaluator, theta[None], k)
-        pools.append(specimen_pool(likelihood, params, rng, size=len(likelihood.readings)))
-    draws_seed = int(rng.integers(2**31))
-    asked = Sampling(draws=job.draws, adjustment=job.adjustment, random_seed=draws_seed)
+    hyperparameters = evaluator.hyperparameters
+    theta = hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
+    data = fresh_data(evaluator, theta[0], rng) if evaluator.nodes else {}
+    # With a likelihood by specimen the emulator is the response.
+    pools = [
+        specimen_pool(
+            likelihood, specimen_params(evaluator, theta, k), rng, size=len(likelihood.readings)
+        )
+        for k, likelihood in enumerate(evaluator.likelihoods)
+    ]
+    settings = SamplingSettings(
+        draws=job.draws, adjustment=job.adjustment, random_seed=int(rng.integers(2**31))
+    )
     draw = sample if job.adjustment is None else draw_posterior
     with other_specimens(evaluator.likelihoods, [pool.data_set(rng) for pool in pools]):
-        posterior = draw(evaluator.observing(data), asked)["posterior"]
+        posterior = draw(evaluator.observing(data), settings)["posterior"]
     row = {}
-    for name, (truth,) in evaluator.hyperparameters.constrained(theta[None]).items():
-        found = np.asarray(posterior[name])[0]
-        below = (found < truth).sum(axis=0)
-        # Somewhere between the two neighbours, so that ranks are uniform and not discrete.
-        between = rng.random(np.shape(below))
-        rank = (below + between) / (job.draws + 1)
-        row[name] = np.stack([rank, truth, found.std(axis=0)])
+    for name, (truth,) in hyperparameters.constrained(theta).items():
+        values = np.asarray(posterior[name])[0]
+        below = (values < truth).sum(axis=0)
+        # At random between the two neighbours: ranks are continuous.
+        rank = (below + rng.random(np.shape(below))) / (job.draws + 1)
+        row[name] = np.stack([rank, truth, values.std(axis=0)])
     return row

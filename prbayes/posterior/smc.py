@@ -1,48 +1,59 @@
-"""Sequential Monte Carlo from the prior: `sample_smc`."""
+"""Sequential Monte Carlo from the prior (Del Moral, Doucet and Jasra 2006): `sample_smc`."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
 import pymc as pm
 import xarray as xr
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
 from prbayes._finding import Finding, report
-from prbayes._progress import shown
+from prbayes._progress import CONSOLE, lines, live, shown
 from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes.model.budgets import designs_as_before, explained
 from prbayes.model.coverage import shortcomings
 from prbayes.model.epsilon import checked_epsilon
-from prbayes.model.evaluator import Evaluator, is_current, missing_mass, n_design_runs
+from prbayes.model.evaluator import (
+    Evaluator,
+    coarser_evaluator,
+    is_current,
+    missing_mass,
+    n_design_runs,
+)
 from prbayes.model.fingerprint import identity_of, require_same
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import log_kernel
+from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
 from prbayes.optimize.optimum import Optimum, require_sampling
-from prbayes.posterior.arviz_groups import arviz_groups, specimen_groups
-from prbayes.posterior.chains import Chains, Particles, Stages
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.importance import LogDensity
-from prbayes.posterior.initial_particles import fingerprint, starting_thetas
+from prbayes.posterior.kernel import BatchedKernel, starting_thetas
 from prbayes.posterior.results import (
-    as_asked,
+    Draws,
+    Stages,
+    arviz_groups,
     as_multitrace,
-    checked_idata_kwargs,
-    checked_names,
+    posterior_tree,
+    require_idata_kwargs,
+    require_names,
+    selected,
+    share_of_lossy,
 )
 from prbayes.posterior.target import estimate_target, prior_conflicts, require_density
-from prbayes.posterior.trees import posterior_tree, share_of_lossy
 from prbayes.propagation.base import Missing, discrepancy_error
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
@@ -51,8 +62,7 @@ _log = logging.getLogger("prbayes")
 
 Adjustment = Literal["estimate"] | None
 
-# Share of draws that may fall short, as single ones far out do: that of what designs support.
-_FAR_OUT = 0.05
+_SAVED = ("thetas", "discrepancies", "lost")  # arrays of a finished chain
 
 
 @locked
@@ -185,22 +195,20 @@ def sample_smc(
     positive_integer(draws, "draws", minimum=10)
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample_smc")
-    refuse_adjustment(adjustment)
+    require_adjustment(adjustment)
     flag(refine, "refine")
     share(threshold, "threshold")
     if checkpoint is not None:
         file_path(checkpoint, "checkpoint")
-    if optimum is not None and not isinstance(optimum, Optimum):
-        got = type(optimum).__name__
-        raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
+    require_optimum(optimum)
     if max_stages is not None:
         positive_integer(max_stages, "max_stages")
-    names = checked_names(var_names, model)
-    keywords = checked_idata_kwargs(idata_kwargs)
+    names = require_names(var_names, model)
+    keywords = require_idata_kwargs(idata_kwargs)
     flag(return_inferencedata, "return_inferencedata")
     if cores is not None:
         positive_integer(cores, "cores")
-    asked = Sampling(
+    settings = SamplingSettings(
         draws=draws,
         chains=chains,
         epsilon=epsilon,
@@ -223,15 +231,15 @@ def sample_smc(
         nullcontext() if cores is None else threadpool_limits(cores),
     ):
         evaluator = evaluator_of(model, optimum, "sample_smc")
-        tree = sample(evaluator, asked)
+        tree = sample(evaluator, settings)
         if not return_inferencedata:
             return as_multitrace(tree, evaluator)  # type: ignore[no-any-return]
-        return as_asked(tree, names, keywords)
+        return selected(tree, names, keywords)
 
 
 @dataclass(frozen=True, eq=False)
-class Sampling:
-    """What `sample_smc` is asked for."""
+class SamplingSettings:
+    """Arguments of `sample_smc` and `sample`."""
 
     draws: int = 1000
     chains: int = 1
@@ -245,11 +253,11 @@ class Sampling:
     checkpoint: str | PathLike[str] | None = None
     random_seed: int | None = 0
     progressbar: bool = False
-    with_groups: bool = False  # whether the result has what ArviZ looks for besides
+    with_groups: bool = False  # whether the result has the groups of `arviz_groups`
 
 
-def refuse_adjustment(adjustment: object) -> None:
-    """Raise if it is not one of the two."""
+def require_adjustment(adjustment: object) -> None:
+    """Raise unless it is "estimate" or None."""
     if adjustment is not None and adjustment != "estimate":
         raise ValueError(
             f'adjustment: got {adjustment!r}, expected "estimate", or None for draws of '
@@ -257,354 +265,131 @@ def refuse_adjustment(adjustment: object) -> None:
         )
 
 
-def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+def require_optimum(optimum: object) -> None:
+    """Raise unless it is an optimum or None."""
+    if optimum is not None and not isinstance(optimum, Optimum):
+        got = type(optimum).__name__
+        raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
+
+
+def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evaluator:
+    """Return the evaluator of a model; raise if the optimum is of another problem."""
+    if optimum is None:
+        return Evaluator.of(model)
+    is_reusable = optimum.model is model and is_current(optimum.evaluator)
+    evaluator = optimum.evaluator if is_reusable else Evaluator.of(model)
+    require_same(optimum.identity, identity_of(evaluator), f"{caller}: optimum")
+    return evaluator
+
+
+def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``."""
-    if evaluator.nodes and asked.adjustment is None:
-        return _sample_kernel(evaluator, asked)
-    if asked.epsilon is not None:
+    if evaluator.nodes and settings.adjustment is None:
+        return _sample_kernel(evaluator, settings)
+    if settings.epsilon is not None:
         raise ValueError(
-            f"epsilon: got {asked.epsilon!r}, expected none: this posterior has no scale to "
+            f"epsilon: got {settings.epsilon!r}, expected none: this posterior has no scale to "
             "choose; leave epsilon= out, or pass adjustment=None with a metric"
         )
-    return sample_posterior(evaluator, asked)
+    return sample_posterior(evaluator, settings)
 
 
-def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+# -- the posterior ---------------------------------------------------------------------------------
+
+
+def sample_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     """Return draws of the posterior: given the estimate, or of a log-likelihood by specimen."""
     clock = time.perf_counter()
-    before = evaluator.n_responses - n_design_runs(evaluator)
+    n_before = evaluator.n_responses - n_design_runs(evaluator)
     with designs_as_before(evaluator) as restore_designs:
-        optimum = estimate_of(evaluator, asked, "sample_smc")
-        rounds = _rounds(evaluator, asked, optimum)
-        particles = rounds.until_supported(asked.progressbar)
-        log_likelihood = None
-        if rounds.log_likelihood is not None:
-            rows = particles.thetas.reshape(-1, evaluator.hyperparameters.size)
-            log_likelihood = rounds.log_likelihood(rows).reshape(particles.thetas.shape[:2])
-        tree = result_tree(
-            evaluator,
-            particles.thetas,
-            asked,
-            optimum,
-            {"sampler": "SMC"},
-            log_likelihood=log_likelihood,
-            stats=particles.stats,
-            findings=_of_budget(particles.stopped, particles, asked),
-            stopped=particles.stopped,
-            n_before=before,
-            clock=clock,
-        )
-        if particles.stopped:
+        optimum = estimate_of(evaluator, settings, "sample_smc")
+        draws, log_likelihood = _draws_on_designs(evaluator, settings, optimum)
+        if log_likelihood is not None:
+            logs = log_likelihood(draws.thetas.reshape(-1, evaluator.hyperparameters.size))
+            draws = replace(draws, log_likelihood=logs.reshape(draws.thetas.shape[:2]))
+        tree = result_of(evaluator, draws, settings, optimum, n_before=n_before, clock=clock)
+        if draws.stopped:
             restore_designs()
         return tree
 
 
-def estimate_of(evaluator: Evaluator, asked: Sampling, caller: str) -> Optimum | None:
+def estimate_of(evaluator: Evaluator, settings: SamplingSettings, caller: str) -> Optimum | None:
     """Return the estimate that the posterior is given, by a search if needed.
 
-    With a log-likelihood by specimen the optimum that was passed, if any.
-
-    Raises
-    ------
-    ValueError
-        If the density of the estimate is not known (`require_density`), or the optimum is at the
-        edge of a support or at a jump.
+    With a log-likelihood by specimen it is the optimum that was passed, if any. Raises ValueError
+    if the density of the estimate is not known, or the optimum is at an edge or a jump.
     """
-    optimum = asked.optimum
+    optimum = settings.optimum
     if not evaluator.nodes:
         return optimum
     require_density(evaluator)
     if optimum is None:
-        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=asked.refine)))
+        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=settings.refine)))
     return require_sampling(optimum, caller)
 
 
-def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
-    """Return draws of prior times exp(-sum of d_k / epsilon_k)."""
-    clock = time.perf_counter()
-    before = evaluator.n_responses - n_design_runs(evaluator)
-    with epsilons_restored(evaluator), designs_as_before(evaluator) as restore_designs:
-        optimum = _calibrated(evaluator, asked)
-        particles = _rounds(evaluator, asked, optimum).until_supported(asked.progressbar)
-        stopped, errors, missing = particles.stopped, None, None
-        try:
-            errors, missing = _at_the_best(evaluator, particles)
-        except BudgetError as spent:
-            stopped = stopped or str(spent)
-        else:
-            _refuse_lost(evaluator, particles.lost, missing)
-        with unlimited():
-            groups = None
-            if asked.with_groups:
-                thetas = particles.thetas
-                kernels = np.asarray(log_kernel(particles.discrepancies, evaluator.epsilon))
-                other = evaluator.log_other(thetas.reshape(-1, evaluator.hyperparameters.size))
-                logs = kernels.sum(axis=-1) + other.reshape(thetas.shape[:2])
-                groups = arviz_groups(evaluator, thetas, logs, asked.random_seed)
-            tree = posterior_tree(
-                evaluator,
-                particles.thetas,
-                particles.discrepancies,
-                particles.lost,
-                particles.stats,
-                sampler={"sampler": "SMC-ABC"},
-                findings=(
-                    *_of_budget(stopped, particles, asked),
-                    *_of_lost(evaluator, particles.lost),
-                    *(() if optimum is None else optimum.findings),
-                ),
-                errors=errors,
-                missing=missing,
-                stopped=stopped,
-                seed=asked.random_seed,
-                n_responses=evaluator.n_responses - before,
-                seconds=time.perf_counter() - clock,
-                groups=groups,
-            )
-        if stopped:
-            restore_designs()
-        return tree
-
-
-def _of_budget(stopped: str, particles: Particles, asked: Sampling) -> tuple[Finding, ...]:
-    """Say, also in the log, that a budget was spent before everything was done."""
-    if not stopped:
-        return ()
-    again = "" if asked.checkpoint is None else f" and checkpoint={asked.checkpoint}"
-    finding = Finding(
-        "budget-spent",
-        f"{stopped}, so that {len(particles.stats)} of {asked.chains} chains are here, and what "
-        f"would have cost responses is left out; call prb.sample_smc with a larger budget{again}.",
-        "expensive.md#a-night-is-not-enough",
-    )
-    return report(finding)
-
-
-def _refuse_lost(
+def result_of(
     evaluator: Evaluator,
-    lost: Floats,
-    missing: Mapping[str, Mapping[str, float]] | None = None,
-) -> None:
-    """Raise if too much of the populations of most draws, or of the best, has no response.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    lost : ndarray, shape (chains, draws, k)
-        Shares of the populations without response; NaN if not known.
-    missing : mapping, optional
-        By simulator, of the best draw.
-    """
-    shares = {}
-    for k, node in enumerate(evaluator.nodes):
-        shares[node.name] = 0.0 if missing is None else missing[node.name]["lost_mass"]
-        values = lost[:, :, k]
-        if not np.isnan(values).all():
-            shares[node.name] = max(shares[node.name], float(np.nanmedian(values)))
-    refuse_lost(evaluator, shares)
-
-
-def _of_lost(evaluator: Evaluator, lost: Floats) -> tuple[Finding, ...]:
-    """Report, also in the log, the share of draws whose populations lack too many responses.
-
-    For designs, `diagnose` reports it.
-    """
-    findings = []
-    for k, node in enumerate(evaluator.nodes):
-        most = node.bound.max_lost
-        share = share_of_lossy(lost[:, :, k], most)
-        if share > _FAR_OUT:
-            findings.append(
-                Finding(
-                    "lost-mass",
-                    f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
-                    f"{most:.1%} of the population has no response (NaN), so that they rest on the "
-                    "specimens that have one; repair the response, return +inf for specimens that "
-                    "fail, or narrow the priors.",
-                    "expensive.md#when-a-run-fails",
-                )
-            )
-    return report(*findings)
-
-
-def _calibrated(evaluator: Evaluator, asked: Sampling) -> Optimum | None:
-    """Set the epsilons; return the optimum if they are calibrated there."""
-    _set_epsilons(evaluator, asked.epsilon)
-    unset = [node for node in evaluator.nodes if np.isnan(node.epsilon_value)]
-    optimum = asked.optimum
-    if not unset:
-        return optimum
-    if optimum is None:
-        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=asked.refine)))
-    require_sampling(optimum, "sample_smc")
-    calibrated = calibrate_epsilon(optimum)
-    for node in unset:
-        node.epsilon.set_value(np.asarray(calibrated[node.name]))
-    return optimum
-
-
-def _rounds(evaluator: Evaluator, asked: Sampling, optimum: Optimum | None) -> Rounds:
-    """Return the rounds of sampling, perhaps with the state that a run before has saved."""
-    starts = _starts(evaluator, asked)
-    given = {} if starts is None else {"start": fingerprint(starts)}
-    saved = _checkpoint(
-        asked.checkpoint,
-        evaluator,
-        asked.random_seed,
-        draws=asked.draws,
-        chains=asked.chains,
-        threshold=asked.threshold,
-        adjustment=asked.adjustment,
-        refine=asked.refine,
-        **given,
-    )
-    entropy = asked.random_seed if saved is None else int(saved.settings["entropy"])
-    return Rounds(
-        run=Chains(evaluator, asked.draws, asked.threshold, saved, asked.max_stages, starts),
-        seeds=np.random.SeedSequence(entropy),
-        asked=asked,
-        optimum=optimum,
-    )
-
-
-def _starts(evaluator: Evaluator, asked: Sampling) -> list[Floats] | None:
-    """Return the particles that each chain begins with, None for draws of the prior."""
-    start = asked.start
-    if start is None:
-        return None
-    each = list(start) if isinstance(start, list | tuple) else [start] * asked.chains
-    if len(each) != asked.chains:
-        raise ValueError(
-            f"start: got {len(each)} dicts, expected one, or {asked.chains}, one for each chain"
-        )
-    return [starting_thetas(evaluator.hyperparameters, one, asked.draws) for one in each]
-
-
-@dataclass(eq=False)
-class Rounds:
-    """Sampling and refinement, again until the designs support the draws.
-
-    Attributes
-    ----------
-    run : Chains
-    seeds : SeedSequence
-    asked : Sampling
-    optimum : Optimum or None
-    log_likelihood : callable or None
-        Given the estimate, of the last round.
-    """
-
-    run: Chains
-    seeds: np.random.SeedSequence
-    asked: Sampling
-    optimum: Optimum | None
-    log_likelihood: LogDensity | None = None
-
-    def until_supported(self, progressbar: bool) -> Particles:
-        """Return the draws of the first round that its designs support.
-
-        Raises
-        ------
-        DesignError
-            If there is none.
-        BudgetError
-            If a budget is spent before.
-        """
-        evaluator = self.run.evaluator
-        refines = self.asked.refine and bool(evaluator.reweighted)
-        for round_ in range(MAX_ROUNDS + 1):
-            children = self.seeds.spawn(self.asked.chains)
-            saved = self.run.saved_refinement(round_)
-            if saved is not None:
-                self.run.refined.append(saved)
-                refine_at(evaluator, saved)
-                continue
-            self.log_likelihood = self._log_likelihood()
-            particles = self.run(children, progressbar, self.log_likelihood)
-            if not refines:
-                return particles
-            rows = particles.thetas.reshape(-1, evaluator.hyperparameters.size)
-            thetas = np.random.default_rng(self.seeds).permutation(rows)[:THETAS]
-            if particles.stopped and shortcomings(evaluator, thetas):
-                raise BudgetError(particles.stopped)
-            if round_ == MAX_ROUNDS:
-                refuse(shortcomings(evaluator, thetas), evaluator)
-                return particles
-            if not refine_at(evaluator, thetas):
-                return particles
-            self.run.refined.append(thetas)
-            _log.info("sampling again on the refined design")
-        raise AssertionError("the last round returns or raises")
-
-    def _log_likelihood(self) -> LogDensity | None:
-        """Return the log-likelihood given the estimate, on the designs as they are."""
-        evaluator = self.run.evaluator
-        if not evaluator.nodes or self.asked.adjustment is None:
-            return None
-        assert self.optimum is not None
-        return estimate_target(evaluator, self.optimum).log_likelihood
-
-
-def result_tree(
-    evaluator: Evaluator,
-    thetas: Floats,
-    asked: Sampling,
+    draws: Draws,
+    settings: SamplingSettings,
     optimum: Optimum | None,
-    sampler: Mapping[str, Any],
     *,
-    log_likelihood: Floats | None,
-    stats: Sequence[Stages] = (),
-    sample_stats: xr.Dataset | None = None,
-    findings: Sequence[Finding] = (),
-    stopped: str = "",
     n_before: int,
     clock: float,
 ) -> xr.DataTree:
-    """Return the DataTree of draws of the posterior, (chains, draws, d).
+    """Return the DataTree of draws of the posterior.
 
-    With a metric ``log_likelihood``, (chains, draws), is that given the estimate. Discrepancies are
-    computed where that costs no response. ``n_before`` and ``clock`` are the number of responses
-    and the time at the start.
-
-    Raises
-    ------
-    DesignError
-        If too much of the populations of most draws has no response.
+    Discrepancies are computed if that costs no response. ``n_before`` and ``clock`` are the number
+    of responses and the time at the start. Raises DesignError if too much of the populations of
+    most draws has no response.
     """
-    chains, draws, d = thetas.shape
-    shape = (chains, draws, len(evaluator.nodes))
+    budget = _budget_findings(draws, settings)
+    thetas = draws.thetas
+    shape = (*thetas.shape[:2], len(evaluator.nodes))
     discrepancies = np.full(shape, np.nan)
     lost = _lost_of_some(evaluator, thetas)
     _refuse_lost(evaluator, lost)
     with unlimited():
         if evaluator.nodes and not evaluator.responses_per_theta:
-            evaluation = evaluator(thetas.reshape(-1, d))
+            evaluation = evaluator(thetas.reshape(-1, evaluator.hyperparameters.size))
             discrepancies = evaluation.discrepancies.reshape(shape)
-        groups = None
-        if asked.with_groups and log_likelihood is None:
-            groups = specimen_groups(evaluator, thetas, asked.random_seed)
-        elif asked.with_groups and log_likelihood is not None:
-            groups = arviz_groups(evaluator, thetas, log_likelihood, asked.random_seed)
+        draws = replace(draws, discrepancies=discrepancies, lost=lost)
+        groups = (
+            arviz_groups(evaluator, draws, settings.random_seed) if settings.with_groups else {}
+        )
+        findings = [*budget, *_lost_findings(evaluator, lost)]
+        if optimum is None:
+            findings += [
+                f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings
+            ]
+        else:
+            conflicts = prior_conflicts(optimum, evaluator, thetas) if evaluator.nodes else ()
+            findings += [*optimum.findings, *conflicts]
         return posterior_tree(
             evaluator,
-            thetas,
-            discrepancies,
-            lost,
-            stats,
-            sampler=sampler,
-            sample_stats=sample_stats,
+            draws,
             adjustment="estimate" if evaluator.nodes else "none",
-            findings=(
-                *findings,
-                *_of_lost(evaluator, lost),
-                *_findings(evaluator, optimum, thetas),
-            ),
-            stopped=stopped,
-            seed=asked.random_seed,
+            findings=findings,
+            seed=settings.random_seed,
             n_responses=evaluator.n_responses - n_before,
             seconds=time.perf_counter() - clock,
             groups=groups,
         )
+
+
+def _budget_findings(draws: Draws, settings: SamplingSettings) -> tuple[Finding, ...]:
+    """Report that a budget was spent before all chains were finished."""
+    if not draws.stopped:
+        return ()
+    again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
+    finding = Finding(
+        "budget-spent",
+        f"{draws.stopped}, so that {len(draws.stages)} of {settings.chains} chains are here, and "
+        "what would have cost responses is left out; call prb.sample_smc with a larger "
+        f"budget{again}.",
+        "expensive.md#a-night-is-not-enough",
+    )
+    return report(finding)
 
 
 def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floats:
@@ -618,27 +403,108 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floa
     rows = np.linspace(0, chains * draws - 1, count).astype(np.intp)
     try:
         for row in np.unique(rows):
-            where = np.unravel_index(row, (chains, draws))
+            place = np.unravel_index(row, (chains, draws))
             for k, node in enumerate(evaluator.nodes):
                 if not node.bound.stored:
-                    population = evaluator.populations(thetas[where][None], k)
-                    lost[(*where, k)] = Missing.of(*population).lost[0]
+                    population = evaluator.populations(thetas[place][None], k)
+                    lost[(*place, k)] = Missing.of(*population).lost[0]
     except BudgetError:
         pass
     return lost
 
 
-def _findings(evaluator: Evaluator, optimum: Optimum | None, thetas: Floats) -> tuple[Finding, ...]:
-    """Return the findings of the data, the runs and the optimum, and conflicts with the prior."""
-    if optimum is None:
-        return tuple(finding for each in evaluator.likelihoods for finding in each.findings)
-    conflicts = prior_conflicts(optimum, evaluator, thetas) if evaluator.nodes else ()
-    return (*optimum.findings, *conflicts)
+def _refuse_lost(
+    evaluator: Evaluator,
+    lost: Floats,
+    missing: Mapping[str, Mapping[str, float]] | None = None,
+) -> None:
+    """Raise if too much of the populations of most draws has no response.
+
+    ``lost``, (chains, draws, k), is NaN if not known; ``missing`` is that of the best draw, by
+    simulator.
+    """
+    shares = {}
+    for k, node in enumerate(evaluator.nodes):
+        shares[node.name] = 0.0 if missing is None else missing[node.name]["lost_mass"]
+        if not np.isnan(lost[:, :, k]).all():
+            shares[node.name] = max(shares[node.name], float(np.nanmedian(lost[:, :, k])))
+    refuse_lost(evaluator, shares)
+
+
+def _lost_findings(evaluator: Evaluator, lost: Floats) -> tuple[Finding, ...]:
+    """Report that the populations of many draws lack responses; `diagnose` does for designs."""
+    findings = []
+    for k, node in enumerate(evaluator.nodes):
+        limit = node.bound.max_lost
+        share = share_of_lossy(lost[:, :, k], limit)
+        if share > 0.05:  # a few draws may be far out
+            findings.append(
+                Finding(
+                    "lost-mass",
+                    f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
+                    f"{limit:.1%} of the population has no response (NaN), so that they rest on "
+                    "the specimens that have one; repair the response, return +inf for specimens "
+                    "that fail, or narrow the priors.",
+                    "expensive.md#when-a-run-fails",
+                )
+            )
+    return report(*findings)
+
+
+# -- the pseudo-posterior --------------------------------------------------------------------------
+
+
+def _sample_kernel(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
+    """Return draws of prior times exp(-sum of d_k / epsilon_k)."""
+    clock = time.perf_counter()
+    n_before = evaluator.n_responses - n_design_runs(evaluator)
+    with _epsilons_restored(evaluator), designs_as_before(evaluator) as restore_designs:
+        optimum = _set_epsilons(evaluator, settings)
+        draws, _ = _draws_on_designs(evaluator, settings, optimum)
+        discrepancies, lost = draws.discrepancies, draws.lost
+        assert discrepancies is not None
+        assert lost is not None
+        errors, missing = None, None
+        try:
+            errors, missing = _at_best(evaluator, draws.thetas, discrepancies)
+        except BudgetError as spent:
+            draws = replace(draws, stopped=draws.stopped or str(spent))
+        else:
+            _refuse_lost(evaluator, lost, missing)
+        with unlimited():
+            groups = {}
+            if settings.with_groups:
+                kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
+                other = evaluator.log_other(
+                    draws.thetas.reshape(-1, evaluator.hyperparameters.size)
+                )
+                logs = kernels.sum(axis=-1) + other.reshape(draws.thetas.shape[:2])
+                draws = replace(draws, log_likelihood=logs)
+                groups = arviz_groups(evaluator, draws, settings.random_seed)
+            tree = posterior_tree(
+                evaluator,
+                replace(draws, sampler={"sampler": "SMC-ABC"}),
+                adjustment="none",
+                findings=(
+                    *_budget_findings(draws, settings),
+                    *_lost_findings(evaluator, lost),
+                    *(() if optimum is None else optimum.findings),
+                ),
+                errors=errors,
+                missing=missing,
+                seed=settings.random_seed,
+                n_responses=evaluator.n_responses - n_before,
+                seconds=time.perf_counter() - clock,
+                groups=groups,
+            )
+        if draws.stopped:
+            restore_designs()
+        return tree
 
 
 @contextmanager
-def epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
-    """Give the simulators their epsilons back afterwards."""
+def _epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
+    """Restore the epsilons of the simulators afterwards."""
     before = evaluator.epsilon
     try:
         yield
@@ -647,63 +513,264 @@ def epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
             node.epsilon.set_value(np.asarray(value))
 
 
-def _set_epsilons(evaluator: Evaluator, epsilon: float | dict[str, float] | None) -> None:
-    """Set the epsilons that were given for this run."""
-    if epsilon is None:
-        return
-    names = [node.name for node in evaluator.nodes]
-    if not isinstance(epsilon, dict):
-        if len(names) > 1:
-            raise ValueError(
-                f"epsilon: got one number for {len(names)} simulators, "
-                f"expected a dict by name: {names}"
-            )
-        epsilon = {names[0]: epsilon}
-    values = checked_epsilon(epsilon, evaluator.nodes, evaluator.model, "sample_smc: epsilon")
-    for node in evaluator.nodes:
-        if node.name in values:
-            node.epsilon.set_value(np.asarray(values[node.name]))
-
-
-def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evaluator:
-    """Return the evaluator of a model.
-
-    An optimum's own if it is this model's, and no optimum of another problem.
-    """
+def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum | None:
+    """Set the epsilons, passed or calibrated; return the optimum if it is known."""
+    epsilon, nodes = settings.epsilon, evaluator.nodes
+    if epsilon is not None:
+        names = [node.name for node in nodes]
+        if not isinstance(epsilon, dict):
+            if len(names) > 1:
+                raise ValueError(
+                    f"epsilon: got one number for {len(names)} simulators, "
+                    f"expected a dict by name: {names}"
+                )
+            epsilon = {names[0]: epsilon}
+        values = checked_epsilon(epsilon, nodes, evaluator.model, "sample_smc: epsilon")
+        for node in nodes:
+            if node.name in values:
+                node.epsilon.set_value(np.asarray(values[node.name]))
+    unset = [node for node in nodes if np.isnan(node.epsilon_value)]
+    optimum = settings.optimum
+    if not unset:
+        return optimum
     if optimum is None:
-        return Evaluator.of(model)
-    own = optimum.model is model and is_current(optimum.evaluator)
-    evaluator = optimum.evaluator if own else Evaluator.of(model)
-    require_same(optimum.identity, identity_of(evaluator), f"{caller}: optimum")
-    return evaluator
+        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=settings.refine)))
+    require_sampling(optimum, "sample_smc")
+    calibrated = calibrate_epsilon(optimum)
+    for node in unset:
+        node.epsilon.set_value(np.asarray(calibrated[node.name]))
+    return optimum
 
 
-def _at_the_best(
-    evaluator: Evaluator, particles: Particles
+def _at_best(
+    evaluator: Evaluator, thetas: Floats, discrepancies: Floats
 ) -> tuple[Floats, dict[str, dict[str, float]]]:
-    """Return, of the best particle, the Monte Carlo errors of its discrepancies, and what it lacks.
-
-    The errors have shape (k,); shares of its populations without numbers come by simulator.
-    """
-    total = (particles.discrepancies / evaluator.epsilon).sum(axis=-1)
-    where = np.unravel_index(total.argmin(), total.shape)
-    best = particles.thetas[where][None]
+    """Return errors of the discrepancies, (k,), and missing responses, at the best draw."""
+    total = (discrepancies / evaluator.epsilon).sum(axis=-1)
+    best = thetas[np.unravel_index(total.argmin(), total.shape)]
     errors = []
     missing = {}
     for k, node in enumerate(evaluator.nodes):
-        roots = evaluator.roots(best, k)
-        errors.append(discrepancy_error(node.bound, roots))
-        missing[node.name] = missing_mass(evaluator, best[0], k)
+        errors.append(discrepancy_error(node.bound, evaluator.roots(best[None], k)))
+        missing[node.name] = missing_mass(evaluator, best, k)
     return np.array(errors), missing
 
 
+# -- chains ----------------------------------------------------------------------------------------
+
+
+def _draws_on_designs(
+    evaluator: Evaluator, settings: SamplingSettings, optimum: Optimum | None
+) -> tuple[Draws, LogDensity | None]:
+    """Return draws that the designs support, after refinements, and their log-likelihood.
+
+    Raises DesignError if the refined designs do not support the draws, and BudgetError if a budget
+    is spent before.
+    """
+    starts = _starts(evaluator, settings)
+    checkpoint = _checkpoint(evaluator, settings, starts)
+    entropy = settings.random_seed if checkpoint is None else int(checkpoint.settings["entropy"])
+    seeds = np.random.SeedSequence(entropy)
+    refinements: list[Floats] = []
+    for round_ in range(MAX_ROUNDS + 1):
+        children = seeds.spawn(settings.chains)
+        if checkpoint is not None and round_ < checkpoint.note.get("round", 0):
+            refinements.append(checkpoint.arrays[f"refined{round_}_thetas"])
+            refine_at(evaluator, refinements[-1])
+            continue
+        log_likelihood = None
+        if evaluator.nodes and settings.adjustment is not None:
+            assert optimum is not None
+            log_likelihood = estimate_target(evaluator, optimum).log_likelihood
+        chains = Chains(evaluator, settings, log_likelihood, starts, checkpoint, tuple(refinements))
+        draws = chains.run(children)
+        if not (settings.refine and evaluator.reweighted):
+            break
+        rows = draws.thetas.reshape(-1, evaluator.hyperparameters.size)
+        thetas = np.random.default_rng(seeds).permutation(rows)[:THETAS]
+        if draws.stopped and shortcomings(evaluator, thetas):
+            raise BudgetError(draws.stopped)
+        if round_ == MAX_ROUNDS:
+            refuse(shortcomings(evaluator, thetas), evaluator)
+            break
+        if not refine_at(evaluator, thetas):
+            break
+        refinements.append(thetas)
+        _log.info("sampling again on the refined design")
+    return draws, log_likelihood
+
+
+def _starts(evaluator: Evaluator, settings: SamplingSettings) -> list[Floats] | None:
+    """Return the particles that each chain begins with, None for draws of the prior."""
+    start, chains = settings.start, settings.chains
+    if start is None:
+        return None
+    by_chain = list(start) if isinstance(start, list | tuple) else [start] * chains
+    if len(by_chain) != chains:
+        raise ValueError(
+            f"start: got {len(by_chain)} dicts, expected one, or {chains}, one for each chain"
+        )
+    hyperparameters = evaluator.hyperparameters
+    return [starting_thetas(hyperparameters, values, settings.draws) for values in by_chain]
+
+
 def _checkpoint(
-    path: str | PathLike[str] | None, evaluator: Evaluator, seed: int | None, **settings: Any
+    evaluator: Evaluator, settings: SamplingSettings, starts: list[Floats] | None
 ) -> Checkpoint | None:
-    """Open the checkpoint; a run without a seed takes that of the run it goes on with."""
+    """Open the checkpoint; a run without a seed takes that of the run that it continues."""
+    path = settings.checkpoint
     if path is None:
         return None
-    entropy = str(np.random.SeedSequence(seed).entropy)
-    if seed is None:
+    entropy = str(np.random.SeedSequence(settings.random_seed).entropy)
+    if settings.random_seed is None:
         entropy = stored_settings(path).get("entropy", entropy)
-    return Checkpoint(path, identity_of(evaluator), {**settings, "entropy": entropy})
+    stored: dict[str, Any] = {
+        name: getattr(settings, name)
+        for name in ("draws", "chains", "threshold", "adjustment", "refine")
+    }
+    if starts is not None:
+        content = b"".join(np.ascontiguousarray(thetas).tobytes() for thetas in starts)
+        stored["start"] = hashlib.sha256(content).hexdigest()
+    return Checkpoint(path, identity_of(evaluator), stored | {"entropy": entropy})
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """The chains of one round on the designs as they are, saved after each stage."""
+
+    evaluator: Evaluator
+    settings: SamplingSettings
+    log_likelihood: LogDensity | None = None  # in place of exp(-sum of d_k / epsilon_k)
+    starts: list[Floats] | None = None
+    checkpoint: Checkpoint | None = None
+    refinements: tuple[Floats, ...] = ()  # thetas, (n, d), of earlier rounds
+
+    def run(self, seeds: Sequence[np.random.SeedSequence]) -> Draws:
+        """Run a chain for each seed, or as many as a budget allows.
+
+        Raises BudgetError if it is spent before the first one is finished.
+        """
+        saved = {} if self.checkpoint is None else self.checkpoint.note
+        if saved.get("round") != len(self.refinements):
+            saved = {}
+        coarse = coarser_evaluator(self.evaluator) if self.log_likelihood is None else None
+        finished: list[dict[str, Floats]] = []
+        stages: list[Stages] = []
+        stopped = ""
+        columns = (
+            TextColumn("SMC chain {task.fields[chain]}"),
+            BarColumn(),
+            TextColumn("beta {task.completed:.4f}"),
+            TextColumn("acceptance {task.fields[rate]:.2f}"),
+            TimeElapsedColumn(),
+        )
+        with (
+            shown(self.settings.progressbar) as visible,
+            Progress(*columns, console=CONSOLE, disable=not (visible and live())) as progress,
+        ):
+            write = lines()
+            for chain, seed in enumerate(seeds):
+                task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
+                if self.checkpoint is not None and chain < saved.get("chain", 0):
+                    finished.append(self.checkpoint.arrays_of(f"chain{chain}_"))
+                    stages.append(saved["stats"][chain])
+                    continue
+                try:
+                    kernel, chain_stages = self._begin(chain, seed, coarse, saved)
+                    for _ in self._temper(kernel, chain_stages):
+                        self._save(finished, [*stages, chain_stages], kernel)
+                        progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
+                        write(f"SMC chain {chain + 1} of {len(seeds)}: beta {kernel.beta:.3g} of 1")
+                except BudgetError as spent:
+                    stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
+                    break
+                particles = kernel.particles._asdict()
+                finished.append({name: particles[name] for name in _SAVED})
+                stages.append(chain_stages)
+        if not finished:
+            raise BudgetError(stopped)
+        thetas, discrepancies, lost = (
+            np.array([arrays[name] for arrays in finished]) for name in _SAVED
+        )
+        return Draws(
+            thetas=thetas,
+            sampler={"sampler": "SMC"},
+            discrepancies=discrepancies,
+            lost=lost,
+            stages=stages,
+            stopped=stopped,
+        )
+
+    def _begin(
+        self,
+        chain: int,
+        seed: np.random.SeedSequence,
+        coarse: Evaluator | None,
+        saved: Mapping[str, Any],
+    ) -> tuple[BatchedKernel, Stages]:
+        """Return a kernel at the prior, or in a saved state, and the statistics of its stages.
+
+        It begins on a coarser evaluator, if there is one.
+        """
+        (stream,) = seed.generate_state(1)
+        for node in self.evaluator.nodes:
+            node.bound.restart(int(stream))
+        is_resumed = chain == saved.get("chain")
+        is_coarse = saved["state"]["is_coarse"] if is_resumed else coarse is not None
+        kernel = BatchedKernel(
+            self.settings.draws,
+            model=self.evaluator.model,
+            threshold=self.settings.threshold,
+            evaluator=coarse if is_coarse and coarse is not None else self.evaluator,
+            log_likelihood=self.log_likelihood,
+        )
+        kernel.is_coarse = is_coarse
+        if self.checkpoint is None or not is_resumed:
+            start = None if self.starts is None else self.starts[chain]
+            kernel.initialize(start, np.random.default_rng(seed))
+            return kernel, {name: [] for name in kernel.stats_dtypes_shapes}
+        kernel.restore(self.checkpoint.arrays_of("now_"), saved["state"])
+        for node in self.evaluator.nodes:
+            if node.bound.random:
+                node.bound.draws = saved["generators"][node.name]
+        return kernel, saved["stats"][chain]
+
+    def _temper(self, kernel: BatchedKernel, stages: Stages) -> Iterator[None]:
+        """Do the remaining stages of a chain, and yield after each."""
+        while kernel.beta < 1 or kernel.is_coarse:
+            if len(stages["beta"]) == self.settings.max_stages:
+                raise BudgetError(
+                    f"max_stages = {self.settings.max_stages} was reached (beta {kernel.beta:.3g}, "
+                    "of 1)"
+                )
+            if kernel.beta < 1:
+                kernel.update_beta_and_weights()
+            elif not kernel.reweight(self.evaluator):
+                # The coarse posterior differs: once more, on all points.
+                kernel.initialize(kernel.start, kernel.rng)
+                for values in stages.values():
+                    values.clear()
+                continue
+            for name, value in kernel.step().items():
+                stages[name].append(value)
+            yield
+
+    def _save(
+        self, finished: list[dict[str, Floats]], stages: list[Stages], kernel: BatchedKernel
+    ) -> None:
+        if self.checkpoint is None:
+            return
+        now, state = kernel.state()
+        arrays = {f"now_{name}": array for name, array in now.items()}
+        for i, chain in enumerate(finished):
+            arrays |= {f"chain{i}_{name}": array for name, array in chain.items()}
+        arrays |= {f"refined{i}_thetas": thetas for i, thetas in enumerate(self.refinements)}
+        bounds = [node.bound for node in self.evaluator.nodes]
+        note = {
+            "round": len(self.refinements),
+            "chain": len(finished),
+            "stats": stages,
+            "state": state,
+            "generators": {bound.name: bound.draws for bound in bounds if bound.random},
+        }
+        self.checkpoint.save(arrays, note)

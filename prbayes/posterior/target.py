@@ -1,8 +1,8 @@
-"""The posterior that `sample` and `sample_smc` draw from: priors and a log-likelihood."""
+"""Posterior density: priors and a log-likelihood, by specimen or given the estimate."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,23 +18,12 @@ from prbayes.posterior.refit_likelihood import refit_likelihood
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A posterior density in unconstrained space.
-
-    Attributes
-    ----------
-    evaluator : Evaluator
-    log_likelihood : callable
-        (S, d) -> (S,): all terms but the priors.
-    starts : tuple of ndarray, shapes (d,)
-        Points near the modes.
-    scale : ndarray, shape (d,)
-        Unit of each element for `laplace`.
-    """
+    """A posterior density in unconstrained space."""
 
     evaluator: Evaluator
-    log_likelihood: LogDensity
-    starts: tuple[Floats, ...]
-    scale: Floats
+    log_likelihood: LogDensity  # all terms but the priors
+    starts: Floats  # (M, d): points near the modes
+    scale: Floats  # (d,): unit of each element for `laplace`
 
     def log_posterior(self, thetas: Floats) -> Floats:
         """Return the unnormalised log-density, (S, d) -> (S,); -inf where it is not known."""
@@ -43,60 +32,49 @@ class Target:
 
 def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     """Return the posterior of a model whose simulators have a log-likelihood by specimen."""
-    if optimum is None:
-        starts = _prior_starts(evaluator)
-    else:
-        starts = tuple(optima_of(optimum, evaluator))
-    return Target(evaluator, evaluator.log_other, starts, evaluator.hyperparameters.prior_sd)
+    prior_sd = evaluator.hyperparameters.prior_sd
+    if optimum is not None:
+        return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
+    target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
+    return replace(target, starts=_prior_starts(target))
 
 
-def _prior_starts(evaluator: Evaluator, screened: int = 1024, count: int = 8) -> tuple[Floats, ...]:
-    """Return the best point of the prior, and others of the best quarter far from each other."""
-    thetas = evaluator.hyperparameters.prior_points(screened, 0)
-    heights = Target(
-        evaluator, evaluator.log_other, (), evaluator.hyperparameters.prior_sd
-    ).log_posterior(thetas)
-    order = np.argsort(-heights, kind="stable")
-    candidates = thetas[order[: screened // 4]] / evaluator.hyperparameters.prior_sd
-    chosen = [0]
-    distance = np.full(len(candidates), np.inf)
-    while len(chosen) < count:
-        away = ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1)
-        distance = np.minimum(distance, away)
-        chosen.append(int(np.argmax(distance)))
-    return tuple(candidates[chosen] * evaluator.hyperparameters.prior_sd)
+def _prior_starts(target: Target) -> Floats:
+    """Return the best of 1024 prior points, and seven of the best quarter far from each other."""
+    prior_sd = target.evaluator.hyperparameters.prior_sd
+    thetas = target.evaluator.hyperparameters.prior_points(1024, 0)
+    order = np.argsort(-target.log_posterior(thetas), kind="stable")
+    candidates = thetas[order[: len(thetas) // 4]] / prior_sd
+    selected = [0]
+    distances = np.full(len(candidates), np.inf)
+    while len(selected) < 8:
+        squares = ((candidates - candidates[selected[-1]]) ** 2).sum(axis=1)
+        distances = np.minimum(distances, squares)
+        selected.append(int(np.argmax(distances)))
+    return np.asarray(candidates[selected] * prior_sd)
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
-    """Return the posterior given the metrics' own estimate.
+    """Return the posterior given the metrics' own estimate; raise as `require_density`.
 
     The estimate of metrics whose gradient is a mean over specimens is an M-estimator, and its
     density follows from the scores of stored responses. The density of other estimates follows from
     refits.
-
-    Raises
-    ------
-    ValueError
-        If the density is not known (`require_density`).
     """
     require_density(evaluator)
-    by_scores = score_obstacle(evaluator) is None
-    density = estimate_likelihood if by_scores else refit_likelihood
-    likelihood = density(evaluator, optimum)
+    is_mean = score_obstacle(evaluator) is None
+    likelihood = (estimate_likelihood if is_mean else refit_likelihood)(evaluator, optimum)
 
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
 
-    return Target(evaluator, log_likelihood, tuple(likelihood.starts), likelihood.scale)
+    return Target(evaluator, log_likelihood, likelihood.starts, likelihood.scale)
 
 
 def require_density(evaluator: Evaluator) -> None:
-    """Raise if the density of the metrics' estimate is not known, before a search for it.
+    """Raise if the density of the metrics' estimate is not known.
 
-    Raises
-    ------
-    ValueError
-        If responses are random, or not stored although the density takes refits.
+    Responses are random, or not stored although the density requires refits.
     """
     obstacle = score_obstacle(evaluator)
     for node in evaluator.nodes:
@@ -118,19 +96,10 @@ def require_density(evaluator: Evaluator) -> None:
 def prior_conflicts(
     optimum: Optimum, evaluator: Evaluator, thetas: Floats, size: int = 4096
 ) -> tuple[Finding, ...]:
-    """Report hyperparameters whose prior pulls the posterior away from the estimate.
+    """Report hyperparameters whose prior pulls the posterior, thetas (..., d), from the estimate.
 
     The predictive distribution of an estimate is that of draws of the prior with the standard
     errors of the optimum.
-
-    Parameters
-    ----------
-    optimum : Optimum
-    evaluator : Evaluator
-    thetas : ndarray, shape (..., d)
-        Draws of the posterior.
-    size : int
-        Number of draws of the prior.
     """
     if optimum.prior or any(rival["comparable"] for rival in optimum.rivals):
         return ()

@@ -22,6 +22,7 @@ from prbayes.model.labels import (
     observed_dataset,
     versions,
 )
+from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import MAX_LOST
 
 
@@ -175,7 +176,7 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, beside: xr.Dataset) -> xr
     values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
     names = [m.name for m in measurements]
     discrepancies = np.stack([-values[name].sum(axis=1) for name in names], axis=-1)
-    runs = [len(likelihood.emulation.z) for likelihood in likelihoods]
+    runs = [len(prepared(likelihood).emulation.z) for likelihood in likelihoods]
     known: dict[str, Any] = {
         "discrepancy": (_EACH_DRAW, discrepancies.reshape(chains, draws, -1)),
         "epsilon": ("simulator", np.ones(len(names))),
@@ -183,7 +184,7 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, beside: xr.Dataset) -> xr
         "metric": ("simulator", [without_addresses(m.metric) for m in measurements]),
         "compared": ("simulator", [""] * len(names)),
         "propagation": ("simulator", [f"emulator of {count} runs" for count in runs]),
-        "n_points": ("simulator", [each.points.log_a.size for each in likelihoods]),
+        "n_points": ("simulator", [prepared(each).points.log_a.size for each in likelihoods]),
         "n_runs": ("simulator", runs),
         "is_likelihood": ("simulator", np.ones(len(names), dtype=int)),
     }

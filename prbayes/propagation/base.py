@@ -35,8 +35,8 @@ from prbayes.response.distributions import (
 from prbayes.response.executors import refuse_timeout
 from prbayes.response.failures import Abort, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
-from prbayes.response.outputs import lacking
-from prbayes.response.response import Responses, refuse_calling
+from prbayes.response.outputs import is_missing
+from prbayes.response.response import Responses, check_call_settings
 
 # Parts of a population's points whose differences tell its error: few enough that each is a design
 # of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
@@ -231,7 +231,7 @@ class Bound(ABC):
             return no_response
         values, weights = self.populations(roots)
         points = values[0]
-        mass = np.where(~lacking(points), weights[0], 0.0)
+        mass = np.where(~is_missing(points), weights[0], 0.0)
         total = mass.sum()
         if not total > 0:
             return no_response
@@ -296,7 +296,7 @@ class Propagation(ABC):
 
     def check(self) -> None:
         """Refuse what is no executor, folder or policy."""
-        refuse_calling(self.executor, self.store, self.version, self.on_failure)
+        check_call_settings(self.executor, self.store, self.version, self.on_failure)
         flag(self.retry_failed, "retry_failed")
         refuse_timeout(self.timeout, self.executor)
 

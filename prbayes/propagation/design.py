@@ -30,7 +30,7 @@ from prbayes.propagation.points import Mixture, MixtureSampler
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import Known, Responses, once_each
+from prbayes.response.response import KnownPoints, Responses, deduplicated_responses
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,8 +283,8 @@ def _responses_at(points: Sequence[Floats], responses: Responses, design: Design
     if values is not None:
         responses.count_reused(len(values))
         return values
-    known = None if design is None else Known(design.runs.points, design.runs.values)
-    values = once_each(responses, points, known)
+    known = None if design is None else KnownPoints(design.runs.points, design.runs.values)
+    values = deduplicated_responses(responses, points, known)
     responses.runs.stored.append((list(points), values))
     return values
 

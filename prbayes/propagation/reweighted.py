@@ -47,13 +47,13 @@ from prbayes.propagation.ops import stored_discrepancy
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import prior_draws, refuse_without_density
 from prbayes.response.inputs import Inputs
-from prbayes.response.outputs import lacking
+from prbayes.response.outputs import is_missing
 from prbayes.response.response import (
-    Known,
+    KnownPoints,
     Responses,
-    once_each,
+    deduplicated_responses,
     refuse_coarse,
-    refuse_other_number,
+    refuse_wrong_arity,
 )
 
 # Largest basis in a compiled graph, 1 GiB, for the largest design. Graphs without a basis are as
@@ -198,7 +198,7 @@ class Reweighted(Propagation):
             self._refuse_emulating(name, inputs)
         if self.coarse is not None:
             self._refuse_following(name, inputs)
-            refuse_other_number(f"{name}: coarse", self.coarse, inputs)
+            refuse_wrong_arity(f"{name}: coarse", self.coarse, inputs)
 
     def check_likelihood(self, name: str) -> None:
         """Refuse options that the log-likelihood by specimen, with its own emulator, lacks."""
@@ -493,7 +493,7 @@ class ReweightedBound(Bound):
         if len(values) < len(runs):
             points = self.points_of(responses.inputs, runs.points)
             missing = [x[len(values) :] for x in points]
-            more = once_each(responses, missing, Known(points, values))
+            more = deduplicated_responses(responses, missing, KnownPoints(points, values))
             values = np.concatenate([values.reshape(-1, *more.shape[1:]), more])
             if pairs:
                 self._other_responses.remove(pairs[0])
@@ -597,7 +597,7 @@ class ReweightedBound(Bound):
         values = self._design.sample.values
         weights = self._log_weights(params, self._design)
         log_totals = normalise(weights)
-        is_lost = lacking(values)
+        is_lost = is_missing(values)
         has_failed = np.isposinf(values).reshape(self.n_points, -1).any(axis=1)
         lost = weights @ is_lost
         with np.errstate(divide="ignore", invalid="ignore"):

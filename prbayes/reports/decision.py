@@ -1,4 +1,4 @@
-"""The decision: what is risked, what moves it, and what more data would change."""
+"""The section of a report on a decision: risk, sensitivity, and the value of more data."""
 
 from __future__ import annotations
 
@@ -15,41 +15,29 @@ from prbayes.reports.schema import kind_of_decision
 from prbayes.reports.section import Section
 from prbayes.reports.tables import rows_table
 
-REJECTED = (
-    "The calibrated model was rejected, see Validity: these are the answers of a model that data "
-    "contradict, and not to be relied on."
-)
-
 
 def decision(m: Material) -> list[Section]:
-    """Return what was asked for a decision, a table for each kind of question."""
+    """Return the answers for a decision, a table for each kind of question."""
     if not m.decisions:
         return []
     about = ["These answers count that the hyperparameters are uncertain, as the posterior says."]
     if m.rejected:
-        about.insert(0, REJECTED)
-    found = [Section("Decision", about)]
+        about.insert(
+            0,
+            "The calibrated model was rejected, see Validity: these are the answers of a model "
+            "that data contradict, and not to be relied on.",
+        )
+    sections = [Section("Decision", about)]
     for kind, (title, text, rows_of) in _KINDS.items():
-        rows = []
-        for label, table in m.decisions.items():
-            if kind_of_decision(table) == kind:
-                rows += [{"question": label} | row for row in rows_of(table, m.labels)]
+        rows = [
+            {"question": label} | row
+            for label, table in m.decisions.items()
+            if kind_of_decision(table) == kind
+            for row in rows_of(table, m.labels)
+        ]
         if rows:
-            found.append(Section(title, text, rows_table(rows), level=3))
-    return found
-
-
-def refuse_decisions(given: Any) -> None:
-    """Raise if it is no table of a decision, or no mapping of such."""
-    if given is None:
-        return
-    several = isinstance(given, Mapping) and not isinstance(given, xr.Dataset)
-    for table in given.values() if several else [given]:
-        if kind_of_decision(table) is None:
-            raise TypeError(
-                f"Report: decision: got {type(table).__name__}, expected the Dataset of "
-                "prb.exceedance, prb.sensitivity or prb.plan, or several by name"
-            )
+            sections.append(Section(title, text, rows_table(rows), level=3))
+    return sections
 
 
 def _risk(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -57,15 +45,19 @@ def _risk(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
     values, errors = (np.atleast_1d(table[key].values) for key in ("probability", "error"))
     bounds = table["bound"].values if "bound" in table.coords else [""]
     beyond = "below" if table.attrs["below"] else "above"
-    interval = interval_of(table)
+    required = verdict = ""
+    if "requirement" in table.attrs:
+        required = f"at most {table.attrs['requirement']:g}"
+        verdict = str(table.attrs["verdict"])
     return [
         {
             "beyond": f"{beyond} {table.attrs['limit']:g}",
             "bound": str(bound),
             "probability": number(float(value), 2),
             "its error": number(float(error), 1),
-            f"{percentage(table.attrs['prob'])} interval": interval,
-            **_required(table),
+            f"{percentage(table.attrs['prob'])} interval": interval_of(table),
+            "required": required,
+            "requirement is": verdict,
         }
         for bound, value, error in zip(bounds, values, errors, strict=True)
     ]
@@ -76,36 +68,23 @@ def interval_of(table: xr.Dataset) -> str:
     return f"{number(float(table.lower), 2)} to {number(float(table.upper), 2)}"
 
 
-def _required(table: xr.Dataset) -> dict[str, str]:
-    """Return what was required of a probability, and whether it is met."""
-    if "requirement" not in table.attrs:
-        return {"required": "", "requirement is": ""}
-    most = f"at most {table.attrs['requirement']:g}"
-    return {"required": most, "requirement is": str(table.attrs["verdict"])}
-
-
-def _shares(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the rows of shares, one for each factor."""
+def _indices(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return the rows of sensitivity indices, one for each factor."""
+    value = plus_minus(float(table.attrs["value"]), float(table.attrs["sd"]))
+    quantity = f"{table.attrs['quantity']} = {value}"
+    response = str(table.attrs.get("of_inputs", "the response"))
     return [
         {
-            "of": _of_what(table, str(kind)),
+            "of": response if str(kind) == "input" else quantity,
             "factor": named(str(factor), labels),
-            "by itself": _share(table, "first", i),
-            "with all others known": _share(table, "total", i),
+            "by itself": _index(table, "first", i),
+            "with all others known": _index(table, "total", i),
         }
         for i, (factor, kind) in enumerate(zip(table.factor.values, table.kind.values, strict=True))
     ]
 
 
-def _of_what(table: xr.Dataset, kind: str) -> str:
-    """Return what a factor has a share of."""
-    if kind == "input":
-        return str(table.attrs.get("of_inputs", "the response"))
-    value = plus_minus(float(table.attrs["value"]), float(table.attrs["sd"]))
-    return f"{table.attrs['quantity']} = {value}"
-
-
-def _share(table: xr.Dataset, key: str, i: int) -> str:
+def _index(table: xr.Dataset, key: str, i: int) -> str:
     value = float(table[key][i])
     error = float(table[f"{key}_error"][i])
     return f"{value:.2f} ± {error:.2f}" if np.isfinite(value) else ""
@@ -114,13 +93,16 @@ def _share(table: xr.Dataset, key: str, i: int) -> str:
 def _plan(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return the rows of a plan, the present first."""
     names = [str(name) for name in table.name.values]
-    now = {name: number(float(table.now.sel(name=name)), 3) for name in names}
-    rows = [{"specimens": "none more", **now}]
+
+    def row(text: str, sd: xr.DataArray) -> dict[str, Any]:
+        sds = {name: number(float(sd.sel(name=name)), 3) for name in names}
+        return {"specimens": text, **sds}
+
+    rows = [row("none more", table.now)]
     for candidate in table.candidate.values:
         for k in table.k.values:
             sd = table.sd.sel(candidate=candidate, k=k)
-            own = {name: number(float(sd.sel(name=name)), 3) for name in names}
-            rows.append({"specimens": f"{k} more, {candidate}", **own})
+            rows.append(row(f"{k} more, {candidate}", sd))
     return rows
 
 
@@ -138,7 +120,7 @@ _KINDS: dict[str, tuple[str, str, _Rows]] = {
         "The share of a variance that knowing a factor would remove, and that is left when all "
         "others are known: of hyperparameters, in the uncertainty of the quantity; of inputs, in "
         "the scatter of specimens.",
-        _shares,
+        _indices,
     ),
     "plan": (
         "What more data would change",

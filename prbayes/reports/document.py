@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from os import PathLike
@@ -17,35 +17,33 @@ import xarray as xr
 
 from prbayes._validate import called, file_path, flag, folder_path, plain_text
 from prbayes.optimize.optimum import Optimum
-from prbayes.reports.contents import contents
 from prbayes.reports.section import Section
+from prbayes.reports.sections import sections_of
 from prbayes.reports.tables import cells
 from prbayes.validation.area_test import ValidityTest
 
-# What Markdown, or HTML inside it, would read as markup (CommonMark 0.31, 2.4; tables and
-# strikethrough of GitHub; formulas between dollars).
+# Markup of Markdown, or of HTML inside it (CommonMark 0.31, 2.4; tables and strikethrough of
+# GitHub; formulas between dollars).
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>|&~$!])")
 # Headings, items, rules and underlines begin a line (CommonMark 0.31, 4.1 to 4.3 and 5.2).
 _AT_START = re.compile(r"^(?:#+|[-+](?=\s|$)|-{2,}|={1,}|\d{1,9}(?=[.)](?:\s|$)))")
-
-
-# What readers make a link of although nothing marks it as one (autolinks of GitHub, 6.9).
+# Texts that readers make a link without markup (autolinks of GitHub, 6.9).
 _BARE_LINK = re.compile(r"(?i)\b(https?|ftp)(:)(?=//)|\b(www)(\.)")
-# Characters that are not seen but change what is: controls but for line ends, and marks of the
-# direction of writing (Unicode, annex 9), which turn what follows around.
-_UNSEEN = re.compile(
+# Invisible characters: controls other than line ends, and marks of the direction of writing
+# (Unicode, annex 9), which reverse the text after them.
+_INVISIBLE = re.compile(
     "[\x00-\x08\x0e-\x1f\x7f-\x84\x86-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
 )
 
 
 def visible(text: str) -> str:
-    """Return a text with a mark in the place of characters that are not seen."""
-    return _UNSEEN.sub("\N{REPLACEMENT CHARACTER}", text)
+    """Return a text with a mark in the place of invisible characters."""
+    return _INVISIBLE.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 @dataclass(frozen=True, eq=False)
 class _Document:
-    """A title and sections, and how they are written."""
+    """A title and sections, with writers."""
 
     title: str
     sections: tuple[Section, ...]
@@ -69,9 +67,8 @@ class _Document:
         if not isinstance(section, Section):
             raise TypeError(f"section: got {called(section)}, expected a prb.reports.Section")
         place = len(self.sections) if after is None else self._end_of(after, section.level)
-        before = self.sections[:place]
-        behind = self.sections[place:]
-        return replace(self, sections=(*before, section, *behind))
+        sections = (*self.sections[:place], section, *self.sections[place:])
+        return replace(self, sections=sections)
 
     def _end_of(self, title: str, level: int) -> int:
         """Return the place behind a section, and behind its parts for one of its own level."""
@@ -86,7 +83,7 @@ class _Document:
         return len(titles)
 
     def to_html(self, path: str | PathLike[str]) -> Path:
-        """Write one file that holds everything, for a browser and for print; return its path."""
+        """Write one file with everything, for a browser and for print; return its path."""
         return _write(file_path(path, "path"), self._html())
 
     def to_markdown(self, folder: str | PathLike[str]) -> Path:
@@ -96,11 +93,8 @@ class _Document:
         """
         folder = folder_path(folder, "folder")
         files = [_file_name(i, section) for i, section in enumerate(self.sections, 1)]
-        text = (
-            _markdown()
-            .get_template("report.md.j2")
-            .render(report=self, byline=self._byline, cells=cells, files=files)
-        )
+        template = _template("report.md.j2", autoescape=False)
+        text = template.render(report=self, byline=self._byline, cells=cells, files=files)
         folder.mkdir(parents=True, exist_ok=True)
         for section, name in zip(self.sections, files, strict=True):
             if name is not None and section.picture is not None:
@@ -112,21 +106,21 @@ class _Document:
         return ", ".join(filter(None, (self.author, self.date)))
 
     def _html(self) -> str:
-        environment = _environment()
-        chapters = []
-        for i, section in enumerate(self.sections, 1):
-            if section.level == 2 and i > 1:  # the summary comes before the list of contents
-                chapters.append((i, section.title))
-        # With its parts the first section is a page of its own
-        front = chapters[0][0] - 1 if chapters else len(self.sections)
-        rendered: str = environment.get_template("report.html.j2").render(
+        # The list of contents comes after the summary, which with its parts is a page of its own.
+        chapters = [
+            (i, section.title)
+            for i, section in enumerate(self.sections, 1)
+            if section.level == 2 and i > 1
+        ]
+        style = _template("report.css", autoescape=True).render(running=_in_css(self.title))
+        rendered: str = _template("report.html.j2", autoescape=True).render(
             report=self,
             byline=self._byline,
-            style=environment.get_template("report.css").render(running=_in_css(self.title)),
+            style=style,
             contents=chapters,
-            front=front,
+            front=chapters[0][0] - 1 if chapters else len(self.sections),
             cells=cells,
-            base64=_base64,
+            base64=lambda picture: base64.b64encode(picture).decode("ascii"),
         )
         return rendered + "\n"
 
@@ -138,20 +132,20 @@ class _Document:
 
 
 class Report(_Document):
-    """A calibration as a document: what was calibrated, the answer, whether it may be trusted.
+    """A calibration as a document: the problem, the answer, whether it may be trusted.
 
-    What is not given is left out. Pictures are made when the report is; after that it is data,
-    and a writer gives the same bytes each time.
+    The report has sections for the results that are given. It is data: pictures are made once, and
+    a writer gives the same bytes each time.
 
     Parameters
     ----------
     title : str
     sections : tuple of Section
-        By default those of the results. With them given, results are not looked at.
+        By default those of the results; with sections, results are not read.
     author, date : str
         Below the title. No date is made up.
     model : pymc.Model, optional
-        What needs it are distributions of populations, and the graph; the rest is in the results.
+        Needed for distributions of populations and for the graph; the rest is in the results.
     optimum : Optimum or xarray.DataTree, or a mapping of such, optional
         From `minimize`, or its ``to_datatree()``; several by name.
     posterior : xarray.DataTree, or a mapping of such, optional
@@ -159,23 +153,22 @@ class Report(_Document):
     validity : ValidityTest, or a mapping of such, optional
         From `area_test`; several by name.
     comparison : xarray.Dataset, optional
-        From `compare`; that of the optima and posteriors by default, where there are two or more.
+        From `compare`; that of the optima and posteriors by default, if there are two or more.
     decision : xarray.Dataset, or a mapping of such, optional
         From `exceedance`, `sensitivity` or `plan`; several by name.
     pictures : bool
-        Whether pictures are made of the results.
+        Whether pictures of the results are made.
     validation : mapping, optional
-        What validity was tested on, by condition: a pair of what was measured on other specimens
-        and what `predict` says of it. It becomes a table and a picture.
+        Data of the validity tests, by condition: a pair of measured responses of other specimens
+        and their prediction by `predict`. They become a table and a picture.
     labels : mapping, optional
-        What a reader calls hyperparameters, inputs, simulators and outputs, by their names, with
-        units: ``{"mu": "mean of log C", "crack": "crack length / notch length"}``.
+        Labels of hyperparameters, inputs, simulators and outputs by name, with units: ``{"mu":
+        "mean of log C", "crack": "crack length / notch length"}``.
 
     Attributes
     ----------
     sections : tuple of Section
-        For a report of your own: ``report.with_section``, or
-        ``dataclasses.replace(report, sections=...)``.
+        Other sections: ``report.with_section``, or ``dataclasses.replace(report, sections=...)``.
 
     Raises
     ------
@@ -221,79 +214,30 @@ class Report(_Document):
             raise TypeError(
                 f"Report: sections: got {called(sections)}, expected prb.reports.Section objects"
             )
-        made = tuple(sections)
-        if not made:
-            results = (model, optimum, posterior, validity, comparison, decision, validation)
-            made = contents(*results, labels=labels, pictures=pictures)
-        for section in made:
+        contents = tuple(sections) or sections_of(
+            model=model,
+            optimum=optimum,
+            posterior=posterior,
+            validity=validity,
+            comparison=comparison,
+            decision=decision,
+            validation=validation,
+            labels=labels,
+            pictures=pictures,
+        )
+        for section in contents:
             if not isinstance(section, Section):
                 got = type(section).__name__
                 raise TypeError(
                     f"Report: sections: got {got}, expected prb.reports.Section objects"
                 )
-        super().__init__(title, made, author, date)
+        super().__init__(title, contents, author, date)
 
 
-@cache
-def _environment() -> Any:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
-
-    def seen(value: Any) -> Any:
-        return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
-
-    return Environment(
-        loader=PackageLoader("prbayes.reports"),
-        autoescape=True,
-        finalize=seen,
-        undefined=StrictUndefined,
-    )
-
-
-@cache
-def _markdown() -> Any:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
-
-    def escaped(value: Any) -> str:
-        return str(value) if isinstance(value, Markup) else _literal(str(value))
-
-    return Environment(
-        loader=PackageLoader("prbayes.reports"),
-        autoescape=False,
-        finalize=escaped,
-        undefined=StrictUndefined,
-    )
-
-
-def _literal(text: str) -> str:
-    """Return a text, in one line, that Markdown shows as it is."""
-    line = _MARKUP.sub(r"\\\1", " ".join(visible(text).split()))
-    line = _BARE_LINK.sub(r"\1\3\\\2\4", line)
-    return _AT_START.sub(_escaped_start, line)
-
-
-def _escaped_start(found: re.Match[str]) -> str:
-    # Of '1.' the point is escaped, as digits cannot be.
-    start = found[0]
-    return f"{start}\\" if start.isdigit() else f"\\{start}"
-
-
-# A running title longer than this would meet the page's number on A4, 178 mm wide between margins.
-_RUNNING = 80
-
-
-def _in_css(text: str) -> str:
-    """Return a text for a string of CSS, escaped but for letters and digits (CSS 2.1, 4.1.3)."""
-    line = " ".join(visible(text).split())
-    if len(line) > _RUNNING:
-        line = line[: _RUNNING - 1] + "…"
-    plain = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 "
-    return "".join(c if c in plain else f"\\{ord(c):x} " for c in line)
-
-
-def _base64(picture: bytes) -> str:
-    return base64.b64encode(picture).decode("ascii")
+def _write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8", newline="\n")
+    return path
 
 
 def _file_name(i: int, section: Section) -> str | None:
@@ -304,7 +248,48 @@ def _file_name(i: int, section: Section) -> str | None:
     return f"{i:02d}-{slug or 'picture'}.{section.kind}"
 
 
-def _write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8", newline="\n")
-    return path
+# -- templates -------------------------------------------------------------------------------
+
+
+@cache
+def _template(name: str, *, autoescape: bool) -> Any:
+    """Return a template that shows all texts as they are: escaped for HTML, or for Markdown."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    escape: Callable[[Any], Any] = _visible_text if autoescape else _literal
+    environment = Environment(
+        loader=PackageLoader("prbayes.reports"),
+        autoescape=autoescape,
+        finalize=lambda value: value if isinstance(value, Markup) else escape(value),
+        undefined=StrictUndefined,
+    )
+    return environment.get_template(name)
+
+
+def _visible_text(value: Any) -> Any:
+    return visible(value) if isinstance(value, str) else value
+
+
+def _literal(value: Any) -> str:
+    """Return a text, in one line, that Markdown shows as it is."""
+    line = _MARKUP.sub(r"\\\1", " ".join(visible(str(value)).split()))
+    line = _BARE_LINK.sub(r"\1\3\\\2\4", line)
+    # In '1.' the point is escaped, as digits cannot be.
+    start = _AT_START.match(line)
+    if start is None:
+        return line
+    escaped = f"{start[0]}\\" if start[0].isdigit() else f"\\{start[0]}"
+    return escaped + line[start.end() :]
+
+
+def _in_css(text: str) -> str:
+    """Return a text for a string of CSS, escaped but for letters and digits (CSS 2.1, 4.1.3).
+
+    A running title of more than 80 characters would meet the page's number on A4.
+    """
+    line = " ".join(visible(text).split())
+    if len(line) > 80:
+        line = line[:79] + "…"
+    plain = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 "
+    return "".join(c if c in plain else f"\\{ord(c):x} " for c in line)

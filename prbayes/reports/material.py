@@ -1,4 +1,4 @@
-"""What a report is made of: results of any origin, checked, and brought into one form."""
+"""The results of a report, of any origin: checked, and in one form."""
 
 from __future__ import annotations
 
@@ -25,15 +25,12 @@ from prbayes.model.fingerprint import (
 from prbayes.model.fingerprint import from_attributes as identity_of_attributes
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.plots._labels import refuse_labels
-from prbayes.response.outputs import ONE, Outputs, read_observed
+from prbayes.reports.schema import kind_of_decision
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.results.compare import compare
 from prbayes.results.diagnose import Diagnosis, diagnose
 from prbayes.validation.area_test import ValidityTest, u_values
 from prbayes.validation.conditions import comparables
-
-# Measured values are rounded, or predicted ones for a test: by far less than this in half of the
-# u-values, while those of other data are apart by .3 on average.
-_ROUNDED_BY = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +40,7 @@ class Material:
     model: pm.Model | None
     description: dict[str, Any] | None  # of the model; from a file where there is no model
     optima: dict[str, xr.DataTree]
-    found: dict[str, Optimum]  # those of the optima that are not from a file
+    live_optima: dict[str, Optimum]  # the optima that are not from a file
     posteriors: dict[str, xr.DataTree]
     tests: dict[str, ValidityTest]
     comparison: xr.Dataset | None
@@ -51,9 +48,9 @@ class Material:
     outputs: dict[str, Outputs]  # of a run, by simulator
     diagnoses: dict[str, Diagnosis | None]
     decisions: dict[str, xr.Dataset]
-    # Of other specimens, by condition: what was measured, and what was predicted of it.
+    # Measured and predicted responses of other specimens, by condition
     validation: dict[str, tuple[Any, xr.DataArray]] = field(default_factory=dict)
-    # What a reader calls variables, inputs, simulators and outputs, with units.
+    # Labels of variables, inputs, simulators and outputs, with units
     labels: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -68,30 +65,30 @@ class Material:
 
     @property
     def calibrations(self) -> dict[str, xr.Dataset]:
-        """Discrepancies, metrics and epsilons, of those results that have them."""
-        found = {}
-        for label, tree in self.results.items():
-            if "calibration" in tree.children:
-                found[label] = tree.children["calibration"].to_dataset()
-        return found
+        """Discrepancies, metrics and epsilons, of the results that have them."""
+        return {
+            label: tree.children["calibration"].to_dataset()
+            for label, tree in self.results.items()
+            if "calibration" in tree.children
+        }
 
     def attrs(self, label: str) -> dict[Any, Any]:
-        """Return what a result says about itself."""
-        return dict(_answer(self.results[label]).attrs)
+        """Return the attributes of a result."""
+        return dict(_estimates(self.results[label]).attrs)
 
     @property
     def is_by_specimen(self) -> bool:
         """Whether all simulators of all results have the log-likelihood by specimen."""
-        known = [
-            calibration["is_likelihood"].values
+        flags = [
+            bool(calibration["is_likelihood"].values.all())
             for calibration in self.calibrations.values()
             if "is_likelihood" in calibration
         ]
-        return bool(known) and all(bool(own.all()) for own in known)
+        return bool(flags) and all(flags)
 
     @property
     def variables(self) -> list[dict[str, Any]]:
-        """The variables of the model; none where they are not known."""
+        """The variables of the model; none where they are unknown."""
         return [] if self.description is None else list(self.description["variables"])
 
     @property
@@ -99,109 +96,132 @@ class Material:
         """Names of the hyperparameters, without deterministics where they are known as such."""
         if self.description is not None:
             return [v["name"] for v in self.variables if v["role"] == "hyperparameter"]
-        if not self.results:
-            return []
-        first = next(iter(self.results.values()))
-        return list(map(str, _answer(first).data_vars))
+        first = next(iter(self.results.values()), None)
+        return [] if first is None else list(map(str, _estimates(first).data_vars))
 
 
 def gather(
-    model: Any,
-    optimum: Any,
-    posterior: Any,
-    validity: Any,
-    comparison: Any,
+    model: Any = None,
+    optimum: Any = None,
+    posterior: Any = None,
+    validity: Any = None,
+    comparison: Any = None,
     decision: Any = None,
     validation: Any = None,
     labels: Mapping[str, str] | None = None,
 ) -> Material:
-    """Check what was given.
+    """Check results, and derive the missing ones.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If a result is not what it is given as, or of other populations or data than the model or
-        the first of them.
+    Raise a `TypeError` or `ValueError` if a result is of another kind, or of other populations or
+    data than the model or the first result.
     """
-    given = _labelled(optimum, "optimum")
-    posteriors = _labelled(posterior, "posterior")
-    tests = _labelled(validity, "validity")
-    decisions = _labelled(decision, "decision")
-
-    # Refuse what is not as described
-    _require_model(model)
-    _require_comparison(comparison)
-    _require_validation(validation)
-    if labels is not None:
-        texts(labels, "Report: labels")
-    _require_different_names(given, posteriors)
-    for label, test in tests.items():
-        _require_test(label, test)
-    for label, tree in posteriors.items():
-        _require(label, tree, "posterior", ("chain", "draw"), "prb.sample_smc")
-    found = {label: o for label, o in given.items() if isinstance(o, Optimum)}
-    optima = given | {label: o.to_datatree() for label, o in found.items()}
+    optima = _by_label(optimum, "optimum")
+    posteriors = _by_label(posterior, "posterior")
+    tests = _by_label(validity, "validity")
+    decisions = _by_label(decision, "decision")
+    validation = {} if validation is None else validation
+    _require_kinds(model, optima, posteriors, tests, comparison, decisions, validation, labels)
+    live_optima = {label: o for label, o in optima.items() if isinstance(o, Optimum)}
+    optima |= {label: o.to_datatree() for label, o in live_optima.items()}
     for label, tree in optima.items():
-        _require_optimum(label, tree)
+        _require_group(label, tree, "optimum", (), "prb.minimize")
+        if "stderr" not in tree:
+            raise TypeError(
+                f"Report: {label}: got a DataTree without the group stderr, "
+                "expected one of prb.minimize"
+            )
 
-    # Refuse what is of different problems
     results = optima | posteriors
-    identities = {label: identity_in(result) for label, result in (results | found).items()}
+    identities = {label: identity_in(result) for label, result in (results | live_optima).items()}
     identities |= {label: test.identity for label, test in tests.items()}
     identities |= {label: identity_in(table) for label, table in decisions.items()}
-    for label, (_, predicted) in (validation or {}).items():
+    for label, (_, predicted) in validation.items():
         identities[f"validation, {label}"] = identity_of_attributes(predicted.attrs)
     identities["comparison"] = identity_in(comparison)
     require_together(identities, "Report", model=model)
     _require_prior({label: identities[label] for label in posteriors}, model)
-    _require_tested(validation or {}, tests)
+    _require_tested(validation, tests)
 
-    # Find out what was not given
     description = _stored_description(results) if model is None else describe(model)
     if comparison is None and len(results) > 1:
-        comparison = compare(results | found, model=model)
+        comparison = compare(results | live_optima, model=model)
     observed, outputs = _observed(model, results)
-    _require_known_labels(labels, model, description, outputs, validation)
-    diagnoses = {}
-    for label, result in (results | found).items():
-        diagnoses[label] = _diagnosis(result, model)
+    _require_labels(labels, model, description, outputs, validation)
     return Material(
         model=model,
         description=description,
         optima=optima,
-        found=found,
+        live_optima=live_optima,
         posteriors=posteriors,
         tests=tests,
         comparison=comparison,
         observed=observed,
         outputs=outputs,
-        diagnoses=diagnoses,
+        diagnoses={
+            label: _diagnosis(result, model) for label, result in (results | live_optima).items()
+        },
         decisions=decisions,
-        validation=dict(validation or {}),
+        validation=dict(validation),
         labels=dict(labels or {}),
     )
+
+
+def _by_label(results: Any, kind: str) -> dict[str, Any]:
+    if results is None:
+        return {}
+    if isinstance(results, Mapping) and not isinstance(results, xr.DataTree | xr.Dataset):
+        return {str(label): value for label, value in results.items()}
+    return {kind: results}
 
 
 # -- checks ----------------------------------------------------------------------------------
 
 
-def _labelled(given: Any, kind: str) -> dict[str, Any]:
-    if given is None:
-        return {}
-    if isinstance(given, Mapping) and not isinstance(given, xr.DataTree | xr.Dataset):
-        return {str(label): value for label, value in given.items()}
-    return {kind: given}
-
-
-def _require_model(model: Any) -> None:
+def _require_kinds(
+    model: Any,
+    optima: dict[str, Any],
+    posteriors: dict[str, Any],
+    tests: dict[str, Any],
+    comparison: Any,
+    decisions: dict[str, Any],
+    validation: Any,
+    labels: Any,
+) -> None:
+    """Raise if an argument is of another kind."""
+    for table in decisions.values():
+        if kind_of_decision(table) is None:
+            raise TypeError(
+                f"Report: decision: got {type(table).__name__}, expected the Dataset of "
+                "prb.exceedance, prb.sensitivity or prb.plan, or several by name"
+            )
     if model is not None and not isinstance(model, pm.Model):
         raise TypeError(f"Report: model: got {type(model).__name__}, expected a pm.Model")
+    is_comparison = isinstance(comparison, xr.Dataset) and "estimate" in comparison
+    if comparison is not None and not is_comparison:
+        raise TypeError(
+            f"Report: comparison: got {type(comparison).__name__}, expected the Dataset of "
+            "prb.compare"
+        )
+    _require_validation(validation)
+    if labels is not None:
+        texts(labels, "Report: labels")
+    names = sorted(set(optima) & set(posteriors))
+    if names:
+        raise ValueError(
+            f"Report: got the names {names} for optima and posteriors, expected different ones"
+        )
+    for label, test in tests.items():
+        if not isinstance(test, ValidityTest):
+            raise TypeError(
+                f"Report: {label}: got {type(test).__name__}, expected a ValidityTest from "
+                "prb.area_test"
+            )
+    for label, tree in posteriors.items():
+        _require_group(label, tree, "posterior", ("chain", "draw"), "prb.sample_smc")
 
 
 def _require_validation(validation: Any) -> None:
-    """Refuse what is no data with a prediction of them, by condition."""
-    if validation is None:
-        return
+    """Raise if it is no mapping of conditions to measured and predicted responses."""
     expected = (
         "expected by condition what was measured and what prb.predict says of it, such as "
         '{"80 000 cycles": (lengths, prb.predict(...))}'
@@ -214,93 +234,7 @@ def _require_validation(validation: Any) -> None:
         comparables({condition: pair[0]}, {condition: pair[1]}, "Report: validation")
 
 
-def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | None) -> None:
-    """Refuse draws none of which is under the prior of the model, which the report prints."""
-    if model is None or not population_simulators(model):
-        return
-    expected = identity_of_model(model)
-    found = {}
-    for label, identity in identities.items():
-        if identity is not None:
-            found[label] = differences(identity, expected, Level.PRIORS)
-    if found and all(found.values()):
-        label = next(iter(found))
-        require_same(identities[label], expected, f"Report: {label}", Level.PRIORS)
-
-
-def _require_tested(
-    validation: Mapping[str, tuple[Any, xr.DataArray]], tests: Mapping[str, ValidityTest]
-) -> None:
-    """Refuse validation data that are not those of a test, where there are tests."""
-    known: list[Floats] = []
-    for test in tests.values():
-        known.append(test.u_values)
-        for condition in np.unique(test.conditions):
-            known.append(test.u_values[test.conditions == condition])
-    for condition, (measured, predicted) in validation.items():
-        u = u_values({condition: measured}, {condition: predicted})
-        if known and not any(_alike(u, own) for own in known):
-            raise ValueError(
-                f"Report: validation: {condition}: got {u.size} values other than those of the "
-                f"tests in validity=, expected what prb.area_test was given; test them too, or "
-                "leave validity= out"
-            )
-
-
-def _alike(u: Floats, tested: Floats) -> bool:
-    """Return whether u-values are those of a test, up to rounding and ties, in their order."""
-    folded = np.abs(2 * u - 1)
-    return u.shape == tested.shape and any(
-        np.median(np.abs(own - tested)) < _ROUNDED_BY for own in (u, folded)
-    )
-
-
-def _require_known_labels(
-    labels: Mapping[str, str] | None,
-    model: pm.Model | None,
-    description: dict[str, Any] | None,
-    outputs: Mapping[str, Outputs],
-    validation: Mapping[str, Any] | None,
-) -> None:
-    """Refuse labels of what the report does not have, where it is known what it has."""
-    if not labels or (description is None and model is None):
-        return
-    known = set(validation or {})
-    for simulator, own in outputs.items():
-        known |= {simulator, *own.names}
-    if description is not None:
-        known |= {str(variable["name"]) for variable in description["variables"]}
-    evaluator = None if model is None else Evaluator.of(model)
-    refuse_labels(labels, sorted(known), evaluator=evaluator)
-
-
-def _require_comparison(comparison: Any) -> None:
-    if comparison is None:
-        return
-    if not isinstance(comparison, xr.Dataset) or "estimate" not in comparison:
-        raise TypeError(
-            f"Report: comparison: got {type(comparison).__name__}, "
-            "expected the Dataset of prb.compare"
-        )
-
-
-def _require_different_names(optima: dict[str, Any], posteriors: dict[str, Any]) -> None:
-    twice = sorted(set(optima) & set(posteriors))
-    if twice:
-        raise ValueError(
-            f"Report: got the names {twice} for optima and posteriors, expected different ones"
-        )
-
-
-def _require_test(label: str, test: Any) -> None:
-    if not isinstance(test, ValidityTest):
-        raise TypeError(
-            f"Report: {label}: got {type(test).__name__}, "
-            "expected a ValidityTest from prb.area_test"
-        )
-
-
-def _require(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: str) -> None:
+def _require_group(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: str) -> None:
     if not isinstance(tree, xr.DataTree) or group not in tree or not tree[group].data_vars:
         raise TypeError(
             f"Report: {label}: got {type(tree).__name__}, "
@@ -315,27 +249,76 @@ def _require(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: s
         )
 
 
-def _require_optimum(label: str, tree: Any) -> None:
-    _require(label, tree, "optimum", (), "prb.minimize")
-    if "stderr" not in tree:
-        raise TypeError(
-            f"Report: {label}: got a DataTree without the group stderr, "
-            "expected one of prb.minimize"
-        )
+def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | None) -> None:
+    """Raise if no posterior is under the prior of the model, which the report prints."""
+    if model is None or not population_simulators(model):
+        return
+    expected = identity_of_model(model)
+    posteriors = {label: identity for label, identity in identities.items() if identity is not None}
+    if posteriors and all(differences(i, expected, Level.PRIORS) for i in posteriors.values()):
+        label, identity = next(iter(posteriors.items()))
+        require_same(identity, expected, f"Report: {label}", Level.PRIORS)
 
 
-# -- what was not given ----------------------------------------------------------------------
+def _require_tested(
+    validation: Mapping[str, tuple[Any, xr.DataArray]], tests: Mapping[str, ValidityTest]
+) -> None:
+    """Raise if validation data are not those of a test, where there are tests."""
+    tested: list[Floats] = []
+    for test in tests.values():
+        tested.append(test.u_values)
+        tested += [test.u_values[test.conditions == name] for name in np.unique(test.conditions)]
+    for condition, (measured, predicted) in validation.items():
+        u = u_values({condition: measured}, {condition: predicted})
+        if tested and not any(_are_alike(u, values) for values in tested):
+            raise ValueError(
+                f"Report: validation: {condition}: got {u.size} values other than those of the "
+                f"tests in validity=, expected what prb.area_test was given; test them too, or "
+                "leave validity= out"
+            )
 
 
-def _answer(tree: xr.DataTree) -> xr.DataTree:
-    """Return the group of a result that has its estimates."""
+def _are_alike(u: Floats, tested: Floats) -> bool:
+    """Return whether u-values are those of a test, up to rounding and ties, in their order.
+
+    Rounded data change half of the values by far less than .02; other data are .3 apart on average.
+    """
+    return u.shape == tested.shape and any(
+        np.median(np.abs(values - tested)) < 0.02 for values in (u, np.abs(2 * u - 1))
+    )
+
+
+def _require_labels(
+    labels: Mapping[str, str] | None,
+    model: pm.Model | None,
+    description: dict[str, Any] | None,
+    outputs: Mapping[str, Outputs],
+    validation: Mapping[str, Any],
+) -> None:
+    """Raise if labels are of unknown names, where the names of the model are known."""
+    if not labels or (description is None and model is None):
+        return
+    names = set(validation)
+    for simulator, columns in outputs.items():
+        names |= {simulator, *columns.names}
+    if description is not None:
+        names |= {str(variable["name"]) for variable in description["variables"]}
+    evaluator = None if model is None else Evaluator.of(model)
+    refuse_labels(labels, sorted(names), evaluator=evaluator)
+
+
+# -- derived results -------------------------------------------------------------------------
+
+
+def _estimates(tree: xr.DataTree) -> xr.DataTree:
+    """Return the group of a result with its estimates."""
     return tree.children["posterior" if "posterior" in tree else "optimum"]
 
 
 def _stored_description(results: dict[str, xr.DataTree]) -> dict[str, Any] | None:
     """Return the first description of the model that a result has."""
     for tree in results.values():
-        description = from_attributes(_answer(tree).attrs)
+        description = from_attributes(_estimates(tree).attrs)
         if description is not None:
             return description
     return None
@@ -344,50 +327,42 @@ def _stored_description(results: dict[str, xr.DataTree]) -> dict[str, Any] | Non
 def _observed(
     model: pm.Model | None, results: dict[str, xr.DataTree]
 ) -> tuple[dict[str, Floats], dict[str, Outputs]]:
-    """Return the measured responses, and what their columns are, by simulator."""
+    """Return the measured responses, and their columns, by simulator."""
     if model is not None:
-        known = population_simulators(model)
-        observed = {simulator.name: simulator.observed for simulator in known}
-        return observed, {simulator.name: simulator.outputs for simulator in known}
+        simulators = population_simulators(model)
+        observed = {simulator.name: simulator.observed for simulator in simulators}
+        return observed, {simulator.name: simulator.outputs for simulator in simulators}
     for tree in results.values():
         if "observed_data" in tree:
-            stored = tree["observed_data"].data_vars.items()
-            found = {str(name): _stored_observed(str(name), values) for name, values in stored}
+            variables = tree["observed_data"].data_vars.items()
+            stored = {str(name): _stored_observed(str(name), x) for name, x in variables}
             return (
-                {name: values for name, (values, _) in found.items()},
-                {name: outputs for name, (_, outputs) in found.items()},
+                {name: values for name, (values, _) in stored.items()},
+                {name: outputs for name, (_, outputs) in stored.items()},
             )
     return {}, {}
 
 
 def _stored_observed(name: str, values: xr.DataArray) -> tuple[Floats, Outputs]:
-    """Return the measured responses of a simulator, and what their columns are, from a result."""
-    if values.ndim != 2:
-        unit = values.attrs.get("units")
-        outputs = Outputs(units=(unit,)) if isinstance(unit, str) and unit else ONE
-        return np.ravel(values.values), outputs
+    """Return the measured responses of a simulator, and their columns, from a result."""
     units = values.attrs.get("units")
+    if values.ndim != 2:
+        outputs = Outputs(units=(units,)) if isinstance(units, str) and units else SINGLE_OUTPUT
+        return np.ravel(values.values), outputs
     if units is not None and not isinstance(units, str):  # of each output
         values = values.assign_coords(units=(values.dims[1], np.asarray(units)))
     return read_observed(name, values)
 
 
 def _diagnosis(result: Optimum | xr.DataTree, model: pm.Model | None) -> Diagnosis | None:
-    """Return what is wrong with a result; None where only the model could tell."""
+    """Return the diagnosis of a result; None where it needs the model."""
     if isinstance(result, Optimum):
         return diagnose(result)
-    stored = "optimum" in result or "calibration" in result
-    # By a metric or prior other than the model's, say: the result then tells by itself.
-    if model is not None and not _is_of(result, model):
-        model = None
-    if model is None and not stored:
+    if model is not None:
+        # A result by another metric or prior is diagnosed without the model.
+        identity = identity_in(result)
+        if identity is not None and differences(identity, identity_of_model(model), Level.OPTIMUM):
+            model = None
+    if model is None and "optimum" not in result and "calibration" not in result:
         return None
     return diagnose(result, model=model)
-
-
-def _is_of(result: xr.DataTree, model: pm.Model) -> bool:
-    """Return whether a result is of a model's very problem, as far as is known."""
-    identity = identity_in(result)
-    if identity is None:
-        return True
-    return not differences(identity, identity_of_model(model), Level.OPTIMUM)

@@ -1,4 +1,4 @@
-"""How numbers are written in a report."""
+"""Numbers as text."""
 
 from __future__ import annotations
 
@@ -10,13 +10,9 @@ import numpy as np
 
 NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no number
 
-# Numbers from 0.0001 up to ten million are written out, others with an exponent: the same lower end
-# as Python's own "g"; the upper one keeps loads in newtons and cycles to failure readable.
-_SMALLEST_WRITTEN_OUT, _LARGEST_WRITTEN_OUT = -4, 7
-
-# The smallest p-value that is told: of smaller ones a null distribution of 9999 replicates knows
-# not even the first digit.
-_SMALLEST_PROBABILITY = 0.001
+# Powers of ten that are written out, others have an exponent: the lower end is that of Python's
+# "g"; the upper one keeps loads in newtons and cycles to failure readable.
+_SMALLEST, _LARGEST = -4, 7
 
 
 def number(value: Any, digits: int = 4) -> str:
@@ -28,12 +24,9 @@ def number(value: Any, digits: int = 4) -> str:
         return NOTHING
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
-    if isinstance(value, float | np.floating):
-        return _real(float(value), digits)
-    return str(value)
-
-
-def _real(x: float, digits: int) -> str:
+    if not isinstance(value, float | np.floating):
+        return str(value)
+    x = float(value)
     if math.isnan(x):
         return NOTHING
     if math.isinf(x):
@@ -41,26 +34,24 @@ def _real(x: float, digits: int) -> str:
     if x == 0:
         return "0"
     magnitude = math.floor(math.log10(abs(x)))
-    if not _SMALLEST_WRITTEN_OUT <= magnitude < _LARGEST_WRITTEN_OUT:
+    if not _SMALLEST <= magnitude < _LARGEST:
         return f"{x:.{digits - 1}e}"
     if x == round(x) and magnitude >= digits - 1:
         return f"{x:.0f}"
-    decimals = max(0, digits - 1 - magnitude)
-    return f"{x:.{decimals}f}"
+    return f"{x:.{max(0, digits - 1 - magnitude)}f}"
 
 
 def places(sd: float, digits: int = 3) -> int | None:
-    """Return how many decimals show so many significant digits of a spread.
+    """Return the number of decimals that show so many significant digits of a spread.
 
     None where fixed decimals do not suit.
     """
     if not (math.isfinite(sd) and sd > 0):
         return None
     # Rounded first: 0.0996 with two digits is 0.10, which needs two decimals and not three.
-    rounded = float(f"{sd:.{digits - 1}e}")
-    magnitude = math.floor(math.log10(rounded))
+    magnitude = math.floor(math.log10(float(f"{sd:.{digits - 1}e}")))
     # A spread may be a hundred times smaller than its value, and is still written out.
-    if not _SMALLEST_WRITTEN_OUT - 2 <= magnitude < _LARGEST_WRITTEN_OUT:
+    if not _SMALLEST - 2 <= magnitude < _LARGEST:
         return None
     return max(0, digits - 1 - magnitude)
 
@@ -68,14 +59,13 @@ def places(sd: float, digits: int = 3) -> int | None:
 def alike(values: Iterable[float], sd: float, digits: int = 3) -> list[str]:
     """Return numbers of one unit with the decimals that their spread warrants."""
     decimals = places(sd, digits)
-    return [_with_decimals(float(value), decimals) for value in values]
-
-
-def _with_decimals(value: float, decimals: int | None) -> str:
-    too_large = abs(value) >= 10**_LARGEST_WRITTEN_OUT
-    if decimals is None or not math.isfinite(value) or too_large:
-        return number(value)
-    return f"{value + 0.0:.{decimals}f}"  # the sum turns -0.0 into 0.0
+    texts = []
+    for value in map(float, values):
+        if decimals is None or not math.isfinite(value) or abs(value) >= 10**_LARGEST:
+            texts.append(number(value))
+        else:
+            texts.append(f"{value + 0.0:.{decimals}f}")  # the sum turns -0.0 into 0.0
+    return texts
 
 
 def plus_minus(value: float, sd: float) -> str:
@@ -85,18 +75,26 @@ def plus_minus(value: float, sd: float) -> str:
     return " ± ".join(alike((value, sd), sd, 2))
 
 
+def sample_sd(finite: Any) -> float:
+    """Return the standard deviation of finite values, NaN of fewer than two."""
+    return float(finite.std(ddof=1)) if finite.size > 1 else math.nan
+
+
 def percentage(share: float) -> str:
     """Return a share of one, such as '5%'."""
     return f"{100 * share:g}%"
 
 
 def probability(p: float) -> str:
-    """Return a p-value after its sign, such as '= 0.18' or '< 0.001'."""
-    return f"= {p:.2g}" if p >= _SMALLEST_PROBABILITY else f"< {_SMALLEST_PROBABILITY:g}"
+    """Return a p-value after its sign, such as '= 0.18' or '< 0.001'.
+
+    A null distribution of 9999 replicates does not give the first digit of smaller ones.
+    """
+    return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
 
 
 def span(values: Any, form: str) -> str:
-    """Return the least and the largest of several numbers, or one of them where they look alike."""
+    """Return the least and the largest of several numbers, or one where their texts are equal."""
     low = f"{values.min():{form}}"
     high = f"{values.max():{form}}"
     return low if low == high else f"{low} to {high}"
@@ -104,10 +102,45 @@ def span(values: Any, form: str) -> str:
 
 def shown(seconds: float) -> str:
     """Return seconds, to a tenth below ten."""
-    rounds_to_ten = seconds >= 9.95
-    return f"{seconds:.0f}" if rounds_to_ten else f"{seconds:.1f}"
+    return f"{seconds:.0f}" if seconds >= 9.95 else f"{seconds:.1f}"
 
 
-def counted(n: int, what: str) -> str:
+def counted(n: int, noun: str) -> str:
     """Return a number with a noun."""
-    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def enumerated(items: list[str]) -> str:
+    """Return items with commas and 'and'."""
+    *first, last = items
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def described(y: Any) -> dict[str, Any]:
+    """Return counts, range, mean and spread of one output: NaN was not measured, +inf failed."""
+    measured = y[~np.isnan(y)]
+    finite = measured[np.isfinite(measured)]
+    failed = measured.size - finite.size
+    missing = y.size - measured.size
+    sd = sample_sd(finite)
+    moments = [math.nan] * 3
+    if finite.size:
+        moments = [float(finite.min()), float(finite.max()), float(finite.mean())]
+    low, high, mean, spread = alike((*moments, sd), sd)
+    return {
+        "N": measured.size,
+        "failed": str(failed) if failed else "",
+        "missing": str(missing) if missing else "",
+        "smallest": low,
+        "largest": high,
+        "mean": mean,
+        "sd": spread,
+    }
+
+
+def with_zeros(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows with a zero for no failures and no missing values, if another row has some."""
+    for key in ("failed", "missing"):
+        if any(row[key] for row in rows):
+            rows = [row | {key: row[key] or "0"} for row in rows]
+    return rows

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import re
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from prbayes._validate import plain_text
-from prbayes.reports.images import image, is_broad, kind_of
 from prbayes.reports.tables import cells
+
+# Beginnings of files (PNG: ISO/IEC 15948, 5.2; JPEG: ITU T.81, B.1, marker SOI).
+_BEGINNINGS = (
+    (b"\x89PNG\r\n", "png", "image/png"),
+    (b"\xff\xd8\xff", "jpg", "image/jpeg"),
+)
 
 
 @dataclass(frozen=True, eq=False)
 class _Content:
-    """What a section holds, in the one form that writers take."""
+    """The content of a section, as writers take it."""
 
     title: str
     text: tuple[str, ...]
@@ -78,6 +86,11 @@ class Section(_Content):
     ) -> None:
         if not isinstance(title, str) or not title.strip():
             raise TypeError(f"Section: title: got {title!r:.60}, expected a text")
+        paragraphs = (text,) if isinstance(text, str) else text
+        if not isinstance(paragraphs, Sequence) or not all(isinstance(p, str) for p in paragraphs):
+            raise TypeError(
+                f"Section {title!r}: text: got {text!r:.60}, expected a text or several"
+            )
         plain_text(alt, f"Section {title!r}: alt", empty=True)
         plain_text(caption, f"Section {title!r}: caption", empty=True)
         if level not in (2, 3):
@@ -85,41 +98,86 @@ class Section(_Content):
                 f"Section: level: got {level!r}, expected 2, or 3 for a part of a section"
             )
         if table is not None:
-            cells(table)  # raises what is wrong with it now
+            cells(table)  # raises errors of the table now
         if picture is not None:
             if not alt.strip():
                 raise ValueError(
                     f"Section {title!r}: alt: got nothing, expected a sentence on what is seen"
                 )
             picture = image(picture)
-        super().__init__(title, _paragraphs(title, text), table, picture, alt, caption, level)
+        paragraphs = tuple(paragraph for paragraph in paragraphs if paragraph.strip())
+        super().__init__(title, paragraphs, table, picture, alt, caption, level)
 
     @property
     def kind(self) -> str:
         """The ending of a file with the picture."""
-        return kind_of(self._drawn)[0]
+        return kind_of(self._bytes)[0]
 
     @property
     def media_type(self) -> str:
         """The type of the picture for a data URI."""
-        return kind_of(self._drawn)[1]
+        return kind_of(self._bytes)[1]
 
     @property
     def broad(self) -> bool:
         """Whether the picture scrolls on a narrow screen, where it would be too small to read."""
-        return is_broad(self._drawn)
+        return is_broad(self._bytes)
 
     @property
-    def _drawn(self) -> bytes:
+    def _bytes(self) -> bytes:
         if self.picture is None:
             raise ValueError(f"Section {self.title!r}: got no picture, expected one")
         return self.picture
 
 
-def _paragraphs(title: str, text: str | Sequence[str]) -> tuple[str, ...]:
-    given = (text,) if isinstance(text, str) else text
-    if not isinstance(given, Sequence) or not all(
-        isinstance(paragraph, str) for paragraph in given
-    ):
-        raise TypeError(f"Section {title!r}: text: got {text!r:.60}, expected a text or several")
-    return tuple(paragraph for paragraph in given if paragraph.strip())
+# -- pictures --------------------------------------------------------------------------------
+
+
+def image(picture: Any) -> bytes:
+    """Return the bytes of a picture; those of a figure are the same each time.
+
+    Raise a `TypeError` or `ValueError` if it is neither bytes of a known kind nor a figure.
+    """
+    if isinstance(picture, bytes):
+        kind_of(picture)
+        return picture
+    if not hasattr(picture, "savefig"):
+        raise TypeError(
+            f"picture: got {type(picture).__name__}, expected bytes (SVG, PNG, JPEG) "
+            "or a figure with savefig"
+        )
+    from matplotlib import rc_context  # heavy, and only needed for pictures
+
+    reproducible: Any = {"svg.hashsalt": "prbayes", "svg.fonttype": "path"}
+    with tempfile.TemporaryDirectory() as folder, rc_context(reproducible):
+        vector = Path(folder, "picture.svg")
+        picture.savefig(vector, bbox_inches="tight", metadata={"Date": None})
+        # Five times as large as this package's pictures. A larger one, such as a scatter of ten
+        # thousand points, is stored as pixels, which a browser opens at once.
+        if vector.stat().st_size <= 500_000:
+            return vector.read_bytes()
+        pixels = Path(folder, "picture.png")
+        picture.savefig(pixels, bbox_inches="tight", dpi=200)
+        return pixels.read_bytes()
+
+
+def is_broad(picture: bytes) -> bool:
+    """Return whether a drawing is so wide that a phone should not shrink it.
+
+    Pictures of one panel are 400 points wide, those of two 650.
+    """
+    width = re.search(rb'<svg[^>]*\swidth="([0-9.]+)(?:pt)?"', picture[:2000])
+    return width is not None and float(width[1]) > 560
+
+
+def kind_of(picture: bytes) -> tuple[str, str]:
+    """Return the file ending and the media type of a picture, or raise a `ValueError`."""
+    for beginning, ending, media_type in _BEGINNINGS:
+        if picture.startswith(beginning):
+            return ending, media_type
+    # The tag begins after a declaration, a DOCTYPE and a comment.
+    if b"<svg" in picture[:2000]:
+        return "svg", "image/svg+xml"
+    raise ValueError(
+        f"picture: got bytes that begin with {picture[:8]!r}, expected SVG, PNG or JPEG"
+    )

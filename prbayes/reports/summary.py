@@ -1,10 +1,9 @@
-"""A report in a few sentences: what was calibrated, the answer, whether it may be trusted."""
+"""The summary of a report: problem, answer, trust, decision, and the next steps."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from prbayes._validate import Floats
 from prbayes.model.elements import (
     read_variables,
     single_elements,
@@ -18,29 +17,37 @@ from prbayes.plots._labels import metric_label, named
 from prbayes.plots.validity import in_directions
 from prbayes.reports.decision import interval_of
 from prbayes.reports.material import Material
-from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus, probability
+from prbayes.reports.numbers import (
+    alike,
+    counted,
+    enumerated,
+    number,
+    percentage,
+    plus_minus,
+    probability,
+)
 from prbayes.reports.schema import kind_of_decision
 from prbayes.validation.area_test import ValidityTest
 
-# More hyperparameters than this make a list, which a table shows better: by judgement.
+# Most hyperparameters in a sentence: of more a table is easier to read.
 _MOST_NAMES = 6
-# More conditions than this make a sentence too long to read: by judgement.
-_MOST_CONDITIONS = 4
-# More rows than these leave no room for the rest on the first page: by judgement.
-_MOST_ROWS_IN_SUMMARY = 10
 
 
 def summary(m: Material) -> list[str]:
     """Return the sentences, as paragraphs."""
-    paragraphs = [_verdict(m), _what_was_calibrated(m), f"{_answer(m)} {_agreement(m)}", _trust(m)]
-    paragraphs += [verdict(label, test, m) for label, test in m.tests.items()]
-    paragraphs += _risks(m)
-    stripped = map(str.strip, paragraphs)
-    return list(filter(None, stripped))
+    paragraphs = [
+        _whole_verdict(m),
+        _problem(m),
+        f"{_answer(m)} {_agreement(m)}",
+        _trust(m),
+        *(verdict(label, test, m) for label, test in m.tests.items()),
+        *_risks(m),
+    ]
+    return [paragraph.strip() for paragraph in paragraphs if paragraph.strip()]
 
 
 def answers(m: Material) -> list[dict[str, str]]:
-    """Return the rows of a table: the hyperparameters, what they are called, what is known."""
+    """Return the rows of a table of the hyperparameters, unless they fill the first page."""
     if not m.results:
         return []
     label = next(iter(m.posteriors or m.optima))
@@ -57,17 +64,16 @@ def answers(m: Material) -> list[dict[str, str]]:
                 spread: error,
             }
         )
-    return rows if len(rows) <= _MOST_ROWS_IN_SUMMARY else []
+    return rows if len(rows) <= 10 else []
 
 
-def _verdict(m: Material) -> str:
+def _whole_verdict(m: Material) -> str:
     """Return in one sentence whether the calibration may be used."""
     if not m.results:
         return ""
-    problems = any(found is not None and not found.ok for found in m.diagnoses.values())
     if m.rejected:
         return "Verdict: the calibrated model is rejected by data that it has not seen."
-    if problems:
+    if _has_problems(m):
         return "Verdict: not to be used before the problems under Diagnostics are removed."
     if not m.tests:
         return "Verdict: calibrated, and not tested on data that it has not seen."
@@ -77,9 +83,13 @@ def _verdict(m: Material) -> str:
     )
 
 
+def _has_problems(m: Material) -> bool:
+    return any(diagnosis is not None and not diagnosis.ok for diagnosis in m.diagnoses.values())
+
+
 def verdict(label: str, test: ValidityTest, m: Material) -> str:
-    """Return what a test found, in one sentence."""
-    who = f"{label}: " if len(m.tests) > 1 else ""
+    """Return the verdict of a test, in one sentence."""
+    name = f"{label}: " if len(m.tests) > 1 else ""
     aspect = "the spread of the responses" if test.folded else "the responses"
     specimens = counted(int(np.unique(test.specimens).size), "specimen")
     directions = len(in_directions(test))
@@ -87,22 +97,23 @@ def verdict(label: str, test: ValidityTest, m: Material) -> str:
     if directions:
         values = f"several outputs, seen in {counted(directions, 'direction')}"
     conditions = test.of_conditions
-    # One alone may be called after a function only.
-    told = len(conditions) > 1 or conditions[0] in {*m.validation, *m.labels}
-    if told and len(conditions) <= _MOST_CONDITIONS:
-        values += f": {_enumerated([named(name, m.labels) for name in conditions])}"
+    # A single condition may only have the name of a function.
+    is_named = len(conditions) > 1 or conditions[0] in {*m.validation, *m.labels}
+    if is_named and len(conditions) <= 4:
+        values += f": {enumerated([named(condition, m.labels) for condition in conditions])}"
     area = "mean area" if directions else "area"
-    found = "is rejected" if test.rejected else "is not rejected"
+    rejected = "is rejected" if test.rejected else "is not rejected"
     sign = ">" if test.statistic > test.critical_value else "≤"
     return (
-        f"{who}On {aspect} of {specimens} ({values}), the calibrated model {found} "
+        f"{name}On {aspect} of {specimens} ({values}), the calibrated model {rejected} "
         f"at level {percentage(test.alpha)} "
         f"({area} {test.statistic:.3f} {sign} critical {test.critical_value:.3f}, "
         f"p {probability(test.p_value)})."
     )
 
 
-def _what_was_calibrated(m: Material) -> str:
+def _problem(m: Material) -> str:
+    """Return the hyperparameters, data and metrics of the calibration."""
     names = m.hyperparameters
     if not names:
         return ""
@@ -111,57 +122,29 @@ def _what_was_calibrated(m: Material) -> str:
         hyperparameters += f" ({', '.join(named(name, m.labels) for name in names)})"
     if not m.results:
         return f"The model has {hyperparameters}. No result of a calibration was given."
+    data = []
+    for name, y in m.observed.items():
+        measured = counted(y.size, "measured response")
+        if y.ndim > 1:
+            n, outputs = y.shape
+            measured = f"{counted(n, 'specimen')} with {counted(outputs, 'output')}"
+        data.append(f"{measured} of {named(name, m.labels)}")
     were = "was" if len(names) == 1 else "were"
-    data = [_measured(named(name, m.labels), y) for name, y in m.observed.items()]
-    on = f" on {_enumerated(data)}" if data else ""
+    on = f" on {enumerated(data)}" if data else ""
     metrics = _metrics(m)
-    by = f", by the {_enumerated(metrics)}" if metrics else ""
+    by = f", by the {enumerated(metrics)}" if metrics else ""
     return f"{hyperparameters} of the model {were} calibrated{on}{by}."
 
 
-def _measured(name: str, y: Floats) -> str:
-    """Return how much was measured of a simulator's responses."""
-    if y.ndim == 1:
-        return f"{counted(y.size, 'measured response')} of {name}"
-    n, outputs = y.shape
-    return f"{counted(n, 'specimen')} with {counted(outputs, 'output')} of {name}"
-
-
 def _metrics(m: Material) -> list[str]:
-    """Return the metrics in words, each once."""
-    described: list[str] = []
+    """Return the labels of the metrics, each once."""
+    metrics: list[str] = []
     if m.description is not None:
-        described = [str(s["metric"]) for s in m.description["simulators"]]
+        metrics = [str(s["metric"]) for s in m.description["simulators"]]
     elif m.calibrations:
         first = next(iter(m.calibrations.values()))
-        described = list(map(str, first["metric"].values.tolist()))
-    in_words = [metric_label(description) for description in described]
-    return list(dict.fromkeys(in_words))
-
-
-def _risks(m: Material) -> list[str]:
-    """Return in a sentence each the probabilities that were asked for; of a rejected model none."""
-    if m.rejected:
-        return ["The questions of a decision are not answered by it."] if m.decisions else []
-    sentences = []
-    for label, table in m.decisions.items():
-        if kind_of_decision(table) != "risk" or table.probability.ndim:
-            continue
-        level = percentage(table.attrs["prob"])
-        said = (
-            f"{label}: probability {number(float(table.probability), 2)} ({level} interval "
-            f"{interval_of(table)})"
-        )
-        if "requirement" in table.attrs:
-            most = f"at most {table.attrs['requirement']:g}"
-            said += f"; the requirement, {most}, is {table.attrs['verdict']}"
-        sentences.append(f"{said}.")
-    return sentences
-
-
-def _enumerated(items: list[str]) -> str:
-    *first, last = items
-    return f"{', '.join(first)} and {last}" if first else last
+        metrics = list(map(str, first["metric"].values.tolist()))
+    return list(dict.fromkeys(map(metric_label, metrics)))
 
 
 def _answer(m: Material) -> str:
@@ -169,79 +152,145 @@ def _answer(m: Material) -> str:
     if not m.results:
         return ""
     if m.posteriors:
-        of_kind, kind = m.posteriors, "posterior"
-        what = "mean and standard deviation of the posterior"
+        results, kind = m.posteriors, "posterior"
+        estimator = "mean and standard deviation of the posterior"
     else:
-        of_kind, kind = m.optima, "optimum"
-        what = "optimum and standard error"
-    label = next(iter(of_kind))
+        results, kind = m.optima, "optimum"
+        estimator = "optimum and standard error"
+    label = next(iter(results))
     estimates = _estimates(m, label)
     if not estimates or len(estimates) > _MOST_NAMES:
         return f"The answer is in the table of the {kind}."
     pairs = []
     for name, (value, sd) in estimates.items():
-        found = f"= {plus_minus(value, sd)}" if sd < np.inf else "is not identified"
-        pairs.append(f"{named(name, m.labels)} {found}")
-    which = f" of {label}" if len(of_kind) > 1 else ""
-    return f"The answer{which} is {', '.join(pairs)} ({what})."
+        estimate = f"= {plus_minus(value, sd)}" if sd < np.inf else "is not identified"
+        pairs.append(f"{named(name, m.labels)} {estimate}")
+    of_result = f" of {label}" if len(results) > 1 else ""
+    return f"The answer{of_result} is {', '.join(pairs)} ({estimator})."
 
 
 def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
     """Return estimate and spread of each element of the hyperparameters, by a result."""
-    found: dict[str, tuple[float, float]] = {}
     if label in m.posteriors:
         stacked = stacked_draws(m.posteriors[label]["posterior"])
         draws = split_elements(stacked)
-        for name in told_elements(stacked):
-            values = draws[name]
-            mean = float(values.mean())
-            sd = float(values.std(ddof=1))
-            found[name] = (mean, sd)
+        estimates = {
+            name: (float(draws[name].mean()), float(draws[name].std(ddof=1)))
+            for name in told_elements(stacked)
+        }
     else:
-        tree = m.optima[label]
-        optimum = tree["optimum"].data_vars
-        stderr = tree["stderr"].data_vars
+        optimum = m.optima[label]["optimum"].data_vars
+        stderr = m.optima[label]["stderr"].data_vars
         points = single_elements(optimum)
         errors = single_elements(stderr)
-        for name in told_of(optimum, stderr):
-            found[name] = (points[name], errors[name])
-    variables = {name: variable_of(name) for name in found}
-    known = read_variables(m.hyperparameters, set(variables.values()))
-    return {name: pair for name, pair in found.items() if variables[name] in known}
+        estimates = {name: (points[name], errors[name]) for name in told_of(optimum, stderr)}
+    variables = read_variables(m.hyperparameters, {variable_of(name) for name in estimates})
+    return {name: pair for name, pair in estimates.items() if variable_of(name) in variables}
 
 
 def _agreement(m: Material) -> str:
-    """Return how far apart two results are; nothing of more."""
+    """Return the distance between two results; nothing of more."""
     if m.comparison is None or m.comparison.sizes["result"] != 2:
         return ""
-    # What one of them does not identify has no estimate there.
-    told = (m.comparison["sd"] < np.inf).all("result")
-    shifts = np.abs(m.comparison["shift"].where(told).values)
-    if not np.isfinite(shifts).any():
-        return ""
-    largest = float(np.nanmax(shifts))
-    if not np.isfinite(largest):
+    # An unidentified hyperparameter has no estimate.
+    is_identified = (m.comparison["sd"] < np.inf).all("result")
+    shifts = np.abs(m.comparison["shift"].where(is_identified).values)
+    if not np.isfinite(shifts).any() or not np.isfinite(np.nanmax(shifts)):
         return ""
     first, second = m.comparison["result"].values.tolist()
     return (
-        f"The estimates of {first} and {second} differ by at most {number(largest, 2)} "
-        "standard deviations."
+        f"The estimates of {first} and {second} differ by at most "
+        f"{number(float(np.nanmax(shifts)), 2)} standard deviations."
     )
 
 
 def _trust(m: Material) -> str:
-    known = {label: found for label, found in m.diagnoses.items() if found is not None}
-    if not known:
+    diagnoses = {label: d for label, d in m.diagnoses.items() if d is not None}
+    if not diagnoses:
         return ""
-    problems = []
-    for label, found in known.items():
-        if not found.ok:
-            problems.append(f"{counted(len(found.messages), 'problem')} with {label}")
-    if not problems:
-        if any(found.untested for found in known.values()):
-            return "The diagnostics that were run found no problem."
-        return "The diagnostics found no problem."
-    return (
-        f"The diagnostics found {_enumerated(problems)}; "
-        "see the section on diagnostics before the answer is used."
-    )
+    problems = [
+        f"{counted(len(diagnosis.messages), 'problem')} with {label}"
+        for label, diagnosis in diagnoses.items()
+        if not diagnosis.ok
+    ]
+    if problems:
+        return (
+            f"The diagnostics found {enumerated(problems)}; "
+            "see the section on diagnostics before the answer is used."
+        )
+    if any(diagnosis.untested for diagnosis in diagnoses.values()):
+        return "The diagnostics that were run found no problem."
+    return "The diagnostics found no problem."
+
+
+def _risks(m: Material) -> list[str]:
+    """Return a sentence for each probability of a decision; of a rejected model none."""
+    if m.rejected:
+        return ["The questions of a decision are not answered by it."] if m.decisions else []
+    sentences = []
+    for label, table in m.decisions.items():
+        if kind_of_decision(table) != "risk" or table.probability.ndim:
+            continue
+        prob = percentage(table.attrs["prob"])
+        sentence = (
+            f"{label}: probability {number(float(table.probability), 2)} ({prob} interval "
+            f"{interval_of(table)})"
+        )
+        if "requirement" in table.attrs:
+            most = f"at most {table.attrs['requirement']:g}"
+            sentence += f"; the requirement, {most}, is {table.attrs['verdict']}"
+        sentences.append(f"{sentence}.")
+    return sentences
+
+
+# -- next steps ------------------------------------------------------------------------------
+
+
+def next_steps(m: Material) -> list[str]:
+    """Return at most four sentences on what to do next, the most urgent first."""
+    if not m.results:
+        return []
+    steps = []
+    if _has_problems(m):
+        steps.append("Remove the problems under Diagnostics: each sentence there says what to do.")
+    if not m.tests:
+        steps.append(
+            "Test the calibrated model on specimens that were not used for it: prb.predict for "
+            "their condition, then prb.area_test. With few specimens, prb.cross_validate."
+        )
+    elif m.rejected:
+        steps.append(
+            "Do not use the model beyond the data of its calibration. See under Validity whether "
+            "the measured responses lie beside the predicted ones or are scattered more widely; "
+            "correct the response, let another input vary, or calibrate what the response leaves "
+            "out (prb.response.Additive, prb.response.Multiplicative)."
+        )
+    # In directions of several outputs the area of |2u - 1| is a part of the statistic.
+    elif not any(test.folded or in_directions(test) for test in m.tests.values()):
+        steps.append(
+            "Test the spread as well: prb.area_test(..., folded=True), each of the two tests at "
+            "half the level."
+        )
+    if not m.posteriors:
+        steps.append(
+            "Find the uncertainty of the hyperparameters: prb.sample_smc(optimum=optimum)."
+        )
+    if not m.rejected:
+        steps += _decision_steps(m)
+    return [f"{i}. {step}" for i, step in enumerate(steps[:4], 1)]
+
+
+def _decision_steps(m: Material) -> list[str]:
+    """Return the questions of a decision that are open."""
+    kinds = {kind_of_decision(table) for table in m.decisions.values()}
+    steps = []
+    if any(table.attrs.get("verdict") == "not decided" for table in m.decisions.values()):
+        steps.append(
+            "A requirement is not decided, as too little is known of the probability: make as many "
+            "more specimens as prb.plan says, with prb.decision.Exceedance as its quantity."
+        )
+    if "risk" not in kinds:
+        steps.append("Ask for the probability that a response is beyond its limit: prb.exceedance.")
+    if "plan" not in kinds:
+        steps.append("Ask what more specimens would change, before they are made: prb.plan.")
+    return steps

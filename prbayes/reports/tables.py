@@ -1,4 +1,4 @@
-"""Tables of pandas and xarray as text, with decimal points in line."""
+"""Tables of pandas and xarray as text, with aligned decimal points."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ import xarray as xr
 from prbayes.reports.numbers import NOTHING, number
 
 _NUMBER = re.compile(r"-?\d*\.?\d+(e[-+]?\d+)?%?|-?∞")  # all that `number` and `alike` write
-# A figure space is as wide as a digit, a punctuation space as a point (Unicode, chapter 6.2).
-_DIGIT_WIDE, _POINT_WIDE = "\u2007", "\u2008"
 
 
 @dataclass(frozen=True)
@@ -26,7 +24,7 @@ class Cells:
     numeric: tuple[bool, ...]  # which columns hold numbers
 
     def aligned(self) -> tuple[tuple[str, ...], ...]:
-        """Return the rows with spaces after numbers, so that decimal points stand in line."""
+        """Return the rows with spaces after numbers that align decimal points."""
         columns = []
         for column, numeric in zip(zip(*self.rows, strict=True), self.numeric, strict=True):
             columns.append(_padded(column) if numeric else column)
@@ -34,40 +32,32 @@ class Cells:
 
 
 def cells(table: Any) -> Cells:
-    """Return a table of pandas or xarray as text.
-
-    Raises
-    ------
-    TypeError
-        If it is no table.
-    """
+    """Return a table of pandas or xarray as text, or raise a `TypeError` if it is none."""
     frame = _frame(table)
-    # An index of plain numbers that nobody named only counts the rows.
-    named = any(name is not None for name in frame.index.names)
-    shows_index = named or frame.index.dtype.kind not in "iu"
-    unnamed = shows_index and frame.index.names == [None]
-    if shows_index:
+    # An unnamed index of integers only counts the rows.
+    is_named = any(name is not None for name in frame.index.names)
+    is_unnamed_text = not is_named and frame.index.dtype.kind not in "iu"
+    if is_named or is_unnamed_text:
         frame = frame.reset_index()
     header = tuple(map(str, frame.columns))
-    if unnamed:
+    if is_unnamed_text:
         header = ("", *header[1:])
-    rows = tuple(
-        tuple(number(value) for value in row) for row in frame.itertuples(index=False, name=None)
-    )
-    columns = list(zip(*rows, strict=True)) if rows else [()] * len(header)
-    numeric = tuple(_is_numeric(column) for column in columns)
-    return Cells(header, rows, numeric)
+    rows = tuple(tuple(map(number, row)) for row in frame.itertuples(index=False, name=None))
+    columns = zip(*rows, strict=True) if rows else [()] * len(header)
+    return Cells(header, rows, tuple(map(_is_numeric, columns)))
 
 
 def rows_table(rows: list[dict[str, Any]]) -> Any:
-    """Return a table without the columns in which no row has anything; NaN is something."""
+    """Return a table without columns that are empty in every row; NaN is not empty."""
     pandas: Any = import_module("pandas")
-    columns = {}
-    for key in rows[0]:
-        column = [row[key] for row in rows]
-        if any(value not in (None, "") for value in column):
-            columns[key] = column
-    return pandas.DataFrame(columns)
+    columns = {key: [row[key] for row in rows] for key in rows[0]}
+    return pandas.DataFrame(
+        {
+            key: column
+            for key, column in columns.items()
+            if any(value not in (None, "") for value in column)
+        }
+    )
 
 
 def _frame(table: Any) -> Any:
@@ -88,21 +78,19 @@ def _frame(table: Any) -> Any:
 
 
 def _is_numeric(column: Sequence[str]) -> bool:
-    known = [cell for cell in column if cell != NOTHING]
-    parts = [part for cell in known for part in cell.split(" ± ")]
+    parts = [part for cell in column if cell != NOTHING for part in cell.split(" ± ")]
     return bool(parts) and all(_NUMBER.fullmatch(part) for part in parts)
 
 
 def _padded(column: Sequence[str]) -> Sequence[str]:
-    """Return numbers with spaces after them, as wide as the decimals that others have more."""
-    if any("e" in cell for cell in column):
+    """Return numbers with spaces in the place of decimals that only longer ones have."""
+    if any("e" in cell for cell in column) or not any("." in cell for cell in column):
         return column
+    # A figure space is as wide as a digit, a punctuation space as a point (Unicode, chapter 6.2).
+    digit, point = "\u2007", "\u2008"
     decimals = [len(cell.partition(".")[2]) for cell in column]
-    most = max(decimals)
-    if not any("." in cell for cell in column):
-        return column
     padded = []
-    for cell, own in zip(column, decimals, strict=True):
-        point = "" if "." in cell else _POINT_WIDE
-        padded.append(cell if cell == NOTHING else cell + point + _DIGIT_WIDE * (most - own))
+    for cell, n in zip(column, decimals, strict=True):
+        space = ("" if "." in cell else point) + digit * (max(decimals) - n)
+        padded.append(cell if cell == NOTHING else cell + space)
     return padded

@@ -29,7 +29,7 @@ class Budget:
     computed: int = 0  # responses; those found in a store cost nothing
     spent: str = ""  # why the budget is spent, as a clause; final once it is set
 
-    def go_on(self) -> None:
+    def check(self) -> None:
         """Raise if the budget is spent."""
         seconds = time.perf_counter() - self.start
         if not self.spent and self.max_seconds is not None and seconds > self.max_seconds:
@@ -39,7 +39,7 @@ class Budget:
 
     def grant(self, runs: int, least: int) -> int:
         """Return how many of the runs may be computed, and count them; raise below ``least``."""
-        self.go_on()
+        self.check()
         if self.max_runs is None:
             return runs
         granted = min(runs, self.max_runs - self.computed)
@@ -94,7 +94,7 @@ class RunCost:
     ----------
     first : int
         Runs at the first use of the model.
-    each : int
+    per_theta : int
         Runs for each value of the hyperparameters.
     most : int or None
         Largest number of runs; None without a limit.
@@ -103,7 +103,7 @@ class RunCost:
     """
 
     first: int
-    each: int
+    per_theta: int
     most: int | None
     growth: str
 
@@ -122,11 +122,11 @@ class SimulatorCost:
         """Return the cost as lines."""
         needed = self.needed
         workers = "one at a time" if self.workers == 1 else f"{self.workers} at a time"
-        each = f"{needed.each} runs" if needed.each else "no run"
+        per_theta = f"{needed.per_theta} runs" if needed.per_theta else "no run"
         return (
             f"{self.name}: {self.propagation}\n"
             f"  at first: {needed.first} runs, {self.computed} of them computed, {workers}\n"
-            f"  for each value of the hyperparameters: {each}\n"
+            f"  for each value of the hyperparameters: {per_theta}\n"
             f"  more: {needed.growth}"
         )
 
@@ -138,8 +138,8 @@ class Cost:
     Attributes
     ----------
     simulators : tuple
-        For each simulator: ``name``, ``propagation``, the ``needed`` runs (``first``, ``each``,
-        ``most`` and ``growth``), the number of ``computed`` runs, and ``workers``.
+        For each simulator: ``name``, ``propagation``, the ``needed`` runs (``first``,
+        ``per_theta``, ``most`` and ``growth``), the number of ``computed`` runs, and ``workers``.
     """
 
     simulators: tuple[SimulatorCost, ...]
@@ -152,7 +152,7 @@ class Cost:
     @property
     def runs_each(self) -> int:
         """Runs for each value of the hyperparameters, of all simulators."""
-        return sum(cost.needed.each for cost in self.simulators)
+        return sum(cost.needed.per_theta for cost in self.simulators)
 
     def __repr__(self) -> str:
         """Return the costs of the simulators, one after the other."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from prbayes._validate import Floats
 from prbayes.response.executors import time_limit
 from prbayes.response.failures import ResponseError
-from prbayes.response.outputs import ONE, Outputs, outputs_of_result
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, outputs_of_result
 
 Rows = NDArray[np.intp]
 
@@ -147,7 +147,7 @@ def compute(
     points: Points,
     tolerant: bool,
     timeout: float | None = None,
-    outputs: Outputs | None = ONE,
+    outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> Chunk:
     """Return the responses at points; unless failures are tolerated, up to the first one."""
     clock = time.perf_counter()
@@ -266,7 +266,7 @@ def checked(
     result: Any,
     batch: tuple[int, ...],
     arguments: Sequence[Any],
-    outputs: Outputs | None = ONE,
+    outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> Floats:
     """Return a response's result as floats, shape (*batch, *event), or raise `ResponseError`.
 
@@ -339,7 +339,7 @@ def compute_packed(
     points: Points,
     tolerant: bool,
     timeout: float | None = None,
-    outputs: Outputs | None = ONE,
+    outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> Chunk:
     """Unpack the function, once for all chunks of a worker, and compute."""
     return compute(_unpacked(payload), points, tolerant, timeout, outputs)

@@ -38,15 +38,15 @@ from prbayes.response.executors import (
     is_loss,
 )
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
-from prbayes.response.outputs import ONE, Outputs, lacking
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing
 from prbayes.response.store import Store, StoreError
 
 # A finished chunk, with the rows of its points.
-type Done = tuple[Rows, Chunk]
+type Finished = tuple[Rows, Chunk]
 
 
 @dataclass(frozen=True)
-class Calling:
+class CallSettings:
     """How a response is called."""
 
     name: str  # of the simulator, for messages
@@ -56,7 +56,7 @@ class Calling:
     on_failure: OnFailure = field(default_factory=Abort)
     retry_failed: bool = False  # whether points that are stored as failed are computed again
     timeout: float | None = None  # seconds for one response
-    outputs: Outputs | None = ONE  # None takes them from the first run
+    outputs: Outputs | None = SINGLE_OUTPUT  # None takes them from the first run
 
     @property
     def accepts_stored_failures(self) -> bool:
@@ -115,7 +115,7 @@ class Tally:
 
 
 def respond(
-    calling: Calling,
+    settings: CallSettings,
     points: Points,
     tally: Tally,
     on_start: Callable[[int, float], None] | None = None,
@@ -132,43 +132,43 @@ def respond(
     StoreError
         If the store holds other values than the response gives.
     """
-    policy = calling.on_failure
-    _verify_store(calling, points, tally)
-    keys = points.keys() if calling.store is not None else np.empty((len(points), 0))
-    values, missing, failed = _stored(calling, keys)
+    policy = settings.on_failure
+    _verify_store(settings, points, tally)
+    keys = points.keys() if settings.store is not None else np.empty((len(points), 0))
+    values, missing, failed = _stored(settings, keys)
     raised: dict[int, str] = {}
     for attempt in range(policy.tries):
         is_last = attempt == policy.tries - 1
         tolerant = policy.final.goes_on or not is_last
         raised = {}
-        for done in chunks(calling, points, missing, tolerant, tally):
+        for finished in chunks(settings, points, missing, tolerant, tally):
             if on_start is not None:
                 on_start(missing.size, tally.seconds)
                 on_start = None
-            for rows, chunk in done:
+            for rows, chunk in finished:
                 values = assign_rows(values, rows, tally.aligned(chunk))
                 raised.update({int(rows[i]): reason for i, reason in chunk.raised.items()})
                 tally.has_succeeded |= len(chunk.raised) < len(rows)
             if not tally.has_succeeded and raised and all(map(is_wrong_result, raised.values())):
                 # No run has given a response: the function is another one, whatever the policy.
-                raise _failure_error(calling, points, raised)
-            if calling.store is not None:
-                _add_to_store(calling.store, keys, done, is_last=is_last, tolerant=tolerant)
+                raise _failure_error(settings, points, raised)
+            if settings.store is not None:
+                _add_to_store(settings.store, keys, finished, is_last=is_last, tolerant=tolerant)
         if raised and not tolerant:
             tally.record_failures(points, raised)
-            raise _failure_error(calling, points, raised)
-        missing = missing[lacking(values[missing])]
+            raise _failure_error(settings, points, raised)
+        missing = missing[is_missing(values[missing])]
         if not missing.size:
             break
-    return _apply_policy(calling, points, values, failed | raised, tally)
+    return _apply_policy(settings, points, values, failed | raised, tally)
 
 
-def _verify_store(calling: Calling, points: Points, tally: Tally) -> None:
+def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
     """Compute one stored response again, once for a store without a version.
 
     The function, or its variables, may have changed since the response was stored.
     """
-    store = calling.store
+    store = settings.store
     if store is None or store.verified:
         return
     keys, values = store.known()
@@ -179,14 +179,14 @@ def _verify_store(calling: Calling, points: Points, tally: Tally) -> None:
         first = usable[:1]
         expected = columns[first[0]]
         scale = np.maximum(np.abs(expected), np.median(np.abs(columns[usable]), axis=0))
-        response, text = _recomputed(calling, points.from_keys(keys[first]), tally)
+        response, text = _recomputed(settings, points.from_keys(keys[first]), tally)
         # More than the rounding of another machine or version of a library.
         tolerance = 1e-6 * scale
         same_number = response.size == expected.size
         if not same_number or not (np.abs(response - expected) <= tolerance).all():
             at = ", ".join(f"{x:.6g}" for x in keys[first[0]])
             raise StoreError(
-                f"{calling.name}: store: got a response that gives {text} at ({at}), expected "
+                f"{settings.name}: store: got a response that gives {text} at ({at}), expected "
                 f"{_numbers_text(expected)}, which is stored in {store.path}: it is of another "
                 "function, or its variables have changed; nothing was changed: pass another "
                 "folder, or version= with a name for the response as it is now, whose runs are "
@@ -195,11 +195,11 @@ def _verify_store(calling: Calling, points: Points, tally: Tally) -> None:
     store.verified = True
 
 
-def _recomputed(calling: Calling, point: Points, tally: Tally) -> tuple[Floats, str]:
+def _recomputed(settings: CallSettings, point: Points, tally: Tally) -> tuple[Floats, str]:
     """Return the response at one point, NaN if it fails, and the result in words."""
     chunk = Chunk(np.array([np.nan]), {}, 0.0)
-    for _ in range(calling.on_failure.tries):
-        for ((_, chunk),) in chunks(calling, point, np.arange(1), True, tally):
+    for _ in range(settings.on_failure.tries):
+        for ((_, chunk),) in chunks(settings, point, np.arange(1), True, tally):
             if not chunk.raised:
                 response = tally.aligned(chunk).ravel()
                 return response, _numbers_text(response)
@@ -214,71 +214,71 @@ def _numbers_text(values: Floats, digits: int = 10) -> str:
     return f"({text}, ...)" if values.size > 6 else f"({text})"
 
 
-def _stored(calling: Calling, keys: Floats) -> tuple[Floats, Rows, dict[int, str]]:
+def _stored(settings: CallSettings, keys: Floats) -> tuple[Floats, Rows, dict[int, str]]:
     """Return the stored responses, the rows to compute, and the reasons of stored failures."""
-    if calling.store is None:
-        event = () if calling.outputs is None else calling.outputs.event
+    if settings.store is None:
+        event = () if settings.outputs is None else settings.outputs.event
         return np.full((len(keys), *event), np.nan), np.arange(len(keys)), {}
-    values, is_stored = calling.store.find(keys)
-    if calling.outputs is not None:
-        values = values.reshape(len(keys), *calling.outputs.event)
-    failed = calling.store.failed(keys)
-    if not calling.accepts_stored_failures:
+    values, is_stored = settings.store.find(keys)
+    if settings.outputs is not None:
+        values = values.reshape(len(keys), *settings.outputs.event)
+    failed = settings.store.failed(keys)
+    if not settings.accepts_stored_failures:
         is_stored[list(failed)] = False
         failed = {}
     return values, np.flatnonzero(~is_stored), failed
 
 
 def _add_to_store(
-    store: Store, keys: Floats, done: Sequence[Done], *, is_last: bool, tolerant: bool
+    store: Store, keys: Floats, finished: Sequence[Finished], *, is_last: bool, tolerant: bool
 ) -> None:
     """Store finished chunks in one transaction, since each waits for the disk.
 
     After the last try NaN is a result, too, except in a chunk that a failure ended.
     """
     parts = []
-    for rows, chunk in done:
+    for rows, chunk in finished:
         is_complete = tolerant or not chunk.raised
-        kept = np.flatnonzero(~lacking(chunk.values) | (is_last and is_complete))
-        if kept.size:
-            kept_rows = enumerate(map(int, kept))
-            reasons = {i: chunk.raised[row] for i, row in kept_rows if row in chunk.raised}
-            parts.append((keys[rows[kept]], chunk.values[kept], reasons))
+        stored = np.flatnonzero(~is_missing(chunk.values) | (is_last and is_complete))
+        if stored.size:
+            stored_rows = enumerate(map(int, stored))
+            reasons = {i: chunk.raised[row] for i, row in stored_rows if row in chunk.raised}
+            parts.append((keys[rows[stored]], chunk.values[stored], reasons))
     if parts:
         store.add_all(parts)
 
 
 def _apply_policy(
-    calling: Calling, points: Points, values: Floats, raised: dict[int, str], tally: Tally
+    settings: CallSettings, points: Points, values: Floats, raised: dict[int, str], tally: Tally
 ) -> Floats:
     """Return responses with the policy's replacement of NaN, or raise if it refuses NaN."""
     tally.record_failures(points, raised)
-    is_nan = lacking(values)
-    policy = calling.on_failure.final
+    is_nan = is_missing(values)
+    policy = settings.on_failure.final
     if not is_nan.any():
         return values
     first = next(iter(raised.values()), "it is NaN")
     if policy.refuses_nan:
-        raise _failure_error(calling, points, raised or {int(np.flatnonzero(is_nan)[0]): first})
+        raise _failure_error(settings, points, raised or {int(np.flatnonzero(is_nan)[0]): first})
     if policy.replacement is not None:
         n_nan = int(is_nan.sum())
         tally.failures += n_nan
         text = f"{n_nan} of {is_nan.size} responses failed, replaced by {policy.replacement}"
-        report(Finding("responses-replaced", f"{calling.name}: {text}; the first: {first}"))
+        report(Finding("responses-replaced", f"{settings.name}: {text}; the first: {first}"))
         tally.record_failures(points, dict.fromkeys(map(int, np.flatnonzero(is_nan)), "it is NaN"))
         values[is_nan] = policy.replacement
     return values
 
 
-def _failure_error(calling: Calling, points: Points, raised: dict[int, str]) -> ResponseError:
+def _failure_error(settings: CallSettings, points: Points, raised: dict[int, str]) -> ResponseError:
     row, reason = next(iter(raised.items()))
     place = ""
-    if isinstance(calling.function, scalar):  # the point of a batch is not known
+    if isinstance(settings.function, scalar):  # the point of a batch is not known
         (inputs,) = points.at(np.array([row])).keys()
         place = f", the first with inputs {_numbers_text(inputs, 6)}"
-    kept = ""
-    if calling.store is not None:
-        kept = f"; {len(calling.store)} responses are kept in {calling.store.folder}"
+    store_text = ""
+    if settings.store is not None:
+        store_text = f"; {len(settings.store)} responses are kept in {settings.store.folder}"
     policies = "on_failure=prb.response.Replace() or prb.response.Retry()"
     advice = (
         "repair it, keep priors and inputs where it has a response, or pass "
@@ -287,32 +287,32 @@ def _failure_error(calling: Calling, points: Points, raised: dict[int, str]) -> 
     if is_wrong_result(reason):
         advice = f"repair it; if this is what a run that failed returns, pass {policies}"
     return ResponseError(
-        f"{calling.name}: the response failed at {len(raised)} point(s){place}: {reason}{kept}; "
-        f"{advice}"
+        f"{settings.name}: the response failed at {len(raised)} point(s){place}: {reason}"
+        f"{store_text}; {advice}"
     )
 
 
 # -- sending chunks --------------------------------------------------------------------------------
 
 
-def chunk_size(calling: Calling, tally: Tally, left: int, workers: int) -> int:
+def chunk_size(settings: CallSettings, tally: Tally, n_left: int, workers: int) -> int:
     """Return the number of points for the next chunk."""
-    is_scalar = isinstance(calling.function, scalar)
+    is_scalar = isinstance(settings.function, scalar)
     if tally.seconds == 0:
         # The cost is not known yet, and may be minutes for each point.
-        return 1 if is_scalar else min(left, 16)
+        return 1 if is_scalar else min(n_left, 16)
     # From twice the cost of sending a chunk on, no response waits for others to be stored.
     if is_scalar and tally.seconds >= 0.01:
         return 1
     # Smaller chunks towards the end keep all workers busy. Otherwise 0.2 s: long against the 4.5 ms
     # that sending one costs (`python -m benchmarks.scale`), short against the loss of a worker.
-    share = left if calling.executor is None else max(1, left // (2 * workers))
+    share = n_left if settings.executor is None else max(1, n_left // (2 * workers))
     return int(max(1, min(share, 0.2 / tally.seconds)))
 
 
 def chunks(
-    calling: Calling, points: Points, rows: Rows, tolerant: bool, tally: Tally
-) -> Iterator[list[Done]]:
+    settings: CallSettings, points: Points, rows: Rows, tolerant: bool, tally: Tally
+) -> Iterator[list[Finished]]:
     """Compute the responses at some rows of the points, and yield chunks as they are finished.
 
     After a failure that is not tolerated, or a spent budget, no chunk begins; those that have begun
@@ -325,56 +325,56 @@ def chunks(
     BudgetError
         After all chunks, if a budget was spent.
     """
-    work = _work(calling)
-    limits = capacity(calling.executor)
-    pool = Pool(calling.name, calling.executor)
+    work = _work(settings)
+    limits = capacity(settings.executor)
+    pool = Pool(settings.name, settings.executor)
     suspects: list[Rows] = []  # chunks at work when a worker was lost
     loss: BaseException | None = None
     begun: dict[Future[Chunk], Rows] = {}
-    left = rows
+    waiting = rows
     error: BaseException | None = None
-    with progress(f"responses of {calling.name}", rows.size) as report:
-        while left.size or begun or suspects:
+    with progress(f"responses of {settings.name}", rows.size) as report:
+        while waiting.size or begun or suspects:
             if suspects and not begun:
                 for chunk_rows, chunk in _one_at_a_time(pool, work, points, suspects, loss):
                     tally.count(chunk_rows.size, chunk.seconds)
                     report(chunk_rows.size, "")
                     yield [(chunk_rows, chunk)]
                 suspects = []
-            while left.size and not suspects and len(begun) < limits.chunks:
-                size = chunk_size(calling, tally, left.size, limits.workers)
+            while waiting.size and not suspects and len(begun) < limits.chunks:
+                size = chunk_size(settings, tally, waiting.size, limits.workers)
                 try:
                     size = budget().grant(size, least=1)
                 except BudgetError as spent:
                     error = error or spent
-                    left = left[:0]
+                    waiting = waiting[:0]
                     break
-                chunk_rows, left = left[:size], left[size:]
+                chunk_rows, waiting = waiting[:size], waiting[size:]
                 begun[pool.submitted(work, points.at(chunk_rows), tolerant)] = chunk_rows
-            done = []
+            finished = []
             for future in pool.done(begun):
                 chunk_rows = begun.pop(future)
                 failure = failure_of(future)
                 if has_slipped(failure):
-                    left = np.concatenate([chunk_rows, left])
+                    waiting = np.concatenate([chunk_rows, waiting])
                 elif tolerant and is_loss(failure):
                     suspects.append(chunk_rows)
                     loss = failure
                 elif failure is not None:
                     error = error or failure
-                    left = left[:0]
+                    waiting = waiting[:0]
                 else:
                     chunk = future.result()
                     if chunk.raised and not tolerant:
-                        left = left[:0]
+                        waiting = waiting[:0]
                     tally.count(chunk_rows.size, chunk.seconds)
                     report(chunk_rows.size, f"{limits.workers / max(tally.seconds, 1e-9):.3g}/s")
-                    done.append((chunk_rows, chunk))
-            if done:
-                yield done
+                    finished.append((chunk_rows, chunk))
+            if finished:
+                yield finished
     if error is not None:
         pool.renew(error)  # for the next response that is sent to this executor
-        _raise_lost(calling.name, error)
+        _raise_lost(settings.name, error)
 
 
 def _one_at_a_time(
@@ -383,13 +383,13 @@ def _one_at_a_time(
     points: Points,
     suspects: list[Rows],
     loss: BaseException | None,
-) -> Iterator[Done]:
+) -> Iterator[Finished]:
     """Compute chunks one by one, and bisect those that end their worker, down to a failed point."""
     pool.renew(loss)
     pool.refuse_dead()
-    left = list(reversed(suspects))
-    while left:
-        rows = left.pop()
+    waiting = list(reversed(suspects))
+    while waiting:
+        rows = waiting.pop()
         future = pool.submitted(work, points.at(rows), True)
         pool.done([future])
         failure = failure_of(future)
@@ -397,14 +397,14 @@ def _one_at_a_time(
         if failure is None:
             yield rows, future.result()
         elif has_slipped(failure):
-            left.append(rows)
+            waiting.append(rows)
         elif not is_loss(failure):
             _raise_lost(pool.name, failure)
         elif rows.size == 1:
             reason = f"it ended its worker ({type(failure).__name__}), or took far too long"
             yield rows, Chunk(np.array([np.nan]), {0: reason}, 0.0)
         else:
-            left += [rows[rows.size // 2 :], rows[: rows.size // 2]]
+            waiting += [rows[rows.size // 2 :], rows[: rows.size // 2]]
 
 
 def _raise_lost(name: str, error: BaseException) -> None:
@@ -421,10 +421,10 @@ def _raise_lost(name: str, error: BaseException) -> None:
     ) from error
 
 
-def _work(calling: Calling) -> Callable[[Points, bool], Chunk]:
+def _work(settings: CallSettings) -> Callable[[Points, bool], Chunk]:
     """Return the work on points; other processes get the function as bytes."""
-    outputs = calling.outputs
-    if calling.executor is None or isinstance(calling.executor, ThreadPoolExecutor):
-        return partial(compute, calling.function, outputs=outputs)
-    payload = packed(calling.function)
-    return partial(compute_packed, payload, timeout=calling.timeout, outputs=outputs)
+    outputs = settings.outputs
+    if settings.executor is None or isinstance(settings.executor, ThreadPoolExecutor):
+        return partial(compute, settings.function, outputs=outputs)
+    payload = packed(settings.function)
+    return partial(compute_packed, payload, timeout=settings.timeout, outputs=outputs)

@@ -129,25 +129,28 @@ def fmu(
             "variable once"
         )
     limit = None if timeout is None else positive_number(timeout, "fmu: timeout")
-    reuse = flag(reset, "fmu: reset")
+    flag(reset, "fmu: reset")
     unit, description = _read_unit(file)
     grid = _time_grid(description, times, start_time, stop_time, step)
-    variables = _Variables(unit, {v.name: v for v in description.modelVariables})
+
+    def variable(name: str, argument: str) -> Variable:
+        return _variable(description, name, argument)
+
     parameter_values = []
     for name, value in values.items():
-        variable = variables.settable(name, "parameters")
-        parameter_values.append((variable, variable.converted(value, "fmu: parameters")))
+        parameter = variable(name, "parameters")
+        parameter_values.append((parameter, parameter.converted(value, "fmu: parameters")))
     model = Simulation(
         unit,
-        tuple(variables.settable(name, "inputs") for name in input_names),
-        {label: variables.readable(name) for label, name in output_names.items()},
+        tuple(variable(name, "inputs") for name in input_names),
+        {label: variable(name, "outputs") for label, name in output_names.items()},
         tuple(parameter_values),
         grid,
         limit,
-        reuse,
+        reset,
     )
-    with _opened(unit).instance(reuse):
-        pass
+    with _opened(unit).instance(reset):
+        pass  # whether it can be instantiated here
     return scalar(model)
 
 
@@ -308,53 +311,40 @@ class Variable:
         raise ValueError(f"{label}: got {value!r} for {self.name}, expected {expected}")
 
 
-@dataclass(frozen=True)
-class _Variables:
-    """The variables of a unit, by name, as FMPy describes them."""
+def _variable(description: Any, name: str, argument: str) -> Variable:
+    """Return a variable with one number, which inputs and parameters can set.
 
-    unit: Unit
-    described: dict[str, Any]
-
-    def settable(self, name: str, argument: str) -> Variable:
-        """Return a variable that can be set before a simulation begins."""
-        variable = self._named(name, argument)
-        if not _is_settable(variable):
-            names = [n for n, v in self.described.items() if _is_settable(v)]
-            raise ValueError(
-                f"fmu: {argument}: got {name!r}, which {self.unit.name} computes itself ("
-                f"{variable.causality}, {variable.initial or variable.variability}), expected a "
-                f"parameter or an input: {_listed(names)}"
-            )
-        return self._scalar(variable, argument)
-
-    def readable(self, name: str) -> Variable:
-        """Return a variable that has numbers."""
-        return self._scalar(self._named(name, "outputs"), "outputs")
-
-    def _named(self, name: str, argument: str) -> Any:
-        if name in self.described:
-            return self.described[name]
-        close = get_close_matches(name, self.described, n=3)
+    A parameter may be a text.
+    """
+    unit = description.modelName
+    described = {v.name: v for v in description.modelVariables}
+    if name not in described:
+        close = get_close_matches(name, described, n=3)
         hint = f"did you mean {' or '.join(map(repr, close))}?"
         raise ValueError(
-            f"fmu: {argument}: got {name!r}, expected a variable of {self.unit.name}; "
-            f"{hint if close else 'it has ' + _listed(list(self.described))}"
+            f"fmu: {argument}: got {name!r}, expected a variable of {unit}; "
+            f"{hint if close else 'it has ' + _listed(list(described))}"
         )
-
-    def _scalar(self, variable: Any, argument: str) -> Variable:
-        """Return a variable with one number, or for a parameter one value."""
-        kind = str(variable.type)
-        if kind == "Enumeration":
-            kind = "Integer" if self.unit.version == 2 else "Int64"
-        takes_text = argument == "parameters"
-        kinds = (*_REALS, *_INTEGERS, "Boolean", *(("String",) if takes_text else ()))
-        if variable.shape or kind not in kinds:
-            got = "an array" if variable.shape else f"of type {kind}"
-            raise ValueError(
-                f"fmu: {argument}: got {variable.name!r}, which is {got} in {self.unit.name}, "
-                f"expected a variable with {'one value' if takes_text else 'one number'}"
-            )
-        return Variable(str(variable.name), int(variable.valueReference), kind)
+    variable = described[name]
+    if argument != "outputs" and not _is_settable(variable):
+        settable = [n for n, v in described.items() if _is_settable(v)]
+        raise ValueError(
+            f"fmu: {argument}: got {name!r}, which {unit} computes itself ("
+            f"{variable.causality}, {variable.initial or variable.variability}), expected a "
+            f"parameter or an input: {_listed(settable)}"
+        )
+    kind = str(variable.type)
+    if kind == "Enumeration":
+        kind = "Integer" if description.fmiVersion.startswith("2") else "Int64"
+    takes_text = argument == "parameters"
+    kinds = (*_REALS, *_INTEGERS, "Boolean", *(("String",) if takes_text else ()))
+    if variable.shape or kind not in kinds:
+        got = "an array" if variable.shape else f"of type {kind}"
+        raise ValueError(
+            f"fmu: {argument}: got {name!r}, which is {got} in {unit}, expected a variable with "
+            f"{'one value' if takes_text else 'one number'}"
+        )
+    return Variable(name, int(variable.valueReference), kind)
 
 
 def _is_settable(variable: Any) -> bool:
@@ -401,16 +391,20 @@ class _TimeGrid:
 
 def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -> _TimeGrid:
     """Return the points of communication, from the user's arguments and the unit's defaults."""
-    defaults = description.defaultExperiment
     interface = description.coSimulation
+    default = description.defaultExperiment
 
-    def default(key: str) -> float | None:
-        value = getattr(defaults, key, None)
-        return None if value is None else float(value)
+    def number(value: Any, name: str, key: str) -> float | None:
+        if value is None:
+            value = getattr(default, key, None)
+            return None if value is None else float(value)
+        array = real_array(value, f"fmu: {name}")
+        if array.ndim or not np.isfinite(array):
+            raise ValueError(f"fmu: {name}: got {value!r:.60}, expected a finite number")
+        return float(array)
 
-    begin = default("startTime") if start is None else _finite(start, "start_time")
-    begin = begin or 0.0
-    end = default("stopTime") if stop is None else _finite(stop, "stop_time")
+    begin = number(start, "start_time", "startTime") or 0.0
+    end = number(stop, "stop_time", "stopTime")
     if times is not None:
         marks = _increasing_times(times, begin, end if stop is not None else None)
     elif end is None or end <= begin:
@@ -420,7 +414,8 @@ def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -
         marks = (end,)
     # 500 steps where neither the user nor the unit states a step, as FMPy does.
     longest = (marks[-1] - begin) / 500
-    size = default("stepSize") if step is None else positive_number(step, "fmu: step")
+    size = None if step is None else positive_number(step, "fmu: step")
+    size = number(size, "step", "stepSize")
     internal = getattr(interface, "fixedInternalStepSize", None)
     is_even = not interface.canHandleVariableCommunicationStepSize
     if size is None and internal is not None:
@@ -430,23 +425,17 @@ def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -
             f"fmu: step: got none, and {description.modelName} takes steps of one size only and "
             "does not say which, expected a number"
         )
-    size = longest if size is None else float(size)
-    for mark in marks if is_even else ():
-        count = (mark - begin) / size
-        if abs(count - round(count)) > 1e-6 or round(count) < 1:
-            raise ValueError(
-                f"fmu: got the time {mark:g}, which steps of {size:g} from {begin:g} do not reach, "
-                f"expected multiples of the step, as {description.modelName} takes steps of one "
-                "size only; pass other times, or step="
-            )
-    return _TimeGrid(begin, marks, times is not None, size, is_even, default("tolerance"))
-
-
-def _finite(value: Any, name: str) -> float:
-    array = real_array(value, f"fmu: {name}")
-    if array.ndim or not np.isfinite(array):
-        raise ValueError(f"fmu: {name}: got {value!r:.60}, expected a finite number")
-    return float(array)
+    size = longest if size is None else size
+    counts = (np.array(marks) - begin) / size
+    is_off = (np.abs(counts - np.round(counts)) > 1e-6) | (np.round(counts) < 1)
+    if is_even and is_off.any():
+        raise ValueError(
+            f"fmu: got the time {marks[int(is_off.argmax())]:g}, which steps of {size:g} from "
+            f"{begin:g} do not reach, expected multiples of the step, as {description.modelName} "
+            "takes steps of one size only; pass other times, or step="
+        )
+    tolerance = number(None, "", "tolerance")
+    return _TimeGrid(begin, marks, times is not None, size, is_even, tolerance)
 
 
 def _increasing_times(times: Any, begin: float, end: float | None) -> tuple[float, ...]:
@@ -654,7 +643,7 @@ class _OpenUnit:
 
         with self.lock:
             _log.lines.clear()
-            slave = self._idle_instance(reset) if self.idle else self._new_instance()
+            slave = self._at_start(reset)
             try:
                 yield slave
             except FMICallException as error:
@@ -667,21 +656,23 @@ class _OpenUnit:
                 raise
             self.idle.append(slave)
 
-    def _idle_instance(self, reset: bool) -> Any:
-        """Return an idle instance at its start, reset or instantiated again."""
+    def _at_start(self, reset: bool) -> Any:
+        """Return an idle instance, reset or instantiated again, or a new one."""
         try:
             slave = self.idle.pop()
-        except IndexError:  # another thread took the last one
-            return self._new_instance()
-        if reset:
-            with suppress(Exception):  # not all units have a reset
-                slave.reset()
-                return slave
-        _free(slave)
+        except IndexError:
+            slave = self._loaded()
+        else:
+            if reset:
+                with suppress(Exception):  # not all units have a reset
+                    slave.reset()
+                    return slave
+            _free(slave)
         self._instantiate(slave)
         return slave
 
-    def _new_instance(self) -> Any:
+    def _loaded(self) -> Any:
+        """Return an object of FMPy with the library of the unit."""
         from fmpy import fmi2, fmi3
 
         unit = self.unit
@@ -690,7 +681,7 @@ class _OpenUnit:
         with _lock:
             folder = os.getcwd()  # where FMPy does not return if loading fails
             try:
-                slave = kind(
+                return kind(
                     guid=unit.token,
                     unzipDirectory=self.folder,
                     modelIdentifier=unit.identifier,
@@ -704,8 +695,6 @@ class _OpenUnit:
                 ) from None
             finally:
                 os.chdir(folder)
-        self._instantiate(slave)
-        return slave
 
     def _instantiate(self, slave: Any) -> None:
         try:

@@ -157,7 +157,7 @@ def refuse_groups(name: str, roots: Iterable[Variable]) -> None:
         )
 
 
-def places_of(name: str, observed: Any, groups: Groups) -> tuple[NDArray[np.intp], Any]:
+def group_indices(name: str, observed: Any, groups: Groups) -> tuple[NDArray[np.intp], Any]:
     """Return the number of each specimen's group, (N,), and the observed values without groups.
 
     Raises

@@ -81,7 +81,7 @@ class Outputs:
         return np.concatenate(columns, axis=-1)
 
 
-ONE = Outputs()
+SINGLE_OUTPUT = Outputs()
 
 
 def outputs_of_result(result: Mapping[str, Any], batch_ndim: int) -> Outputs:
@@ -130,7 +130,7 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
             raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
         return values, _labelled_columns(observed, values.shape[1])
     unit = getattr(observed, "attrs", {}).get("units") if hasattr(observed, "dims") else None
-    return values, Outputs(units=(str(unit),)) if unit else ONE
+    return values, Outputs(units=(str(unit),)) if unit else SINGLE_OUTPUT
 
 
 def _refuse_texts(label: str, observed: Any) -> None:
@@ -196,7 +196,7 @@ def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outp
     return np.concatenate(columns, axis=1), outputs_of_keys(keys)
 
 
-def lacking(values: Floats) -> NDArray[np.bool_]:
+def is_missing(values: Floats) -> NDArray[np.bool_]:
     """Return which points, (n,) or (n, m) -> (n,), have an output that is NaN: no response."""
     nan = np.isnan(values)
     return nan.any(axis=-1) if nan.ndim > 1 else nan

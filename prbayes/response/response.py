@@ -20,12 +20,12 @@ from prbayes._finding import report
 from prbayes._validate import Floats, called, executes, folder_path
 from prbayes.response.budget import budget
 from prbayes.response.call import Points, checked, scalar, shapes
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs, batch_shape, broadcast_batch
-from prbayes.response.outputs import ONE, Outputs, outputs_of_result
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, outputs_of_result
 from prbayes.response.store import Store
 
 
@@ -58,7 +58,7 @@ def refuse_misfit(
         refuse(name, sizes(), outputs)
 
 
-def refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
+def refuse_wrong_arity(name: str, function: object, inputs: Inputs) -> None:
     """Raise if the signature of a function has more or fewer arguments than there are inputs."""
     inner: Any = function.function if isinstance(function, scalar) else function
     try:
@@ -76,7 +76,9 @@ def refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
         ) from None
 
 
-def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
+def check_call_settings(
+    executor: object, store: object, version: object, on_failure: object
+) -> None:
     """Raise if an argument that says how a response is called has the wrong type."""
     executes(executor, "executor")
     if store is not None:
@@ -176,10 +178,10 @@ class Responses:
         on_failure: OnFailure | None = None,
         retry_failed: bool = False,
         timeout: float | None = None,
-        outputs: Outputs | None = ONE,
+        outputs: Outputs | None = SINGLE_OUTPUT,
     ) -> None:
         refuse_uncallable(name, function)
-        refuse_other_number(name, function, inputs)
+        refuse_wrong_arity(name, function, inputs)
         refuse_misfit(name, function, partial(_sizes, inputs), outputs)
         report(*findings_of(function))
         policy = Abort() if on_failure is None else on_failure
@@ -208,7 +210,7 @@ class Responses:
         self.runs = Runs()
         self._checks_batches = self.plain
         self._n_reused = 0
-        self._calling = Calling(
+        self._settings = CallSettings(
             name, function, executor, opened, policy, retry_failed, timeout, outputs
         )
         self._tally = Tally()
@@ -239,7 +241,7 @@ class Responses:
     @property
     def replacement(self) -> float:
         """Value in place of a response that failed; NaN if nothing is."""
-        value = self._calling.on_failure.final.replacement
+        value = self._settings.on_failure.final.replacement
         return np.nan if value is None else float(value)
 
     @property
@@ -250,12 +252,12 @@ class Responses:
     @property
     def workers(self) -> int:
         """Number of workers."""
-        return capacity(self._calling.executor).workers
+        return capacity(self._settings.executor).workers
 
     @property
     def folder(self) -> Path | None:
         """Folder of the store."""
-        return None if self._calling.store is None else self._calling.store.folder
+        return None if self._settings.store is None else self._settings.store.folder
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, inputs and constants, and output order."""
@@ -287,10 +289,10 @@ class Responses:
             If the response raises, or if its result is not real numbers in the batch shape.
         """
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
-        known = self.runs.repeated(values)
-        if known is not None:
-            self.count_reused(known.size)
-            return known
+        responses = self.runs.repeated(values)
+        if responses is not None:
+            self.count_reused(responses.size)
+            return responses
         responses = self._as_batch(values) if self.plain else self._as_points(values)
         self.runs.record(values, responses)
         return responses
@@ -301,7 +303,7 @@ class Responses:
         if self.plain:
             return self._called(values, (1,), is_run=False)
         _, points = self._points(values)
-        return respond(replace(self._calling, store=None), points, self._tally.copied())
+        return respond(replace(self._settings, store=None), points, self._tally.copied())
 
     def count_symbolic(self, size: int) -> None:
         """Count responses that are computed in a graph."""
@@ -333,7 +335,7 @@ class Responses:
         """Return the responses by `respond`, each specimen a point."""
         batch, points = self._points(values)
         self.count += len(points)
-        responses = respond(self._calling, points, self._tally, self.on_start)
+        responses = respond(self._settings, points, self._tally, self.on_start)
         if self.outputs is None:
             self.outputs = self._tally.named
         return responses.reshape(batch + responses.shape[1:])
@@ -436,14 +438,16 @@ def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownPoints:
     """Points whose responses are known."""
 
     points: Sequence[Floats]  # (m, *event) for each aleatory input
     values: Floats  # (m,), or (m, outputs)
 
 
-def once_each(responses: Responses, points: Sequence[Floats], known: Known | None) -> Floats:
+def deduplicated_responses(
+    responses: Responses, points: Sequence[Floats], known: KnownPoints | None
+) -> Floats:
     """Return the responses at points, (n,) or (n, m); each different point is computed once.
 
     Discrete inputs have few values, and a censored input repeats its bounds. If four points that
@@ -455,7 +459,7 @@ def once_each(responses: Responses, points: Sequence[Floats], known: Known | Non
         Without epistemic inputs.
     points : sequence of ndarray, shapes (n, *event)
         One for each aleatory input.
-    known : Known, optional
+    known : KnownPoints, optional
     """
     n = len(points[0])
     known_values = np.empty(0) if known is None else known.values

@@ -41,7 +41,7 @@ from prbayes.model.fingerprint import as_attributes, require_together
 from prbayes.model.labels import labelled
 from prbayes.model.locking import locked
 from prbayes.model.random_variable import simulators
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.optimize.design_refinement import temporary_first_samples
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.response.inputs import event_shape

@@ -30,6 +30,8 @@ from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.inference.identifiability import oriented
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import roots_of
+from prbayes.model.specimen_likelihood import arrays
+from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.minimize import Minimisation, find_optimum
 from prbayes.optimize.optimum import Optimum
@@ -116,7 +118,7 @@ def emulator_remarks(evaluator: Evaluator) -> tuple[Finding, ...]:
     """Report the emulator and the points of each likelihood by specimen."""
     remarks = []
     for likelihood in evaluator.likelihoods:
-        emulation, points = likelihood.emulation, likelihood.points
+        emulation, points = prepared(likelihood).emulation, prepared(likelihood).points
         roots = points.n_roots
         low, high = int(roots.min()), int(roots.max())
         count = f"{low} root(s)" if low == high else f"{low} to {high} roots"
@@ -145,7 +147,7 @@ def _population(optimum: Optimum) -> Checked:
     scores = [_Scores.of(each.inputs) for each in evaluator.likelihoods]
     observed = [
         ([x.get_value() for x in points], log_a.get_value())
-        for points, log_a in (each.arrays for each in evaluator.likelihoods)
+        for points, log_a in (arrays(each) for each in evaluator.likelihoods)
     ]
     samples = _points(evaluator, scores, optimum.theta, observed)
     null: list[list[Floats]] = [[] for _ in samples]

@@ -43,8 +43,8 @@ from prbayes.response.discrepancy import findings_of
 from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.groups import is_group
 from prbayes.response.inputs import Inputs, model_on_context, read_inputs
-from prbayes.response.outputs import Outputs, lacking
-from prbayes.response.response import Responses, refuse_calling, refuse_uncallable
+from prbayes.response.outputs import Outputs, is_missing
+from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
 
 
 @locked
@@ -163,7 +163,7 @@ def predict(
         refuse_max_lost(max_lost, "prb.predict")
     if name is not None:
         plain_text(name, "name")
-    refuse_calling(executor, store, version, Abort())
+    check_call_settings(executor, store, version, Abort())
     label = _label(response, name, store)
     model = model_of(result, model, "prb.predict")
     points, coords = populations_of(result, model, n_draws, "prb.predict")
@@ -284,7 +284,7 @@ def _label(response: Callable[..., Any], name: str | None, store: object) -> str
 
 def _count_missing(label: str, values: Floats, max_lost: float) -> int:
     """Return how many responses are NaN, said in the log; raise if too many are."""
-    nan = lacking(values.reshape(-1, *values.shape[2:]))
+    nan = is_missing(values.reshape(-1, *values.shape[2:]))
     missing = int(nan.sum())
     if missing == nan.size:
         raise ResponseError(

@@ -16,6 +16,7 @@ from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.labels import versions
 from prbayes.model.locking import locked
+from prbayes.model.measurement import specimen_numbers
 from prbayes.optimize.optimum import Optimum, require_refits
 from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.validation.scores import log_scores, scoring_target
@@ -194,7 +195,7 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     columns = []
     for simulator, weights in zip(evaluator.emulated, data, strict=True):
         likelihood, measurement = simulator.likelihood, simulator.measurement
-        numbers = likelihood.numbers(measurement)
+        numbers = specimen_numbers(likelihood, measurement)
         rows = numbers[simulator.rows]
         weights = weights / np.bincount(numbers)[rows]  # a specimen counts once
         logs = by_name[likelihood.measurements[-1].name][:, rows]

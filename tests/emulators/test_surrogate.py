@@ -335,7 +335,7 @@ def test_outputs_keep_their_names_also_from_a_store(tmp_path: Path) -> None:
             propagation=prb.Reweighted(64, emulator=None),
             progressbar=False,
         )
-    values = Evaluator.of(model).nodes[0].bound.known_responses
+    values = Evaluator.of(model).nodes[0].bound.first_responses
     assert 15 < values[:, 0].mean() < 25
     assert 1 < values[:, 1].mean() < 2
 

@@ -15,12 +15,13 @@ import numpy as np
 import pymc as pm
 import pytest
 import units
+from first_use import first_use
 from um_server import Real
 
 import prbayes as prb
 from prbayes.model.random_variable import nodes
 from prbayes.response.call import Points
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.executors import Capacity, capacity
 from prbayes.response.outputs import Outputs
 from prbayes.response.store import Store
@@ -46,14 +47,15 @@ def build(**keywords: object) -> pm.Model:
             observed=[1, 2.0],
             propagation=prb.Reweighted(N, **keywords),
         )
+    first_use(model)
     return model
 
 
 def all_there(model: pm.Model, store: Path) -> None:
     """The responses are those of this process, and all of them are stored."""
-    responses = next(iter(nodes(model).values())).bound
+    (node,), (expected,) = nodes(model).values(), nodes(build()).values()
     np.testing.assert_array_equal(
-        responses.values, next(iter(nodes(build()).values())).bound.values
+        node.bound.design.sample.values, expected.bound.design.sample.values
     )
     again = next(iter(nodes(build(store=store)).values())).bound.responses
     assert again.computed == 1  # whether the response is still the same
@@ -145,7 +147,7 @@ def study(code: str, folder: Path, executor: Any, n: int) -> Tally:
     making = make(folder)
     response = next(making)
     try:
-        calling = Calling("y", response, executor, store, outputs=outputs)
+        calling = CallSettings("y", response, executor, store, outputs=outputs)
         found = respond(calling, points, tally)
     finally:
         making.close()

@@ -15,7 +15,7 @@ from um_server import Real
 
 import prbayes as prb
 from prbayes.response.call import Points
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 
 LIMIT = 0.4
 
@@ -61,7 +61,7 @@ def test_a_model_that_never_returns_costs_its_specimen_without_workers_in_proces
         for where in ("nothing", "threads"):
             tally, clock = Tally(), time.monotonic()
             with EXECUTORS[where]() as executor:
-                calling = Calling("y", response, executor, None, prb.response.Replace(-1.0))
+                calling = CallSettings("y", response, executor, None, prb.response.Replace(-1.0))
                 found = respond(calling, Points([x], [True]), tally)
             np.testing.assert_allclose(found, np.where(x == 3, -1.0, 2 * x), rtol=1e-12)
             (failure,) = tally.failed.values()

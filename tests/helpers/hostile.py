@@ -19,7 +19,7 @@ import numpy as np
 
 import prbayes as prb
 from prbayes.response.call import Points
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.failures import OnFailure, ResponseError
 from prbayes.response.store import Store
 
@@ -137,7 +137,7 @@ def on_workers(
         x = points.arguments[0]
         store, tally = Store(folder, f"{where}, {policy}, {bad}", columns=1), Tally()
         timeout = None if safe else 0.5
-        calling = Calling("y", prb.scalar(hostile), executor, store, policy, timeout=timeout)
+        calling = CallSettings("y", prb.scalar(hostile), executor, store, policy, timeout=timeout)
         try:
             found = respond(calling, points, tally)
         except ResponseError as error:

@@ -15,16 +15,17 @@ from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import Discrepancy, Metric, Minimum
+from prbayes.metrics.base import Discrepancy, Metric, Minimum, is_additive, is_likelihood
 from prbayes.metrics.correlation import MarginalCorrelation
 from prbayes.metrics.custom import FunctionMetric
 from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, Histogram, overlap
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.multivariate import directions, failure_caps, repelled, sufficient_directions
 from prbayes.metrics.residual import ProbabilityResidual
 
-NAN = np.nan
+INF, NAN = np.inf, np.nan
 PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
 
 
@@ -247,3 +248,133 @@ def test_a_function_is_called_with_what_each_part_sees(draw: Any) -> None:
         np.testing.assert_allclose(
             by_basis(several, equal[:, None], several.basis(x))[:, 0], d(x), rtol=1e-12
         )
+
+
+def largest_cosine(u: Floats) -> float:
+    cosine = np.abs(u @ u.T)
+    np.fill_diagonal(cosine, 0.0)
+    return float(cosine.max())
+
+
+def test_two_outputs_have_equal_angles() -> None:
+    u = directions(2, 5, 0)
+    angles = np.sort(np.arctan2(u[:, 1], u[:, 0]) % np.pi)
+    np.testing.assert_allclose(np.diff(angles), np.pi / 5)
+    np.testing.assert_array_equal(u, directions(2, 5, 7))
+
+
+# The best arrangements of lines: of an icosahedron, of the 24-cell, and of the roots of E6.
+@pytest.mark.parametrize(("m", "number", "best"), [(3, 6, 5**-0.5), (4, 12, 0.5), (6, 36, 0.5)])
+def test_known_best_arrangements_are_found(m: int, number: int, best: float) -> None:
+    assert largest_cosine(directions(m, number, 0)) == pytest.approx(best, abs=2e-3)
+
+
+@pytest.mark.parametrize("m", [3, 4, 5, 8])
+def test_they_are_of_unit_length_and_see_every_direction_alike(m: int) -> None:
+    u = directions(m, sufficient_directions(m), 0)
+    assert u.shape == ((m - 1) * (m + 2), m)
+    np.testing.assert_allclose(np.linalg.norm(u, axis=-1), 1, rtol=1e-15)
+    np.testing.assert_allclose(u.T @ u * m / len(u), np.eye(m), atol=0.03)
+    # All symmetric matrices differ on them: each covariance is told from every other.
+    i, j = np.tril_indices(m)
+    assert np.linalg.matrix_rank(u[:, i] * u[:, j], tol=0.3) == i.size
+
+
+def test_rounding_does_not_decide_where_they_are() -> None:
+    for m, number in ((3, 100), (4, 18), (4, 40), (8, 70)):
+        start = np.random.default_rng(0).standard_normal((number, m))
+        noise = np.random.default_rng(1).standard_normal((number, m))
+        np.testing.assert_allclose(
+            repelled(start, 400), repelled(start * (1 + 1e-14 * noise), 400), atol=1e-9
+        )
+
+
+def test_more_steps_change_little() -> None:
+    for m, number in ((3, 10), (4, 18), (6, 40)):
+        start = np.random.default_rng(0).standard_normal((number, m))
+        assert abs(largest_cosine(repelled(start)) - largest_cosine(repelled(start, 4000))) < 0.03
+
+
+def test_a_seed_is_another_arrangement() -> None:
+    assert not np.allclose(directions(3, 10, 0), directions(3, 10, 1))
+    np.testing.assert_array_equal(directions(3, 1, 0).shape, (1, 3))
+
+
+Lift = Callable[[Metric], Metric]
+LIFTED: dict[str, Metric] = {
+    "pr": ProbabilityResidual(),
+    "kl": KullbackLeibler(),
+    "kl-reverse": KullbackLeibler(reverse=True),
+    "ll": LogLikelihood(density=GaussianKDE()),
+    "area": AreaMetric(),
+}
+by_metric = pytest.mark.parametrize("metric", LIFTED.values(), ids=LIFTED)
+both = pytest.mark.parametrize("lift", [Joint, MarginalCorrelation])
+
+
+def sample(n: int, seed: int = 0) -> Floats:
+    y = np.random.default_rng(seed).standard_normal((n, 2))
+    y[:, 1] += y[:, 0]
+    return y
+
+
+@both
+@by_metric
+def test_one_output_is_the_metric_itself(lift: Lift, metric: Metric) -> None:
+    x, z = sample(40)[:, 0], sample(20, seed=1)[:, 0]
+    x[0] = INF
+    w, u = np.random.default_rng(2).dirichlet(np.ones(40)), np.arange(1.0, 21.0)
+    flat, column = lift(metric).against(z, u), lift(metric).against(z[:, None], u)
+    expected = metric.against(z, u)
+    assert type(flat) is type(expected)
+    assert flat(x, w) == expected(x, w) == column(x[:, None], w)
+    assert (column.event, column.scale, is_likelihood(column)) == (
+        (1,),
+        expected.scale,
+        metric.likelihood,
+    )
+    basis = column.basis(x[:, None])
+    rows = np.stack([w, w[::-1]])
+    np.testing.assert_array_equal(
+        column.outer(*basis.features(rows), xp=np),
+        expected.outer(*expected.basis(x).features(rows), xp=np),
+    )
+    others = column.with_observed(x[1:9, None]), expected.with_observed(x[1:9])
+    assert others[0](x[:, None], w) == others[1](x, w)
+
+
+def test_every_metric_declares_what_its_inner_one_does() -> None:
+    for metric in LIFTED.values():
+        joint = Joint(metric)
+        for name in ("minimum", "additive", "takes_weights", "tail_responses", "distance"):
+            assert getattr(joint, name) == getattr(metric, name)
+        d = joint.against(sample(30))
+        assert joint.takes_outputs
+        assert (is_likelihood(d), is_additive(d)) == (False, metric.additive)
+        assert not joint.likelihood
+    assert Joint(AreaMetric(), directions=5).like(KullbackLeibler()) == Joint(
+        KullbackLeibler(), directions=5
+    )
+    assert AreaMetric().like(KullbackLeibler()) == KullbackLeibler()
+    assert hash(Joint(AreaMetric(), directions=5)) != hash(Joint(AreaMetric(), directions=6))
+    assert (
+        repr(Joint(AreaMetric(), directions=5))
+        == "Joint(metric=AreaMetric(), directions=5, components=None, random_seed=0)"
+    )
+
+
+@both
+@pytest.mark.parametrize("metric", [3, AreaMetric, Joint(AreaMetric())])
+def test_only_a_metric_of_one_output_is_lifted(lift: Any, metric: Any) -> None:
+    with pytest.raises(TypeError, match="expected a metric of one output"):
+        lift(metric)
+
+
+def test_a_failure_counts_as_the_largest_value_and_the_range_beyond() -> None:
+    y = np.array([[1.0, NAN], [4.0, -2.0], [INF, -1.0], [3.0, -5.0]])
+    np.testing.assert_array_equal(failure_caps(y), [7.0, 3.0])
+
+
+def test_data_of_no_shape_are_left_to_the_metric_of_one_output() -> None:
+    with pytest.raises(ValueError, match=r"shape \(\), expected one dimension"):
+        Joint(AreaMetric()).against(3.0)

@@ -19,7 +19,8 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.specimen_points import PointOptions
 from prbayes.response.compile import PLAIN
 from prbayes.validation.cross_validation import _mean_log_losses
@@ -294,8 +295,8 @@ def test_repeated_readings_share_the_inputs_of_their_specimen() -> None:
     model = fine(repeated())
     assert_close(lambda point: values(model, "y", point), lambda point: exact_repeated(point, 0.3))
     (likelihood,) = specimen_likelihoods(model).values()
-    drawn = likelihood.draws(
-        np.random.default_rng(0), dict.fromkeys(likelihood.variables(), np.full(500, 1.0)),
+    drawn = draw_readings(
+        likelihood, np.random.default_rng(0), dict.fromkeys(likelihood.variables(), np.full(500, 1.0)),
         len(LABELS), likelihood.measurements[0],
     )  # fmt: skip
     rows = np.flatnonzero(LABELS == 0)

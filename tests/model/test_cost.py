@@ -143,8 +143,8 @@ def test_propagations_state_their_runs() -> None:
         bind = None  # type: ignore[assignment]
 
     cost = prb.Reweighted(64, max_points=96).cost
-    assert (cost.first, cost.each, cost.most) == (64, 0, 96)
+    assert (cost.first, cost.per_theta, cost.most) == (64, 0, 96)
     assert cost.growth.startswith("up to 96 in all, ")
     assert prb.Reweighted(64).cost.most == 2048
-    assert (prb.Resimulated(50).cost.each, prb.Fresh(7).cost.each) == (50, 7)
+    assert (prb.Resimulated(50).cost.per_theta, prb.Fresh(7).cost.per_theta) == (50, 7)
     assert Custom().cost == RunCost(0, 0, None, "as Custom asks for them")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Callable
 
@@ -14,6 +15,8 @@ from prbayes.model.data_checks import (
     data_findings,
     identical_specimens,
     resolution,
+    warn_duplicates,
+    warn_out_of_range,
 )
 
 QUICK = DataCheckOptions(draws=199)
@@ -168,9 +171,6 @@ def test_values_at_a_limit_are_not_repeated_specimens() -> None:
     y = correlated(rng, 30, 2)
     y[:, 0] = np.minimum(y[:, 0], 0.3)
     assert codes(y) == ["censored-data"]
-    assert codes(y, censored=[0.3, np.nan]) == []
-    assert codes(y, censored=[np.nan, 0.3]) == ["censored-data"]
-    assert codes(np.minimum(y[:, 0], 0.3), censored=0.3) == []
 
 
 def test_the_finding_names_the_limit() -> None:
@@ -305,12 +305,80 @@ def test_small_samples(n: int) -> None:
 
 def test_equal_values_are_a_pile() -> None:
     assert set(codes(np.full(10, 3.0))) == {"censored-data"}
-    assert codes(np.full(10, 3.0), censored=3.0) == []
 
 
-def test_arguments_have_one_value_or_one_by_output() -> None:
-    y = np.random.default_rng(20).standard_normal((9, 2))
-    with pytest.raises(
-        ValueError, match=r"rounded: got shape \(3,\), expected one value or one by"
-    ):
-        data_findings(y, rounded=[0.1, 0.2, 0.3])
+# Data beside the first responses.
+
+RNG = np.random.default_rng(0)
+SIMULATED = RNG.normal(size=(64, 2)) * [1, 2]
+MEASURED = RNG.normal(size=(20, 2))
+
+
+@pytest.fixture
+def logged(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level(logging.WARNING, logger="prbayes")
+    return caplog
+
+
+@pytest.mark.parametrize("factor", [1.0, 1000.0])
+def test_data_around_the_responses_are_in_range(
+    factor: float, logged: pytest.LogCaptureFixture
+) -> None:
+    warn_out_of_range("y", factor * MEASURED, SIMULATED, ["a", "b"])
+    assert not logged.records
+
+
+def test_data_beyond_all_responses_are_reported(logged: pytest.LogCaptureFixture) -> None:
+    warn_out_of_range("y", np.add(np.abs(MEASURED), [0.0, 1e4]), SIMULATED, ["a", "b"])
+    (record,) = logged.records
+    assert "y[b]: got observed values from 1e+04 to 1e+04, all above the first 64" in record.message
+    logged.clear()
+    warn_out_of_range("y", -9.0 - np.abs(MEASURED[:, 0]), SIMULATED[:, 0], [])
+    assert "y: got observed values from -" in logged.text
+    assert "all below the first 64 responses" in logged.text
+
+
+@pytest.mark.parametrize(
+    ("observed", "simulated"),
+    [
+        (np.ones(5), np.empty(0)),
+        (np.ones((5, 2)), np.empty((0, 2))),
+        (np.full(5, 99.0), np.zeros(15)),  # of which a range says little
+        (np.full(5, np.inf), np.zeros(64)),  # all of which failed
+    ],
+)
+def test_few_responses_show_no_range(
+    observed: Floats, simulated: Floats, logged: pytest.LogCaptureFixture
+) -> None:
+    warn_out_of_range("y", observed, simulated, [])
+    assert not logged.records
+
+
+@pytest.mark.parametrize(
+    "values", [MEASURED[:, 0], MEASURED, MEASURED[:, 0].round(3), 0.001 * np.arange(20) ** 2]
+)
+def test_duplicates_of_all_specimens_are_reported(
+    values: Floats, logged: pytest.LogCaptureFixture
+) -> None:
+    warn_duplicates("y", np.concatenate([values, values[::-1]]))
+    (record,) = logged.records
+    assert "y: got 40 observed values of which only 20 are different" in record.message
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        MEASURED[:, 0],
+        np.append(MEASURED[:, 0], MEASURED[:3, 0]),  # some of them
+        RNG.binomial(4, 0.5, 60),  # counts
+        np.repeat([3, 5, 8], 4),
+        np.repeat([300, 500, 800], 4),  # of hundreds
+        RNG.normal(size=400).round(1).clip(-1, 1),  # rounded readings
+        np.full(9, 2.5),  # all equal
+        [1.0, 1.0, 2.0, 2.0],  # few
+    ],
+    ids=["once", "some", "counts", "other counts", "hundreds", "rounded", "equal", "few"],
+)
+def test_ties_by_chance_are_no_duplicates(values: Floats, logged: pytest.LogCaptureFixture) -> None:
+    warn_duplicates("y", np.asarray(values, dtype=float))
+    assert not logged.records

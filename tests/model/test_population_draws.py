@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import weakref
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.population_draws import Populations, specimens_of
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_variable import specimen_likelihoods
 
 N, SD, PRIOR_SD = 12, 0.5, 2.0
 X = np.random.default_rng(4).normal(1.0, SD, N)
@@ -22,9 +22,7 @@ X = np.random.default_rng(4).normal(1.0, SD, N)
 
 def populations_of(model: pm.Model) -> Populations:
     (likelihood,) = specimen_likelihoods(model).values()
-    return Populations(
-        weakref.ref(model), likelihood.inputs, likelihood.coordinates, likelihood.stacked.groups
-    )
+    return Populations(likelihood)
 
 
 def normal_model(scale: float = 1.0) -> pm.Model:
@@ -38,8 +36,8 @@ def normal_model(scale: float = 1.0) -> pm.Model:
 
 def points_at(populations: Populations, x: Floats) -> tuple[Floats, Floats]:
     """Return one point for each specimen, at its inputs, with the number of the density of x."""
-    z = populations.coordinates.of([x], 1)[:, None]
-    return z, -populations.coordinates.log_jacobian(z)
+    z = populations.likelihood.coordinates.of([x], 1)[:, None]
+    return z, -populations.likelihood.coordinates.log_jacobian(z)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6])
@@ -72,12 +70,12 @@ def test_smoothing_widens_populations() -> None:
     model = normal_model()
     populations = populations_of(model)
     z, log_a = points_at(populations, X)
-    unit = populations.coordinates.half_width[0]
+    unit = populations.likelihood.coordinates.half_width[0]
     smoothing = np.array([[(0.7 / unit) ** 2]])
     thetas = np.array([[0.0], [1.5]])
     smoothed = populations.log_likelihoods(thetas, z, log_a, smoothing)
     # Moments of 256 specimens: their standard errors shift log L by about .1.
-    jacobian = populations.coordinates.log_jacobian(z)[:, 0]
+    jacobian = populations.likelihood.coordinates.log_jacobian(z)[:, 0]
     expected = norm.logpdf(X, thetas, np.hypot(SD, 0.7)) - jacobian
     spread = np.abs(X - thetas) / (SD**2 + 0.7**2) * SD / np.sqrt(256) + 0.05
     assert (np.abs(smoothed - expected - jacobian) < 5 * spread).all()
@@ -90,7 +88,7 @@ def test_specimens_are_those_of_the_predictive_population() -> None:
     model = normal_model()
     populations = populations_of(model)
     draws = populations.posterior(*points_at(populations, X))
-    (x,) = populations.coordinates.inputs(draws.specimens())
+    (x,) = populations.likelihood.coordinates.inputs(draws.specimens())
     precision = N / SD**2 + 1 / PRIOR_SD**2
     assert x.shape == (256 * 16,)
     assert x.mean() == pytest.approx(X.sum() / SD**2 / precision, abs=5 * precision**-0.5 / 16)
@@ -117,9 +115,9 @@ def test_groups_have_populations_of_their_own() -> None:
         mean = (X + 3 * groups)[groups == group].sum() / SD**2 / precision
         error = 5 * precision**-0.5 / 16
         assert draws.thetas[:, group].mean() == pytest.approx(mean, abs=error)
-    specimens = specimens_of(populations, draws.thetas, each=4)
+    specimens = specimens_of(populations, draws.thetas, n_of_each=4)
     assert len(specimens) == 2 * 256 * 4
-    (x,) = populations.coordinates.inputs(specimens)
+    (x,) = populations.likelihood.coordinates.inputs(specimens)
     assert x[: len(x) // 2].mean() == pytest.approx(draws.thetas[:, 0].mean(), abs=0.1)
     assert x[len(x) // 2 :].mean() == pytest.approx(draws.thetas[:, 1].mean(), abs=0.1)
 
@@ -146,6 +144,6 @@ def test_specimens_that_no_population_reaches() -> None:
 def test_a_model_that_is_gone() -> None:
     model: Any = normal_model()
     populations = populations_of(model)
-    gone = Populations(lambda: None, populations.inputs, populations.coordinates, None)  # type: ignore[arg-type]
+    gone = Populations(replace(populations.likelihood, model=lambda: None))
     with pytest.raises(RuntimeError, match="build the model again"):
         _ = gone.hyperparameters

@@ -25,7 +25,7 @@ from pytensor.graph.replace import vectorize_graph
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.random_variable import Node, SimulatorRV, nodes
+from prbayes.model.random_variable import Node, SimulatorRV, has_default_epsilon, nodes
 from prbayes.propagation.base import Propagation
 from prbayes.response.compile import PLAIN
 
@@ -452,7 +452,7 @@ def test_the_default_epsilon_is_one_for_other_data_too(n: int) -> None:
         prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), **given)
     evaluator = Evaluator.of(model)
     (other,) = evaluator.observing({"y": data + 1.0}).nodes
-    assert evaluator.nodes[0].epsilon_is_default
-    assert other.epsilon_is_default
+    assert has_default_epsilon(evaluator.nodes[0])
+    assert has_default_epsilon(other)
     prb.set_epsilon(model, {"y": 1.01 / n})
-    assert not evaluator.nodes[0].epsilon_is_default
+    assert not has_default_epsilon(evaluator.nodes[0])

@@ -19,7 +19,9 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.base import DesignError
 from prbayes.response.compile import PLAIN
 
@@ -134,7 +136,7 @@ def test_no_run_is_made_when_a_model_is_written_and_128_at_its_first_use() -> No
 
 def test_two_uses_share_points() -> None:
     (likelihood,) = specimen_likelihoods(shared()).values()
-    assert likelihood.points is likelihood.points
+    assert prepared(likelihood).points is prepared(likelihood).points
     assert np.array_equal(values(shared()), values(shared()))
 
 
@@ -303,7 +305,7 @@ def test_inputs_without_a_response_truncate_the_population() -> None:
         assert slope == pytest.approx((total[0] - total[1]) / 2e-4, abs=0.1)
     (likelihood,) = specimen_likelihoods(model).values()
     params = dict(zip(likelihood.variables(), [np.array([1.0]), np.array([0.5])], strict=True))
-    drawn = likelihood.draws(np.random.default_rng(0), params, 500)
+    drawn = draw_readings(likelihood, np.random.default_rng(0), params, 500)
     assert (drawn < 1 + 2 * LIMIT + 0.05).all()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from prbayes._validate import Floats
-from prbayes.numerics.derivatives import cross, differences, slopes
+from prbayes.numerics.derivatives import cross, differences, second_differences, slopes
 
 STEP = np.array([1e-4, 3e-4])
 
@@ -42,3 +42,11 @@ def test_differences_at_an_edge_are_one_sided(side: float) -> None:
 
     _, gradient, _ = differences(values, np.array([1e-4, 1e-4]))(np.array([side, 3.0]))
     np.testing.assert_allclose(gradient, [2.0 * side, 1.0], rtol=1e-3)
+
+
+def test_a_parabola() -> None:
+    exact = np.array([[3.0, 1.0, 0.5], [1.0, -2.0, 0.0], [0.5, 0.0, 1.0]])
+    found = second_differences(
+        lambda x: 0.5 * np.einsum("bsi,ij,bsj->s", x, exact, x) + x.sum(axis=(0, 2)), 3
+    )
+    np.testing.assert_allclose(found, exact, atol=1e-12)

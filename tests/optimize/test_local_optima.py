@@ -376,10 +376,13 @@ def test_a_bent_valley_has_no_two_optima(formula: Any, joined: bool) -> None:
 
 
 class Valley:
-    """A bent valley with one minimum, at (1, 1), and what rivals ask of an evaluator."""
+    """A bent valley with one minimum, at (1, 1), and the attributes of an evaluator."""
 
     nodes: tuple[()] = ()
-    has_other_terms = False
+
+    @property
+    def hyperparameters(self) -> Any:
+        return self
 
     def total(self, thetas: Floats, scales: Floats) -> Floats:
         x, y = thetas.T

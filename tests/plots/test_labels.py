@@ -1,22 +1,12 @@
-"""Names of elements, by one rule in both directions; labels of metrics."""
+"""Labels of elements and metrics, and refusals of labels for unknown names."""
 
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 
 import prbayes as prb
-from prbayes.model.elements import element_name, split_elements, variable_of
 from prbayes.plots._labels import metric_label, named
-
-
-@pytest.mark.parametrize(("index", "expected"), [((), "mu"), ((1,), "mu[1]"), ((0, 2), "mu[0,2]")])
-def test_an_element_has_the_name_of_its_variable_and_its_index(
-    index: tuple[int, ...], expected: str
-) -> None:
-    assert element_name("mu", index) == expected
-    assert variable_of(expected) == "mu"
 
 
 def test_elements_take_the_label_of_their_variable() -> None:
@@ -24,13 +14,6 @@ def test_elements_take_the_label_of_their_variable() -> None:
     found = [named(name, labels) for name in ("mu[0]", "mu[1]", "nu", "nu[0]", "mu")]
     assert found == ["mean[0]", "second mean", "nu", "nu[0]", "mean"]
     assert named("mu[0]", None) == "mu[0]"
-
-
-def test_values_are_split_along_all_axes_but_the_first() -> None:
-    cov = np.arange(12.0).reshape(3, 2, 2)
-    found = split_elements({"mu": np.arange(3.0), "cov": cov})
-    assert list(found) == ["mu", "cov[0,0]", "cov[0,1]", "cov[1,0]", "cov[1,1]"]
-    np.testing.assert_array_equal(found["cov[0,1]"], cov[:, 0, 1])
 
 
 PICTURES = ("responses", "population", "posterior", "optimizer", "landscape", "comparison")

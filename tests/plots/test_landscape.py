@@ -72,7 +72,7 @@ def test_other_optima_are_marked(read: SimpleNamespace) -> None:
     )
     np.testing.assert_allclose(
         np.sort(np.abs(read.xy(pc, "asked", "landscape")[0]))[-1],
-        np.abs(found.trace["theta"]).max(),
+        np.abs(found.search.trace["theta"]).max(),
     )
 
 

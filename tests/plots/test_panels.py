@@ -11,7 +11,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes.plots._panels import LEVELS, Output, is_curve, panels_of, quantiles
-from prbayes.response.outputs import ONE, Outputs
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 
 
 def node(outputs: Outputs, name: str = "y") -> Any:
@@ -21,7 +21,7 @@ def node(outputs: Outputs, name: str = "y") -> Any:
 @pytest.mark.parametrize(
     ("outputs", "expected"),
     [
-        (ONE, False),
+        (SINGLE_OUTPUT, False),
         (Outputs((0, 1, 2)), False),  # columns of an array
         (Outputs((0, 1, 2), "hour"), True),
         (Outputs((0.5, 2.0, 3.0), "hour"), True),
@@ -36,7 +36,7 @@ def test_a_curve_has_different_numbers_as_labels(outputs: Outputs, expected: boo
 
 def test_each_output_has_a_panel_but_a_curve_or_many_have_one() -> None:
     nodes = [
-        node(ONE),
+        node(SINGLE_OUTPUT),
         node(Outputs(("a", "b")), "z"),
         node(Outputs((0.0, 1.0, 2.0), "hour"), "curve"),
         node(Outputs(tuple(range(9))), "many"),

@@ -13,7 +13,7 @@ from prbayes._validate import Floats
 from prbayes.inference.sandwich import Information
 from prbayes.metrics.density import Histogram
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.random_variable import nodes
+from prbayes.model.random_variable import has_default_epsilon, nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size
@@ -333,7 +333,7 @@ def test_a_likelihood_counts_specimens_and_not_observations(metric: prb.Metric) 
     model = _shared(metric, np.arange(30) // 3, observed=thrice)
     (node,) = nodes(model).values()
     assert node.epsilon_value == pytest.approx(0.1)
-    assert node.epsilon_is_default
+    assert has_default_epsilon(node)
     assert prb.calibrate_epsilon(prb.minimize(model))["y"] == pytest.approx(0.1)
 
 

@@ -1,4 +1,4 @@
-"""The kernel's stages: what they keep, what they leave as it is, and what PyMC asks of it."""
+"""The kernel's stages, and the particles that they begin with."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.kernel import BatchedKernel, Normal, correlation
+from prbayes.model.parameters import Hyperparameters
+from prbayes.posterior.kernel import (
+    BatchedKernel,
+    Particles,
+    correlation,
+    fitted_normal,
+    starting_thetas,
+)
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 
@@ -65,10 +72,10 @@ class Quadratic:
 
     within: float = np.inf
 
-    def __call__(self, thetas: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    def __call__(self, thetas: Floats) -> Particles:
         squared = (thetas**2).sum(axis=1)
         likelihood = np.where(np.abs(thetas[:, 0]) < self.within, -squared / 2, np.nan)
-        return -squared / 4, likelihood, squared[:, None], thetas[:, :1] ** 3
+        return Particles(thetas, -squared / 4, likelihood, squared[:, None], thetas[:, :1] ** 3)
 
 
 def at_standard_normal(n: int, target: Quadratic) -> BatchedKernel:
@@ -76,21 +83,20 @@ def at_standard_normal(n: int, target: Quadratic) -> BatchedKernel:
     kernel._evaluate = target
     kernel.beta = 0.5
     kernel.rng = np.random.default_rng(8)
-    kernel.tempered_posterior = kernel.rng.standard_normal((n, 2))
-    found = target(kernel.tempered_posterior)
-    kernel.prior_logp, kernel.likelihood_logp, kernel.discrepancies, kernel.lost = found
+    kernel._take(target(kernel.rng.standard_normal((n, 2))))
     return kernel
 
 
-@pytest.mark.parametrize("proposal", ["_jump", "_walk"])
+@pytest.mark.parametrize("proposal", ["_independent_step", "_random_walk_step"])
 def test_proposals_leave_a_standard_normal_as_it_is(proposal: str) -> None:
     n = 20_000
     kernel = at_standard_normal(n, Quadratic())
     # A fit that is off, as one to few particles is: the acceptance has to make up for it.
-    fitted = Normal(np.array([0.4, -0.3]), np.array([[1.4, 0.0], [0.5, 0.8]]))
+    root = np.array([[1.4, 0.0], [0.5, 0.8]])
+    fitted = (np.array([0.4, -0.3]), root) if proposal == "_independent_step" else (root,)
     propose = getattr(kernel, proposal)
-    before = kernel.tempered_posterior.copy()
-    rates = [propose(fitted, kernel.rng.standard_normal((n, 2))) for _ in range(8)]
+    before = kernel.tempered_posterior
+    rates = [propose(*fitted, kernel.rng.standard_normal((n, 2))) for _ in range(8)]
     after = kernel.tempered_posterior
     assert 0.2 < np.mean(rates) < 0.95
     assert (after != before).any(axis=1).mean() > 0.8
@@ -99,21 +105,16 @@ def test_proposals_leave_a_standard_normal_as_it_is(proposal: str) -> None:
     np.testing.assert_allclose(after.var(axis=0), 1.0, atol=5 * 2**0.5 * standard_error)
     assert abs((after[:, 0] * after[:, 1]).mean()) < 5 * standard_error
     # What is noted of the particles goes with them.
-    prior, likelihood, discrepancies, lost = Quadratic()(after)
-    np.testing.assert_array_equal(kernel.prior_logp, prior)
-    np.testing.assert_array_equal(kernel.likelihood_logp, likelihood)
-    np.testing.assert_array_equal(kernel.discrepancies, discrepancies)
-    np.testing.assert_array_equal(kernel.lost, lost)
+    for found, expected in zip(kernel.particles, Quadratic()(after), strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_places_without_a_discrepancy_are_never_accepted() -> None:
     kernel = at_standard_normal(500, Quadratic())
     inside = np.clip(kernel.tempered_posterior, -0.9, 0.9)
-    kernel.tempered_posterior = inside
     target = Quadratic(within=1.0)
     kernel._evaluate = target
-    found = target(inside)
-    kernel.prior_logp, kernel.likelihood_logp, kernel.discrepancies, kernel.lost = found
+    kernel._take(target(inside))
     rate = kernel._accept(inside + 3.0, np.full(500, 100.0))
     assert rate == 0.0
     np.testing.assert_array_equal(kernel.tempered_posterior, inside)
@@ -121,11 +122,10 @@ def test_places_without_a_discrepancy_are_never_accepted() -> None:
 
 def test_the_fitted_normal_has_the_moments_of_the_particles() -> None:
     particles = np.random.default_rng(2).normal([1.0, -2.0], [0.5, 3.0], (200, 2))
-    fitted = Normal.of(particles)
-    np.testing.assert_allclose(fitted.mean, particles.mean(axis=0))
-    np.testing.assert_allclose(fitted.root @ fitted.root.T, np.cov(particles.T), rtol=1e-9)
-    identical = Normal.of(np.ones((10, 2)))
-    assert np.isfinite(identical.root).all()
+    mean, root = fitted_normal(particles)
+    np.testing.assert_allclose(mean, particles.mean(axis=0))
+    np.testing.assert_allclose(root @ root.T, np.cov(particles.T), rtol=1e-9)
+    assert np.isfinite(fitted_normal(np.ones((10, 2)))[1]).all()
 
 
 def test_correlation_of_particles_with_those_before() -> None:
@@ -153,53 +153,53 @@ def test_the_weights_of_a_stage_keep_the_share_asked_for() -> None:
 def test_what_is_noted_of_particles_is_theirs_after_a_stage() -> None:
     kernel = begun()
     stage(kernel)
-    prior, likelihood, discrepancies, _ = kernel._evaluate(kernel.tempered_posterior)
-    np.testing.assert_allclose(kernel.prior_logp, prior)
-    np.testing.assert_allclose(kernel.likelihood_logp, likelihood)
-    np.testing.assert_allclose(kernel.discrepancies, discrepancies)
-    np.testing.assert_allclose(kernel.likelihood_logp, -discrepancies[:, 0] / 0.02)
+    expected = kernel._evaluate(kernel.tempered_posterior)
+    for found, values in zip(kernel.particles, expected, strict=True):
+        np.testing.assert_allclose(found, values)
+    np.testing.assert_allclose(kernel.likelihood_logp, -expected.discrepancies[:, 0] / 0.02)
 
 
 def test_resampling_takes_particles_by_their_weights() -> None:
     kernel = begun(10)
-    before = kernel.tempered_posterior.copy(), kernel.discrepancies.copy()
+    before = kernel.particles
     kernel.weights = np.zeros(10)
     kernel.weights[[2, 7]] = 0.3, 0.7
     kernel.resample()
     taken = np.repeat([2, 7], [3, 7])
-    np.testing.assert_array_equal(kernel.tempered_posterior, before[0][taken])
-    np.testing.assert_array_equal(kernel.discrepancies, before[1][taken])
+    np.testing.assert_array_equal(kernel.tempered_posterior, before.thetas[taken])
+    np.testing.assert_array_equal(kernel.particles.discrepancies, before.discrepancies[taken])
 
 
 def test_another_evaluator_weighs_the_particles() -> None:
     # A standard normal at beta 1, of prior and likelihood exp(-x^2 / 4) each.
     kernel = at_standard_normal(4000, Quadratic())
-    kernel.beta, kernel.draws, kernel.roughly = 1.0, 4000, True
-    kernel.likelihood_logp /= 2
+    kernel.beta, kernel.draws, kernel.is_coarse = 1.0, 4000, True
+    likelihood = kernel.likelihood_logp / 2
+    kernel._take(kernel.particles._replace(log_likelihood=likelihood))
     kernel._evaluate = Quadratic()
-    assert kernel.go_over(evaluator())
-    assert not kernel.roughly
+    assert kernel.reweight(evaluator())
+    assert not kernel.is_coarse
     assert kernel.evaluator is evaluator()
     # The mean of exp(-x^2 / 4) in two dimensions is 2/3; variances become 2/3.
     assert kernel.log_marginal_likelihood == pytest.approx(np.log(2 / 3), abs=0.03)
     kernel.resample()
     np.testing.assert_allclose(kernel.tempered_posterior.var(axis=0), 2 / 3, rtol=0.1)
-    np.testing.assert_array_equal(kernel.likelihood_logp, Quadratic()(kernel.tempered_posterior)[1])
+    np.testing.assert_array_equal(kernel.likelihood_logp, Quadratic()(kernel.tempered_posterior)[2])
 
 
 def test_particles_that_carry_no_weight_do_not_serve() -> None:
     kernel = at_standard_normal(1000, Quadratic())
     kernel.beta, kernel.draws = 1.0, 1000
     kernel._evaluate = Quadratic(within=0.0)
-    assert not kernel.go_over(evaluator())
+    assert not kernel.reweight(evaluator())
     kernel = at_standard_normal(1000, Quadratic())
     kernel.draws = 1000
     kernel._evaluate = Quadratic(within=0.2)  # 16% of them
-    assert not kernel.go_over(evaluator())
+    assert not kernel.reweight(evaluator())
     kernel = at_standard_normal(1000, Quadratic())
     kernel.draws = 1000
     kernel._evaluate = Quadratic(within=0.4)  # 31%
-    assert kernel.go_over(evaluator())
+    assert kernel.reweight(evaluator())
 
 
 def test_a_state_that_is_restored_goes_on_bit_for_bit() -> None:
@@ -293,3 +293,43 @@ def test_the_kernel_needs_an_epsilon() -> None:
         )
     with pytest.raises(ValueError, match=r"y: epsilon is not set; call prb\.set_epsilon"):
         BatchedKernel(50, model=model)
+
+
+RNG = np.random.default_rng(1)
+MU = RNG.normal(1, 1, (7, 2))
+SIGMA = np.abs(RNG.normal(size=7))
+
+
+def names() -> Hyperparameters:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 1, 1, shape=2), pm.HalfNormal("sigma", 1)
+        prb.Simulator(
+            "y", np.positive, pm.Normal.dist(mu[0] + mu[1], sigma), metric=prb.AreaMetric(),
+            observed=[0.0, 1.0, 2.0], propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    return Evaluator.of(model).hyperparameters
+
+
+def test_own_units_and_transformed_values_are_the_same_thetas() -> None:
+    found = starting_thetas(names(), {"mu": MU, "sigma": SIGMA}, 7)
+    np.testing.assert_allclose(found, np.column_stack([MU, np.log(SIGMA)]), rtol=1e-12)
+    other = starting_thetas(names(), {"sigma_log__": np.log(SIGMA), "mu": MU}, 7)
+    np.testing.assert_allclose(found, other, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("start", "error", "message"),
+    [
+        (3, TypeError, "got int 3, expected a dict of arrays"),
+        ({"mu": MU}, KeyError, r"got \['mu'\], expected values for each of \['mu', 'sigma'\]"),
+        ({"mu": MU, "sigma": SIGMA, "sigma_log__": SIGMA}, KeyError, "expected values for each"),
+        ({"mu": MU, "sigma": SIGMA, "nu": SIGMA}, KeyError, "expected values for each"),
+        ({"mu": MU[:3], "sigma": SIGMA}, ValueError, r"mu: got shape \(3, 2\), expected \(7, 2\)"),
+        ({"mu": MU, "sigma_log__": [0.0]}, ValueError, r"got shape \(1,\), expected \(7,\)"),
+        ({"mu": MU, "sigma": -SIGMA}, ValueError, "got 7 of 7 points outside the support"),
+        ({"mu": MU * np.nan, "sigma": SIGMA}, ValueError, "got 7 of 7 points outside"),
+    ],
+)
+def test_other_starts_are_refused(start: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        starting_thetas(names(), start, 7)

@@ -189,12 +189,12 @@ def likelihood_of(model: pm.Model) -> EstimateLikelihood:
 
 def target_of(likelihood: EstimateLikelihood) -> Target:
     log_likelihood = likelihood.log_likelihood
-    return Target(likelihood.evaluator, log_likelihood, (likelihood.point,), likelihood.scale)
+    return Target(likelihood.evaluator, log_likelihood, likelihood.point[None], likelihood.scale)
 
 
 def sample_of(likelihood: EstimateLikelihood) -> ImportanceSample:
     target = target_of(likelihood)
-    modes = laplace(target.log_posterior, np.stack(target.starts), target.scale)
+    modes = laplace(target.log_posterior, target.starts, target.scale)
     return importance_sample(target.log_posterior, modes, 1000, seed=0)
 
 

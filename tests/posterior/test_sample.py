@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -96,7 +95,8 @@ def test_moving_ends_are_sampled_by_smc() -> None:
 def test_few_specimens_are_sampled_by_nuts(monkeypatch: pytest.MonkeyPatch) -> None:
     from prbayes.posterior import sample as module
 
-    monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, effective=100.0))
+    options = module.ImportanceOptions(effective=100.0)
+    monkeypatch.setattr(module, "ImportanceOptions", lambda: options)
     result = prb.sample(500, chains=2, model=linear_model(), progressbar=False)
     assert result.posterior.attrs["sampler"] == "NUTS"
     for name, (mean, sd) in exact_moments(X).items():
@@ -180,7 +180,8 @@ def test_where_importance_sampling_is_not_reliable_a_metric_is_sampled_by_smc(
 ) -> None:
     from prbayes.posterior import sample as module
 
-    monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, effective=100.0))
+    options = module.ImportanceOptions(effective=100.0)
+    monkeypatch.setattr(module, "ImportanceOptions", lambda: options)
     model = metric_model(prb.ProbabilityResidual(), X)
     result = prb.sample(50, chains=1, model=model, progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC"

@@ -215,7 +215,7 @@ def test_failures_are_counted_and_not_lost(caplog: pytest.LogCaptureFixture) -> 
 def test_single_failures_leave_the_others_as_they_are(
     error: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original, calls = sbc._one, []
+    original, calls = sbc._ranks, []
 
     def sometimes(*arguments: Any) -> Any:
         calls.append(1)
@@ -226,7 +226,7 @@ def test_single_failures_leave_the_others_as_they_are(
 
     keywords = {"model": build(epsilon=0.02), "draws": 10, "adjustment": None, "progressbar": False}
     whole = prb.simulation_based_calibration(6, **keywords)
-    monkeypatch.setattr(sbc, "_one", sometimes)
+    monkeypatch.setattr(sbc, "_ranks", sometimes)
     result = prb.simulation_based_calibration(6, **keywords)
     assert result.prior_sbc.attrs["failed"] == 2
     np.testing.assert_array_equal(
@@ -239,7 +239,7 @@ def test_mostly_failures_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ValueError("no luck")
 
     model = build()
-    monkeypatch.setattr(sbc, "_one", never)
+    monkeypatch.setattr(sbc, "_ranks", never)
     with pytest.raises(RuntimeError, match="4 of 4 data sets failed; first: ValueError: no luck"):
         prb.simulation_based_calibration(4, model=model, progressbar=False)
 
@@ -249,7 +249,7 @@ def test_mistakes_are_not_failures(monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyError("a bug")
 
     model = build()
-    monkeypatch.setattr(sbc, "_one", wrong)
+    monkeypatch.setattr(sbc, "_ranks", wrong)
     with pytest.raises(KeyError, match="a bug"):
         prb.simulation_based_calibration(4, model=model, progressbar=False)
 

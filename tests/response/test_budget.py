@@ -60,16 +60,16 @@ def test_a_budget_that_was_spent_stays_spent() -> None:
         with pytest.raises(BudgetError):
             budget().grant(11, least=11)
         with pytest.raises(BudgetError):
-            budget().go_on()
+            budget().check()
         with unlimited():
-            budget().go_on()
+            budget().check()
 
 
 def test_time_runs_out() -> None:
     with limited(0.001, None):
         time.sleep(0.002)
         with pytest.raises(BudgetError, match=r"max_seconds = 0\.001 was reached"):
-            budget().go_on()
+            budget().check()
 
 
 def test_a_budget_holds_in_its_own_thread() -> None:
@@ -154,7 +154,7 @@ def test_refine_goes_on_with_the_design_that_has_grown() -> None:
         prb.refine(parts, thetas=FAR, max_runs=20, **QUIET)
     assert other.bound.n_points == 32 < node.bound.n_points
     prb.refine(parts, thetas=FAR, **QUIET)
-    assert np.array_equal(other.bound.known_responses, node.bound.known_responses)
+    assert np.array_equal(other.bound.design.runs.values, node.bound.design.runs.values)
 
 
 def test_refinement_around_the_optimum_has_a_budget_too() -> None:

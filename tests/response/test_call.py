@@ -1,4 +1,4 @@
-"""Calling the response: executors, chunks, failures, what is stored, and runs that are killed."""
+"""CallSettings the response: executors, chunks, failures, what is stored, and runs that are killed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from first_use import first_use
 import prbayes as prb
 from prbayes.model.random_variable import nodes
 from prbayes.response.call import Points, checked, compute
-from prbayes.response.chunks import Calling, Tally, chunk_size, chunks, respond
+from prbayes.response.chunks import CallSettings, Tally, chunk_size, chunks, respond
 from prbayes.response.executors import has_slipped
 from prbayes.response.failures import Abort, OnFailure, Replace
 from prbayes.response.store import Store
@@ -55,7 +55,7 @@ def model(response: Any, propagation: Any = None, **keywords: Any) -> pm.Model:
 
 def stored(found: pm.Model) -> Any:
     """Return the design's responses."""
-    return next(iter(nodes(found).values())).bound.values
+    return next(iter(nodes(found).values())).bound.design.sample.values
 
 
 def responses(found: pm.Model) -> Any:
@@ -163,7 +163,7 @@ def test_chunks_follow_the_measured_cost() -> None:
         return a * x
 
     tally = Tally()
-    found = respond(Calling("y", response), line(100), tally)
+    found = respond(CallSettings("y", response), line(100), tally)
     np.testing.assert_array_equal(found, 2 * np.arange(100.0))
     assert sizes[0] == 16
     # 10 ms each: at most 20 of them make up the 200 ms of a chunk; a slow machine makes them fewer.
@@ -172,7 +172,7 @@ def test_chunks_follow_the_measured_cost() -> None:
 
 
 def test_a_scalar_function_that_is_slow_is_a_task_of_its_own() -> None:
-    calling = Calling("y", prb.scalar(lambda x, a: time.sleep(0.02) or x))
+    calling = CallSettings("y", prb.scalar(lambda x, a: time.sleep(0.02) or x))
     found = chunks(calling, line(5), np.arange(5), False, Tally())
     taken = [rows.size for done in found for rows, _ in done]
     assert taken == [1] * 5
@@ -191,7 +191,7 @@ def test_responses_that_are_done_while_the_disk_is_busy_are_stored_together(
     monkeypatch.setattr(Store, "add_all", slow)
     store = Store(tmp_path, "y", columns=2)
     with ThreadPoolExecutor(4) as pool:
-        calling = Calling("y", prb.scalar(lambda x, a: time.sleep(0.01) or a * x), pool, store)
+        calling = CallSettings("y", prb.scalar(lambda x, a: time.sleep(0.01) or a * x), pool, store)
         found = respond(calling, line(40), Tally())
     assert sum(commits) == 40
     assert len(commits) < 20
@@ -218,7 +218,7 @@ def test_the_size_of_a_chunk(
     with ThreadPoolExecutor(workers) as pool:
         executor = pool if workers > 1 else None
         for function, expected in ((prb.scalar(times), alone), (times, batched)):
-            calling = Calling("y", function, executor)
+            calling = CallSettings("y", function, executor)
             found = chunk_size(calling, Tally(seconds=seconds), left, workers)
             assert found == pytest.approx(expected, abs=1)
             assert 1 <= found <= left
@@ -583,7 +583,7 @@ def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
 
     with ThreadPoolExecutor(N) as pool:
         cluster = Cluster(pool)
-        calling = Calling("y", prb.scalar(lambda x: 2 * x), cluster)  # type: ignore[arg-type]
+        calling = CallSettings("y", prb.scalar(lambda x: 2 * x), cluster)  # type: ignore[arg-type]
         found = respond(calling, Points([POINTS], [True]), Tally())
     np.testing.assert_array_equal(found, 2 * POINTS)
     assert cluster.most == N
@@ -612,7 +612,7 @@ def test_what_is_being_computed_when_one_fails_is_kept(
     points = Points([np.arange(12.0)], [True])
     store = Store(tmp_path, "y", columns=1)
     with Pool(2) as pool, pytest.raises(prb.response.ResponseError, match="too steep"):
-        respond(Calling("y", prb.scalar(function), pool, store), points, Tally())
+        respond(CallSettings("y", prb.scalar(function), pool, store), points, Tally())
     values, known = store.find(points.keys())
     np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
     np.testing.assert_array_equal(values[known], [2.0, 4.0, 6.0])

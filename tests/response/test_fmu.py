@@ -21,7 +21,7 @@ import prbayes as prb
 from prbayes.model.random_variable import nodes
 from prbayes.response import fmu
 from prbayes.response.call import Points
-from prbayes.response.chunks import Calling, Tally, respond
+from prbayes.response.chunks import CallSettings, Tally, respond
 from prbayes.response.executors import Pool
 from prbayes.response.store import Store
 
@@ -460,7 +460,7 @@ def test_a_unit_that_ends_or_hangs_its_process_costs_its_specimen_and_instances_
     points, tally = Points([x, 2 * x], [True, True]), Tally()
     store, policy = Store(tmp_path, "y", columns=2), prb.response.Replace(-1.0)
     with processes() as executor:
-        calling = Calling("y", response, executor, store, policy, timeout=timeout)
+        calling = CallSettings("y", response, executor, store, policy, timeout=timeout)
         found = respond(calling, points, tally)
         np.testing.assert_array_equal(found, np.where(x == stiffness, -1.0, 6.0))
         (failure,) = tally.failed.values()

@@ -13,7 +13,7 @@ from suppliers import labelled
 
 import prbayes as prb
 from prbayes.response.compile import PLAIN
-from prbayes.response.groups import Groups, groups_of, is_group, places_of, refuse_groups
+from prbayes.response.groups import Groups, group_indices, groups_of, is_group, refuse_groups
 
 GROUPS = Groups("supplier", ("Adler", "Busch"))
 VALUES = [1.0, 2.0, 3.0]
@@ -34,14 +34,14 @@ def observed() -> list[Any]:
 
 @pytest.mark.parametrize("given", observed(), ids=lambda given: type(given).__name__)
 def test_groups_are_read_from_coordinate_column_or_index(given: Any) -> None:
-    places, values = places_of("y", given, GROUPS)
+    places, values = group_indices("y", given, GROUPS)
     np.testing.assert_array_equal(places, [1, 0, 1])
     np.testing.assert_array_equal(np.asarray(values), VALUES)
 
 
 def test_several_outputs_stay_named() -> None:
     frame = pd.DataFrame({"a": VALUES, "supplier": WHO, "b": VALUES})
-    places, rest = places_of("y", frame, GROUPS)
+    places, rest = group_indices("y", frame, GROUPS)
     np.testing.assert_array_equal(places, [1, 0, 1])
     assert list(rest.columns) == ["a", "b"]
 
@@ -68,7 +68,7 @@ def test_several_outputs_stay_named() -> None:
 )
 def test_what_tells_no_groups_is_refused(given: Any, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=f"(?s)y: observed: {message}"):
-        places_of("y", given, GROUPS)
+        group_indices("y", given, GROUPS)
 
 
 def test_a_group_is_an_index_that_is_drawn_evenly() -> None:

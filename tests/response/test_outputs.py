@@ -5,7 +5,13 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from prbayes.response.outputs import ONE, Outputs, lacking, outputs_of_result, read_observed
+from prbayes.response.outputs import (
+    SINGLE_OUTPUT,
+    Outputs,
+    is_missing,
+    outputs_of_result,
+    read_observed,
+)
 
 TABLE = np.arange(6.0).reshape(3, 2)
 
@@ -13,7 +19,7 @@ TABLE = np.arange(6.0).reshape(3, 2)
 def test_one_dimension_is_one_output():
     values, outputs = read_observed("y", [1.0, 2.0])
     assert values.tolist() == [1.0, 2.0]
-    assert outputs == ONE
+    assert outputs == SINGLE_OUTPUT
     assert outputs.event == ()
 
 
@@ -78,5 +84,5 @@ def test_mappings_of_something_else_are_refused(observed, expected):
 
 
 def test_a_point_lacks_a_response_where_one_output_is_missing():
-    assert lacking(np.array([1.0, np.nan])).tolist() == [False, True]
-    assert lacking(np.array([[1.0, np.inf], [np.nan, 2.0]])).tolist() == [False, True]
+    assert is_missing(np.array([1.0, np.nan])).tolist() == [False, True]
+    assert is_missing(np.array([[1.0, np.inf], [np.nan, 2.0]])).tolist() == [False, True]

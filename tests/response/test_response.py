@@ -18,7 +18,12 @@ from prbayes.model.random_variable import nodes
 from prbayes.response.call import scalar
 from prbayes.response.failures import Abort, Replace, ResponseError
 from prbayes.response.inputs import Inputs, read_inputs
-from prbayes.response.response import Known, Responses, once_each, refuse_uncallable
+from prbayes.response.response import (
+    KnownPoints,
+    Responses,
+    deduplicated_responses,
+    refuse_uncallable,
+)
 
 with pm.Model() as MODEL:
     MU = pm.Normal("mu")
@@ -329,17 +334,17 @@ def test_each_different_point_is_computed_once_and_four_of_them_twice_at_first()
     responses = responses_of(response, 2)
     rng = np.random.default_rng(0)
     points = [rng.integers(0, 3, 500), rng.integers(0, 4, 500)]
-    found = once_each(responses, points, None)
+    found = deduplicated_responses(responses, points, None)
     np.testing.assert_array_equal(found, 10 * points[0] + points[1])
     assert response.asked == [12 + 4]
     # Known ones are not computed, and none is again.
     more = [rng.integers(0, 4, 300), rng.integers(0, 4, 300)]
-    found = once_each(responses, more, Known(points, found))
+    found = deduplicated_responses(responses, more, KnownPoints(points, found))
     np.testing.assert_array_equal(found, 10 * more[0] + more[1])
     assert response.asked == [16, 4]
     assert responses.count == 800
     assert responses.computed == 20
-    assert once_each(responses, more, Known(more, found)) == pytest.approx(found)
+    assert deduplicated_responses(responses, more, KnownPoints(more, found)) == pytest.approx(found)
     assert response.asked == [16, 4]
 
 
@@ -347,7 +352,7 @@ def test_each_different_point_is_computed_once_and_four_of_them_twice_at_first()
 def test_different_points_are_one_call_with_all_of_them() -> None:
     response = Counted(np.exp)
     points = [np.random.default_rng(1).normal(size=100)]
-    found = once_each(responses_of(response), points, None)
+    found = deduplicated_responses(responses_of(response), points, None)
     np.testing.assert_array_equal(found, np.exp(points[0]))
     assert response.asked == [100]
 
@@ -357,18 +362,18 @@ def test_a_response_with_scatter_of_its_own_is_computed_everywhere() -> None:
     response = Counted(lambda x: x + rng.normal(size=np.shape(x)))
     responses = responses_of(response)
     x = np.repeat([0.0, 1.0], 200)
-    found = once_each(responses, [x], None)
+    found = deduplicated_responses(responses, [x], None)
     assert sum(response.asked) == 400
     assert np.unique(found).size == 400
     assert np.std(found - x) == pytest.approx(1, abs=0.2)
-    once_each(responses, [x], Known([x], found))
+    deduplicated_responses(responses, [x], KnownPoints([x], found))
     assert response.asked[-1] == 400
 
 
 @pytest.mark.exact
 def test_failed_points_fail_again() -> None:
     responses = responses_of(lambda x: np.where(x > 1, np.nan, x))
-    found = once_each(responses, [np.array([0, 2, 2, 1, 0])], None)
+    found = deduplicated_responses(responses, [np.array([0, 2, 2, 1, 0])], None)
     np.testing.assert_array_equal(found, [0, np.nan, np.nan, 1, 0])
     assert responses.scatters is False
 

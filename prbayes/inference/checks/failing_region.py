@@ -7,6 +7,7 @@ import numpy as np
 from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.specimen_preparation import prepared
 from prbayes.response.distributions import PopulationSampler
 
 
@@ -34,7 +35,7 @@ def failing_region_findings(
     rng = np.random.default_rng(23)
     for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
         likelihood = simulator.likelihood
-        emulation = likelihood.emulation
+        emulation = prepared(likelihood).emulation
         if np.isfinite(emulation.y).all():
             continue
         sampler = PopulationSampler(likelihood.inputs)
@@ -45,7 +46,7 @@ def failing_region_findings(
         n = len(simulator.rows)
         if share * n < lost:
             continue
-        if likelihood.share is None:
+        if prepared(likelihood).share is None:
             meaning = (
                 "as no specimen with these inputs is among the data, the population moves away "
                 "from there. If such specimens cannot be measured, return NaN"

@@ -15,8 +15,7 @@ from prbayes.inference.asymptotics import Local
 from prbayes.inference.projections import number_parts
 from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
 from prbayes.model.evaluator import Evaluator
-from prbayes.numerics.derivatives import slopes
-from prbayes.numerics.stencils import hessian_of, stencil
+from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
 # Step of differences, in standard errors: what is of second order in it is then some per cent, and
 # the noise of a design's points small beside it.

@@ -1,4 +1,4 @@
-"""Pictures of a report: which ones, of what, and in what words."""
+"""Pictures of a report, and the graph of its model."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ import pymc as pm
 from prbayes._finding import Finding, report
 from prbayes.model.elements import variable_of
 from prbayes.model.emulated import population_simulators
-from prbayes.model.random_variable import nodes
-from prbayes.model.specimen_likelihood import measurements_of
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.landscape import plot_landscape
 from prbayes.plots.optimizer import plot_optimizer
@@ -27,10 +25,9 @@ from prbayes.plots.responses import plot_responses
 from prbayes.plots.sensitivity import plot_sensitivity
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
-from prbayes.reports.images import image
 from prbayes.reports.material import Material
 from prbayes.reports.schema import kind_of_decision
-from prbayes.reports.section import Section
+from prbayes.reports.section import Section, image
 
 _log = logging.getLogger("prbayes")
 
@@ -45,28 +42,28 @@ class Call:
 
 @dataclass(frozen=True)
 class NotDrawn:
-    """Why there is no picture, in words that a sentence ends with."""
+    """The reason for a missing picture, as the end of a sentence."""
 
     reason: str
 
 
-# Of what a picture is made; None where the report does not have what it shows.
+# None where the report does not have the contents of a picture.
 Request = Call | NotDrawn | None
 
 
 @dataclass(frozen=True)
 class Illustration:
-    """A picture that a report shows where it has what the picture needs."""
+    """A picture that a report shows where it has the contents."""
 
     after: str  # title of the section that it belongs to
     function: Callable[..., Any]  # returns an ArviZ `PlotCollection`
-    request: Callable[[Material], Request]  # from the material to a `Request`
+    request: Callable[[Material], Request]
     title: str
     alt: str
     caption: str
 
 
-# -- what pictures are made of ---------------------------------------------------------------
+# -- arguments of pictures -------------------------------------------------------------------
 
 
 def _first(results: Mapping[str, Any]) -> Any:
@@ -75,32 +72,29 @@ def _first(results: Mapping[str, Any]) -> Any:
 
 def _computes_responses(model: pm.Model) -> bool:
     """Return whether a draw of the model's simulators computes responses: a report spends none."""
-    return any(simulator.runs_per_theta for simulator in population_simulators(model))
+    return any(not simulator.has_specimens for simulator in population_simulators(model))
+
+
+def _model_labels(m: Material) -> dict[str, Any]:
+    """Return as keywords the labels of the model, which has no conditions of a test."""
+    labels = {name: text for name, text in m.labels.items() if name not in m.validation}
+    return {"labels": labels} if labels else {}
+
+
+def _labels_of(m: Material, names: Iterable[Any]) -> dict[str, Any]:
+    """Return as keywords the labels of names in a picture without a model."""
+    variables = {variable_of(str(name)) for name in names}
+    labels = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
+    return {"labels": labels} if labels else {}
 
 
 def _population(m: Material) -> Request:
-    """Ask for the population of the first posterior, or else of the first optimum."""
-    # An optimum from a file has no population: that takes its evaluator.
-    answer = _first(m.posteriors | m.found)
-    if m.model is None or answer is None:
+    """Request the population of the first posterior, or else of the first optimum."""
+    # An optimum from a file has no evaluator, hence no population.
+    result = _first(m.posteriors | m.live_optima)
+    if m.model is None or result is None:
         return None
-    return _labelled(m, (answer,), {"model": m.model})
-
-
-def _labelled(
-    m: Material, arguments: tuple[Any, ...], keywords: dict[str, Any] | None = None
-) -> Call:
-    """Return the arguments of a picture, with the labels if there are any."""
-    # Of the model's own things: it knows no conditions of a test
-    own = {name: text for name, text in m.labels.items() if name not in m.validation}
-    return Call(arguments, (keywords or {}) | ({"labels": own} if own else {}))
-
-
-def _own_labels(m: Material, names: Iterable[Any]) -> dict[str, Any]:
-    """Return as keywords the labels of what a picture shows that does not know the model."""
-    shown = {variable_of(str(name)) for name in names}
-    own = {name: text for name, text in m.labels.items() if variable_of(name) in shown}
-    return {"labels": own} if own else {}
+    return Call((result,), {"model": m.model, **_model_labels(m)})
 
 
 def _responses(m: Material) -> Request:
@@ -110,21 +104,21 @@ def _responses(m: Material) -> Request:
 
 
 def _outputs(m: Material) -> Request:
-    several = any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values())
-    request = _responses(m) if several else None
-    # That it computes responses is said once, of the picture before
+    if not any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values()):
+        return None
+    request = _responses(m)
+    # The picture before has the same reason
     return None if isinstance(request, NotDrawn) else request
 
 
 def _posterior(m: Material) -> Request:
     if not m.posteriors:
         return None
+    posterior = _first(m.posteriors)
+    labels = _model_labels(m)
     if m.model is None:
-        names = _first(m.posteriors)["posterior"].data_vars
-        own = _own_labels(m, names)
-        return Call((_first(m.posteriors),), {"optimum": _first(m.found), "model": None, **own})
-    keywords = {"optimum": _first(m.found), "model": m.model}
-    return _labelled(m, (_first(m.posteriors),), keywords)
+        labels = _labels_of(m, posterior["posterior"].data_vars)
+    return Call((posterior,), {"optimum": _first(m.live_optima), "model": m.model, **labels})
 
 
 def _stages(m: Material) -> Request:
@@ -135,31 +129,36 @@ def _stages(m: Material) -> Request:
 
 
 def _optimizer(m: Material) -> Request:
-    return _labelled(m, (_first(m.found),), {"col_wrap": 2}) if m.found else None
+    return (
+        Call((_first(m.live_optima),), {"col_wrap": 2, **_model_labels(m)})
+        if m.live_optima
+        else None
+    )
 
 
 def _landscape(m: Material) -> Request:
-    if m.model is None or not m.found:
+    if m.model is None or not m.live_optima:
         return None
-    return _labelled(m, (_first(m.found),), {"model": m.model})
+    return Call((_first(m.live_optima),), {"model": m.model, **_model_labels(m)})
 
 
 def _comparison(m: Material) -> Request:
     if m.comparison is None:
         return None
-    return Call((m.comparison,), _own_labels(m, m.comparison["hyperparameter"].values))
+    return Call((m.comparison,), _labels_of(m, m.comparison["hyperparameter"].values))
 
 
 def _validity(m: Material) -> Request:
     if not m.tests:
         return None
-    return Call((_first(m.tests),)) if len(m.tests) == 1 else Call((m.tests,))
+    return Call((_first(m.tests) if len(m.tests) == 1 else m.tests,))
 
 
 def _decision(m: Material) -> Request:
-    tables = m.decisions.values()
-    found = [table for table in tables if kind_of_decision(table) == "sensitivity"]
-    return Call((found[0],), _own_labels(m, found[0]["factor"].values)) if found else None
+    for table in m.decisions.values():
+        if kind_of_decision(table) == "sensitivity":
+            return Call((table,), _labels_of(m, table["factor"].values))
+    return None
 
 
 def _prediction(m: Material) -> Request:
@@ -167,7 +166,7 @@ def _prediction(m: Material) -> Request:
         return None
     measured = {name: pair[0] for name, pair in m.validation.items()}
     predicted = {name: pair[1] for name, pair in m.validation.items()}
-    return Call((measured, predicted), _own_labels(m, m.validation))
+    return Call((measured, predicted), _labels_of(m, m.validation))
 
 
 # In the order of the report, and within a section in this order.
@@ -281,58 +280,46 @@ ILLUSTRATIONS = (
 
 def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Section, ...]:
     """Return the sections with pictures after those that they belong to."""
-    made: list[Section] = []
-    pending: list[Section] = []
+    illustrated: list[Section] = []
+    pictures: list[Section] = []
     for section in sections:
         if section.level == 2:  # pictures come after all parts of the section before
-            made += pending
-            pending = _pictures(section.title, material)
-        made.append(section)
-    return (*made, *pending)
+            illustrated += pictures
+            pictures = [
+                picture
+                for illustration in ILLUSTRATIONS
+                if illustration.after == section.title
+                for picture in _pictures(illustration, material)
+            ]
+        illustrated.append(section)
+    return (*illustrated, *pictures)
 
 
-def _pictures(title: str, material: Material) -> list[Section]:
-    """Return the pictures of the section with a title."""
-    found = []
-    for illustration in ILLUSTRATIONS:
-        if illustration.after == title:
-            found.append(_picture(illustration, material))
-    return [section for section in found if section is not None]
-
-
-def _picture(illustration: Illustration, material: Material) -> Section | None:
-    """Return a picture, or why there is none, as a section; nothing where nothing is to be seen."""
+def _pictures(illustration: Illustration, material: Material) -> list[Section]:
+    """Return a picture, or the reason why it is missing; nothing if there are no contents."""
     request = illustration.request(material)
     if request is None:
-        return None
-    drawn = request if isinstance(request, NotDrawn) else _drawn(illustration, request)
-    if isinstance(drawn, NotDrawn):
+        return []
+    picture = request if isinstance(request, NotDrawn) else _drawn(illustration, request)
+    if isinstance(picture, NotDrawn):
         name = illustration.function.__name__
-        report(Finding("no-picture", f"report: no picture by {name}: {drawn.reason}"))
-        text = f"This picture could not be made: {drawn.reason}"
-        return Section(illustration.title, text, level=3)
-    return Section(
-        illustration.title,
-        picture=drawn,
-        alt=illustration.alt,
-        caption=illustration.caption,
-        level=3,
-    )
+        report(Finding("no-picture", f"report: no picture by {name}: {picture.reason}"))
+        text = f"This picture could not be made: {picture.reason}"
+        return [Section(illustration.title, text, level=3)]
+    texts = {"alt": illustration.alt, "caption": illustration.caption}
+    return [Section(illustration.title, picture=picture, level=3, **texts)]
 
 
 def _drawn(illustration: Illustration, call: Call) -> bytes | NotDrawn:
-    # Heavy, and partly annotated.
-    pyplot: Any = import_module("matplotlib.pyplot")
-    arviz: Any = import_module("arviz")
-    before = set(pyplot.get_fignums())
+    pyplot: Any = import_module("matplotlib.pyplot")  # heavy, and partly annotated
+    open_figures = set(pyplot.get_fignums())
     try:
-        with arviz.rc_context({"plot.backend": "matplotlib"}):
-            return image(illustration.function(*call.arguments, **call.keywords))
+        return image(illustration.function(*call.arguments, **call.keywords))
     except (TypeError, ValueError, NotImplementedError) as error:
-        # What pictures refuse; and distributions for which PyMC has no formula
+        # Refusals of pictures; and distributions for which PyMC has no formula
         return NotDrawn(str(error))
     finally:
-        for figure in set(pyplot.get_fignums()) - before:
+        for figure in set(pyplot.get_fignums()) - open_figures:
             pyplot.close(figure)
 
 
@@ -341,33 +328,25 @@ def _drawn(illustration: Illustration, call: Call) -> bytes | NotDrawn:
 
 def with_graph(sections: tuple[Section, ...], m: Material) -> tuple[Section, ...]:
     """Add the model's graph after the parts of the section on the model, where it can be drawn."""
-    drawn = None if m.model is None else _graph(m.model)
-    if drawn is None:
+    picture = None if m.model is None else _graph(m.model)
+    if picture is None:
         return sections
-    titles = [section.title for section in sections]
-    place = titles.index("Model") + 1
-    while place < len(sections) and sections[place].level == 3:
-        place += 1
-    return (*sections[:place], _graph_section(drawn, m.variables), *sections[place:])
-
-
-def _graph_section(drawn: bytes, variables: list[dict[str, Any]]) -> Section:
-    """Return the model's graph."""
-    names = ", ".join(variable["name"] for variable in variables)
-    return Section(
+    names = ", ".join(variable["name"] for variable in m.variables)
+    graph = Section(
         "Graph",
-        picture=drawn,
+        picture=picture,
         alt=f"Graph of the model: arrows from its variables ({names}) to the simulators.",
         caption="Variables of the model; filled: compared with measured responses.",
         level=3,
     )
+    place = [section.title for section in sections].index("Model") + 1
+    while place < len(sections) and sections[place].level == 3:
+        place += 1
+    return (*sections[:place], graph, *sections[place:])
 
 
 def _graph(model: pm.Model) -> bytes | None:
-    """Return the model's graph; None where Graphviz is not here, which is no reader's affair.
-
-    Nor is it drawn where that would compute responses, or Graphviz does not take a name.
-    """
+    """Return the model's graph; None without Graphviz, which is no reader's affair."""
     if _computes_responses(model):  # PyMC draws each variable once for its shape
         _log.info("report: no graph: PyMC would compute responses for it")
         return None
@@ -386,39 +365,31 @@ def _graph(model: pm.Model) -> bytes | None:
 
 
 def _svg(model: pm.Model) -> bytes:
-    """Return PyMC's graph of a model, with simulators called so."""
+    """Return PyMC's graph of a model, with the simulators labelled."""
     graphs: Any = import_module("pymc.model_graph")
-    whole = graphs.ModelGraph(model)
+    graph = graphs.ModelGraph(model)
     # PyMC collects variables and edges in sets of names, whose order changes from process to
     # process; in the model's order the drawing is always the same.
     order = {name: place for place, name in enumerate(model.named_vars)}
-    plates = whole.get_plates()
+    plates = graph.get_plates()
     for plate in plates:
         plate.variables.sort(key=lambda variable: order[variable.var.name])
     plates.sort(key=lambda plate: order[plate.variables[0].var.name])
-    drawn = graphs.make_graph(
-        model.name,
-        plates=plates,
-        edges=sorted(whole.edges()),
-        node_formatters={"Observed Random Variable": _observed_formatter(model)},
-    )
-    for attributes in (drawn.graph_attr, drawn.node_attr):
-        attributes.update(fontname="Helvetica,Arial,sans-serif", fontsize="11")
-    svg: bytes = drawn.pipe(format="svg", quiet=True)
-    return svg
-
-
-def _observed_formatter(model: pm.Model) -> Callable[[Any], dict[str, Any]]:
-    """Return a function from an observed variable to what Graphviz is told of it."""
-    graphs: Any = import_module("pymc.model_graph")
     plain = graphs.DEFAULT_NODE_FORMATTERS[graphs.NodeType.OBSERVED_RV]
-    simulators = {each.name for each in nodes(model).values()}
-    simulators |= {m.name for m in measurements_of(model).values()}
+    simulators = {simulator.name for simulator in population_simulators(model)}
 
     def formatted(rv: Any) -> dict[str, Any]:
         style: dict[str, Any] = plain(rv)
-        if rv.name in simulators:
-            return {**style, "label": f"{rv.name}\n~\nSimulator"}
-        return style
+        label = {"label": f"{rv.name}\n~\nSimulator"} if rv.name in simulators else {}
+        return style | label
 
-    return formatted
+    drawing = graphs.make_graph(
+        model.name,
+        plates=plates,
+        edges=sorted(graph.edges()),
+        node_formatters={"Observed Random Variable": formatted},
+    )
+    for attributes in (drawing.graph_attr, drawing.node_attr):
+        attributes.update(fontname="Helvetica,Arial,sans-serif", fontsize="11")
+    svg: bytes = drawing.pipe(format="svg", quiet=True)
+    return svg

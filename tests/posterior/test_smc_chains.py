@@ -13,9 +13,10 @@ import pytest
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
-from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint
-from prbayes.posterior.kernel import BatchedKernel
+from prbayes.posterior.kernel import BatchedKernel, KernelOptions
+from prbayes.posterior.results import Draws
+from prbayes.posterior.smc import Chains, SamplingSettings
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 20)
 DRAWS, CHAINS = 20, 3
@@ -50,15 +51,15 @@ def evaluator(name: str) -> Evaluator:
     return Evaluator.of(model)
 
 
-def run(name: str, path: Path | None = None) -> Particles:
+def run(name: str, path: Path | None = None) -> Draws:
     own = evaluator(name)
     checkpoint = None if path is None else Checkpoint(path, identity_of(own), {})
-    chains = Chains(own, DRAWS, 0.5, checkpoint)
-    return chains(np.random.SeedSequence(3).spawn(CHAINS), False)
+    chains = Chains(own, SamplingSettings(draws=DRAWS), checkpoint=checkpoint)
+    return chains.run(np.random.SeedSequence(3).spawn(CHAINS))
 
 
 @cache
-def undisturbed(name: str) -> Particles:
+def undisturbed(name: str) -> Draws:
     return run(name)
 
 
@@ -75,8 +76,8 @@ def kill_after(n_stages: int, patch: pytest.MonkeyPatch) -> None:
     patch.setattr(BatchedKernel, "mutate", mutate)
 
 
-def stages_of(particles: Particles) -> list[int]:
-    return [len(stages["beta"]) for stages in particles.stats]
+def stages_of(draws: Draws) -> list[int]:
+    return [len(stages["beta"]) for stages in draws.stages]
 
 
 @pytest.mark.long
@@ -138,12 +139,12 @@ def test_large_designs_are_whole_in_the_last_stage_alone(monkeypatch: pytest.Mon
         seen.append([])
         return beginning(self, *rest)
 
-    beginning = Chains._begun
+    beginning = Chains._begin
     monkeypatch.setattr(BatchedKernel, "mutate", mutate)
-    monkeypatch.setattr(Chains, "_begun", begun)
+    monkeypatch.setattr(Chains, "_begin", begun)
     found = run("large")
     assert len(seen) == CHAINS
-    for points, stages in zip(seen, found.stats, strict=True):
+    for points, stages in zip(seen, found.stages, strict=True):
         assert points == [64] * (len(points) - 1) + [512]
         # Twice at one: on an eighth of the points, and on all of them.
         betas = stages["beta"]
@@ -153,15 +154,15 @@ def test_large_designs_are_whole_in_the_last_stage_alone(monkeypatch: pytest.Mon
 
 
 def test_where_few_particles_serve_the_chain_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("prbayes.posterior.kernel._SERVE", 1.1)
+    monkeypatch.setattr("prbayes.posterior.kernel._OPTIONS", KernelOptions(effective=1.1))
     found = run("large")
-    for stages in found.stats:
+    for stages in found.stages:
         assert stages["beta"].count(1) == 1
         assert np.all(np.diff(stages["beta"]) > 0)
         assert {len(values) for values in stages.values()} == {len(stages["beta"])}
     # From the prior: all of the evidence is gathered once more.
-    evidence = [stages["log_marginal_likelihood"][-1] for stages in found.stats]
-    others = [stages["log_marginal_likelihood"][-1] for stages in undisturbed("large").stats]
+    evidence = [stages["log_marginal_likelihood"][-1] for stages in found.stages]
+    others = [stages["log_marginal_likelihood"][-1] for stages in undisturbed("large").stages]
     assert np.mean(evidence) == pytest.approx(np.mean(others), abs=0.5)
     again = evaluator("large")(found.thetas.reshape(-1, 1)).discrepancies
     np.testing.assert_allclose(found.discrepancies.reshape(-1, 1), again)
@@ -169,25 +170,13 @@ def test_where_few_particles_serve_the_chain_begins_anew(monkeypatch: pytest.Mon
 
 def test_coarser_designs_change_no_posterior(monkeypatch: pytest.MonkeyPatch) -> None:
     own = evaluator("large")
-    some = [Chains(own, 500, 0.5, None)(np.random.SeedSequence(s).spawn(2), False) for s in (1, 2)]
+    chains = Chains(own, SamplingSettings(draws=500))
+    some = [chains.run(np.random.SeedSequence(s).spawn(2)) for s in (1, 2)]
     monkeypatch.setattr("prbayes.model.evaluator._LARGE", 513)
-    whole = Chains(own, 500, 0.5, None)(np.random.SeedSequence(3).spawn(4), False)
+    whole = chains.run(np.random.SeedSequence(3).spawn(4))
     thetas = np.concatenate([found.thetas for found in some])
     assert abs(thetas.mean() - whole.thetas.mean()) < 0.2 * whole.thetas.std()
     assert thetas.std() == pytest.approx(whole.thetas.std(), rel=0.15)
-    evidence = [found.stats[i]["log_marginal_likelihood"][-1] for found in some for i in (0, 1)]
-    others = [stages["log_marginal_likelihood"][-1] for stages in whole.stats]
+    evidence = [found.stages[i]["log_marginal_likelihood"][-1] for found in some for i in (0, 1)]
+    others = [stages["log_marginal_likelihood"][-1] for stages in whole.stages]
     np.testing.assert_allclose(np.mean(evidence), np.mean(others), atol=0.2)
-
-
-def test_a_saved_refinement_is_of_rounds_that_are_over(tmp_path: Path) -> None:
-    own = evaluator("stored")
-    checkpoint = Checkpoint(tmp_path / "run.nc", identity_of(own), {})
-    chains = Chains(own, DRAWS, 0.5, checkpoint)
-    assert chains.saved_refinement(0) is None
-    at = np.array([[0.5], [1.5]])
-    checkpoint.save({"refined0_thetas": at}, {"round": 1})
-    again = Checkpoint(tmp_path / "run.nc", identity_of(own), {})
-    chains = Chains(own, DRAWS, 0.5, again)
-    np.testing.assert_array_equal(chains.saved_refinement(0), at)
-    assert chains.saved_refinement(1) is None

@@ -17,15 +17,15 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.reports import illustrations
+from prbayes.reports import figures
 from prbayes.reports.material import gather
 
 
 def drawn_by(monkeypatch: pytest.MonkeyPatch, functions: dict[str, Any]) -> None:
     """Put other functions in the place of some pictures, by name."""
-    table = illustrations.ILLUSTRATIONS
+    table = figures.ILLUSTRATIONS
     new = tuple(replace(i, function=functions.get(i.function.__name__, i.function)) for i in table)
-    monkeypatch.setattr(illustrations, "ILLUSTRATIONS", new)
+    monkeypatch.setattr(figures, "ILLUSTRATIONS", new)
 
 
 def test_pictures_close_their_figures_and_leave_settings_alone(calibrated: Any) -> None:
@@ -63,9 +63,9 @@ def test_a_mistake_in_a_request_is_no_sentence(
     def wrong(_: Any) -> Any:
         raise NotImplementedError
 
-    table = illustrations.ILLUSTRATIONS
+    table = figures.ILLUSTRATIONS
     new = tuple(replace(i, request=wrong) for i in table if i.after == "Validity")
-    monkeypatch.setattr(illustrations, "ILLUSTRATIONS", new)
+    monkeypatch.setattr(figures, "ILLUSTRATIONS", new)
     with pytest.raises(NotImplementedError):
         prb.Report("x", validity=calibrated.test)
 
@@ -88,7 +88,7 @@ def test_each_illustration_gets_what_it_needs(
 
         return made
 
-    names = {i.function.__name__ for i in illustrations.ILLUSTRATIONS}
+    names = {i.function.__name__ for i in figures.ILLUSTRATIONS}
     drawn_by(monkeypatch, {name: drawn(name) for name in names})
     full = prb.Report("x", model=model, optimum=optimum, posterior=posterior, validity=test)
     assert set(called) == names - {
@@ -102,7 +102,7 @@ def test_each_illustration_gets_what_it_needs(
     assert called["plot_landscape"] == (optimum, model)
     assert called["plot_validity"] == (test,)
     titles = [s.title for s in full.sections]
-    for illustration in illustrations.ILLUSTRATIONS:
+    for illustration in figures.ILLUSTRATIONS:
         if illustration.function.__name__ not in called:
             continue
         before = full.sections[: titles.index(illustration.title)]
@@ -174,7 +174,7 @@ def test_a_name_that_graphviz_does_not_take(
     def fails(_: Any) -> bytes:
         raise subprocess.CalledProcessError(1, "dot")
 
-    monkeypatch.setattr(illustrations, "_svg", fails)
+    monkeypatch.setattr(figures, "_svg", fails)
     made = prb.Report("x", model=calibrated.model)
     assert "Graph" not in [section.title for section in made.sections]
 
@@ -221,10 +221,10 @@ def test_the_graph_is_the_same_in_every_process(monkeypatch: pytest.MonkeyPatch)
             plate.variables.reverse()
         return plates
 
-    illustrations._svg(model)
+    figures._svg(model)
     monkeypatch.setattr(graphs.ModelGraph, "get_plates", turned_plates)
     monkeypatch.setattr(graphs.ModelGraph, "edges", lambda self: edges(self)[::-1])
-    illustrations._svg(model)
+    figures._svg(model)
     assert sources[0] == sources[1]
     assert sources[0][0] == [["z", "b", "y", "a"], ["s"]]
 
@@ -261,7 +261,7 @@ def test_pairs_of_outputs_are_drawn_where_responses_are_stored(
             )
         asked.clear()
         material = gather(model, None, posterior, None, None)
-        made = illustrations.illustrate((prb.reports.Section("Data"),), material)
+        made = figures.illustrate((prb.reports.Section("Data"),), material)
         assert len(asked) == count
         assert [section.title for section in made[1:]] == (
             ["Measured and calibrated responses", "Pairs of outputs"][: max(count, 1)]
@@ -285,7 +285,7 @@ def test_labels_reach_the_pictures_that_know_the_names(
 
         return made
 
-    names = {i.function.__name__ for i in illustrations.ILLUSTRATIONS}
+    names = {i.function.__name__ for i in figures.ILLUSTRATIONS}
     drawn_by(monkeypatch, {name: drawn(name) for name in names})
     x = pm.Normal.dist(model["mu"], model["sigma"])
     later = prb.predict(posterior, np.positive, x, model=model, n_draws=20)

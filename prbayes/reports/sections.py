@@ -1,0 +1,500 @@
+"""The sections of a report: model, data, metric, optima, posteriors; and the order of all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from prbayes._stats import INTERVAL
+from prbayes._validate import Floats
+from prbayes.model.elements import (
+    read_elements,
+    single_elements,
+    split_elements,
+    stacked_draws,
+    told_elements,
+    told_of,
+)
+from prbayes.model.labels import labelled
+from prbayes.optimize.optimum import compared_in
+from prbayes.plots.outputs import correlation
+from prbayes.reports.assessment import diagnostics, failures, origin, specimens, validity
+from prbayes.reports.decision import decision
+from prbayes.reports.figures import illustrate, with_graph
+from prbayes.reports.material import Material, gather
+from prbayes.reports.numbers import (
+    NOTHING,
+    alike,
+    counted,
+    described,
+    number,
+    places,
+    sample_sd,
+    with_zeros,
+)
+from prbayes.reports.section import Section
+from prbayes.reports.summary import answers, next_steps, summary
+from prbayes.reports.tables import rows_table
+from prbayes.response.outputs import SINGLE_OUTPUT
+
+
+def sections_of(*, pictures: bool, **results: Any) -> tuple[Section, ...]:
+    """Return the sections that results allow, with pictures if wanted.
+
+    The results are keywords of `gather`.
+    """
+    material = gather(**results)
+    parts = (
+        _summary,
+        model,
+        data,
+        metric,
+        optima,
+        posteriors,
+        comparison,
+        diagnostics,
+        failures,
+        validity,
+        specimens,
+        decision,
+        origin,
+    )
+    sections = tuple(section for part in parts for section in part(material))
+    return illustrate(with_graph(sections, material), material) if pictures else sections
+
+
+def _summary(m: Material) -> list[Section]:
+    if not (m.results or m.tests or m.description):
+        return []
+    rows = answers(m)
+    sections = [Section("Summary", summary(m), rows_table(rows) if rows else None)]
+    steps = next_steps(m)
+    if steps:
+        sections.append(Section("What to do next", steps, level=3))
+    return sections
+
+
+# -- model -----------------------------------------------------------------------------------
+
+
+def model(m: Material) -> list[Section]:
+    """Return the variables of the model, and its simulators."""
+    if m.description is None:
+        return []
+    variables = [
+        {
+            "variable": v["name"],
+            "role": v["role"],
+            "distribution": v["distribution"],
+            "meaning": m.labels.get(v["name"], ""),
+        }
+        for v in m.description["variables"]
+    ]
+    about = (
+        "Hyperparameters describe how the inputs vary from specimen to specimen, "
+        "and have prior distributions."
+    )
+    sections = [Section("Model", about, rows_table(variables))]
+    simulators = [
+        {"simulator": s["name"]} | {key: s[key] for key in ("response", "inputs", "propagation")}
+        for s in m.description["simulators"]
+    ]
+    if simulators:
+        about = "A simulator computes the response of a specimen from its inputs."
+        sections.append(Section("Simulators", about, rows_table(simulators), level=3))
+    return sections
+
+
+# -- data ------------------------------------------------------------------------------------
+
+
+def data(m: Material) -> list[Section]:
+    """Return a summary of the measured responses, correlations of outputs, and the values."""
+    if not m.observed:
+        return []
+    rows = [row for name in m.observed for row in _output_rows(name, m)]
+    text = ["Measured responses, in the units of the response."]
+    for simulator in [] if m.description is None else m.description["simulators"]:
+        if simulator["specimens"]:
+            text.append(f"{simulator['name']}: {simulator['specimens']}.")
+    correlations = []
+    for name, y in m.observed.items():
+        if y.ndim == 1:
+            continue
+        n = len(_shown_columns(y))
+        if n < y.shape[1]:
+            text.append(f"{name}: {n} of {y.shape[1]} outputs are told.")
+        if y.shape[1] > 1:
+            correlations.append(_correlations(name, m))
+    table = rows_table(with_zeros(rows))
+    return [Section("Data", tuple(text), table), *correlations, _values(m)]
+
+
+def _output_rows(name: str, m: Material) -> list[dict[str, Any]]:
+    """Return a row for each output of a simulator."""
+    y = m.observed[name]
+    outputs = m.outputs.get(name, SINGLE_OUTPUT)
+    if y.ndim == 1:
+        units = outputs.units[0] if outputs.units else ""
+        meaning = m.labels.get(name, "")
+        about = {"simulator": name, "meaning": meaning, "output": "", "units": units}
+        return [about | described(y)]
+    rows = []
+    for j in _shown_columns(y):
+        units = outputs.units[j] if outputs.units else ""
+        output = outputs.names[j]
+        meaning = m.labels.get(f"{name}[{output}]", m.labels.get(output, ""))
+        about = {"simulator": name, "meaning": meaning, "output": output, "units": units}
+        rows.append(about | described(y[:, j]))
+    return rows
+
+
+def _shown_columns(y: Floats) -> list[int]:
+    """Return at most twelve outputs, half a page, from the first to the last."""
+    m = y.shape[1]
+    return [round(place) for place in np.linspace(0, m - 1, min(m, 12)).tolist()]
+
+
+def _correlations(name: str, m: Material) -> Section:
+    """Return the correlations of outputs."""
+    y = m.observed[name]
+    names = m.outputs[name].names
+    columns = _shown_columns(y)
+    rows = []
+    for i in columns:
+        row = {"": names[i]}
+        for j in columns:
+            pairs = y[:, [i, j]]
+            pairs = pairs[np.isfinite(pairs).all(axis=1)]
+            r = correlation(pairs, np.ones(len(pairs))) if len(pairs) > 2 else math.nan
+            text = NOTHING if math.isnan(r) else f"{r + 0.0:.3f}"
+            row[names[j]] = "1" if i == j else text
+        rows.append(row)
+    about = (
+        f"Correlations of the measured outputs of {name}, each of the specimens that have both; "
+        "those that failed are in none."
+    )
+    return Section(f"Correlations of {name}", about, rows_table(rows), level=3)
+
+
+def _values(m: Material) -> Section:
+    """Return the measured values, by which a calibration can be repeated; at most half a page."""
+    text = []
+    for name, y in m.observed.items():
+        if y.size > 300:
+            text.append(f"{name}: {y.size} values, which are too many to print.")
+        elif y.ndim == 1:
+            text.append(f"{name}: {_listed(y)}.")
+        else:
+            columns = zip(m.outputs[name].names, y.T, strict=True)
+            text += [f"{name}[{output}]: {_listed(column)}." for output, column in columns]
+    about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
+    return Section("Measured values", (about, *text), level=3)
+
+
+def _listed(y: Floats) -> str:
+    return ", ".join(alike(y.tolist(), sample_sd(y[np.isfinite(y)]), 4))
+
+
+# -- metric ----------------------------------------------------------------------------------
+
+
+def metric(m: Material) -> list[Section]:
+    """Return the metric, and the discrepancies and epsilons of the results."""
+    rows = [
+        row
+        for label, calibration in m.calibrations.items()
+        for row in _discrepancies(label, calibration)
+    ]
+    metrics = _metrics(m)
+    if not rows and not metrics:
+        return []
+    if m.is_by_specimen:
+        return [_log_likelihood(rows)]
+    about = (
+        "The metric measures how far the distribution of the simulated responses is "
+        "from that of the measured ones; smaller is better."
+    )
+    if any(row["epsilon"] is not None for row in rows):
+        about += (
+            " Epsilon is the discrepancy that the sampler takes for one unit of log-density."
+            " The discrepancy of a posterior is the mean over its draws."
+        )
+    lines = [f"{name}: {metric}." for name, metric in metrics.items()]
+    compared = [line for table in m.calibrations.values() for line in compared_in(table)]
+    text = (about, *lines, *dict.fromkeys(compared))
+    return [Section("Metric and epsilon", text, rows_table(rows) if rows else None)]
+
+
+def _log_likelihood(rows: list[dict[str, Any]]) -> Section:
+    """Return the section of results of the log-likelihood by specimen."""
+    about = (
+        "The log-likelihood compares specimens: the density of each measured response in the "
+        "population, through the inputs that reproduce it. It is evaluated on an emulator of the "
+        "response, whose runs are counted here. The log-likelihood of a posterior is the mean over "
+        "its draws."
+    )
+    table = [
+        {
+            "result": row["result"],
+            "simulator": row["simulator"],
+            "log-likelihood": -row["discrepancy"],
+            "runs": row["runs"],
+        }
+        for row in rows
+    ]
+    return Section("Log-likelihood", about, rows_table(table))
+
+
+def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
+    """Return a row for each simulator of a result."""
+    sample_dims = [dim for dim in ("chain", "draw") if dim in calibration.dims]
+    mean = calibration["discrepancy"].mean(sample_dims, skipna=False)
+    rows: list[dict[str, Any]] = []
+    for name in calibration["simulator"].values.tolist():
+        values = calibration.sel(simulator=name)
+        keys = ("discrepancy_error", "epsilon")
+        error, epsilon = (float(values[key]) if key in values else None for key in keys)
+        rows.append(
+            {
+                "result": label,
+                "simulator": name,
+                "discrepancy": float(mean.sel(simulator=name)),
+                "Monte Carlo error": error,
+                "epsilon": epsilon,
+                "runs": str(int(values["n_runs"])) if "n_runs" in values else None,
+            }
+        )
+    return rows
+
+
+def _metrics(m: Material) -> dict[str, str]:
+    """Return the metric by simulator; by result as well, where results differ in it."""
+    by_result = {
+        label: {
+            str(name): str(metric)
+            for name, metric in zip(
+                calibration["simulator"].values, calibration["metric"].values, strict=True
+            )
+        }
+        for label, calibration in m.calibrations.items()
+    }
+    if by_result:
+        first, *rest = by_result.values()
+        if all(metrics == first for metrics in rest):
+            return first
+        return {
+            f"{label}, {name}": metric
+            for label, by_simulator in by_result.items()
+            for name, metric in by_simulator.items()
+        }
+    simulators = [] if m.description is None else m.description["simulators"]
+    return {s["name"]: s["metric"] for s in simulators}
+
+
+# -- optima ----------------------------------------------------------------------------------
+
+
+def optima(m: Material) -> list[Section]:
+    """Return a section for each optimum."""
+    sections = []
+    for label, tree in m.optima.items():
+        names = read_elements(told_of(tree["optimum"].data_vars, tree["stderr"].data_vars))
+        text = [_how_it_ended(tree["optimum"].attrs)]
+        if label in m.live_optima:
+            evaluator = m.live_optima[label].evaluator
+            for rival in m.live_optima[label].rivals:
+                place = labelled(evaluator, rival["point"], {}).data_vars
+                text.append(_other_optimum(rival, place, names))
+        text.append(
+            "Standard errors are those of the curvature of the log-likelihood."
+            if m.is_by_specimen
+            else "Standard errors are those of the estimator over repeated sets of as many "
+            "specimens."
+        )
+        point = single_elements(tree["optimum"].data_vars)
+        stderr = single_elements(tree["stderr"].data_vars)
+        rows = []
+        for name in names:
+            estimate, error = alike((point[name], stderr[name]), stderr[name])
+            rows.append({"hyperparameter": name, "estimate": estimate, "standard error": error})
+        sections.append(Section(_titled("Optimum", label, m.optima), text, rows_table(rows)))
+    return sections
+
+
+def _titled(title: str, label: str, results: Mapping[str, Any]) -> str:
+    return title if len(results) == 1 else f"{title}: {label}"
+
+
+def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
+    ended = "converged" if attrs.get("converged") else "did not converge"
+    evaluations = counted(int(attrs.get("n_evaluations", 0)), "evaluation")
+    message = str(attrs.get("message", "")).rstrip(".")
+    text = f"The optimiser {ended} after {evaluations} of the objective: {message}."
+    if attrs.get("prior"):
+        text += (
+            " Minus the log prior was part of the objective: "
+            "the discrepancy alone is smallest elsewhere."
+        )
+    return text
+
+
+def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
+    """Return a sentence on another optimum, by scalars alone if its elements are many."""
+    elements = single_elements(point)
+    shown = [name for name in names if name in elements]
+    if len(shown) > 8:
+        shown = [name for name in shown if name in point] or shown
+    at = ", ".join(f"{name} = {number(elements[name])}" for name in shown)
+    discrepancy = number(float(rival["discrepancy"]))
+    if rival["comparable"]:
+        judged = "the data could as well come from there"
+    else:
+        judged = "the data fit it less well; a posterior tells how much it counts"
+    return f"Another optimum is at {at}, with discrepancy {discrepancy}: {judged}."
+
+
+# -- posteriors ------------------------------------------------------------------------------
+
+
+def posteriors(m: Material) -> list[Section]:
+    """Return a section for each posterior."""
+    sections = []
+    for label, tree in m.posteriors.items():
+        posterior = tree["posterior"]
+        chains = counted(int(posterior.sizes["chain"]), "chain")
+        by = f" by {posterior.attrs['sampler']}" if "sampler" in posterior.attrs else ""
+        text = [
+            f"{chains} of {posterior.sizes['draw']} draws{by}. "
+            f"Intervals hold {INTERVAL:.0%} of the draws, with equal tails."
+        ]
+        if not m.is_by_specimen:
+            text += _width(tree)
+        draws = stacked_draws(posterior)
+        values = split_elements(draws)
+        names = read_elements(told_elements(draws))
+        title = _titled("Posterior", label, m.posteriors)
+        table = rows_table(_posterior_rows(tree, list(values), names))
+        sections.append(Section(title, text, table))
+        rows = _correlation_rows({name: values[name] for name in names})
+        if rows:
+            about = "Correlations of the draws: what is 1 or -1 the data hardly tell apart."
+            title = _titled("Correlations of the hyperparameters", label, m.posteriors)
+            sections.append(Section(title, about, rows_table(rows), level=3))
+    return sections
+
+
+def _width(tree: xr.DataTree) -> list[str]:
+    """Return a sentence on the width of the draws of `sample_smc`."""
+    attrs = tree["posterior"].attrs
+    if "adjustment" not in attrs:
+        return []
+    if str(attrs["adjustment"]) == "estimate":
+        return [
+            "The posterior is that given the metric's own estimate: prior times density of the "
+            "estimate over repeated sets of specimens."
+        ]
+    has_epsilon = bool((tree["calibration"].to_dataset()["is_likelihood"] == 0).any())
+    by_epsilon = "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."
+    return [by_epsilon] if has_epsilon else []
+
+
+def _posterior_rows(
+    tree: xr.DataTree, elements: list[str], names: Sequence[str]
+) -> list[dict[str, Any]]:
+    arviz: Any = import_module("arviz")  # heavy, and partly annotated
+    with np.errstate(all="ignore"):  # a variable that never moves
+        table = arviz.summary(tree, kind="all", ci_prob=INTERVAL, ci_kind="eti", round_to="none")
+    percent = f"{100 * INTERVAL:.0f}"
+    rows = []
+    # ArviZ has the same elements in the same order, with names of its own.
+    for name, (_, values) in zip(elements, table.iterrows(), strict=True):
+        if name not in names:
+            continue
+        in_units = [values[k] for k in ("mean", "sd", f"eti{percent}_lb", f"eti{percent}_ub")]
+        mean, sd, lower, upper = alike(in_units, float(values["sd"]))
+        bulk, tail, rhat, mcse = (
+            float(values[k]) for k in ("ess_bulk", "ess_tail", "r_hat", "mcse_mean")
+        )
+        decimals = places(mcse, 2)
+        rows.append(
+            {
+                "variable": name,
+                "mean": mean,
+                "sd": sd,
+                f"{percent}% from": lower,
+                "to": upper,
+                "ESS, bulk": f"{bulk:.0f}" if math.isfinite(bulk) else NOTHING,
+                "ESS, tail": f"{tail:.0f}" if math.isfinite(tail) else NOTHING,
+                "R-hat": NOTHING if math.isnan(rhat) else f"{rhat:.3f}",
+                "error of mean": number(mcse) if decimals is None else f"{mcse:.{decimals}f}",
+            }
+        )
+    return rows
+
+
+def _correlation_rows(draws: dict[str, Floats]) -> list[dict[str, str]]:
+    """Return the correlations of draws; none of one variable, or of more than fit on a page."""
+    names = [name for name, values in draws.items() if np.ptp(values) > 0]
+    if not 2 <= len(names) <= 8:
+        return []
+    r = np.corrcoef([draws[name] for name in names])
+    rows = []
+    for i, name in enumerate(names):
+        row = {"": name}
+        for j, column in enumerate(names):
+            row[column] = "1" if i == j else f"{r[i, j] + 0.0:.2f}"
+        rows.append(row)
+    return rows
+
+
+# -- comparison ------------------------------------------------------------------------------
+
+
+def comparison(m: Material) -> list[Section]:
+    """Return the results side by side."""
+    if m.comparison is None:
+        return []
+    table = m.comparison
+    labels = table["result"].values.tolist()
+    rows = []
+    for name in table["hyperparameter"].values.tolist():
+        for label in labels:
+            cell = table.sel(hyperparameter=name, result=label)
+            rows.append({"hyperparameter": name, "result": label} | _estimate(cell))
+    about = (
+        f"The shift is the distance from the estimate of {labels[0]}, "
+        "in standard deviations of the result in the row."
+    )
+    sections = [Section("Comparison", about, rows_table(rows))]
+    scores = [
+        {"under the metric": str(key)} | dict(zip(labels, values.values.tolist(), strict=True))
+        for key, values in table.data_vars.items()
+        if values.dims == ("result",) and key not in ("n_responses", "seconds")
+    ]
+    if scores:
+        about = (
+            "Discrepancy of the population at each estimate, under each metric, "
+            "whatever it was calibrated with."
+        )
+        sections.append(Section("Scores under each metric", about, rows_table(scores), level=3))
+    return sections
+
+
+def _estimate(cell: xr.Dataset) -> dict[str, str]:
+    """Return an estimate with its spread, as text."""
+    values = [float(cell[key]) for key in ("estimate", "sd", "lower", "upper")]
+    estimate, sd, lower, upper = alike(values, values[1])
+    shift = float(cell["shift"])
+    return {
+        "estimate": estimate,
+        "sd": sd,
+        f"{INTERVAL:.0%} from": lower,
+        "to": upper,
+        "shift in sd": f"{shift + 0.0:.2f}" if math.isfinite(shift) else number(shift),
+    }

@@ -1,0 +1,403 @@
+"""The sections on model, data, metric, optima and posteriors, and their order."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.reports.material import gather
+from prbayes.reports.numbers import NOTHING
+from prbayes.reports.sections import _other_optimum, data, metric
+from prbayes.reports.tables import cells
+from prbayes.response.outputs import Outputs
+
+
+def test_model_and_data(
+    observed: Any, report: prb.Report, page: Any, row: Any, section: Any
+) -> None:
+    assert row("mu", "distribution", page)["distribution"] == "Normal(1.5, 1)"
+    assert row("cv", "distribution", page) == {
+        "variable": "cv", "role": "deterministic", "distribution": "computed from sigma, mu",
+    }  # fmt: skip
+    assert row("y", "inputs", page)["inputs"] == "Normal(mu, sigma)"
+    data = row("y", "smallest", page)
+    assert data["N"] == "30"
+    found = [float(data[key]) for key in ("smallest", "largest", "mean", "sd")]
+    expected = [observed.min(), observed.max(), observed.mean(), observed.std(ddof=1)]
+    np.testing.assert_allclose(found, expected, atol=5.1e-4)
+    assert "y: 30 specimens: 100, 101" in " ".join(section(report, "Data").text)
+
+
+def test_metric_and_epsilon(
+    calibrated: Any, report: prb.Report, page: Any, row: Any, section: Any
+) -> None:
+    _, optimum, posterior, _ = calibrated
+    table = row("posterior", "epsilon", page)
+    calibration = posterior["calibration"]
+    assert float(table["epsilon"]) == pytest.approx(float(calibration["epsilon"][0]), rel=1e-3)
+    assert float(table["discrepancy"]) == pytest.approx(
+        float(calibration["discrepancy"].mean()), rel=1e-3
+    )
+    assert float(row("optimum", "epsilon", page)["discrepancy"]) == pytest.approx(
+        optimum.discrepancy, rel=1e-3
+    )
+    assert any(
+        p.startswith("y: KullbackLeibler(") for p in section(report, "Metric and epsilon").text
+    )
+
+
+def test_results_under_different_metrics(calibrated: Any) -> None:
+    first = calibrated.optimum.to_datatree()
+    other = first.copy(deep=True)
+    other["calibration"] = (
+        other["calibration"].to_dataset().assign(metric=("simulator", ["Other()"]))
+    )
+    given = dict.fromkeys(("model", "posterior", "validity", "comparison"))
+    (same,) = metric(gather(optimum={"a": first, "b": first}, **given))
+    assert [p.split(": ")[0] for p in same.text[1:]] == ["y"]
+    (different,) = metric(gather(optimum={"a": first, "b": other}, **given))
+    assert different.text[2] == "b, y: Other()."
+    assert different.text[1].startswith("a, y: KullbackLeibler(")
+    assert "Epsilon" not in different.text[0], "optima have none"
+    assert "epsilon" not in cells(different.table).header
+
+
+def test_one_measured_value_has_no_spread(calibrated: Any) -> None:
+    nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
+    m = dataclasses.replace(gather(**nothing), observed={"y": np.array([2.5])})
+    (row,) = cells(data(m)[0].table).rows
+    assert row == ("y", "1", "2.500", "2.500", "2.500", "\u2013")
+
+
+# -- several outputs -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def measured() -> Any:
+    """Two outputs of 20 specimens: of the second two were not measured, and one has failed."""
+    y = np.random.default_rng(1).normal([5.0, 70.0], [0.5, 3.0], (20, 2))
+    y[:2, 1], y[2, 1] = np.nan, np.inf
+    return y
+
+
+@pytest.fixture(scope="module")
+def frame(measured: Any) -> pm.Model:
+    data = xr.DataArray(
+        measured,
+        dims=("i", "mode"),
+        coords={"mode": ["first", "second"], "units": ("mode", ["Hz", "mm"])},
+    )
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 5, 1), 0.5)
+        b = pm.Normal.dist(70, 3.0)
+        prb.Simulator(
+            "frame",
+            lambda a, b: np.stack([a, b], axis=-1),
+            *(a, b),
+            metric=prb.Joint(prb.ProbabilityResidual()),
+            observed=data,
+            propagation=prb.Resimulated(128),
+        )
+    return model
+
+
+def test_each_output_has_a_row_and_pairs_have_correlations(frame: Any, measured: Any) -> None:
+    about, correlations, values = data(gather(frame, None, None, None, None))
+    table = cells(about.table)
+    assert table.header == (
+        *("simulator", "output", "units", "N", "failed", "missing"),
+        *("smallest", "largest", "mean", "sd"),
+    )
+    first, second = table.rows
+    assert first[:6] == ("frame", "first", "Hz", "20", "0", "0")
+    assert second[:6] == ("frame", "second", "mm", "18", "1", "2")
+    known = measured[3:, 1]
+    assert float(second[8]) == pytest.approx(known.mean(), abs=0.01)
+    assert float(second[9]) == pytest.approx(known.std(ddof=1), abs=0.01)
+    r = np.corrcoef(measured[3:].T)[0, 1]
+    assert correlations.title == "Correlations of frame"
+    assert cells(correlations.table).rows[0][1:] == ("1", f"{r:.3f}")
+    _, first_listed, second_listed = values.text
+    numbers = first_listed.removeprefix("frame[first]: ").removesuffix(".").split(", ")
+    np.testing.assert_allclose(list(map(float, numbers)), measured[:, 0], atol=1e-3)
+    assert second_listed.removeprefix("frame[second]: ").split(", ")[:3] == [NOTHING, NOTHING, "∞"]
+
+
+def test_a_result_alone_tells_the_same_of_outputs(frame: Any) -> None:
+    optimum = prb.minimize(frame)
+    told = data(gather(frame, None, None, None, None))
+    tree = optimum.to_datatree()
+    stored = data(gather(None, tree, None, None, None))
+    for one, other in zip(told, stored, strict=True):
+        assert other.text == one.text
+        if one.table is not None:
+            assert cells(other.table) == cells(one.table)
+    report = prb.Report("Frame", optimum=optimum, model=frame, pictures=False)
+    assert (
+        "on 20 specimens with 2 outputs of frame, by the joint probability residual"
+        in (report.sections[0].text[1])
+    )
+
+
+def test_of_a_curve_some_outputs_have_a_row(calibrated: Any) -> None:
+    nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
+    rng = np.random.default_rng(1)
+    m = dataclasses.replace(
+        gather(**nothing),
+        observed={"y": rng.normal(size=(5, 40))},
+        outputs={"y": Outputs(tuple(np.arange(40) / 2), "hour")},
+    )
+    about, correlations, values = data(m)
+    rows = cells(about.table).rows
+    assert len(rows) == len(cells(correlations.table).rows) == 12
+    assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
+    assert "y: 12 of 40 outputs are told." in about.text
+    assert len(values.text) == 41  # of few specimens all outputs are listed
+
+
+def test_one_output_tells_its_units_from_memory_and_from_a_result() -> None:
+    values = xr.DataArray([1.0, 2.0, 4.0], dims="specimen", attrs={"units": "N/mm"})
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), 1.0)
+        prb.Simulator(
+            "k", np.positive, x, metric=prb.AreaMetric(), observed=values,
+            propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    optimum = prb.minimize(model)
+    for given in ((model, None), (None, optimum.to_datatree())):
+        section, values = data(gather(*given, None, None, None))
+        assert values.text[1] == "k: 1.000, 2.000, 4.000."
+        assert section.table["units"].tolist() == ["N/mm"]
+    picture = prb.plot_responses(optimum)
+    assert picture.viz["plot"]["k"].item().get_xlabel() == "k (N/mm)"
+
+
+def test_optimum(calibrated: Any, report: prb.Report, page: Any, row: Any, section: Any) -> None:
+    _, optimum, _, _ = calibrated
+    for name in ("mu", "sigma", "cv"):
+        found = row(name, "standard error", page)
+        assert float(found["standard error"]) == pytest.approx(optimum.stderr[name], rel=6e-3)
+        assert float(found["estimate"]) == pytest.approx(
+            optimum.point[name], abs=optimum.stderr[name] * 6e-3
+        )
+    assert f"after {optimum.search.n_evaluations} evaluations" in " ".join(
+        section(report, "Optimum").text
+    )
+
+
+def test_posterior(calibrated: Any, page: Any, row: Any) -> None:
+    _, _, posterior, _ = calibrated
+    summary = az.summary(posterior, ci_prob=0.89, ci_kind="eti", round_to="none")
+    for name in ("mu", "sigma", "cv"):
+        found, exact = row(name, "R-hat", page), summary.loc[name]
+        draws = posterior["posterior"][name].values
+        low, high = np.quantile(draws, [0.055, 0.945])
+        for key, value in (
+            ("mean", draws.mean()),
+            ("sd", draws.std(ddof=1)),
+            ("89% from", low),
+            ("to", high),
+        ):
+            assert float(found[key]) == pytest.approx(value, abs=exact["sd"] * 6e-3)
+        assert float(found["ESS, bulk"]) == pytest.approx(exact["ess_bulk"], abs=0.6)
+        assert float(found["ESS, tail"]) == pytest.approx(exact["ess_tail"], abs=0.6)
+        assert float(found["R-hat"]) == pytest.approx(exact["r_hat"], abs=6e-4)
+        assert float(found["error of mean"]) == pytest.approx(exact["mcse_mean"], rel=0.06)
+
+
+def test_elements_have_the_same_names_in_every_table(section: Any) -> None:
+    """ArviZ has names of its own, and its own order."""
+    rng = np.random.default_rng(2)
+    means = np.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])
+    values = means + rng.normal(size=(2, 30, 2, 3))
+    coords = {"part": ["shaft", "disk"], "load": [5, 6, 7]}
+    posterior = xr.Dataset(
+        {
+            "z": (["chain", "draw"], 70 + rng.normal(size=(2, 30))),
+            "a": (["chain", "draw", "part", "load"], values),
+        },
+        coords,
+    )
+    tree = xr.DataTree.from_dict({"posterior": posterior})
+    made = prb.Report("x", posterior=tree, pictures=False)
+    rows = cells(section(made, "Posterior").table).rows
+    loads = ["shaft,5", "shaft,6", "shaft,7", "disk,5", "disk,6", "disk,7"]
+    names = ["z", *(f"a[{load}]" for load in loads)]
+    assert [r[0] for r in rows] == names
+    found = [float(r[1]) for r in rows]
+    np.testing.assert_allclose(found, [70, *means.ravel()], atol=1)
+
+
+@pytest.mark.parametrize(
+    ("adjustment", "sentence"),
+    [
+        ("estimate", "The posterior is that given the metric's own estimate: prior times density"),
+        ("none", "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."),
+    ],
+)
+def test_what_sets_the_width_of_the_draws(
+    adjustment: str, sentence: str, calibrated: Any, section: Any
+) -> None:
+    tree = calibrated.posterior.copy(deep=True)
+    tree["posterior"].attrs["adjustment"] = adjustment
+    made = prb.Report("x", posterior=tree, pictures=False)
+    assert section(made, "Posterior").text[1].startswith(sentence)
+
+
+def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
+    rivals = tuple(
+        {"point": {"mu": mu, "w": np.ones(2)}, "discrepancy": 0.25, "comparable": comparable}
+        for mu, comparable in ((-1.5, True), (3.0, False))
+    )
+    optimum = dataclasses.replace(
+        calibrated.optimum, rivals=rivals, converged=False, message="stopped."
+    )
+    text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
+    assert text[0].startswith("The optimiser did not converge after ")
+    assert text[0].endswith("of the objective: stopped.")
+    assert text[1] == (
+        "Another optimum is at mu = -1.500, with discrepancy 0.2500: "
+        "the data could as well come from there."
+    )
+    assert text[2].endswith(
+        "at mu = 3.000, with discrepancy 0.2500: the data fit it less well; a posterior tells how "
+        "much it counts."
+    )
+    vector = ({"point": {"w": np.array([1.0, 2.0])}, "discrepancy": 0.25, "comparable": True},)
+    of_it = {"w": np.array([3.0, 4.0])}
+    optimum = dataclasses.replace(optimum, rivals=vector, point=of_it, stderr=of_it)
+    text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
+    assert "is at w[0] = 1.000, w[1] = 2.000, with" in text[1]
+
+
+def test_a_place_of_many_elements_is_told_by_scalars_alone() -> None:
+    for size, told in ((7, "mu = 2.000, w[0]"), (8, "mu = 2.000, with")):
+        point = {"mu": 2.0, "w": np.ones(size)}
+        names = ["mu", *(f"w[{i}]" for i in range(size))]
+        rival = {"discrepancy": 0.1, "comparable": False}
+        assert f"is at {told}" in _other_optimum(rival, point, names)
+
+
+def test_of_a_covariance_standard_deviations_and_correlations_are_read(
+    calibrated: Any, section: Any
+) -> None:
+    read = ["mu", "chol_corr[0,1]", "chol_stds[0]", "chol_stds[1]"]
+    point = {
+        "mu": 1.0,
+        "chol": np.array([0.5, 0.1, 0.3]),
+        "chol_corr": np.array([[1.0, 0.3], [0.3, 1.0]]),
+        "chol_stds": np.array([0.5, 0.32]),
+    }
+    stderr = {name: 0.1 * np.ones(np.shape(value)) for name, value in point.items()}
+    stderr["chol_corr"] = np.array([[0.0, 0.1], [0.1, 0.0]])
+    rival = {"point": {**point, "mu": 7.0}, "discrepancy": 0.25, "comparable": True}
+    optimum = dataclasses.replace(calibrated.optimum, point=point, stderr=stderr, rivals=(rival,))
+    found = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum")
+    assert [row[0] for row in cells(found.table).rows] == read
+    assert "is at mu = 7.000, chol_corr[0,1] = 0.3000, chol_stds[0] = 0.5000, chol" in found.text[1]
+
+    rng = np.random.default_rng(0)
+    r = np.tanh(rng.normal(size=(2, 100)))
+    matrices = np.array([[np.ones_like(r), r], [r, np.ones_like(r)]]).transpose(2, 3, 0, 1)
+    draws = {
+        "mu": (["chain", "draw"], rng.normal(size=(2, 100))),
+        "chol": (["chain", "draw", "k"], rng.normal(size=(2, 100, 3))),
+        "chol_corr": (["chain", "draw", "i", "j"], matrices),
+        "chol_stds": (["chain", "draw", "i"], rng.gamma(4.0, size=(2, 100, 2))),
+    }
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
+    made = prb.Report("x", posterior=tree, pictures=False)
+    for title in ("Posterior", "Correlations of the hyperparameters"):
+        (found,) = [each for each in made.sections if each.title == title]
+        assert [row[0] for row in cells(found.table).rows] == read
+
+
+def test_a_variable_that_never_moves_is_shown() -> None:
+    tree = xr.DataTree.from_dict(
+        {"posterior": xr.Dataset({"p": (["chain", "draw"], np.ones((2, 20)))})}
+    )
+    made = prb.Report("x", posterior=tree, pictures=False)
+    (found,) = [section for section in made.sections if section.title == "Posterior"]
+    (row,) = cells(found.table).rows
+    assert row[:2] == ("p", "1.000")
+
+
+def test_sections_come_in_order(report: prb.Report, page: Any) -> None:
+    titles = [s.title for s in report.sections if s.level == 2]
+    assert titles == [
+        "Summary",
+        "Model",
+        "Data",
+        "Metric and epsilon",
+        "Optimum",
+        "Posterior",
+        "Comparison",
+        "Diagnostics",
+        "Validity",
+        "Cost and origin",
+    ]
+    assert page.text("h1") == "Shaft"
+    assert "2 May 2024" in page.text("p")
+
+
+def test_what_is_not_given_is_left_out(calibrated: Any) -> None:
+    model, optimum, posterior, test = calibrated
+    have = {
+        "model": prb.Report("x", model=model, pictures=False),
+        "optimum": prb.Report("x", optimum=optimum, pictures=False),
+        "posterior": prb.Report("x", posterior=posterior, pictures=False),
+        "validity": prb.Report("x", validity=test, pictures=False),
+    }
+    titles = {k: {s.title for s in r.sections if s.level == 2} for k, r in have.items()}
+    assert titles["model"] == {"Summary", "Model", "Data", "Metric and epsilon"}
+    assert "No result of a calibration was given." in have["model"].sections[0].text[0]
+    assert titles["validity"] == {"Summary", "Validity"}
+    assert {"Posterior", "Comparison", "Validity"}.isdisjoint(titles["optimum"])
+    assert {"Optimum", "Comparison", "Validity"}.isdisjoint(titles["posterior"])
+
+
+def test_a_hostile_model_is_reported(row: Any, parse: Any) -> None:
+    for name in ("<b>x<b>", "a|b", "p & q"):
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal(name, 0, 2), 1.0)
+            prb.Simulator(
+                "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+            )
+        text = prb.Report(name, model=model)._html()
+        assert row(name, "distribution", parse(text))["distribution"] == "Normal(0, 2)"
+        assert "<b>" not in text
+
+
+@pytest.mark.long
+def test_several_simulators_and_vectors(tmp_path: Path, section: Any, parse: Any) -> None:
+    with pm.Model(coords={"part": ["shaft", "disk"]}) as model:
+        mu = pm.Normal("mu", 1, 1, dims="part")
+        k = pm.HalfNormal("k", 1)
+        x = pm.Normal.dist(mu[0], 1.0)
+        z = pm.Normal.dist(mu[1], k)
+        prb.Simulator(
+            "first", np.positive, x, metric=prb.AreaMetric(), observed=[0.1, 1.0, 2.0, 2.2]
+        )
+        prb.Simulator(
+            "second", np.positive, z, metric=prb.KullbackLeibler(), observed=[0.0, 1.0, 3.0]
+        )
+    optimum = prb.minimize(model)
+    made = prb.Report("x", model=model, optimum=optimum, pictures=False)
+    data = cells(section(made, "Data").table)
+    assert [r[:2] for r in data.rows] == [("first", "4"), ("second", "3")]
+    assert [r[0] for r in cells(section(made, "Optimum").table).rows] == [
+        "mu[shaft]",
+        "mu[disk]",
+        "k",
+    ]
+    assert [
+        p for p in section(made, "Metric and epsilon").text if p.startswith("first: AreaMetric(")
+    ]
+    parse(made._html())
+    made.to_markdown(tmp_path)
