@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,9 +26,6 @@ from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross
 from prbayes.optimize.convergence import AGREE
 from prbayes.propagation.importance import SIZES
-
-if TYPE_CHECKING:
-    from prbayes.optimize.local_optima import Rival
 
 # Design error of which is warned, in standard errors: half as much again as is asked for, since an
 # estimate from eight blocks is itself uncertain by a quarter.
@@ -281,7 +277,7 @@ def _nearest(values: Floats, places: Floats) -> Floats:
 def caveats(
     evaluator: Evaluator,
     sampling: SamplingDistribution | None,
-    others: Sequence[Rival],
+    rivals: Sequence[Floats],
     design_error: float,
 ) -> tuple[Finding, ...]:
     """Say what is not seen, is identified only by the prior, or could as well be elsewhere.
@@ -294,9 +290,7 @@ def caveats(
     ]
     if design_error > _TOLERATED:
         findings.append(_of_design(evaluator, design_error))
-    for rival in others:
-        if rival.comparable:
-            findings.append(_of_rival(evaluator, rival))
+    findings += [_of_rival(evaluator, theta) for theta in rivals]
     if sampling is not None:
         ends = at_prior_ends(sampling)
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
@@ -370,10 +364,10 @@ def _of_design(evaluator: Evaluator, error: float) -> Finding:
     return Finding("design-error", f"{apart}{advice}.", "choose.md#how-many-responses")
 
 
-def _of_rival(evaluator: Evaluator, rival: Rival) -> Finding:
+def _of_rival(evaluator: Evaluator, theta: Floats) -> Finding:
     # Beside another point, by which what is the same everywhere is seen.
     points = evaluator.hyperparameters.constrained(
-        np.stack([rival.theta, evaluator.hyperparameters.initial])
+        np.stack([theta, evaluator.hyperparameters.initial])
     )
     read = read_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
     values = labelled(evaluator, {name: points[name] for name in read}, {"point": 2}).data_vars

@@ -84,6 +84,14 @@ class Trace:
             count=self.count + objective.count,
         )
 
+    def arrays(self, size: int) -> dict[str, Floats]:
+        """Return the trace of ``size`` parameters as arrays."""
+        return {
+            "theta": np.array(self.thetas).reshape(-1, size),
+            "discrepancy": np.array(self.values),
+            "evaluations": np.array(self.counts, dtype=np.int64),
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class Run:

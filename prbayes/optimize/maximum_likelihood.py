@@ -66,12 +66,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     best = modes[0]
     point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
     ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
-    if settings.prior or len(modes) == 1:
-        weights = mode_weights(modes)
-    else:
-        thetas = np.stack([mode.theta for mode in modes])
-        log_prior = evaluator.hyperparameters.log_prior(thetas)
-        weights = mode_weights(modes, log_prior, evaluator.hyperparameters.prior_sd)
+    weights = _posterior_weights(evaluator, modes, with_prior=settings.prior)
     findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
     findings += report(*_findings(evaluator, modes, weights, ends))
     rivals = tuple(
@@ -85,8 +80,8 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         for mode, weight in zip(modes[1:], weights[1:], strict=True)
     )
     log_likelihoods = specimen_log_likelihoods(evaluator, best.theta[None])
-    has_errors = np.isfinite(best.covariance).all() or np.isinf(best.covariance).any()
-    is_converged = best.converged and bool(has_errors)
+    # The covariance is NaN at the edge of a support.
+    is_converged = best.converged and not np.isnan(best.covariance).any()
     return Optimum(
         point=point,
         stderr=stderr,
@@ -112,6 +107,16 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         rivals=rivals,
         findings=tuple(findings),
     )
+
+
+def _posterior_weights(
+    evaluator: Evaluator, modes: list[LocalOptimum], *, with_prior: bool
+) -> Floats:
+    """Return the share of each mode in the posterior's mass."""
+    if with_prior or len(modes) == 1:
+        return mode_weights(modes)
+    log_prior = evaluator.hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
+    return mode_weights(modes, log_prior, evaluator.hyperparameters.prior_sd)
 
 
 def mode_weights(

@@ -57,7 +57,7 @@ from prbayes.optimize.local_optima import Rival, find_rivals
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
 from prbayes.optimize.methods import Method
 from prbayes.optimize.objective import Ridge, initial_scales
-from prbayes.optimize.optimum import Optimum, n_computed, optimum_of
+from prbayes.optimize.optimum import Optimum, SearchRecord, n_computed, optimum_of
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -511,16 +511,17 @@ def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = 
         at_jump = tuple(evaluator.nodes[k].name for k in fit.sampling.unsettled())
         if at_edge or at_jump:
             fit, rivals = replace(fit, sampling=None), []
-    optimum = optimum_of(
-        search,
-        fit,
-        details=_details(problem, fit, at_edge, stopped),
+    record = SearchRecord(
+        result=fit.run.result,
+        details=f"{fit.run.details} {_details(problem, fit, at_edge, stopped)}".strip(),
+        n_evaluations=fit.run.trace.count,
         n_screened=problem.n_screened,
-        n_previous=problem.n_previous,
+        trace=fit.run.trace.arrays(fit.theta.size),
         stopped=stopped,
         at_edge=at_edge,
         at_jump=at_jump,
     )
+    optimum = optimum_of(search, fit, record, problem.n_previous)
     if stopped:
         finding = Finding(
             "budget-spent",
@@ -536,7 +537,12 @@ def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = 
         *heavy_tails(evaluator, fit.theta),
         *between_runs(evaluator, fit.theta),
         *wide_kernels(evaluator, fit.theta, fit.scales, fit.local),
-        *caveats(evaluator, fit.sampling, rivals, fit.design_error),
+        *caveats(
+            evaluator,
+            fit.sampling,
+            [rival.theta for rival in rivals if rival.comparable],
+            fit.design_error,
+        ),
     )
     records = tuple(rival.record(evaluator) for rival in rivals)
     return replace(optimum, design_error=fit.design_error, rivals=records, findings=findings)

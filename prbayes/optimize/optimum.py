@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,7 @@ from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.caveats import breakdown, no_information
-from prbayes.optimize.convergence import Fit, Result, Search, Trace, apart_from_data
+from prbayes.optimize.convergence import Fit, Result, Search, apart_from_data
 
 # A smaller share is displayed as 0.0%.
 SMALLEST_SHARE = 5e-4
@@ -297,48 +297,24 @@ def _sentences(optimum: Optimum) -> list[str]:
 # -- from the end of a minimisation ----------------------------------------------------------------
 
 
-def optimum_of(
-    search: Search,
-    fit: Fit,
-    *,
-    details: str,
-    n_screened: int,
-    n_previous: int,
-    stopped: str = "",
-    at_edge: tuple[str, ...] = (),
-    at_jump: tuple[str, ...] = (),
-) -> Optimum:
-    """Return the record of a minimisation, without findings, rivals and design error.
+def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) -> Optimum:
+    """Return the optimum of a fit, without findings, rivals and design error.
 
     ``n_previous`` responses were computed for something else. None is computed if a budget has
-    ``stopped`` the search.
+    stopped the search.
     """
-    evaluator, run = search.evaluator, fit.run
-    theta, scales, covariance = fit.theta, fit.scales, fit.covariance
+    evaluator, theta, scales = search.evaluator, fit.theta, fit.scales
     functions = None if fit.sampling is None else fit.sampling.of_functions
-    point, stderr = point_and_stderr(evaluator, theta, covariance, functions)
-    is_affordable = not (stopped and evaluator.responses_per_theta)
-    result = run.result
-    # A variance of rounding errors is suspect as well; the discrepancy decides.
-    variance = np.diag(covariance) / evaluator.hyperparameters.prior_sd**2
-    is_suspect = bool((np.isinf(variance) | (variance < 1e-16)).all())
-    if is_suspect and no_information(evaluator, theta):
-        result = Result.NO_INFORMATION
-    elif is_affordable and not search.prior and apart_from_data(evaluator, theta):
-        # Such a minimum is one of the mass beyond the grid, and no fit.
-        result = Result.NO_OVERLAP
-    if stopped:
-        result = Result.STOPPED
-    elif at_edge:
-        result = Result.AT_EDGE
+    point, stderr = point_and_stderr(evaluator, theta, fit.covariance, functions)
+    is_affordable = not (record.stopped and evaluator.responses_per_theta)
+    record = replace(record, result=_final_result(search, fit, record, is_affordable=is_affordable))
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
     elif len(scales) > 1 or search.prior or has_other_terms(evaluator):
         values = np.full(len(scales), np.nan)
     else:
-        values = run.lowest * scales
+        values = fit.run.lowest * scales
     n_responses = evaluator.n_responses - n_previous  # without those of the support
-    names = [node.name for node in evaluator.nodes]
     support = {
         name: {key: float(value[0]) for key, value in numbers.items()}
         for name, numbers in evaluator.support(theta[None]).items()
@@ -346,11 +322,12 @@ def optimum_of(
     for k, node in enumerate(evaluator.nodes):
         if node.reweighted is None and is_affordable:
             support[node.name] = missing_mass(evaluator, theta, k)
+    names = [node.name for node in evaluator.nodes]
     return Optimum(
         point=point,
         stderr=stderr,
         theta=theta,
-        covariance=covariance,
+        covariance=fit.covariance,
         names=evaluator.hyperparameters.names,
         evaluator=evaluator,
         discrepancy=float((values / scales).sum()),
@@ -359,33 +336,34 @@ def optimum_of(
         n_responses=n_responses,
         prior=search.prior,
         identity=identity_of(evaluator, prior_minimised=search.prior),
+        search=record,
         support=support,
-        search=SearchRecord(
-            result=result,
-            details=f"{run.details} {details}".strip(),
-            n_evaluations=run.trace.count,
-            n_screened=n_screened,
-            trace=trace_arrays(run.trace, theta.size),
-            stopped=stopped,
-            at_edge=at_edge,
-            at_jump=at_jump,
-        ),
     )
+
+
+def _final_result(search: Search, fit: Fit, record: SearchRecord, *, is_affordable: bool) -> Result:
+    """Return how a minimisation ended: the result of its last run, unless it is no minimum."""
+    evaluator = search.evaluator
+    # A variance of rounding errors is suspect as well; the discrepancy decides.
+    variance = np.diag(fit.covariance) / evaluator.hyperparameters.prior_sd**2
+    is_suspect = bool((np.isinf(variance) | (variance < 1e-16)).all())
+    is_flat = is_suspect and no_information(evaluator, fit.theta)
+    if record.stopped:
+        return Result.STOPPED
+    if record.at_edge:
+        return Result.AT_EDGE
+    if is_flat:
+        return Result.NO_INFORMATION
+    if is_affordable and not search.prior and apart_from_data(evaluator, fit.theta):
+        # Such a minimum is one of the mass beyond the grid, and no fit.
+        return Result.NO_OVERLAP
+    return fit.run.result
 
 
 def n_computed(evaluator: Evaluator) -> int:
     """Return the number of responses computed for a model, without those found in a store."""
     by_metric = sum(node.bound.responses.computed for node in evaluator.nodes)
     return by_metric + sum(m.responses.computed for m in evaluator.measurements)
-
-
-def trace_arrays(trace: Trace, size: int) -> dict[str, Floats]:
-    """Return a trace as arrays."""
-    return {
-        "theta": np.array(trace.thetas).reshape(-1, size),
-        "discrepancy": np.array(trace.values),
-        "evaluations": np.array(trace.counts, dtype=np.int64),
-    }
 
 
 def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.optimize.caveats import between_runs, breakdown, caveats, elements_at_edge
-from prbayes.optimize.local_optima import Rival
 from prbayes.propagation.importance import SIZES
 
 
@@ -56,10 +55,8 @@ def test_a_mirror_is_told_by_standard_deviations_and_correlations() -> None:
         prb.Simulator("y", np.positive, x, metric=prb.Joint(prb.AreaMetric()), observed=response)
     evaluator = Evaluator.of(model)
     point = {"mean": [1.0, 2.0], "cov": [0.5, -0.3, 0.4]}
-    rival = Rival(
-        evaluator.hyperparameters.unconstrained(point), 0.1, comparable=True, better=False
-    )
-    (finding,) = caveats(evaluator, None, (rival,), 0.0)
+    rival = evaluator.hyperparameters.unconstrained(point)
+    (finding,) = caveats(evaluator, None, [rival], 0.0)
     assert (
         "come from mean[rod] = 1, mean[pin] = 2, cov_stds[0] = 0.5, cov_stds[1] = 0.5, "
         "cov_corr[0,1] = -0.6: another optimum"
