@@ -22,6 +22,7 @@ import numpy as np
 import prbayes as prb
 from benchmarks import few_runs, record
 from benchmarks.responses import RESPONSES
+from prbayes.inference.design_error import design_error
 
 NAMES = ("resonance", "noise")
 SIZES = (8192, 32_768)
@@ -48,7 +49,7 @@ def scatter(name: str, seeds: int) -> dict[str, Any]:
             asked = Minimisation(start=first.point, refine=False, starts=0)
             optimum = find_optimum(first.evaluator, asked)
             optima.append(optimum.theta / unit)
-            claimed.append(optimum.sampling().design_error().points / np.sqrt(2))
+            claimed.append(design_error(optimum.sampling()).points / np.sqrt(2))
         spread = np.std(optima, axis=0, ddof=1)[np.isfinite(unit)]
         found[str(size)] = {
             "scatter": float(spread.max()),

@@ -29,7 +29,8 @@ def fleet(products: int, size: int = 20) -> dict[str, Any]:
     from prbayes.model.evaluator import Evaluator
     from prbayes.posterior.importance import importance_sample, laplace
     from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
-    from prbayes.propagation.specimen_points import draw_points, specimen_roots
+    from prbayes.propagation.specimen_emulation import specimen_roots
+    from prbayes.propagation.specimen_points import draw_points
 
     problem = PROBLEMS["frame"]
     data = [problem.data(size, r) for r in range(products)]

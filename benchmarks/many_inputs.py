@@ -27,9 +27,9 @@ from benchmarks.responses import RESPONSES
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.population_draws import PopulationDraws, Populations
 from prbayes.model.specimen_preparation import Runs, prepared
-from prbayes.propagation.fibre import ReferencePopulation
+from prbayes.propagation.charts import ReferencePopulation
 from prbayes.propagation.fibre_points import FibreProposals
-from prbayes.propagation.specimen_points import DifferencedResponse
+from prbayes.propagation.specimen_emulation import DifferencedResponse
 
 RESPONSE = RESPONSES["eight inputs"]
 N, SETS, POINTS = 50, 4, 1024

@@ -27,7 +27,7 @@ from scipy.stats import norm, qmc
 
 from benchmarks import record
 from benchmarks.responses import RESPONSES, Response
-from prbayes.emulators.selection import Runs, candidates, chosen, emulated
+from prbayes.emulators.selection import Runs, candidate_surfaces, predict_outputs, select_surfaces
 
 RUNS = 64
 WIDER = 1.4  # the first runs, as those of a prior are
@@ -54,7 +54,7 @@ def fitted(response: Response, z: Any, blocks: Any) -> tuple[Runs, Any, Any]:
     weights = np.exp(log_p - log_g)
     x = response.mean + response.sd * z
     runs = Runs(x, response(x), weights / weights.sum(), blocks)
-    models, said = chosen(candidates(*x.shape), runs)
+    models, said = select_surfaces(candidate_surfaces(*x.shape), runs)
     return runs, models, said
 
 
@@ -80,7 +80,7 @@ def placed(way: str, first: Any, errors: Any, d: int, seed: int) -> Any:
 def off(response: Response, runs: Runs, models: Any) -> float:
     """Return the mean square error of distribution functions, in units of the sampling noise."""
     x = response.mean + response.sd * sobol(response.d, 8192, 99)
-    truth, said = response(x), emulated(models, runs, x)
+    truth, said = response(x), predict_outputs(models, runs, x)
     known = np.isfinite(truth).all(axis=1) & np.isfinite(said).all(axis=1)
     squares = []
     for one, other in zip(truth[known].T, said[known].T, strict=True):

@@ -1,4 +1,4 @@
-"""Progress bars on stderr, for work that turns out to be long."""
+"""Progress bars on stderr for long work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Response surfaces that stand for a response within the ranges of their runs."""
+"""Response surfaces within the ranges of their runs."""
 
 from prbayes.emulators.cross_validation import CrossValidation
 from prbayes.emulators.gaussian_process import GaussianProcess

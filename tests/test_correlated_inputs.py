@@ -14,7 +14,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, refit, sampling_of_functions
 from prbayes.inference.resampling import DataSets
 from prbayes.model.evaluator import Evaluator
 from prbayes.optimize.optimum import point_and_stderr
@@ -127,7 +127,7 @@ def test_how_faint_a_direction_may_be_changes_nothing_of_what_is_known(
     faint: float, optimum: prb.Optimum, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("prbayes.inference.refits._FAINT", faint)
-    functions = optimum.sampling().of_functions
+    functions = sampling_of_functions(optimum.sampling())
     _, stderr = point_and_stderr(optimum.evaluator, optimum.theta, optimum.covariance, functions)
     for name in ("chol_stds", "chol_corr"):
         np.testing.assert_allclose(stderr[name], optimum.stderr[name], rtol=1e-6)
@@ -159,7 +159,7 @@ def test_marginal_responses_tell_the_standard_deviations_and_no_correlation() ->
     theta = theta_of_truth(evaluator)
     sampling = SamplingDistribution.of(evaluator, theta, np.ones(2))
     covariance = sampling.local.in_theta
-    _, stderr = point_and_stderr(evaluator, theta, covariance, sampling.of_functions)
+    _, stderr = point_and_stderr(evaluator, theta, covariance, sampling_of_functions(sampling))
     # Each is a sample of its own: sd / sqrt(2 N).
     np.testing.assert_allclose(stderr["chol_stds"], SDS / np.sqrt(2 * N), rtol=0.25)
     np.testing.assert_array_equal(stderr["chol_corr"], [[0.0, np.inf], [np.inf, 0.0]])
@@ -252,7 +252,7 @@ def test_standard_errors_are_the_spread_over_data_sets(metric: prb.Metric) -> No
         values.append(drawn.ravel())
         weights.append(np.kron(np.eye(SETS), np.full(N, 1 / N)))
     sampling = optimum.sampling()
-    x, arrived = sampling.refit(DataSets(values, weights))
+    x, arrived = refit(sampling, DataSets(values, weights))
     assert arrived.mean() > 0.95
     fits = optimum.evaluator.hyperparameters.constrained(sampling.thetas(x[arrived]))
     correlation = fits["chol_corr"][:, 0, 1]

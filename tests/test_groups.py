@@ -19,7 +19,7 @@ from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.random_variable import nodes
 from prbayes.optimize.design_refinement import _add_runs
-from prbayes.plots._margins import margins, select_margins
+from prbayes.plots.population import margins, select_margins
 from prbayes.response.compile import PLAIN
 
 NAMES = ["Adler", "Busch"]

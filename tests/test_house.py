@@ -544,7 +544,7 @@ INNER = {
         "pytensor.tensor.variable.TensorVariable",
     },
     "model.pymc_distance": {"pytensor.graph.basic.Apply", "pytensor.graph.op.Op"},
-    "plots._margins": {"pytensor.tensor.variable.TensorVariable"},
+    "plots.population": {"pytensor.tensor.variable.TensorVariable"},
     "posterior.kernel": {
         "pymc.smc.kernels.SMC_KERNEL",
         "pymc.smc.kernels.systematic_resampling",

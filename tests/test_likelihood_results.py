@@ -19,8 +19,12 @@ import prbayes as prb
 from prbayes.model.evaluator import specimen_log_likelihoods, specimen_params
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.optimize.specimen_refits import other_specimens, specimen_pool, specimen_refits
-from prbayes.results import likelihood_checks as _specimen_checks
-from prbayes.results.likelihood_checks import influence, separate_modes
+from prbayes.results.likelihood_checks import (
+    NormalScores,
+    influence,
+    scored_specimens,
+    separate_modes,
+)
 
 N = 20
 
@@ -291,8 +295,8 @@ def test_scores_of_the_population_test_are_those_of_the_inputs(
     (likelihood,) = evaluator.likelihoods
     (points,), log_a = arrays(likelihood)
     data = [([points.get_value()], log_a.get_value())]
-    scores = [_specimen_checks._Scores.of(likelihood.inputs)]
-    ((z, weights),) = _specimen_checks._points(evaluator, scores, optimum.theta, data)
+    scores = [NormalScores.of(likelihood.inputs)]
+    ((z, weights),) = scored_specimens(evaluator, scores, optimum.theta, data)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0)
     exact = (2 * np.log(problem.observed) - optimum.point["mu"]) / optimum.point["sigma"]
     np.testing.assert_allclose((weights * z[..., 0]).sum(axis=1), exact, atol=1e-3)

@@ -28,7 +28,7 @@ from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_preparation import prepared
 from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.specimen_points import PointOptions
+from prbayes.propagation.specimen_emulation import PointOptions
 from prbayes.response.failures import ResponseError
 from prbayes.results.likelihood_checks import check_draws, check_optimum
 

@@ -14,8 +14,7 @@ from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
 from prbayes.decision.populations import Populations, ResponseSample
 from prbayes.decision.quantities import Quantity, refuse_quantity
-from prbayes.inference.measured import drawn_in
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
 from prbayes.model.elements import split_elements, told_elements
@@ -311,7 +310,7 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     n = max(round(node.n_specimens), 50)
     target = (metric or node.metric).against(_ideal_sample(sample, n))
     bound = design.copied(design.design.with_values(sample.outputs))
-    bound.target = target.metric.beside(target, sample.outputs, design.inputs.dimensions)
+    bound.target = target.metric.with_design(target, sample.outputs, design.inputs.dimensions)
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
     # Directions with a standard error of up to ten spreads of the prior: fainter ones have less
     # than a hundredth of the prior's information.

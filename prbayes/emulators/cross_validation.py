@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.emulators.multifidelity import predicted
+from prbayes.emulators.multifidelity import predict
 from prbayes.emulators.surfaces import Surface
 
 # Tenfold: Kohavi (1995), A study of cross-validation and bootstrap, IJCAI.
@@ -74,7 +74,7 @@ def cross_validated(
 
     Parameters
     ----------
-    model : Following, Surface or regressor
+    model : MultifidelityModel, Surface or regressor
     x : ndarray, shape (n, d)
         In the unit cube.
     y : ndarray, shape (n,) or (n, m)
@@ -91,7 +91,7 @@ def cross_validated(
     for fold in np.array_split(order, min(FOLDS, len(y))):
         fitted = np.setdiff1d(order, fold)
         pair = (None, None) if coarse is None else (coarse[fitted], coarse[fold])
-        residuals[fold] = y[fold] - predicted(model, x[fitted], y[fitted], x[fold], *pair)
+        residuals[fold] = y[fold] - predict(model, x[fitted], y[fitted], x[fold], *pair)
     return residuals
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from math import comb
 
 import numpy as np
@@ -104,9 +103,9 @@ class Interpolant:
         order = np.argsort(self.z[:, 0])
         runs, weights = self.z[order, 0], self.weights[order]
         middles = np.concatenate([runs[:1], (runs[1:] + runs[:-1]) / 2, runs[-1:]])
-        away = middles[:, None] - runs
+        distances = middles[:, None] - runs
         side = np.where(np.arange(len(middles))[:, None] > np.arange(len(runs)), 1.0, -1.0)
-        powers = [-comb(5, p) * (side * away ** (5 - p)) @ weights for p in range(6)]
+        powers = [-comb(5, p) * (side * distances ** (5 - p)) @ weights for p in range(6)]
         return runs, middles, np.stack(powers)
 
     def _on_line(self, z: Floats, *, has_slopes: bool = True) -> tuple[Floats, Floats]:
@@ -200,8 +199,10 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
     low, high = z.min(axis=0), z.max(axis=0)
     center, half_width = (low + high) / 2, np.maximum((high - low) / 2, 1e-300)
     scaled = np.ascontiguousarray(((z - center) / half_width).T)
-    square, spare = np.empty((2, n, n))
-    _squared_differences(z.T, z.T, square, spare)
+    # By differences, since products lose digits of small distances.
+    square = np.zeros((n, n))
+    for column in z.T:
+        square += (column[:, None] - column) ** 2
     radial = -(square**2) * np.sqrt(square)
     largest = -radial.min()
     spread = np.where(y.std(axis=0) > 0, y.std(axis=0), 1.0)
@@ -252,15 +253,13 @@ def _degrees(n: int, d: int) -> list[int]:
 
 def _powers(d: int, degree: int) -> NDArray[np.intp]:
     """Return the degrees by coordinate of all terms up to a total degree, (terms, d)."""
-    rows = product(range(degree + 1), repeat=d) if d <= 4 else _sparse_powers(d, degree)
-    return np.array([row for row in rows if sum(row) <= degree], dtype=np.intp)
 
+    def rows(d: int, degree: int) -> list[tuple[int, ...]]:
+        if d == 1:
+            return [(p,) for p in range(degree + 1)]
+        return [(p, *rest) for p in range(degree + 1) for rest in rows(d - 1, degree - p)]
 
-def _sparse_powers(d: int, degree: int) -> list[tuple[int, ...]]:
-    """Return the powers up to a total degree without trying all combinations."""
-    if d == 1:
-        return [(p,) for p in range(degree + 1)]
-    return [(p, *rest) for p in range(degree + 1) for rest in _sparse_powers(d - 1, degree - p)]
+    return np.array(rows(d, degree), dtype=np.intp)
 
 
 def _legendre(u: Floats, powers: NDArray[np.intp]) -> Floats:
@@ -282,16 +281,3 @@ def _terms(single: Floats, powers: NDArray[np.intp]) -> Floats:
     for a in range(1, powers.shape[1]):
         terms *= single[powers[:, a], a]
     return terms
-
-
-def _squared_differences(a: Floats, b: Floats, out: Floats, spare: Floats) -> None:
-    """Put squared distances of points, (d, n) and (d, k), into ``out``, (n, k).
-
-    By differences, since products lose digits of small ones.
-    """
-    np.subtract(a[0][:, None], b[0], out=out)
-    out *= out
-    for column, row in zip(a[1:], b[1:], strict=True):
-        np.subtract(column[:, None], row, out=spare)
-        spare *= spare
-        out += spare

@@ -20,7 +20,7 @@ from prbayes.emulators.surfaces import Predict, Surface, fitted, least_squares
 
 
 @dataclass(frozen=True)
-class Following:
+class MultifidelityModel:
     """The model of an output that follows a coarse response."""
 
     model: Any  # of the remainder beside the coarse response
@@ -29,7 +29,7 @@ class Following:
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class MultifidelitySurface:
     """A response as rho times a coarse one and a surface; a class, so that it can be pickled."""
 
     rho: float
@@ -41,7 +41,9 @@ class Followed:
         return self.rho * coarse + self.rest(_points(at, coarse, self.scaling))
 
 
-def followed(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool) -> Followed:
+def fit_multifidelity(
+    model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool
+) -> MultifidelitySurface:
     """Return a response (n,) at points (n, d) as a multiple of a finite coarse one, and a surface.
 
     A `Surface` estimates rho; ``joined`` makes the coarse response an input of the surface.
@@ -49,10 +51,10 @@ def followed(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool) 
     scaling = _scaling(x, coarse) if joined else None
     points = _points(x, coarse, scaling)
     rho = _rho(model, points, y, coarse)
-    return Followed(rho, scaling, fitted(model, points, y - rho * coarse))
+    return MultifidelitySurface(rho, scaling, fitted(model, points, y - rho * coarse))
 
 
-def tuned_beside(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool) -> Any:
+def tuned_for_remainder(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool) -> Any:
     """Return a model of a response with settings for the remainder beside a coarse one."""
     if not isinstance(model, Surface):
         return model
@@ -64,7 +66,7 @@ def tuned_beside(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bo
     return model.tuned(points, (rest - rest.mean()) / (rest.std() or 1.0))
 
 
-def predicted(
+def predict(
     model: Any,
     x: Floats,
     y: Floats,
@@ -74,16 +76,16 @@ def predicted(
 ) -> Floats:
     """Return predictions at points, (k,), of a surface through runs (n, d), (n,).
 
-    A model that is `Following` needs the coarse response at the runs, (n,), and the points, (k,);
-    it is not finite where there is none.
+    A `MultifidelityModel` needs the coarse response at the runs, (n,), and the points, (k,), which
+    is not finite where there is none.
     """
-    if not isinstance(model, Following):
+    if not isinstance(model, MultifidelityModel):
         return fitted(model, x, y)(at)
     assert coarse is not None
     assert coarse_at is not None
     has_coarse = np.isfinite(coarse)
     follows = np.isfinite(coarse_at)
-    surface = followed(
+    surface = fit_multifidelity(
         model.model, x[has_coarse], y[has_coarse], coarse[has_coarse], joined=model.joined
     )
     values = np.empty(len(at))

@@ -15,7 +15,7 @@ from scipy.special import ndtr
 
 from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import MOST_TUNED, GaussianProcess
-from prbayes.emulators.multifidelity import Following, predicted, tuned_beside
+from prbayes.emulators.multifidelity import MultifidelityModel, predict, tuned_for_remainder
 from prbayes.emulators.surfaces import RadialBasis, Surface
 
 # Most runs of a surface, whose cost grows with their cube; with more runs their weights suffice.
@@ -78,7 +78,7 @@ class Runs:
         return np.asarray(self.blocks == np.unique(self.blocks)[:, None])
 
 
-def candidates(n: int, dimensions: int) -> list[Surface]:
+def candidate_surfaces(n: int, dimensions: int) -> list[Surface]:
     """Return the surfaces that are tried on n runs.
 
     Processes with a length for each input are best on nearly all responses, and with few runs a
@@ -101,7 +101,7 @@ def has_enough_runs(model: Any, n: int, dimensions: int) -> bool:
     return 2 * n >= 3 * terms
 
 
-def emulated(
+def predict_outputs(
     models: Sequence[Any],
     runs: Runs,
     at: Floats,
@@ -121,7 +121,7 @@ def emulated(
     return _bounded(np.stack(outputs, axis=1), runs, rows, mask, at)
 
 
-def emulated_without_each(
+def predict_without_blocks(
     models: Sequence[Any], runs: Runs, at: Floats, coarse: Floats | None = None
 ) -> Iterator[Floats]:
     """Yield the predictions, (k, m), of surfaces without each block of the runs."""
@@ -131,9 +131,9 @@ def emulated_without_each(
     by_output = {}  # (k, B), where a surface has a short way
     for k, model in enumerate(models):
         if isinstance(model, Surface):
-            predict = model.without_each(x, runs.y[fitted, k], runs.block_masks[:, fitted])
-            if predict is not None:
-                by_output[k] = predict(points)
+            surfaces = model.without_each(x, runs.y[fitted, k], runs.block_masks[:, fitted])
+            if surfaces is not None:
+                by_output[k] = surfaces(points)
     for b, block in enumerate(runs.block_masks):
         rows = runs.among(~block)
         outputs = [
@@ -152,7 +152,7 @@ def _predicted(
     coarse_runs = None if runs.coarse is None else runs.coarse[rows, k]
     coarse_points = None if coarse is None else coarse[:, k]
     x = runs.scaled(runs.x[rows])
-    return predicted(model, x, runs.y[rows, k], points, coarse_runs, coarse_points)
+    return predict(model, x, runs.y[rows, k], points, coarse_runs, coarse_points)
 
 
 def _bounded(
@@ -175,10 +175,10 @@ def _bounded(
     return values
 
 
-def left_out(models: Sequence[Any], runs: Runs) -> Floats:
+def left_out_predictions(models: Sequence[Any], runs: Runs) -> Floats:
     """Return the predictions at the runs, (n, m), of surfaces without the block of each run."""
     values = np.empty_like(runs.y)
-    predictions = emulated_without_each(models, runs, runs.x, runs.coarse)
+    predictions = predict_without_blocks(models, runs, runs.x, runs.coarse)
     for block, at_runs in zip(runs.block_masks, predictions, strict=True):
         values[block] = at_runs[block]
     return values
@@ -194,7 +194,7 @@ class _Selection:
 
     def improved(self, models: Sequence[Any], runs: Runs, rows: NDArray[np.intp]) -> _Selection:
         """Return the selection with other models of the outputs that they predict better."""
-        predictions = left_out(models, runs)
+        predictions = left_out_predictions(models, runs)
         # Part of the importance is uniform: the errors of a few runs alone would be noise.
         importance = runs.importance[rows] + 0.1 / len(runs.y)
         # A failure predicted by a neighbour has an error of the spread.
@@ -210,7 +210,7 @@ class _Selection:
         )
 
 
-def chosen(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
+def select_surfaces(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
     """Return the model of each output with the smallest left-out errors, and its predictions.
 
     The predictions, (n, m), are at runs that were left out; errors are squared, and weighted by
@@ -275,14 +275,14 @@ def _with_following(
     x, y, coarse = runs.scaled(runs.x[tuning]), runs.y[tuning], runs.coarse[tuning]
     following = []
     for k, model in enumerate(models):
-        tuned = tuned_beside(model, x, y[:, k], coarse[:, k], joined=joined)
-        following.append(Following(tuned, otherwise[k], joined))
+        tuned = tuned_for_remainder(model, x, y[:, k], coarse[:, k], joined=joined)
+        following.append(MultifidelityModel(tuned, otherwise[k], joined))
     with suppress(np.linalg.LinAlgError):
         return best.improved(following, runs, rows)
     return best
 
 
-def share_of_runs(
+def mixing_weight(
     weights: Floats, y: Floats, predictions: Floats, blocks: NDArray[np.intp]
 ) -> float:
     """Return the share of a population that the runs have, from 0 (the emulator alone) to 1.

@@ -26,7 +26,11 @@ from prbayes._validate import (
 )
 from prbayes.emulators.cross_validation import CrossValidation, cross_validated, points_needed
 from prbayes.emulators.io import read, write
-from prbayes.emulators.multifidelity import Followed, Following, followed
+from prbayes.emulators.multifidelity import (
+    MultifidelityModel,
+    MultifidelitySurface,
+    fit_multifidelity,
+)
 from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.numerics.points import sobol
@@ -99,14 +103,11 @@ class Surrogate:
     coarse: Callable[..., Any] | None = None
     # Whether the coarse response is among the inputs of the surface, too.
     _joined: bool = field(repr=False, default=False)
-    _predict: Predict = field(repr=False, default=cast(Predict, None))
-    _followed: Followed = field(repr=False, default=cast(Followed, None))
     # Not empty after the first warning of points outside.
     _warned: list[bool] = field(repr=False, default_factory=list)
     # Names of the outputs in the response's mapping; None without names.
     _named: Outputs | None = field(repr=False, default=None)
-    # Search trees of all points, and of those that did not fail.
-    _trees: tuple[Any, Any] = field(repr=False, default=(None, None))
+    _fitted: _FittedSurface = field(repr=False, default=cast("_FittedSurface", None))
 
     @classmethod
     def fit(
@@ -202,15 +203,7 @@ class Surrogate:
         refuse_misfit(name, response, lambda: [r.size for r in domain.inputs], None)
         n_needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=n_needed)
-        unit = sobol(n, domain.dimensions, seed)
-        if points == "predictive":
-            if predictive is None:
-                raise ValueError(
-                    f"{name}: points: got 'predictive' for inputs that are ranges, expected a "
-                    "`.dist()` among them; leave points= out"
-                )
-            unit = domain.like(predictive, unit)
-        design = domain.at(unit)
+        design = _design(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
 
         # Compute the responses; the coarse ones first, as an error in them then costs no run.
         coarse_values = None if coarse is None else _first_coarse(name, coarse, domain, design)
@@ -244,7 +237,7 @@ class Surrogate:
             coarse=coarse,
             _joined=bool(joined),
             _named=tally.named,
-        )._completed()
+        )._with_surface()
         if predictive is not None:
             values = surrogate._at(predictive)
             error = CrossValidation(residuals, _spread(values[_usable(values)]))
@@ -352,7 +345,7 @@ class Surrogate:
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        write(path, self, self._probes())
+        write(path, self, self._fitted.probes())
 
     @classmethod
     def load(
@@ -396,11 +389,11 @@ class Surrogate:
                 "follows: a file does not keep it; pass coarse="
             )
         coarse = None if record.joined is None else coarse
-        surrogate = cls(**record.fields, model=model, coarse=coarse)._completed()
+        surrogate = cls(**record.fields, model=model, coarse=coarse)._with_surface()
         responses = surrogate.responses
         spread = np.asarray(_spread(responses[_usable(responses)]))
         size = np.where(spread > 0, spread, 1.0)
-        probes, saved = surrogate._probes() / size, record.probes / size
+        probes, saved = surrogate._fitted.probes() / size, record.probes / size
         # The tolerance is above rounding on another processor, below the effect of a setting.
         if not np.allclose(probes, saved, rtol=0, atol=1e-6, equal_nan=True):
             and_coarse = "" if record.joined is None else ", and the same coarse response"
@@ -411,21 +404,17 @@ class Surrogate:
             )
         return surrogate
 
-    def _completed(self) -> Surrogate:
-        """Return the surrogate with its surface and its search trees."""
-        from scipy.spatial import cKDTree
-
-        unit = self.domain.scaled(self.points)
-        usable = _usable(self.responses)
-        surface = _surfaces(self.model, unit[usable], self.responses[usable])
-        surrogate = replace(self, _predict=surface, _trees=(cKDTree(unit), cKDTree(unit[usable])))
-        if self.coarse is None:
-            return surrogate
-        coarse = _coarse_at("surrogate", self.coarse, self.domain, self.points)
-        usable &= np.isfinite(coarse)
-        x, y = unit[usable], self.responses[usable]
-        surface_beside = followed(self.model, x, y, coarse[usable], joined=self._joined)
-        return replace(surrogate, _followed=surface_beside)
+    def _with_surface(self) -> Surrogate:
+        """Return the surrogate with its surface."""
+        surface = _FittedSurface.of(
+            self.model,
+            self.domain,
+            self.points,
+            self.responses,
+            self.coarse,
+            joined=self._joined,
+        )
+        return replace(self, _fitted=surface)
 
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
@@ -433,26 +422,77 @@ class Surrogate:
             return np.empty((0, *self.responses.shape[1:]))
         # Rounding may put a point on the edge outside.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
-        values = self._surface(columns, unit)
+        values = self._fitted(columns, unit)
         if self.noise is not None:
-            values = values + self._noise_at(columns, unit, self.noise)
+            values = values + _hashed_noise(self._nearby(unit), columns, self.noise)
         failed = ~_usable(self.responses)
         if failed.any():
-            _, nearest = self._trees[0].query(unit)
+            _, nearest = self._fitted.all_runs.query(unit)
             is_failed = failed[nearest]
             values[is_failed] = self.responses[nearest[is_failed]]
         return values
 
-    def _surface(self, columns: Floats, unit: Floats) -> Floats:
+    def _nearby(self, unit: Floats) -> Floats:
+        """Return the residuals at the nearest design points that did not fail, (n, k, ...)."""
+        residuals = self.error.residuals[_usable(self.responses)]
+        # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
+        k = min(len(residuals), 4 * (unit.shape[1] + 1))
+        # Points that are not finite are outside: any neighbours will do.
+        _, nearest = self._fitted.usable_runs.query(np.where(np.isfinite(unit), unit, 0.5), k=k)
+        return np.asarray(residuals[nearest])
+
+
+@dataclass(frozen=True, eq=False)
+class _FittedSurface:
+    """A surface through the usable runs, and search trees of runs."""
+
+    domain: Ranges
+    predict: Predict
+    coarse: Callable[..., Any] | None
+    multifidelity: MultifidelitySurface | None  # with a coarse response
+    all_runs: Any
+    usable_runs: Any
+
+    @classmethod
+    def of(
+        cls,
+        model: Any,
+        domain: Ranges,
+        points: Floats,
+        responses: Floats,
+        coarse: Callable[..., Any] | None,
+        *,
+        joined: bool,
+    ) -> _FittedSurface:
+        """Fit a surface, or one for each output, to the runs of a design."""
+        from scipy.spatial import cKDTree
+
+        unit = domain.scaled(points)
+        usable = _usable(responses)
+        trees = cKDTree(unit), cKDTree(unit[usable])
+        x, y = unit[usable], responses[usable]
+        if y.ndim > 1:
+            surfaces = _OutputSurfaces(tuple(fitted(model, x, output) for output in y.T))
+            return cls(domain, surfaces, None, None, *trees)
+        surface = fitted(model, x, y)
+        if coarse is None:
+            return cls(domain, surface, None, None, *trees)
+        coarse_values = _coarse_at("surrogate", coarse, domain, points)
+        usable &= np.isfinite(coarse_values)
+        x, y = unit[usable], responses[usable]
+        multifidelity = fit_multifidelity(model, x, y, coarse_values[usable], joined=joined)
+        return cls(domain, surface, coarse, multifidelity, *trees)
+
+    def __call__(self, columns: Floats, unit: Floats) -> Floats:
         """Return values of the surface at rows, and at the same rows in the unit cube."""
-        if self.coarse is None:
-            return self._predict(unit)
+        if self.coarse is None or self.multifidelity is None:
+            return self.predict(unit)
         coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
         has_coarse = np.isfinite(coarse)
         values = np.empty(len(unit))
-        values[has_coarse] = self._followed(unit[has_coarse], coarse[has_coarse])
+        values[has_coarse] = self.multifidelity(unit[has_coarse], coarse[has_coarse])
         if not has_coarse.all():
-            values[~has_coarse] = self._predict(unit[~has_coarse])
+            values[~has_coarse] = self.predict(unit[~has_coarse])
             n_lost = (~has_coarse).sum()
             report(
                 Finding(
@@ -463,28 +503,19 @@ class Surrogate:
             )
         return values
 
-    def _noise_at(self, columns: Floats, unit: Floats, random_seed: int) -> Floats:
-        """Return residuals of a run nearby for each row, with either sign, (n,) or (n, m)."""
-        residuals = self._nearby(unit)
-        n, k = residuals.shape[:2]
-        number, sign = np.divmod(hashed_rows(columns, random_seed), np.uint64(2))
-        place = (number % np.uint64(k)).astype(np.intp)
-        signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
-        return residuals[np.arange(n), place] * signs
-
-    def _nearby(self, unit: Floats) -> Floats:
-        """Return the residuals at the nearest design points that did not fail, (n, k, ...)."""
-        residuals = self.error.residuals[_usable(self.responses)]
-        # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
-        k = min(len(residuals), 4 * (unit.shape[1] + 1))
-        # Points that are not finite are outside: any neighbours will do.
-        _, nearest = self._trees[1].query(np.where(np.isfinite(unit), unit, 0.5), k=k)
-        return np.asarray(residuals[nearest])
-
-    def _probes(self) -> Floats:
-        """Return values of the surface, without noise, at 64 fixed points, which identify it."""
+    def probes(self) -> Floats:
+        """Return values of the surface at 64 fixed points, which identify it."""
         unit = sobol(64, self.domain.dimensions, 0)
-        return self._surface(self.domain.at(unit), unit)
+        return self(self.domain.at(unit), unit)
+
+
+def _hashed_noise(residuals: Floats, columns: Floats, random_seed: int) -> Floats:
+    """Return one of k residuals for each row, (n, k, ...) -> (n, ...), with either sign."""
+    n, k = residuals.shape[:2]
+    number, sign = np.divmod(hashed_rows(columns, random_seed), np.uint64(2))
+    place = (number % np.uint64(k)).astype(np.intp)
+    signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
+    return residuals[np.arange(n), place] * signs
 
 
 def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
@@ -501,6 +532,20 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
         h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         h = h ^ (h >> np.uint64(31))
     return h
+
+
+def _design(
+    name: str, points: str, domain: Ranges, predictive: Floats | None, unit: Floats
+) -> Floats:
+    """Return the design's rows for points of the unit cube: even, or as the prior predictive."""
+    if points == "even":
+        return domain.at(unit)
+    if predictive is None:
+        raise ValueError(
+            f"{name}: points: got 'predictive' for inputs that are ranges, expected a `.dist()` "
+            "among them; leave points= out"
+        )
+    return domain.at(domain.like(predictive, unit))
 
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:
@@ -522,13 +567,6 @@ class _OutputSurfaces:
 
     def __call__(self, at: Floats) -> Floats:
         return np.stack([predict(at) for predict in self.surfaces], axis=-1)
-
-
-def _surfaces(model: Any, x: Floats, y: Floats) -> Predict:
-    """Return a surface through responses, or one through each of several outputs."""
-    if y.ndim == 1:
-        return fitted(model, x, y)
-    return _OutputSurfaces(tuple(fitted(model, x, output) for output in y.T))
 
 
 def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
@@ -614,7 +652,7 @@ def _best(
     for joined in (False, True):
         if n < points_needed(model, x.shape[1] + joined):
             continue
-        residuals = cross_validated(Following(model, model, joined), x, y, seed, coarse)
+        residuals = cross_validated(MultifidelityModel(model, model, joined), x, y, seed, coarse)
         if (residuals**2).sum() < (least**2).sum():
             least, choice = residuals, joined
     return least, choice

@@ -1,30 +1,413 @@
-"""The sampling distribution of the minimiser, to first order in theta."""
+"""Asymptotic sampling distribution of the minimiser: the sandwich, and its analogue for areas.
+
+The sandwich is H^-1 J H^-1, of the Hessian H and the covariance J of the gradient. Both follow from
+the population at theta, so that `Reweighted` computes no response. Derivatives are central
+differences of stored weights, exact to rounding.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from prbayes._validate import Floats
-from prbayes.inference.identifiability import identified_by_area, identified_by_curvature
-from prbayes.inference.resampling import DataSets, dependent
-from prbayes.inference.sandwich import Information, LinearArea
-from prbayes.metrics.base import Minimum
+from prbayes._stats import distribution_function, quantile, reached
+from prbayes._validate import AT_ONCE, Floats
+from prbayes.inference.identifiability import identified_by_curvature
+from prbayes.inference.resampling import (
+    SETS,
+    DataSets,
+    dependent,
+    observable,
+    simulated_sets,
+    thinned,
+)
+from prbayes.metrics.base import Discrepancy, Minimum, Part, is_additive
+from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.random_variable import Node
+from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
-# Share of a hyperparameter in unidentified directions above which it is not identified.
-_LOADING = 0.02
+# Step of differences in prior standard deviations, for densities that are twice differentiable.
+_NARROW_STEP = 1e-3
+# The same for step functions: distribution functions, jumps, and edges of a support.
+_WIDE_STEP = 0.05
+# Largest distance between distribution functions that a step makes: .6 sd of a normal population,
+# over which differences are right to a few per cent.
+_LARGEST_MOVE = 0.24
+# Avoids division by zero.
+_TINY = np.finfo(float).tiny
+
+
+def number_parts(target: Discrepancy) -> list[Part]:
+    """Return the parts that see one number of a specimen: of one output, the metric itself."""
+    return [part for part in target.parts if not part.target.event]
+
+
+def one_dimensional(target: Discrepancy, values: Floats) -> list[Floats]:
+    """Return the projections of responses, (..., n) or (..., n, m) -> (..., n) each."""
+    return [part.of(values) for part in number_parts(target)]
+
+
+# -- populations around theta ------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class _Expansion:
-    """The objective of data sets around theta, along r directions."""
+class LinearArea:
+    """The area metric of data sets, with distribution functions that are linear in theta.
 
-    force: Floats  # (n_sets, r): minus the gradients of quadratic discrepancies
-    curvature: Floats  # (r, r): their Hessian
-    # With slopes along the directions, (r, m), and lengths divided by the scale.
-    areas: list[LinearArea]
+    At theta + delta it is the sum over intervals of |gaps + delta @ slopes| lengths.
+    """
+
+    # (n_sets, m): simulated less observed distribution function on each interval between knots.
+    gaps: Floats
+    slopes: Floats  # (d, m): derivatives of the simulated one
+    lengths: Floats  # (m,): of the intervals
+
+
+@dataclass(frozen=True, eq=False)
+class Stencil:
+    """Populations around theta, in the order of `numerics.derivatives.stencil`."""
+
+    share: float  # the nominal step, in prior standard deviations
+    step: Floats  # (d,): the step, shorter where the prior is wide beside the population
+    values: Floats  # (s, n), or (s, n, m) of several outputs
+    weights: Floats  # (s, n)
+    blocks: NDArray[np.intp]  # (n,): of the design's points, which may change afterwards
+    target: Discrepancy
+
+    @property
+    def n_cross(self) -> int:
+        """Number of points that are theta and its neighbours along each element."""
+        return 1 + 2 * self.step.size
+
+    @cached_property
+    def has_equal_values(self) -> bool:
+        """Whether the responses are the same at all points, as stored ones are."""
+        return np.array_equal(self.values[0], self.values[-1], equal_nan=True)
+
+    @cached_property
+    def moves(self) -> Floats:
+        """Largest change of a distribution function over a step along each element, (d,)."""
+        d = self.step.size
+        moves = []
+        values = self.values[:1] if self.has_equal_values else self.values
+        for projection in one_dimensional(self.target, values):
+            center, weights = projection[0], self.weights[0]
+            is_usable = np.isfinite(center) & (weights > 0)
+            if not is_usable.any():
+                moves.append(np.zeros(d))
+                continue
+            mass = weights[is_usable]
+            mass = mass / mass.sum()
+            knots = quantile(center[is_usable], mass, np.linspace(0.05, 0.95, 19))
+            across = slice(self.n_cross)
+            simulated = projection[0] if len(projection) == 1 else projection[across]
+            below = distribution_function(simulated, self.weights[across], knots)
+            gaps = np.abs(below[1:] - below[0]).max(axis=-1)
+            moves.append(np.nan_to_num(gaps).reshape(2, d).max(axis=0))
+        return np.asarray(np.max(moves, axis=0))
+
+
+def _stencil_around(evaluator: Evaluator, k: int, theta: Floats, share: float) -> Stencil:
+    """Return populations around theta; steps are shortened until populations overlap."""
+    node = evaluator.nodes[k]
+
+    def within(step: Floats) -> Stencil:
+        values, weights = evaluator.populations(theta + stencil(step.size) * step, k)
+        return Stencil(share, step, values, weights, node.bound.blocks, node.target)
+
+    nominal = within(share * evaluator.hyperparameters.prior_sd)
+    if nominal.moves.max(initial=0.0) <= _LARGEST_MOVE:
+        return nominal
+    around = nominal
+    for _ in range(8):  # each up to ten times: to 1e-11 of the prior's spread
+        # Populations that do not overlap give no estimate of the factor.
+        factor = np.where(around.moves > 0.9, 0.1, 0.5 * _LARGEST_MOVE / around.moves.clip(1e-9))
+        is_too_far = around.moves > _LARGEST_MOVE
+        around = within(np.where(is_too_far, factor, 1.0) * around.step)
+        if around.moves.max() <= _LARGEST_MOVE:
+            return around
+    # A population that is one number overlaps with no other.
+    return nominal
+
+
+# -- H and J ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """Information about theta in one simulator's data, if they are drawn from the model there."""
+
+    evaluator: Evaluator
+    k: int  # index of the simulator
+    theta: Floats  # (d,)
+    n_sets: int = SETS  # number of simulated data sets, each of the observed size
+    # Factor of the step where the discrepancy is a step function of theta, or jumps.
+    widened: float = 1.0
+
+    @property
+    def node(self) -> Node:
+        """The simulator."""
+        return self.evaluator.nodes[self.k]
+
+    @property
+    def prior_sd(self) -> Floats:
+        """The prior's standard deviations, shape (d,)."""
+        return self.evaluator.hyperparameters.prior_sd
+
+    @property
+    def jumps(self) -> bool:
+        """Whether points lose their response close to theta, where a smooth discrepancy jumps."""
+        is_smooth = is_differentiable(self.node.target) and not self.node.bound.stored
+        return is_smooth and self.stencil.share > _NARROW_STEP
+
+    @cached_property
+    def stencil(self) -> Stencil:
+        """The populations around theta, as close as the discrepancy can be differenced."""
+        target, bound = self.node.target, self.node.bound
+        wide = self.widened * _WIDE_STEP
+        if bound.stored:
+            # A moving edge passes several points within a wide step.
+            share = wide if bound.support_moves else _NARROW_STEP
+            return _stencil_around(self.evaluator, self.k, self.theta, share)
+        if is_differentiable(target):
+            narrow = _stencil_around(self.evaluator, self.k, self.theta, _NARROW_STEP)
+            # Of several outputs a failed one is at the end of its scale, and does not jump.
+            is_known = ~np.isnan(narrow.values) if target.event else np.isfinite(narrow.values)
+            # Unless a point gains or loses its response within the step.
+            if (is_known == is_known[0]).all():
+                return narrow
+        return _stencil_around(self.evaluator, self.k, self.theta, wide)
+
+    @cached_property
+    def data_sets(self) -> DataSets:
+        """Data sets drawn from the model at theta, for all simulators."""
+        return simulated_sets(self.evaluator, self.theta, self.n_sets)
+
+    @property
+    def data_set(self) -> tuple[Floats, Floats]:
+        """Values and weights of this simulator's data sets, shapes (n,), (n_sets, n)."""
+        sets = self.data_sets
+        return sets.values[self.k], sets.weights[self.k]
+
+    @cached_property
+    def _center(self) -> tuple[Floats, Floats]:
+        """The population at theta that can be observed, with weights that sum to one."""
+        values = self.stencil.values[0]
+        is_observable = observable(values, self.node.target)
+        mass = self.stencil.weights[0][is_observable]
+        return values[is_observable], mass / mass.sum()
+
+    @cached_property
+    def _features(self) -> Any:
+        """Features at the stencil; they do not depend on the observed side."""
+        around, target = self.stencil, self.node.target
+        has_densities = [isinstance(part.target, DensityDiscrepancy) for part in target.parts]
+        if around.has_equal_values and len(has_densities) > 1 and all(has_densities):
+            # Cells are filled once for all points, and not for each.
+            return target.basis(around.values[0]).features(around.weights)
+        return target.features(around.values, around.weights, np)
+
+    def _along_stencil(
+        self, observed: Floats, weights: Floats, points: slice = slice(None)
+    ) -> Floats:
+        """Return discrepancies at points of the stencil, (s,) or (n_sets, s)."""
+        features = [feature[points] for feature in self._features]
+        target = self.node.target.with_observed(observed, weights)
+        n_sets = len(weights) if weights.ndim > 1 else 1
+        at_once = max(1, AT_ONCE // sum(feature.size for feature in features))
+        if n_sets <= at_once:
+            return np.atleast_1d(target.outer(*features, xp=np))
+        starts = range(0, n_sets, at_once)
+        return np.concatenate(
+            [target.rows(slice(i, i + at_once)).outer(*features, xp=np) for i in starts]
+        )
+
+    @cached_property
+    def noise_floor(self) -> float:
+        """The mean discrepancy between the population at theta and data sets drawn from it.
+
+        Of a log-likelihood, its expected gain from the truth to its maximum: half for each
+        hyperparameter, over N (Wilks 1938, doi:10.1214/aoms/1177732360).
+        """
+        if not self.node.metric.distance:
+            return self.theta.size / (2 * self.node.n_specimens)
+        at_theta = self.evaluator.populations(self.theta[None], self.k)
+        values, weights = thinned(*at_theta, self.node)
+        observed, data_sets = self.data_set
+        distances = []
+        for w in data_sets:
+            is_drawn = w > 0
+            target = self.node.target.with_observed(observed[is_drawn], w[is_drawn])
+            distances.append(target.of(values, weights))
+        return float(np.mean(distances))
+
+    def gradients(self, observed: Floats, weights: Floats) -> Floats:
+        """Return the gradients of the discrepancy at theta for data sets, shape (n_sets, d).
+
+        Parameters
+        ----------
+        observed : ndarray, shape (n,)
+        weights : ndarray, shape (n_sets, n)
+        """
+        across = self._along_stencil(observed, weights[:, None], slice(self.stencil.n_cross))
+        return slopes(across.T, self.stencil.step)
+
+    @cached_property
+    def sampling_covariance(self) -> Floats:
+        """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
+        target = self.node.target
+        if not is_additive(target) or dependent([self.node]):
+            return np.atleast_2d(np.cov(self.gradients(*self.data_set), rowvar=False))
+        # A mean over observations: the covariance of single ones, by N.
+        single, mass = _importance_sample(target, *self._center)
+        # 64 at a time, as the work grows with their square.
+        batches = [single[i : i + 64] for i in range(0, len(single), 64)]
+        gradients = [self.gradients(batch, np.eye(len(batch))) for batch in batches]
+        covariance = np.cov(np.concatenate(gradients), rowvar=False, aweights=mass)
+        return np.atleast_2d(covariance) / target.n_effective
+
+    @cached_property
+    def hessian(self) -> Floats:
+        """H: the Hessian of the discrepancy against the population at theta, shape (d, d)."""
+        step = self.stencil.step
+        differences = hessian_of(self._along_stencil(*self._center), step.size)
+        return differences / np.outer(step, step)
+
+    def areas(
+        self, observed: Floats, weights: Floats, subset: NDArray[np.bool_] | None = None
+    ) -> list[LinearArea]:
+        """Return a linear model around theta of each area that the metric is a sum of.
+
+        Parameters
+        ----------
+        observed : ndarray, shape (n,) or (n, m)
+        weights : ndarray, shape (n_sets, n)
+        subset : ndarray of bool, optional
+            The points of the population that count; all by default.
+        """
+        areas = []
+        for part in self.node.target.parts:
+            values, rows = part.observed_of(observed)
+            w = weights[:, rows]
+            if len(values) < len(observed):
+                w = w / w.sum(axis=1, keepdims=True)
+            areas.append(_linear_area(self.stencil, part, values, w, subset))
+        return areas
+
+
+def _importance_sample(
+    target: Discrepancy, values: Floats, weights: Floats
+) -> tuple[Floats, Floats]:
+    """Return specimens of a population and their weights, for the covariance of gradients.
+
+    Of one output 1000 at equal steps of probability. Of several outputs 2000: half of them in
+    proportion to the fourth power of their distance from the middle, as most of the mean square of
+    gradients is theirs.
+    """
+    order = np.argsort(values.reshape(len(values), -1)[:, 0])
+    n, mass = 1000, weights
+    if values.ndim > 1:
+        n = 2000
+        far = _squared_distances(target, values, weights) ** 2
+        mass = weights * (1 + far / max(float(weights @ far), _TINY))
+        mass = mass / mass.sum()
+    chosen_rows = order[reached(mass[order], (np.arange(n) + 0.5) / n)]
+    return values[chosen_rows], weights[chosen_rows] / mass[chosen_rows]
+
+
+def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> Floats:
+    """Return mean squares of the standardised projections of each specimen, (n,)."""
+    squares = [np.zeros(len(values))]
+    for projection in one_dimensional(target, values):
+        is_finite = np.isfinite(projection)
+        finite = np.where(is_finite, projection, 0.0)
+        mass = np.where(is_finite, weights, 0.0)
+        mass = mass / max(float(mass.sum()), _TINY)
+        centered = np.where(is_finite, finite - mass @ finite, 0.0)
+        variance = float(mass @ centered**2)
+        squares.append(centered**2 / max(variance, _TINY))
+    return np.asarray(np.mean(squares, axis=0))
+
+
+def _linear_area(
+    around: Stencil,
+    part: Part,
+    observed: Floats,
+    weights: Floats,
+    subset: NDArray[np.bool_] | None,
+) -> LinearArea:
+    """Return the linear model of the area of one part, for values (n,), weights (n_sets, n)."""
+    values, simulated_weights = part.of(around.values), around.weights
+    if subset is not None:
+        simulated_weights = simulated_weights * subset
+        total = simulated_weights.sum(axis=-1, keepdims=True)
+        # A population that does not reach these points has a distribution function of zeros.
+        simulated_weights = simulated_weights / np.where(total > 0, total, 1.0)
+    # Values that occur, where distribution functions are exact; 400 of all.
+    occurring = np.concatenate([values[0], observed])
+    knots = np.unique(occurring[np.isfinite(occurring)])
+    knots = knots[np.unique(np.linspace(0, knots.size - 1, 400).astype(int))]
+    # Responses that are the same at all points of the stencil are sorted once.
+    if np.array_equal(values[0], values[-1], equal_nan=True):
+        values = values[0]
+    simulated = distribution_function(values, simulated_weights, knots, kind="quicksort")
+    measured = distribution_function(observed, weights, knots, kind="quicksort")
+    gaps = simulated[0] - measured
+    derivatives = slopes(simulated[: around.n_cross], around.step).T
+    # An interval between knots has the values at its left end.
+    return LinearArea(gaps[:, :-1], derivatives[:, :-1], part.share * np.diff(knots))
+
+
+def identified_by_area(information: Information, weakest: float = 1.0) -> Floats:
+    """Return the directions that an area metric identifies, the strongest last, shape (d, r).
+
+    Orthonormal in units of the prior's spread. A direction is not identified if ``weakest`` prior
+    standard deviations along it change the area by less than half the noise floor, or if two halves
+    of the points do not agree on the change, which is then the points' own error.
+    """
+    spread = information.prior_sd[:, None]
+    areas = information.areas(*information.data_set)
+    gram: Any = 0
+    for area in areas:
+        scaled = np.asarray(area.slopes * spread)
+        gram = gram + (scaled * area.lengths) @ scaled.T
+    _, vectors = np.linalg.eigh(gram)
+    # The change of the area over one prior standard deviation along each direction.
+    change: Any = 0
+    for area in areas:
+        changes = np.abs(vectors.T @ np.asarray(area.slopes * spread))
+        change = change + (changes * area.lengths).sum(axis=-1)
+    is_identified = weakest * change > 0.5 * information.noise_floor
+    if information.stencil.blocks.size >= 256:
+        is_identified &= _halves_agree(information, vectors)
+    return np.asarray(vectors[:, is_identified])
+
+
+def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_]:
+    """Return along which directions both halves of the points change alike, shape (d,)."""
+    spread = information.prior_sd[:, None]
+    blocks = information.stencil.blocks
+    even_areas = information.areas(*information.data_set, blocks % 2 == 0)
+    odd_areas = information.areas(*information.data_set, blocks % 2 == 1)
+    product = even_square = odd_square = np.zeros(vectors.shape[1])
+    for even, odd in zip(even_areas, odd_areas, strict=True):
+        even_change = vectors.T @ np.asarray(even.slopes * spread)
+        odd_change = vectors.T @ np.asarray(odd.slopes * spread)
+        # Both halves have the same knots.
+        lengths = even.lengths
+        product = product + (even_change * odd_change * lengths).sum(axis=-1)
+        even_square = even_square + (even_change**2 * lengths).sum(axis=-1)
+        odd_square = odd_square + (odd_change**2 * lengths).sum(axis=-1)
+    # Correlation of the changes. Half or twice of .35 changes no answer (docs/constants.md).
+    return np.asarray(product > 0.35 * np.sqrt(even_square * odd_square))
+
+
+# -- the sampling distribution --------------------------------------------------------------------
 
 
 def first_order_shifts(
@@ -48,62 +431,44 @@ def first_order_shifts(
     -------
     ndarray, shape (n_sets, r)
     """
-    expansion = _expanded(information, scales, basis, sets)
-    shifts = np.zeros_like(expansion.force)
+    directions = basis * information[0].prior_sd[:, None]
+    r = basis.shape[1]
+    force = np.zeros((len(sets.weights[0]), r))  # minus the gradients
+    curvature = np.zeros((r, r))
+    areas = []
+    for item, scale in zip(information, scales, strict=True):
+        observed, weights = sets.values[item.k], sets.weights[item.k]
+        if item.node.metric.minimum is Minimum.QUADRATIC:
+            force -= item.gradients(observed, weights) @ directions / scale
+            curvature += directions.T @ item.hessian @ directions / scale
+        else:
+            for area in item.areas(observed, weights):
+                areas.append(
+                    LinearArea(area.gaps, directions.T @ area.slopes, area.lengths / scale)
+                )
+    shifts = np.zeros_like(force)
     # Without an area one solution is exact.
-    iterations = 30 if expansion.areas else 1
-    for _ in range(iterations):
-        shifts = _solved(expansion, shifts)
+    for _ in range(30 if areas else 1):
+        shifts = _reweighted_solution(force, curvature, areas, shifts)
     return shifts
 
 
-def _expanded(
-    information: list[Information], scales: Floats, basis: Floats, sets: DataSets
-) -> _Expansion:
-    prior_sd = information[0].prior_sd
-    directions = basis * prior_sd[:, None]
-    r = basis.shape[1]
-    n_sets = len(sets.weights[0])
-    force = np.zeros((n_sets, r))
-    curvature = np.zeros((r, r))
-    areas = []
-    for one, scale in zip(information, scales, strict=True):
-        observed = sets.values[one.k]
-        weights = sets.weights[one.k]
-        if one.node.metric.minimum is Minimum.QUADRATIC:
-            gradients = one.gradients(observed, weights)
-            force -= gradients @ directions / scale
-            hessian = directions.T @ one.hessian
-            curvature += hessian @ directions / scale
-        else:
-            for area in one.areas(observed, weights):
-                slopes = directions.T @ area.slopes
-                lengths = area.lengths / scale
-                areas.append(LinearArea(area.gaps, slopes, lengths))
-    return _Expansion(force, curvature, areas)
-
-
-def _solved(expansion: _Expansion, shifts: Floats) -> Floats:
+def _reweighted_solution(
+    force: Floats, curvature: Floats, areas: list[LinearArea], shifts: Floats
+) -> Floats:
     """Return the minimisers with each |gap| as a parabola through its value at ``shifts``."""
     n_sets, r = shifts.shape
-    curvature = np.broadcast_to(expansion.curvature, (n_sets, r, r))
-    left = curvature.copy()
-    right = expansion.force.copy()
-    for area in expansion.areas:
-        slopes = area.slopes
-        gaps = area.gaps + shifts @ slopes
+    left = np.broadcast_to(curvature, (n_sets, r, r)).copy()
+    right = force.copy()
+    for area in areas:
+        gaps = area.gaps + shifts @ area.slopes
         # Below a gap of 1e-4 an absolute value counts as a parabola.
-        sizes = np.sqrt(gaps**2 + 1e-8)
-        weight = area.lengths / sizes
-        pull = weight * area.gaps
-        left += np.einsum("bm,im,jm->bij", weight, slopes, slopes, optimize=True)
-        right -= np.einsum("bm,im->bi", pull, slopes, optimize=True)
-    # A ridge, small against each direction's own size, keeps it regular: where one prior is far
-    # wider than another, the system is as much larger along it.
-    size = np.diagonal(left, axis1=1, axis2=2)
-    ridge = 1e-10 * size[:, :, None]
-    regular = left + ridge * np.eye(r)
-    solution = np.linalg.solve(regular, right[..., None])
+        weight = area.lengths / np.sqrt(gaps**2 + 1e-8)
+        left += np.einsum("bm,im,jm->bij", weight, area.slopes, area.slopes, optimize=True)
+        right -= np.einsum("bm,im->bi", weight * area.gaps, area.slopes, optimize=True)
+    # A ridge relative to each direction's own size: priors may differ in width by far.
+    ridge = 1e-10 * np.diagonal(left, axis1=1, axis2=2)[:, :, None]
+    solution = np.linalg.solve(left + ridge * np.eye(r), right[..., None])
     return np.asarray(solution[..., 0])
 
 
@@ -112,9 +477,7 @@ class Local:
     """Covariance of the minimiser at one theta, in units of the prior's spread."""
 
     prior_sd: Floats  # (d,): the prior's spread
-    # (d, r): orthonormal directions about which the data tell enough, by default more than the
-    # prior.
-    identified: Floats
+    identified: Floats  # (d, r): orthonormal directions that the data identify
     unidentified: Floats  # (d, d - r): the other directions
     covariance: Floats  # (r, r): of the minimiser, along the directions identified
 
@@ -122,26 +485,28 @@ class Local:
     def in_theta(self) -> Floats:
         """The covariance in theta, (d, d), infinite for elements with a share not identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
-        along = self.identified @ self.covariance
-        covariance = along @ self.identified.T * unit
-        loading = (self.unidentified**2).sum(axis=1)
-        hidden = loading > _LOADING
-        covariance[hidden] = np.inf
-        covariance[:, hidden] = np.inf
+        covariance = self.identified @ self.covariance @ self.identified.T * unit
+        is_hidden = (self.unidentified**2).sum(axis=1) > _LARGEST_LOADING
+        covariance[is_hidden] = np.inf
+        covariance[:, is_hidden] = np.inf
         return np.asarray(covariance)
 
     def variance(self, gradients: Floats) -> Floats:
         """Return the variance of functions of theta with gradients (..., d).
 
-        Infinite for those with a share not identified. A function of elements that are not
-        identified may be, such as the standard deviation of an input whose correlation is not.
+        Infinite for those with a share not identified. A function of unidentified elements may be
+        identified, such as the standard deviation of an input whose correlation is not.
         """
         unit = gradients * self.prior_sd
         along = unit @ self.identified
         across = unit @ self.unidentified
         variance = np.einsum("...i,ij,...j->...", along, self.covariance, along)
-        hidden = (across**2).sum(axis=-1) > _LOADING * (unit**2).sum(axis=-1)
-        return np.asarray(np.where(hidden, np.inf, np.maximum(variance, 0)))
+        is_hidden = (across**2).sum(axis=-1) > _LARGEST_LOADING * (unit**2).sum(axis=-1)
+        return np.asarray(np.where(is_hidden, np.inf, np.maximum(variance, 0)))
+
+
+# Share of an element in unidentified directions above which it is not identified.
+_LARGEST_LOADING = 0.02
 
 
 def local_sampling(information: list[Information], scales: Floats, weakest: float = 1.0) -> Local:
@@ -150,73 +515,50 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
     Directions along which its standard error is above ``weakest``, in units of the prior's spread,
     are not identified.
     """
-    minima = {one.node.metric.minimum for one in information}
-    if minima == {Minimum.QUADRATIC}:
+    if all(item.node.metric.minimum is Minimum.QUADRATIC for item in information):
         return _sandwich(information, scales, weakest)
-    return _by_data_sets(information, scales, weakest)
+    return _area_covariance(information, scales, weakest)
 
 
 def _sandwich(information: list[Information], scales: Floats, weakest: float) -> Local:
     """Return H^-1 J H^-1 along the directions that the data identify."""
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
-    total: Any = 0
-    for one, scale in zip(information, scales, strict=True):
-        total = total + one.hessian / scale
-    hessian = unit * total
-    noise = unit * _gradient_covariance(information, scales)
-    values, vectors, found = identified_by_curvature(hessian, noise, weakest)
-    identified = vectors[:, found]
-    unidentified = vectors[:, ~found]
-    inverse = identified / values[found]
+    pairs = list(zip(information, scales, strict=True))
+    hessian = unit * sum(item.hessian / scale for item, scale in pairs)
+    if dependent(information[0].evaluator.nodes):
+        # Gradients of simulators that share specimens depend on each other.
+        gradients: Any = sum(item.gradients(*item.data_set) / scale for item, scale in pairs)
+        noise = unit * np.atleast_2d(np.cov(gradients, rowvar=False))
+    else:
+        noise = unit * sum(item.sampling_covariance / scale**2 for item, scale in pairs)
+    values, vectors, is_identified = identified_by_curvature(hessian, noise, weakest)
+    identified = vectors[:, is_identified]
+    inverse = identified / values[is_identified]
     covariance = inverse.T @ noise @ inverse
-    return Local(prior_sd, identified, unidentified, covariance)
+    return Local(prior_sd, identified, vectors[:, ~is_identified], covariance)
 
 
-def _gradient_covariance(information: list[Information], scales: Floats) -> Floats:
-    """Return J of the sum of d_k / scale_k in theta, shape (d, d)."""
-    total: Any = 0
-    weighed = zip(information, scales, strict=True)
-    if not dependent(information[0].evaluator.nodes):
-        for one, scale in weighed:
-            total = total + one.sampling_covariance / scale**2
-        return np.asarray(total)
-    # Gradients of the simulators depend on each other where they share specimens.
-    for one, scale in weighed:
-        gradients = one.gradients(*one.data_set)
-        total = total + gradients / scale
-    covariance = np.cov(total, rowvar=False)
-    return np.atleast_2d(covariance)
-
-
-def _by_data_sets(information: list[Information], scales: Floats, weakest: float) -> Local:
-    """Return the covariance of the shifts over simulated data sets, where there are areas."""
+def _area_covariance(information: list[Information], scales: Floats, weakest: float) -> Local:
+    """Return the covariance of the shifts over simulated data sets, if there are areas."""
     prior_sd = information[0].prior_sd
-    spans = [_identified(one, weakest) for one in information]
-    # The space spanned by what each simulator identifies; an empty column, should none do.
-    nothing = np.zeros((prior_sd.size, 1))
-    columns = np.concatenate([nothing, *spans], axis=1)
-    axes, strength, _ = np.linalg.svd(columns)
-    # What one of them identifies has a strength of one or more; rounding is far smaller.
-    spanned = strength > 0.1
-    rank = int(spanned.sum())
+    unit = np.outer(prior_sd, prior_sd)
+    # The space spanned by the directions of all simulators; an empty column, should none have any.
+    columns = [np.zeros((prior_sd.size, 1))]
+    for item in information:
+        if item.node.metric.minimum is Minimum.QUADRATIC:
+            noise = item.sampling_covariance * unit
+            _, vectors, is_identified = identified_by_curvature(item.hessian * unit, noise, weakest)
+            columns.append(np.asarray(vectors[:, is_identified]))
+        else:
+            columns.append(identified_by_area(item, weakest))
+    axes, strength, _ = np.linalg.svd(np.concatenate(columns, axis=1))
+    # An identified direction has a strength of one or more; rounding is far smaller.
+    rank = int((strength > 0.1).sum())
     identified = axes[:, :rank]
-    unidentified = axes[:, rank:]
     covariance = np.zeros((rank, rank))
     if rank:
         sets = information[0].data_sets
         shifts = first_order_shifts(information, scales, identified, sets)
         covariance = np.cov(shifts, rowvar=False).reshape(rank, rank)
-    return Local(prior_sd, identified, unidentified, covariance)
-
-
-def _identified(information: Information, weakest: float) -> Floats:
-    """Return the directions that one simulator identifies, shape (d, r)."""
-    if information.node.metric.minimum is not Minimum.QUADRATIC:
-        return identified_by_area(information, weakest)
-    prior_sd = information.prior_sd
-    unit = np.outer(prior_sd, prior_sd)
-    hessian = information.hessian * unit
-    noise = information.sampling_covariance * unit
-    _, vectors, found = identified_by_curvature(hessian, noise, weakest)
-    return np.asarray(vectors[:, found])
+    return Local(prior_sd, identified, axes[:, rank:], covariance)

@@ -15,9 +15,6 @@ from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.threads import one_thread
 
-# Weights that are held at a time.
-_NUMBERS = 1 << 20
-
 
 @dataclass(frozen=True, eq=False)
 class BatchObjective:
@@ -25,12 +22,12 @@ class BatchObjective:
 
     evaluator: Evaluator  # all its responses are stored
     scales: Floats  # (K,): by simulator of the model
-    simulators: tuple[int, ...]  # which of them count
-    targets: list[Discrepancy]  # of those, each against all B data sets
-    values: list[Floats]  # (n_k,) or (n_k, m): of those, the stored responses
+    simulators: tuple[int, ...]  # indices of the simulators in the sum
+    targets: list[Discrepancy]  # by simulator in the sum, each against all B data sets
+    values: list[Floats]  # (n_k,) or (n_k, m): the stored responses
     bases: list[Basis]  # from weights of stored responses to features
-    # (n_k,): of those that count: the block that each point of the design belongs to. Where there
-    # are several, the b-th data set is compared with the b-th block alone.
+    # (n_k,): the block of each point of the design. If there are several, the b-th data set is
+    # compared with the b-th block alone.
     blocks: Sequence[NDArray[np.intp]] = ()
 
     @classmethod
@@ -46,35 +43,25 @@ class BatchObjective:
     ) -> BatchObjective:
         """Prepare the observed sides of all data sets; of all simulators by default.
 
-        With other responses at the designs' points, ``stored``, by simulator, where they are given.
+        ``stored``, by simulator, replaces the responses at the designs' points unless it is None.
         """
-        every = range(len(evaluator.nodes))
-        chosen = tuple(every if simulators is None else simulators)
-        # Copied row by row: sums over rows then do not depend on how the weights lie in memory.
+        if simulators is None:
+            simulators = range(len(evaluator.nodes))
+        # Copied row by row: sums over rows then do not depend on the layout of the weights.
         rows = np.arange(len(sets.weights[0]))
-        targets = []
-        responses = []
-        bases = []
-        for k in chosen:
+        targets, values, bases = [], [], []
+        for k in simulators:
             node = evaluator.nodes[k]
-            design = evaluator.reweighted[node.name].design
-            weights = sets.weights[k][rows, None]
-            values = sets.values[k]
-            target = node.target.with_observed(values, weights)
-            other = stored[k] if stored else None
-            own = design.sample.values if other is None else other
+            target = node.target.with_observed(sets.values[k], sets.weights[k][rows, None])
+            replacement = stored[k] if stored else None
+            if replacement is None:
+                responses = evaluator.reweighted[node.name].design.sample.values
+            else:
+                responses = replacement
             targets.append(target)
-            responses.append(own)
-            bases.append(target.basis(own))
-        return cls(
-            evaluator=evaluator,
-            scales=scales,
-            simulators=chosen,
-            targets=targets,
-            values=responses,
-            bases=bases,
-            blocks=blocks,
-        )
+            values.append(responses)
+            bases.append(target.basis(responses))
+        return cls(evaluator, scales, tuple(simulators), targets, values, bases, blocks)
 
     @property
     def n_sets(self) -> int:
@@ -85,48 +72,38 @@ class BatchObjective:
     def __call__(self, thetas: Floats, rows: Any) -> Floats:
         """Return the values for data sets ``rows`` at several thetas each, (A, s, d) -> (A, s).
 
-        With thetas of shape (1, s, d) all data sets are compared with the same populations. What is
-        not a number, as where a design has no point, is infinite.
+        With thetas of shape (1, s, d) all data sets are compared with the same populations. NaN,
+        as where a design has no point, becomes infinite.
         """
         portions = self.portions(len(thetas), thetas.shape[1])
         if len(portions) < 2:
             return self._values(thetas, rows)
         numbers = np.arange(self.n_sets)[rows]
-        parts = [self._values(thetas[some], numbers[some]) for some in portions]
-        return np.concatenate(parts)
+        return np.concatenate([self._values(thetas[p], numbers[p]) for p in portions])
 
-    def portions(self, number: int, each: int = 1) -> list[slice]:
-        """Divide data sets, with so many populations each, lest their weights be far from hand."""
+    def portions(self, number: int, populations: int = 1) -> list[slice]:
+        """Divide data sets, each with several populations, into portions of a million weights."""
         most = max(len(values) for values in self.values)
-        at_once = max(1, _NUMBERS // (most * each))
+        at_once = max(1, (1 << 20) // (most * populations))
         return [slice(first, first + at_once) for first in range(0, number, at_once)]
 
     def _values(self, thetas: Floats, rows: Any) -> Floats:
         """Return the values for some data sets."""
         total: Any = 0.0
         for i, k in enumerate(self.simulators):
-            weights = self.weights(thetas, rows, i)
-            features = self.bases[i].rows(rows).features(weights)
-            discrepancies = self.targets[i].rows(rows).outer(*features, xp=np)
-            total = total + discrepancies / self.scales[k]
-        values = np.nan_to_num(total, nan=np.inf, posinf=np.inf)
-        return np.asarray(values)
+            features = self.bases[i].rows(rows).features(self.weights(thetas, rows, i))
+            total = total + self.targets[i].rows(rows).outer(*features, xp=np) / self.scales[k]
+        return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
 
     def weights(self, thetas: Floats, rows: Any, i: int) -> Floats:
         """Return weights of the stored responses, (A, s, n), on the whole design or on blocks."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
-        k = self.simulators[i]
-        _, weights = self.evaluator.populations(stacked, k)
+        _, weights = self.evaluator.populations(stacked, self.simulators[i])
         weights = weights.reshape(*thetas.shape[:-1], -1)
-        if not self.blocks:
+        if not self.blocks or not self.blocks[i].any():
             return weights
-        blocks = self.blocks[i]
-        if not blocks.any():
-            return weights
-        # The b-th data set sees the b-th block alone.
-        numbers = np.arange(self.n_sets)
-        own = numbers[rows, None, None]
-        weights = weights * (blocks == own)
+        block_of_set = np.arange(self.n_sets)[rows, None, None]
+        weights = weights * (self.blocks[i] == block_of_set)
         total = weights.sum(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
             return np.asarray(weights / total)

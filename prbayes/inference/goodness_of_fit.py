@@ -1,71 +1,66 @@
-"""Whether the family of populations can have given the data: parametric-bootstrap goodness of fit.
+"""Goodness of fit by parametric bootstrap: of the population, and by output and pair of outputs.
 
-Data sets are drawn from the model at its minimiser, and each is refitted. How far each is from its
-own fit is what the data's distance from theirs is held against (Stute, Gonzalez Manteiga and
-Presedo Quindimil 1993, doi:10.1007/BF02613687). Responses are stored: none is computed.
+Data sets are drawn from the model at its minimiser, and each is refitted. The distance of the data
+from their fit is compared with the distances of these data sets from theirs (Stute, Gonzalez
+Manteiga and Presedo Quindimil 1993, doi:10.1007/BF02613687). No response is computed.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._finding import Finding
+from prbayes._stats import distribution_function
 from prbayes._validate import Floats
-from prbayes.inference.projections import number_parts
-from prbayes.inference.refits import ARRIVED, SamplingDistribution
+from prbayes.inference.asymptotics import number_parts
+from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit
 from prbayes.inference.requirements import refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
+from prbayes.metrics.multivariate import failure_caps
+from prbayes.model.random_variable import Node
 
-# Probability below which the data are said not to come from the family. By convention; 200 refits
-# tell one of half as much.
+# p-value below which the data do not come from the family, by convention.
 UNLIKELY = 0.01
-# Probability that a population has below its least and above its greatest value at least, so that
-# one observation outside weighs as one in ten thousand, and not without bound.
-_BEYOND = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Refitted:
-    """Data sets drawn from the model at the minimiser of the observed data, and their own."""
+class FittedSets:
+    """Synthetic data sets with their minimisers, and the minimiser of the observed data."""
 
     sampling: SamplingDistribution
-    center: Floats  # (r,): that of the observed data, in coordinates
+    center: Floats  # (r,): of the observed data, in coordinates
     sets: DataSets
-    x: Floats  # (n_sets, r): those of the data sets
+    x: Floats  # (n_sets, r): of the data sets
     converged: NDArray[np.bool_]  # (n_sets,)
 
     @classmethod
-    def of(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> Refitted | None:
-        """Draw and refit data sets; None where nothing tells."""
-        if not sampling.stderr.size or refit_obstacle(sampling.evaluator) is not None:
+    def of(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> FittedSets | None:
+        """Draw and refit data sets; None if nothing is identified, or refits are not possible."""
+        evaluator = sampling.evaluator
+        if not sampling.stderr.size or refit_obstacle(evaluator) is not None:
             return None
-        (center,), _ = sampling.refit(observed_set(sampling.evaluator))
-        sets = simulated_sets(sampling.evaluator, sampling.thetas(center), n_sets, seed)
-        return cls(sampling, center, sets, *sampling.refit(sets))
+        (center,), _ = refit(sampling, observed_set(evaluator))
+        sets = simulated_sets(evaluator, sampling.thetas(center), n_sets, seed)
+        return cls(sampling, center, sets, *refit(sampling, sets))
 
     @classmethod
-    def there(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> Refitted:
-        """Draw data sets at theta itself, which all keep: no minimiser, as a prior holds it."""
+    def at_theta(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> FittedSets:
+        """Draw data sets at theta itself, without refits, for an optimum with the prior."""
         sets = simulated_sets(sampling.evaluator, sampling.theta, n_sets, seed)
         x = np.zeros((n_sets, sampling.stderr.size))
-        return cls(
-            sampling=sampling,
-            center=x[0],
-            sets=sets,
-            x=x,
-            converged=np.ones(n_sets, dtype=bool),
-        )
+        return cls(sampling, x[0], sets, x, np.ones(n_sets, dtype=bool))
 
     @property
-    def probability(self) -> float:
-        """How probable a distance as the data's from their fit is; NaN if too few converged."""
-        if self.converged.mean() < ARRIVED:
+    def p_value(self) -> float:
+        """The p-value of the distance of the data from their fit; NaN if too few converged."""
+        if self.converged.mean() < MIN_CONVERGED:
             return np.nan
         observed = self._distances(self.center[None], observed_set(self.sampling.evaluator))
-        return probability_of(observed[0], self._distances(self.x, self.sets)[self.converged])
+        return worst_p_value(observed[0], self._distances(self.x, self.sets)[self.converged])
 
     def _distances(self, x: Floats, sets: DataSets) -> Floats:
         """Return distances of data sets from their fits, by simulator and part, (n_sets, 2 K)."""
@@ -73,44 +68,39 @@ class Refitted:
         thetas = self.sampling.thetas(x)
         columns = []
         for k, node in enumerate(evaluator.nodes):
-            simulated, shares = evaluator.populations(thetas, k)
+            simulated, weights = evaluator.populations(thetas, k)
             for part in number_parts(node.target):
-                seen, rows = part.observed_of(sets.values[k])
-                weights = sets.weights[k][:, rows]
-                order = np.argsort(seen, kind="stable")
-                expected = _middles(part.of(simulated), shares, seen[order])
-                columns.append(log_distances(expected, weights[:, order]))
+                values, rows = part.observed_of(sets.values[k])
+                order = np.argsort(values, kind="stable")
+                expected = _middles(part.of(simulated), weights, values[order])
+                columns.append(log_distances(expected, sets.weights[k][:, rows][:, order]))
         return np.concatenate(columns, axis=1)
 
 
-def probability_of(observed: Floats, drawn: Floats, *, both_sides: bool = False) -> float:
-    """Return the probability that drawn numbers are as far out as observed ones.
+def worst_p_value(observed: Floats, drawn: Floats, *, two_sided: bool = False) -> float:
+    """Return how often the largest of q drawn statistics is at least the largest observed one.
 
-    Each number is in standard deviations of its own distribution, and the largest of them counts.
-    Data sets with an unknown number are left out.
+    Each statistic is standardised by its own distribution. Rows with an unknown number are left
+    out.
 
     Parameters
     ----------
     observed : ndarray, shape (q,)
     drawn : ndarray, shape (S, q)
-    both_sides : bool
-        Whether small numbers are far out as well.
+    two_sided : bool
+        Whether small numbers are extreme as well.
     """
     rows = drawn[np.isfinite(drawn).all(axis=1)]
     if not np.isfinite(observed).all() or len(rows) < 2:
         return 1.0
-    middle = rows.mean(axis=0)
     spread = np.maximum(rows.std(axis=0), 1e-300)
-    out = (np.vstack([observed, rows]) - middle) / spread
-    worst = (np.abs(out) if both_sides else out).max(axis=1)
+    scores = (np.vstack([observed, rows]) - rows.mean(axis=0)) / spread
+    worst = (np.abs(scores) if two_sided else scores).max(axis=1)
     return float(np.mean(worst >= worst[0]))
 
 
 def log_distances(expected: Floats, weights: Floats) -> Floats:
-    """Return logarithms of two distances of data sets from distribution functions, (S, 2).
-
-    Those of Cramer and von Mises, which sees the middle of a distribution, and of Anderson and
-    Darling, which sees its tails.
+    """Return logarithms of the Cramer-von Mises and Anderson-Darling distances, (S, 2).
 
     Parameters
     ----------
@@ -122,55 +112,157 @@ def log_distances(expected: Floats, weights: Floats) -> Floats:
     weights = weights / weights.sum(axis=1, keepdims=True)
     below = np.cumsum(weights, axis=1) - weights / 2
     squares = weights * (below - expected) ** 2
-    inside = np.clip(expected, _BEYOND, 1 - _BEYOND)
+    # A mass of at least 1e-4 beyond the extremes bounds the weight of single observations there.
+    inside = np.clip(expected, 1e-4, 1 - 1e-4)
     in_the_tails = squares / (inside * (1 - inside))
     both = np.stack([squares.sum(axis=1), in_the_tails.sum(axis=1)], axis=1)
     return np.asarray(np.log(np.maximum(both, 1e-300)))
 
 
-def _middles(values: Floats, weights: Floats, at: Floats) -> Floats:
-    """Return distribution functions at values, (P, n), (P, n), (m,) -> (P, m).
-
-    Each goes through the middles of its steps.
-    """
+def _middles(values: Floats, weights: Floats, points: Floats) -> Floats:
+    """Return distribution functions through the middles of their steps, at (m,) -> (P, m)."""
     rows = []
-    values = np.broadcast_to(values, weights.shape)
-    for own, share in zip(values, weights, strict=True):
-        # Only what is finite can be observed.
-        finite = np.isfinite(own)
-        order = np.argsort(own[finite], kind="stable")
-        mass = share[finite][order]
+    for sample, w in zip(np.broadcast_to(values, weights.shape), weights, strict=True):
+        # Only finite values can be observed.
+        is_finite = np.isfinite(sample)
+        order = np.argsort(sample[is_finite], kind="stable")
+        mass = w[is_finite][order]
         mass = mass / mass.sum()
-        rows.append(np.interp(at, own[finite][order], np.cumsum(mass) - mass / 2))
+        rows.append(np.interp(points, sample[is_finite][order], np.cumsum(mass) - mass / 2))
     return np.array(rows)
 
 
-def of_held_away(probability: float) -> list[Finding]:
-    """Say so where the data cannot have come from the population that the prior holds."""
-    if not probability < UNLIKELY:
+def population_misfit(p_value: float, *, with_prior: bool) -> list[Finding]:
+    """Report data that cannot come from the population at an optimum."""
+    if not p_value < UNLIKELY:
         return []
-    return [
-        Finding(
-            "prior-misfit",
-            "The data are farther from the population at this optimum than "
-            f"{1 - probability:.1%} of data sets drawn there: the prior, which is part of its "
-            "objective, and the data contradict each other, or the inputs have another family; "
-            "look at prb.minimize without the prior.",
-        )
-    ]
-
-
-def of_another_family(probability: float) -> list[Finding]:
-    """Say so where a fit is as good as that of the data too rarely."""
-    if not probability < UNLIKELY:
-        return []
+    if with_prior:
+        return [
+            Finding(
+                "prior-misfit",
+                "The data are farther from the population at this optimum than "
+                f"{1 - p_value:.1%} of data sets drawn there: the prior, which is part of its "
+                "objective, and the data contradict each other, or the inputs have another family; "
+                "look at prb.minimize without the prior.",
+            )
+        ]
     return [
         Finding(
             "population-misfit",
-            f"The data are farther from the best population than {1 - probability:.1%} or more of "
+            f"The data are farther from the best population than {1 - p_value:.1%} or more of "
             "data sets that the model draws there are from theirs: the inputs probably have "
             "another family, or the response an error; look at prb.plot_responses, at outliers, "
             "and at other families, by prb.rank.",
             "choosing_metric.md#a-wrong-family",
         )
     ]
+
+
+# -- by output -------------------------------------------------------------------------------------
+
+
+def output_misfits(fitted: FittedSets) -> list[Finding]:
+    """Report for each simulator of several outputs which of them, and which pairs, misfit.
+
+    Outputs by the distances of Cramer-von Mises and Anderson-Darling, pairs by the residual of
+    their correlation.
+    """
+    nodes = enumerate(fitted.sampling.evaluator.nodes)
+    return [_output_misfit(fitted, k, node) for k, node in nodes if len(node.outputs.labels) > 1]
+
+
+def _output_misfit(fitted: FittedSets, k: int, node: Node) -> Finding:
+    """Report the outputs and pairs of one simulator that misfit."""
+    observed = observed_set(fitted.sampling.evaluator)
+    data = _Outputs.of(fitted, observed, fitted.center[None], k)
+    drawn = _Outputs.of(fitted, fitted.sets, fitted.x, k)
+    names = node.outputs.names
+    outputs, pairs = [], []
+    for j in data.columns:
+        p = worst_p_value(data.distances(j)[0], drawn.distances(j)[fitted.converged])
+        if p < UNLIKELY:
+            outputs.append(f"{names[j]} (p = {p:.2g})")
+    for i, j in combinations(data.columns, 2):
+        measured, calibrated = data.correlations(i, j)
+        drawn_measured, drawn_calibrated = drawn.correlations(i, j)
+        residuals = (drawn_measured - drawn_calibrated)[fitted.converged, None]
+        p = worst_p_value(measured - calibrated, residuals, two_sided=True)
+        if p < UNLIKELY:
+            pairs.append(
+                f"{names[i]} with {names[j]} (measured {measured[0]:.2f}, calibrated "
+                f"{calibrated[0]:.2f}, p = {p:.2g})"
+            )
+    if not outputs and not pairs:
+        return Finding(
+            "outputs-misfit",
+            f"{node.name}: no output by itself, and no correlation of two, disagrees with the best "
+            "population; what does is a combination of outputs.",
+        )
+    parts = [f"outputs {', '.join(outputs)}"] if outputs else []
+    parts += [f"correlations {', '.join(pairs)}"] if pairs else []
+    return Finding(
+        "outputs-misfit",
+        f"{node.name}: what disagrees with the best population are {' and '.join(parts)}.",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Outputs:
+    """Data sets of one simulator, and a population for each; a failure counts as the cap."""
+
+    values: Floats  # (n, m): of the data sets; NaN if an output was not measured
+    weights: Floats  # (S, n)
+    simulated: Floats  # (N, m): of all populations
+    masses: Floats  # (S, N)
+    columns: list[int]  # of the outputs that are tested
+
+    @classmethod
+    def of(cls, fitted: FittedSets, sets: DataSets, x: Floats, k: int) -> _Outputs:
+        """Return the data sets with populations of the k-th simulator at their minimisers."""
+        sampling = fitted.sampling
+        observed = sampling.evaluator.nodes[k].target.observed
+        caps, m = failure_caps(observed), observed.shape[1]
+        simulated, masses = sampling.evaluator.populations(sampling.thetas(x), k)
+        has_response = ~np.isnan(simulated[0]).any(axis=1)
+        masses = masses[:, has_response]
+        return cls(
+            np.minimum(sets.values[k], caps),
+            sets.weights[k],
+            np.minimum(simulated[0][has_response], caps),
+            masses / masses.sum(axis=1, keepdims=True),
+            # At most 12, from the first to the last: neighbours on a curve misfit together.
+            np.linspace(0, m - 1, min(m, 12)).round().astype(int).tolist(),
+        )
+
+    def distances(self, j: int) -> Floats:
+        """Return logarithms of two distances of data sets from their fits in an output, (S, 2)."""
+        is_measured = ~np.isnan(self.values[:, j])
+        values = self.values[is_measured, j]
+        order = np.argsort(values, kind="stable")
+        points, column = values[order], self.simulated[:, j]
+        # In the middle of a step
+        at_most = distribution_function(column, self.masses, points)
+        less = distribution_function(column, self.masses, np.nextafter(points, -np.inf))
+        return log_distances((at_most + less) / 2, self.weights[:, is_measured][:, order])
+
+    def correlations(self, i: int, j: int) -> tuple[Floats, Floats]:
+        """Return the correlations of two outputs in data sets and in populations, (S,) each."""
+        pair = [i, j]
+        is_measured = ~np.isnan(self.values[:, pair]).any(axis=1)
+        weights = self.weights[:, is_measured]
+        total = weights.sum(axis=1, keepdims=True)
+        weights = weights / np.where(total > 0, total, np.nan)
+        measured = _correlation(self.values[is_measured][:, pair], weights)
+        return measured, _correlation(self.simulated[:, pair], self.masses)
+
+
+def _correlation(values: Floats, weights: Floats) -> Floats:
+    """Return correlations, (n, 2), (S, n) -> (S,); NaN if an output does not vary."""
+    spread = values.std(axis=0)
+    a, b = ((values - values.mean(axis=0)) / np.where(spread > 0, spread, 1.0)).T
+    moments = weights @ np.column_stack([a, b, a * a, b * b, a * b])
+    mean_a, mean_b, square_a, square_b, product = moments.T
+    variances = (square_a - mean_a**2) * (square_b - mean_b**2)
+    varies = variances > 1e-20  # beyond rounding, in units of the spread
+    root = np.sqrt(np.where(varies, variances, 1.0))
+    return np.where(varies, (product - mean_a * mean_b) / root, np.nan)

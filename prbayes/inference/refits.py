@@ -1,9 +1,10 @@
-"""The sampling distribution of a minimiser, and refits: the minimisers of many data sets."""
+"""Refits: the minimisers of many data sets, and the sampling distribution that they follow."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,61 +12,33 @@ from numpy.typing import NDArray
 
 from prbayes._progress import progress
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.inference.asymptotics import Local, first_order_shifts, local_sampling
+from prbayes.inference.asymptotics import (
+    Information,
+    Local,
+    first_order_shifts,
+    local_sampling,
+)
 from prbayes.inference.batched_objective import BatchObjective
 from prbayes.inference.identifiability import oriented
-from prbayes.inference.measured import Refits
-from prbayes.inference.requirements import measured_by_refits
-from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set
-from prbayes.inference.sandwich import Information
+from prbayes.inference.requirements import needs_refits
+from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, simulated_sets
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.batched_bfgs import Descent
 from prbayes.numerics.batched_simplex import descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
-from prbayes.propagation.base import N_BLOCKS
-from prbayes.propagation.reweighted import designs_restored
 
-# Step of differences, in standard errors.
-_REFIT_STEP = 0.02
-# Gain, in units of the curvature along a standard error, that is left on the table: the minimiser
-# is then known to about a hundredth of a standard error.
-_TOLERANCE = 1e-4
-# The same where only the error of a design is asked for, of which a tenth matters: three hundredths
-# of a standard error, of each of eight minimisers; or how thousands of minimisers scatter.
-_ROUGHLY = 1e-3
-# Share of refits that has to converge before anything is told from them. Those that do not are not
-# a random part of all: without the outermost tenth at one end a normal sampling distribution is too
-# narrow by 16%, without a fifth by 24%, and without half by 40%.
-ARRIVED = 0.9
-# Standard error, in spreads of the prior, up to which a direction of theta counts where functions
-# of theta are looked at, each of which is then held against its own prior. Of a correlation and its
-# standard deviations any value in [3, 30] gives the same (tests/test_correlated_inputs.py).
-_FAINT = 10.0
-# Ratio of standard errors from one step of the differences and from its double.
-_STEADY = 1.5
-
-
-@dataclass(frozen=True)
-class DesignErrors:
-    """How far the optima of two independent designs are apart, in standard errors."""
-
-    points: float  # by their points; NaN if not known
-    emulators: float  # by what emulators say of them; NaN without emulators
-
-    @property
-    def whole(self) -> float:
-        """Both together; NaN if nothing is known."""
-        known = [e for e in (self.points, self.emulators) if not np.isnan(e)]
-        return float(np.linalg.norm(known)) if known else np.nan
+# Smallest share of refits that converge. Without the outermost tenth at one end, a normal sampling
+# distribution is too narrow by 16 %.
+MIN_CONVERGED = 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class SamplingDistribution:
-    """How the minimiser scatters around an optimum, over data sets that could be observed."""
+    """Sampling distribution of the minimiser around an optimum, over data sets."""
 
     evaluator: Evaluator
     theta: Floats  # (d,)
-    scales: Floats  # (k,): by which the simulators' discrepancies are divided before they are added
+    scales: Floats  # (k,): the simulators' discrepancies are divided by them before they are added
     information: list[Information]  # by simulator
     local: Local
     # (d, r): principal axes of the sampling distribution along the directions that the data
@@ -79,58 +52,21 @@ class SamplingDistribution:
     ) -> SamplingDistribution:
         """Return the distribution at theta.
 
-        From the metrics' derivatives, to first order; from refits where a metric declares nothing.
+        From the metrics' derivatives, to first order; from refits if a metric declares nothing.
         Directions with a standard error above ``weakest`` prior standard deviations are not
         identified.
         """
-        number = len(evaluator.nodes)
-        information = [Information(evaluator, k, theta, n_sets=SETS) for k in range(number)]
-        if measured_by_refits(evaluator):
-            local = Refits.at(evaluator, theta, scales).local(weakest)
+        nodes = range(len(evaluator.nodes))
+        information = [Information(evaluator, k, theta) for k in nodes]
+        if needs_refits(evaluator):
+            local = simplex_refits(evaluator, theta, scales).local(weakest)
         else:
             local = local_sampling(information, scales, weakest)
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = oriented(local.identified @ vectors)
         # Rounding may leave a variance of zero or less.
-        positive = np.maximum(variances, 1e-300)
-        return cls(
-            evaluator,
-            theta,
-            scales,
-            information,
-            local,
-            axes,
-            stderr=np.sqrt(positive),
-        )
-
-    @property
-    def of_functions(self) -> Local:
-        """The same to first order with directions that are known faintly.
-
-        The data may tell much of a function of theta, such as a standard deviation, and little of
-        the elements that it is made of, such as those of a Cholesky factor.
-        """
-        if not self.local.unidentified.size or measured_by_refits(self.evaluator):
-            return self.local
-        return local_sampling(self.information, self.scales, _FAINT)
-
-    def unsettled(self) -> list[int]:
-        """Return the simulators whose discrepancy jumps here, if that matters.
-
-        It does if twice the step of the differences gives other errors: second differences over a
-        jump are the smaller the wider the step, those of a smooth function are not.
-        """
-        jumping = [one.k for one in self.information if one.jumps]
-        if not jumping:
-            return []
-        wider = [replace(one, widened=2.0) for one in self.information]
-        local = local_sampling(self.information, self.scales)
-        other = local_sampling(wider, self.scales)
-        variances = np.diag(local.in_theta)
-        others = np.diag(other.in_theta)
-        ratio = np.sqrt(variances / others)
-        settled = (ratio > 1 / _STEADY) & (ratio < _STEADY)
-        return [] if settled.all() else jumping
+        stderr = np.sqrt(np.maximum(variances, 1e-300))
+        return cls(evaluator, theta, scales, information, local, axes, stderr)
 
     def coordinates(self, thetas: Floats) -> Floats:
         """Return coordinates of thetas along the axes, in standard errors, (..., d) -> (..., r)."""
@@ -142,278 +78,344 @@ class SamplingDistribution:
         shifts = (x * self.stderr) @ self.axes.T
         return np.asarray(self.theta + shifts * self.local.prior_sd)
 
-    def refit(
-        self, sets: DataSets, start: Floats | None = None, *, roughly: bool = False
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the minimiser of each data set, (n_sets, r) in coordinates, and which converged.
 
-        With designs the minimisation is exact, from ``start`` on, (n_sets, r), which is the optimum
-        by default; and else of first order. No response is computed with designs. ``roughly`` is
-        to a few hundredths of a standard error, in half of the time.
-        """
-        if not self._stored:
-            shifts = first_order_shifts(self.information, self.scales, self.axes, sets)
-            converged = np.ones(len(shifts), dtype=bool)
-            return shifts / self.stderr, converged
-        n_sets = len(sets.weights[0])
-        at_once = self._at_once(sets)
-        begin = np.zeros((n_sets, self.stderr.size)) if start is None else start
-        descent = None
-        minimisers = []
-        arrived = []
-        with progress("refits", n_sets) as report:
-            for i in range(0, n_sets, at_once):
-                weights = [w[i : i + at_once] for w in sets.weights]
-                some = DataSets(sets.values, weights)
-                objective = BatchObjective.of(self.evaluator, self.scales, some)
-                if descent is None:  # that of some serves all of them
-                    descent = self._descent(objective, roughly=roughly)
-                x, converged = self._minimise(objective, descent, begin[i : i + at_once])
-                minimisers.append(x)
-                arrived.append(converged)
-                report(len(converged), "")
-        return np.concatenate(minimisers), np.concatenate(arrived)
+def sampling_of_functions(sampling: SamplingDistribution) -> Local:
+    """Return the first-order distribution with directions that are weakly identified as well.
 
-    @property
-    def prepares(self) -> bool:
-        """Whether the metric takes its coordinates from the data, as with several outputs.
+    The data may identify a function of theta, such as a standard deviation, but not its elements,
+    such as those of a Cholesky factor. Directions count up to 10 prior standard deviations; any
+    value from 3 to 30 gives the same (tests/test_correlated_inputs.py).
+    """
+    if not sampling.local.unidentified.size or needs_refits(sampling.evaluator):
+        return sampling.local
+    return local_sampling(sampling.information, sampling.scales, 10.0)
 
-        False unless responses are stored and the metric declares its minimum.
-        """
-        several = any(node.target.event for node in self.evaluator.nodes)
-        return several and self._stored and not measured_by_refits(self.evaluator)
 
-    def refit_prepared(
-        self, sets: DataSets, minimisers: Floats
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the minimiser of the metric prepared for each data set, and which converged.
+def jumping_simulators(sampling: SamplingDistribution) -> list[int]:
+    """Return the simulators whose discrepancy jumps at theta, if that changes standard errors.
 
-        Parameters
-        ----------
-        sets : DataSets
-        minimisers : ndarray, shape (n_sets, r)
-            Those of the metric prepared for the observed data (`refit`). They remain where the
-            metric cannot be prepared, as for specimens that are all alike.
-        """
-        result = minimisers.copy()
-        is_converged = np.zeros(len(minimisers), dtype=bool)
-        shared = BatchObjective.of(self.evaluator, self.scales, observed_set(self.evaluator))
-        descent = self._descent(shared, roughly=True)
-        with progress("refits", len(minimisers)) as report:
-            for i, minimiser in enumerate(minimisers):
-                report(1, "")
-                objective = self._objective_anew(sets, i)
-                if objective is None:
-                    continue
-                starts = np.stack([np.zeros_like(minimiser), minimiser])
-                (values,) = objective(self.thetas(starts)[None], slice(1))
-                x, converged = self._minimise(objective, descent, starts[[values.argmin()]])
-                if converged[0]:
-                    result[i], is_converged[i] = x[0], True
-        return result, is_converged
+    It does if twice the step of the differences gives other errors: second differences over a jump
+    are the smaller the wider the step, those of a smooth function are not.
+    """
+    jumping = [item.k for item in sampling.information if item.jumps]
+    if not jumping:
+        return []
+    wider = [replace(item, widened=2.0) for item in sampling.information]
+    variances, wide_variances = (
+        np.diag(local_sampling(information, sampling.scales).in_theta)
+        for information in (sampling.information, wider)
+    )
+    ratio = np.sqrt(variances / wide_variances)
+    return [] if ((ratio > 1 / 1.5) & (ratio < 1.5)).all() else jumping
 
-    def _objective_anew(self, sets: DataSets, i: int) -> BatchObjective | None:
-        """Return the objective of the metric prepared for a data set; None where it cannot be."""
-        data, weights = one_set(self.evaluator, sets, i)
-        try:
-            other = self.evaluator.observing(data, weights=weights)
-        except ValueError:  # as where all its specimens are alike
-            return None
-        return BatchObjective.of(other, self.scales, observed_set(other))
 
-    def _at_once(self, sets: DataSets) -> int:
-        """Return how many data sets fit into memory."""
-        points = 0
-        for node, values in zip(self.evaluator.nodes, sets.values, strict=True):
-            here = len(node.target.parts) * max(node.bound.n_points, len(values))
-            points = max(points, here)
-        return max(1, 2 * AT_ONCE // points)
+# -- refits from derivatives -----------------------------------------------------------------------
 
-    def design_error(self) -> DesignErrors:
-        """Return how far the optimum of another design would be, by its points and emulators.
 
-        In standard errors, along the worst axis.
-        """
-        if not self._stored:
-            return DesignErrors(np.nan, np.nan)
-        # Two designs differ by the root of two of one's error.
-        points = np.sqrt(2) * self._error_of_points().max(initial=0.0)
-        emulators = np.sqrt(2) * self._error_of_emulators().max(initial=0.0)
-        return DesignErrors(float(points), float(emulators))
+def refit(
+    sampling: SamplingDistribution,
+    sets: DataSets,
+    start: Floats | None = None,
+    *,
+    is_rough: bool = False,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the minimiser of each data set, (n_sets, r) in coordinates, and which converged.
 
-    def _error_of_emulators(self) -> Floats:
-        """Return how far the optimum is off by the emulators' error, (r,); NaN without emulators.
+    Parameters
+    ----------
+    sampling : SamplingDistribution
+    sets : DataSets
+    start : ndarray, shape (n_sets, r), optional
+        The optimum by default. With designs the minimisation is exact from there on, and computes
+        no response; without it is of first order.
+    is_rough : bool
+        Whether a few hundredths of a standard error suffice, in half of the time.
+    """
+    if not is_stored(sampling.evaluator):
+        shifts = first_order_shifts(sampling.information, sampling.scales, sampling.axes, sets)
+        return shifts / sampling.stderr, np.ones(len(shifts), dtype=bool)
+    n_sets = len(sets.weights[0])
+    if start is None:
+        start = np.zeros((n_sets, sampling.stderr.size))
+    points = max(
+        len(node.target.parts) * max(node.bound.n_points, len(values))
+        for node, values in zip(sampling.evaluator.nodes, sets.values, strict=True)
+    )
+    at_once = max(1, 2 * AT_ONCE // points)  # data sets that fit into memory
+    descent = None
+    results = []
+    with progress("refits", n_sets) as advance:
+        for i in range(0, n_sets, at_once):
+            rows = slice(i, i + at_once)
+            batch = DataSets(sets.values, [w[rows] for w in sets.weights])
+            objective = BatchObjective.of(sampling.evaluator, sampling.scales, batch)
+            if descent is None:  # the curvature of the first batch serves all of them
+                descent = descent_of(sampling, objective, is_rough=is_rough)
+            results.append(minimise_sets(sampling, objective, descent, start[rows]))
+            advance(len(results[-1][1]), "")
+    minimisers, converged = zip(*results, strict=True)
+    return np.concatenate(minimisers), np.concatenate(converged)
 
-        The minimum of each emulator that lacks a block of the runs is found, and how far it is from
-        that of the whole: where a descent ends differs from the optimum for other reasons, too.
-        """
-        each = [
-            node.reweighted.design.without_each_block() if node.reweighted else []
-            for node in self.evaluator.nodes
-        ]
-        number = max(map(len, each))
-        if not number:
-            return np.full(self.stderr.size, np.nan)
-        observed = observed_set(self.evaluator)
-        whole = BatchObjective.of(self.evaluator, self.scales, observed)
-        descent = self._descent(whole, roughly=True)
-        end = self._only(whole, descent)
-        end = np.where(np.isfinite(end), end, 0.0)
-        found = []
-        for b in range(number):
-            stored = [values[b] if values else None for values in each]
-            objective = BatchObjective.of(self.evaluator, self.scales, observed, stored=stored)
-            found.append(self._only(objective, descent) - end)
-        return np.asarray(np.sqrt(np.square(found).sum(axis=0)))
 
-    def _error_of_points(self) -> Floats:
-        """Return how far the optimum is off by the design's points, (r,); NaN if not known.
+def is_prepared_by_data(evaluator: Evaluator) -> bool:
+    """Return whether the metric takes its coordinates from the data, as with several outputs.
 
-        The design is taken apart into blocks, each a coarser design of the same kind, and the
-        minimum of each is found: their spread, as if they were independent, bounds the error of the
-        whole. Points of clouds, which are many, fill space better together. Points on a line, which
-        cut it into parts of equal mass, are far better than their parts tell: they count as exact.
-        """
-        blocks = self._blocks()
-        if not any(block.any() for block in blocks):
-            return np.full(self.stderr.size, np.nan)
-        observed = observed_set(self.evaluator)
-        if self._of_clouds:
-            spread = self._spread_of_parts(observed)
-            return np.asarray(spread / N_BLOCKS**self._rate_of_clouds)
-        # The observed responses against each block.
-        every = np.zeros(N_BLOCKS, dtype=int)
-        repeated = [w[every] for w in observed.weights]
-        sets = DataSets(observed.values, repeated)
-        objective = BatchObjective.of(self.evaluator, self.scales, sets, blocks=blocks)
-        x, converged = self._minimise(objective, self._descent(objective))
-        if converged.sum() < N_BLOCKS / 2:
-            return np.full(self.stderr.size, np.inf)
-        spread = x[converged].std(axis=0, ddof=1)
-        return np.asarray(spread / N_BLOCKS**0.5)
+    False unless responses are stored and the metric declares its minimum.
+    """
+    has_outputs = any(node.target.event for node in evaluator.nodes)
+    return has_outputs and is_stored(evaluator) and not needs_refits(evaluator)
 
-    def _spread_of_parts(self, observed: DataSets) -> Floats:
-        """Return by how much the minima of an eighth of the points each scatter, (r,)."""
-        designs = [(bound, bound.design) for bound in self.evaluator.reweighted.values()]
-        found = []
-        descent = None
-        for b in range(N_BLOCKS):
-            with designs_restored(bound for bound, _ in designs):
-                for bound, design in designs:
-                    bound.design = design.rows(design.sample.blocks == b)
-                objective = BatchObjective.of(self.evaluator, self.scales, observed)
-                descent = descent or self._descent(objective, roughly=True)
-                found.append(self._only(objective, descent))
-        arrived = np.array([x for x in found if np.isfinite(x).all()])
-        if len(arrived) < N_BLOCKS / 2:
-            return np.full(self.stderr.size, np.inf)
-        return np.asarray(arrived.std(axis=0, ddof=1))
 
-    @property
-    def _rate_of_clouds(self) -> float:
-        """The power of its size with which the error of a cloud falls.
+def refit_prepared(
+    sampling: SamplingDistribution, sets: DataSets, minimisers: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the minimiser of the metric prepared for each data set, and which converged.
 
-        That of points that fill d dimensions evenly, for functions with a jump along a surface,
-        1/2 + 1/(2d); smooth ones have up to 1/2 + 1/d, so that this claims rather too much
-        (benchmarks/clouds.py).
+    Parameters
+    ----------
+    sampling : SamplingDistribution
+    sets : DataSets
+    minimisers : ndarray, shape (n_sets, r)
+        Those of the metric prepared for the observed data (`refit`). They remain where the metric
+        cannot be prepared, as for specimens that are all alike.
+    """
+    evaluator, scales = sampling.evaluator, sampling.scales
+    result = minimisers.copy()
+    is_converged = np.zeros(len(minimisers), dtype=bool)
+    shared = BatchObjective.of(evaluator, scales, observed_set(evaluator))
+    descent = descent_of(sampling, shared, is_rough=True)
+    with progress("refits", len(minimisers)) as advance:
+        for i, minimiser in enumerate(minimisers):
+            advance(1, "")
+            data, weights = one_set(evaluator, sets, i)
+            try:
+                prepared = evaluator.observing(data, weights=weights)
+            except ValueError:  # as where all specimens of a set are alike
+                continue
+            objective = BatchObjective.of(prepared, scales, observed_set(prepared))
+            starts = np.stack([np.zeros_like(minimiser), minimiser])
+            (values,) = objective(sampling.thetas(starts)[None], slice(1))
+            x, converged = minimise_sets(sampling, objective, descent, starts[[values.argmin()]])
+            if converged[0]:
+                result[i], is_converged[i] = x[0], True
+    return result, is_converged
 
-        References
-        ----------
-        .. [1] He, Z. and A. B. Owen (2016), Extensible grids: uniform sampling on a space filling
-           curve, J. R. Stat. Soc. B 78, 917-931, doi:10.1111/rssb.12132.
-        """
-        dimensions = max(node.bound.inputs.dimensions for node in self.evaluator.nodes)
-        return 0.5 + 0.5 / dimensions
 
-    @property
-    def _of_clouds(self) -> bool:
-        """Whether all responses are those of clouds."""
-        bounds = [node.reweighted for node in self.evaluator.nodes]
-        return all(bound is not None and bound.design.is_emulated for bound in bounds)
+def is_stored(evaluator: Evaluator) -> bool:
+    """Return whether the responses of all simulators are stored."""
+    return all(node.bound.stored for node in evaluator.nodes)
 
-    @property
-    def _stored(self) -> bool:
-        """Whether no simulator's responses are computed anew."""
-        return all(node.bound.stored for node in self.evaluator.nodes)
 
-    def _blocks(self) -> list[NDArray[np.intp]]:
-        """Return by simulator the block of each point of its design; none if not all have one."""
-        if not self._stored:
-            return []
-        blocks = []
-        for node in self.evaluator.nodes:
-            own = node.bound.blocks
-            # Points on a line are one block.
-            blocks.append(np.zeros_like(own) if node.bound.is_line else own)
-        return blocks
+def descent_of(
+    sampling: SamplingDistribution, objective: BatchObjective, *, is_rough: bool = False
+) -> Descent:
+    """Return the minimisation of data sets whose objectives have about the same curvature."""
+    r = sampling.stderr.size
+    step = 0.02  # of differences, in standard errors
+    if r == 0 or needs_refits(sampling.evaluator):  # it is not used then
+        return Descent(np.eye(r), 0.0, step)
+    # Steps of one standard error along uncorrelated directions, in coordinates: along correlated
+    # axes the large curvature across them hides the small one along.
+    along = sampling.axes.T @ sampling.local.identified / sampling.stderr[:, None]
+    try:
+        root = np.asarray(np.linalg.cholesky(along @ sampling.local.covariance @ along.T))
+    except np.linalg.LinAlgError:  # a variance of zero, by rounding
+        root = np.eye(r)
 
-    def _descent(self, objective: BatchObjective, *, roughly: bool = False) -> Descent:
-        """Return how data sets are fitted whose objectives have about the same curvature."""
+    def mean_objective(z: Floats) -> Floats:
+        # A first guess of the curvature: 50 data sets suffice.
+        return np.asarray(objective(sampling.thetas(z @ root.T), slice(50)).mean(axis=0))
 
-        def typical(x: Floats) -> Floats:
-            # The minimiser does not depend on this guess: some data sets will do.
-            values = objective(self.thetas(x), slice(50))
-            return np.asarray(values.mean(axis=0))
+    across = np.linalg.inv(root)
+    curvature = across.T @ _mean_hessian(mean_objective, r) @ across
+    # What an error of one standard error costs in any direction: the harmonic mean, as with
+    # correlated estimates the mean curvature is that of a direction with hardly any error.
+    cost = r / np.trace(np.linalg.inv(curvature))
+    # A gain of 1e-4 is an error of about a hundredth of a standard error.
+    return Descent(curvature, (1e-3 if is_rough else 1e-4) * cost, step)
 
-        r = self.stderr.size
-        if r == 0 or measured_by_refits(self.evaluator):  # then nothing follows it
-            return Descent(np.eye(r), 0.0, _REFIT_STEP)
-        root = self._root
-        across = np.linalg.inv(root)
-        curvature = across.T @ _mean_hessian(lambda z: typical(z @ root.T), r) @ across
-        inverse = np.linalg.inv(curvature)
-        # What an error of one standard error costs, in whichever direction: where estimates hang
-        # together the mean curvature is that of the direction across, in which next to none is.
-        cost = r / np.trace(inverse)
-        gain = (_ROUGHLY if roughly else _TOLERANCE) * cost
-        return Descent(curvature, gain, _REFIT_STEP)
 
-    @property
-    def _root(self) -> Floats:
-        """Steps of one standard error that lead across each other, in coordinates, (r, r).
+def minimise_sets(
+    sampling: SamplingDistribution,
+    objective: BatchObjective,
+    descent: Descent,
+    start: Floats | None = None,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the minimisers of data sets along the axes, by default from the optimum on."""
 
-        Along axes whose estimates hang together the curvature across them would hide that along.
-        """
-        local = self.local
-        along = self.axes.T @ local.identified / self.stderr[:, None]
-        try:
-            return np.asarray(np.linalg.cholesky(along @ local.covariance @ along.T))
-        except np.linalg.LinAlgError:  # a variance that rounding made nothing
-            return np.eye(self.stderr.size)
+    def value(x: Floats, rows: Any) -> Floats:
+        return objective(sampling.thetas(x), rows)
 
-    def _only(self, objective: BatchObjective, descent: Descent) -> Floats:
-        """Return the minimiser of one data set along the axes, (r,): inf where none was found."""
-        x, converged = self._minimise(objective, descent)
-        return x[0] if converged[0] else np.full(self.stderr.size, np.inf)
-
-    def _minimise(
-        self, objective: BatchObjective, descent: Descent, start: Floats | None = None
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the minimisers of data sets, by default from the optimum on, along the axes."""
-
-        def value(x: Floats, rows: Any) -> Floats:
-            return objective(self.thetas(x), rows)
-
-        r = self.stderr.size
-        if start is None:
-            start = np.zeros((objective.n_sets, r))
-        if r == 0:  # the data tell nothing: there is no direction to go
-            return start, np.ones(len(start), dtype=bool)
-        if measured_by_refits(self.evaluator):
-            # In standard errors; the second one starts where the first has ended.
-            x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
-            return x, converged
-        minima = descent(value, start)
-        return minima.x, minima.converged
+    r = sampling.stderr.size
+    if start is None:
+        start = np.zeros((objective.n_sets, r))
+    if r == 0:  # no direction is identified
+        return start, np.ones(len(start), dtype=bool)
+    if needs_refits(sampling.evaluator):
+        # In standard errors; the second simplex starts at the end of the first.
+        x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
+        return x, converged
+    minima = descent(value, start)
+    return minima.x, minima.converged
 
 
 def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:
     """Return the Hessian at zero by differences of one unit, made positive definite."""
-    differences = second_differences(value, r)
-    curvatures, vectors = np.linalg.eigh(differences)
-    largest = max(np.nanmax(curvatures), 1e-300)
+    curvatures, vectors = np.linalg.eigh(second_differences(value, r))
     # As a first guess, no direction is flatter than a twentieth of the steepest.
-    lowest = 0.05 * largest
-    known = np.nan_to_num(curvatures)
-    positive = np.maximum(known, lowest)
+    lowest = 0.05 * max(np.nanmax(curvatures), 1e-300)
+    positive = np.maximum(np.nan_to_num(curvatures), lowest)
     return np.asarray((vectors * positive) @ vectors.T)
+
+
+# -- refits of metrics that declare nothing of their minimum ---------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Along:
+    """An objective in coordinates x along axes, in steps, around theta."""
+
+    objective: BatchObjective
+    theta: Floats  # (d,)
+    prior_sd: Floats  # (d,)
+    axes: Floats  # (d, d): as columns, in units of the prior's spread
+    steps: Floats  # (d,): length of one unit of x along each axis
+
+    def shifts(self, x: Floats) -> Floats:
+        """Return coordinates (..., d) in units of the prior's spread."""
+        return np.asarray((x * self.steps) @ self.axes.T)
+
+    def __call__(self, x: Floats, rows: Any) -> Floats:
+        """Return the values of data sets ``rows``, shapes (A, s, d), (A,) -> (A, s)."""
+        return self.objective(self.theta + self.shifts(x) * self.prior_sd, rows)
+
+
+@dataclass(frozen=True, eq=False)
+class SimplexRefits:
+    """Data sets drawn from the model at one theta, and the minimiser of each."""
+
+    objective: BatchObjective  # of the data sets
+    theta: Floats  # (d,)
+    prior_sd: Floats  # (d,)
+    shifts: Floats  # (n_sets, d): minimisers less theta, in units of the prior's spread
+    gain: float  # mean decrease of the objective from theta to the minimisers
+
+    def local(self, weakest: float = 1.0) -> Local:
+        """Return the minimisers' covariance, along the directions that the data identify.
+
+        A direction is identified if the minimisers scatter along it by less than ``weakest`` prior
+        standard deviations, and if the discrepancy rises along it: its second derivative, averaged
+        over data sets, is more than twice the mean gain of one identified direction over
+        ``weakest**2``. For a quadratic discrepancy both say the same; along a flat one a minimiser
+        stays close to its start, and only the second says so.
+        """
+        curvatures, vectors = np.linalg.eigh(self.hessian())
+        # The largest curvature first.
+        curvatures, vectors = curvatures[::-1], vectors[:, ::-1]
+        number = np.arange(1, curvatures.size + 1)
+        rises = curvatures * weakest**2 > 2 * self.gain / number
+        rank = int(number[rises].max(initial=0))
+        rising, level = vectors[:, :rank], vectors[:, rank:]
+        # Of those, the ones along which the minimisers scatter little enough.
+        axes, sd = principal_axes(self.shifts @ rising)
+        is_narrow = sd < weakest
+        identified = rising @ axes[:, is_narrow]
+        unidentified = np.concatenate([level, rising @ axes[:, ~is_narrow]], axis=1)
+        return Local(self.prior_sd, identified, unidentified, np.diag(sd[is_narrow] ** 2))
+
+    def hessian(self) -> Floats:
+        """Return second differences of the discrepancy at theta, averaged over data sets, (d, d).
+
+        In units of the prior's spread. Steps are the minimisers' standard errors, over which kinks
+        at different places average out, and half a prior standard deviation where these are large.
+        """
+        axes, sd = principal_axes(self.shifts)
+        steps = np.minimum(np.where(sd > 0.1, 0.5, sd), 0.5)
+        along = _Along(self.objective, self.theta, self.prior_sd, axes, steps)
+
+        def mean(x: Floats) -> Floats:
+            return np.asarray(along(x, slice(None)).mean(axis=0))
+
+        differences = np.nan_to_num(second_differences(mean, steps.size))
+        # From differences along the axes to derivatives in units of the prior's spread.
+        back = axes / steps
+        return np.asarray(back @ differences @ back.T)
+
+
+def simplex_refits(
+    evaluator: Evaluator,
+    theta: Floats,
+    scales: Floats,
+    *,
+    simulators: Sequence[int] | None = None,
+) -> SimplexRefits:
+    """Draw data sets at theta and minimise the discrepancy of each; no response is computed.
+
+    The last results are cached: standard errors, epsilon and the adjustment use the same refits.
+    """
+    indices = tuple(range(len(evaluator.nodes)) if simulators is None else simulators)
+    # Minimisers depend on the ratios of scales only.
+    ratios = scales / scales[indices[0]]
+    designs = tuple(
+        hash(bound.design.sample.values.tobytes()) for bound in evaluator.reweighted.values()
+    )
+    return _cached_refits(evaluator, tuple(theta), tuple(ratios), indices, designs)
+
+
+@lru_cache(maxsize=4)  # of the optimum, and for epsilon of a few simulators each
+def _cached_refits(
+    evaluator: Evaluator,
+    theta: tuple[float, ...],
+    scales: tuple[float, ...],
+    simulators: tuple[int, ...],
+    designs: tuple[int, ...],
+) -> SimplexRefits:
+    """Return refits on the present designs, which have hashes ``designs``."""
+    center, prior_sd = np.array(theta), evaluator.hyperparameters.prior_sd
+    sets = simulated_sets(evaluator, center, SETS, seed=0)
+    objective = BatchObjective.of(evaluator, np.array(scales), sets, simulators=simulators)
+    d = center.size
+    start = np.zeros((SETS, d))
+    along_prior = _Along(objective, center, prior_sd, np.eye(d), np.ones(d))
+    before = along_prior(start[:, None], np.arange(SETS))[:, 0]
+    # In spreads of the prior: an ordinary step.
+    shifts, _, _ = descend_by_simplex(along_prior, start, sizes=[0.5])
+    # The second simplices start along the principal axes of the first minimisers.
+    axes, sd = principal_axes(shifts)
+    along = _Along(objective, center, prior_sd, axes, sd)
+    x, after, _ = descend_by_simplex(along, shifts @ axes / sd, sizes=[1.0])
+    is_finite = np.isfinite(before)
+    gain = float((before[is_finite] - after[is_finite]).mean())
+    return SimplexRefits(objective, center, prior_sd, along.shifts(x), gain)
+
+
+# Ends and middle of the central 89 %, whose width is 3.2 standard deviations of a normal.
+_QUANTILES = (0.055, 0.5, 0.945)
+
+
+def principal_axes(points: Floats) -> tuple[Floats, Floats]:
+    """Return principal axes of points, (n, d), as columns (d, d), and robust spreads along them.
+
+    Spreads are those of the central 89 %, so that a few minimisers that ran away do not decide.
+    """
+    d = points.shape[1]
+    if d == 0:
+        return np.empty((0, 0)), np.empty(0)
+    covariance = np.cov(drawn_in(points, 3.0), rowvar=False).reshape(d, d)
+    axes = oriented(np.linalg.eigh(covariance)[1])
+    low, _, high = np.quantile(points @ axes, _QUANTILES, axis=0)
+    sd = (high - low) / 3.2
+    # None so small that a division by it fails.
+    largest = sd.max()
+    return axes, np.maximum(sd, 1e-4 * largest if largest > 0 else 1.0)
+
+
+def drawn_in(points: Floats, most: float) -> Floats:
+    """Return points, (n, d), at most so many robust standard deviations from the median.
+
+    A few in a thousand far out, as where a bounded parameter comes near its bound, would otherwise
+    decide about all others.
+    """
+    low, middle, high = np.quantile(points, _QUANTILES, axis=0)
+    far = most * (high - low) / 3.2
+    return np.clip(points, middle - far, middle + far)

@@ -1,4 +1,4 @@
-"""What a model's metrics and propagations do not allow: sampling distributions, refits.
+"""Requirements of sampling distributions and refits on metrics and propagations.
 
 An obstacle is a reason in words, as the end of a sentence.
 """
@@ -10,30 +10,27 @@ from prbayes.model.evaluator import Evaluator, has_other_terms
 
 
 def simulator_obstacle(evaluator: Evaluator, k: int) -> str | None:
-    """Return why nothing is known of the minimiser of one simulator's discrepancy, or None."""
+    """Return why the minimiser of one simulator's discrepancy has no sampling distribution."""
     node = evaluator.nodes[k]
-    bound = node.bound
-    if bound.random:
+    if node.bound.random:
         return f"{node.name} has prb.Fresh, whose discrepancy is random"
-    if node.metric.minimum is Minimum.UNKNOWN and not bound.stored:
-        metric = type(node.metric).__name__
+    if node.metric.minimum is Minimum.UNKNOWN and not node.bound.stored:
         return (
-            f"{node.name} has a {metric}, of which nothing is known without refits, and these need "
-            "stored responses: use propagation=prb.Reweighted()"
+            f"{node.name} has a {type(node.metric).__name__}, whose standard errors need refits, "
+            "and these need stored responses: use propagation=prb.Reweighted()"
         )
     return None
 
 
 def sampling_obstacle(evaluator: Evaluator) -> str | None:
     """Return why there is no sampling distribution of the minimiser, or None."""
-    nodes = evaluator.nodes
-    for k in range(len(nodes)):
+    for k in range(len(evaluator.nodes)):
         obstacle = simulator_obstacle(evaluator, k)
         if obstacle is not None:
             return obstacle
-    # Where one simulator needs refits, all of them have to be refitted.
-    computed = [node.name for node in nodes if not node.bound.stored]
-    if computed and measured_by_refits(evaluator):
+    # If one simulator needs refits, all of them are refitted.
+    computed = [node.name for node in evaluator.nodes if not node.bound.stored]
+    if computed and needs_refits(evaluator):
         names = ", ".join(computed)
         return f"another metric needs refits, and the responses of {names} are not stored"
     return None
@@ -42,14 +39,11 @@ def sampling_obstacle(evaluator: Evaluator) -> str | None:
 def refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why the model cannot be calibrated to other data sets, or None."""
     obstacle = sampling_obstacle(evaluator)
-    if obstacle is not None:
-        return obstacle
-    if has_other_terms(evaluator):
+    if obstacle is None and has_other_terms(evaluator):
         return "the model has likelihood terms or potentials besides its simulators"
-    return None
+    return obstacle
 
 
-def measured_by_refits(evaluator: Evaluator) -> bool:
-    """Return whether a metric declares nothing of its minimum, so that refits have to tell."""
-    minima = [node.metric.minimum for node in evaluator.nodes]
-    return Minimum.UNKNOWN in minima
+def needs_refits(evaluator: Evaluator) -> bool:
+    """Return whether a metric declares nothing of its minimum, so that refits measure it."""
+    return any(node.metric.minimum is Minimum.UNKNOWN for node in evaluator.nodes)

@@ -1,7 +1,7 @@
-"""Data sets that might have been observed: drawn from the model, or by resampling specimens.
+"""Synthetic data sets, drawn from the model, and bootstrap samples of the observed specimens.
 
-Observations that carry the same specimen label, within a simulator or between simulators, belong
-together: they are drawn, or get their weight, together.
+Observations with the same specimen label, within a simulator or between simulators, are drawn, or
+weighted, together.
 """
 
 from __future__ import annotations
@@ -21,47 +21,43 @@ from prbayes.model.random_variable import Node
 from prbayes.response.distributions import PopulationSampler
 
 # Points of a resimulated population from which data sets are drawn: hundreds of data sets are then
-# weights of some ten million numbers at most.
-_MOST_POINTS = 1 << 15
-# Data sets that tell a sampling distribution: standard errors from them have an error of 5%, those
-# of their middle 89% of 6%, and a coverage of 89% one of 2.2%.
+# ten million weights at most.
+_MAX_POINTS = 1 << 15
+# Data sets for a sampling distribution: standard errors then have an error of 5 %.
 SETS = 200
+
+# Responses and weights of a simulator's population, (1, n) each.
+type _Population = tuple[Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
 class DataSets:
     """Data sets for all simulators of a model, as weights on fixed values."""
 
-    # (n_k,), or (n_k, m) of several outputs: by simulator: all values that occur. NaN is an output
+    # By simulator (n_k,), or (n_k, m) of several outputs: all values that occur. NaN is an output
     # that was not measured.
     values: list[Floats]
-    # (n_sets, n_k): by simulator: the weight of each value in each data set; they sum to one.
+    # By simulator (n_sets, n_k): the weight of each value in each data set; they sum to one.
     weights: list[Floats]
+
+
+# -- specimens in common ---------------------------------------------------------------------------
 
 
 def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[NDArray[np.intp]], int]:
     """Return the specimen's number of each observation, by simulator, and the number of specimens.
 
-    Observations without labels are specimens of their own.
+    An observation without a label is a specimen of its own.
     """
     numbers: dict[object, int] = {}
-    out = []
+    by_simulator = []
     for k, node in enumerate(nodes):
-        found = []
-        for label in _labels(node, k):
-            number = numbers.setdefault(label, len(numbers))
-            found.append(number)
-        out.append(np.array(found, dtype=np.intp))
-    return out, len(numbers)
-
-
-def _labels(node: PopulationSimulator, k: int) -> list[object]:
-    """Return the labels of the k-th simulator's observations; one for each if there are none."""
-    labels = node.specimens
-    if labels is not None:
-        return list(labels.tolist())
-    size = len(node.observed)
-    return [(k, i) for i in range(size)]
+        labels: list[object] = [(k, i) for i in range(len(node.observed))]
+        if node.specimens is not None:
+            labels = list(node.specimens.tolist())
+        rows = [numbers.setdefault(label, len(numbers)) for label in labels]
+        by_simulator.append(np.array(rows, dtype=np.intp))
+    return by_simulator, len(numbers)
 
 
 def dependent(nodes: Sequence[Node]) -> bool:
@@ -71,99 +67,90 @@ def dependent(nodes: Sequence[Node]) -> bool:
 
 
 def groups(nodes: Sequence[Node]) -> list[list[int]]:
-    """Return simulators by position, those together that share specimens, even through others."""
-    numbers, _ = specimens(nodes)
-    found: list[tuple[list[int], set[int]]] = []
-    for k, number in enumerate(numbers):
-        members = [k]
-        shared = set(number.tolist())
-        own = frozenset(shared)
-        # Groups that have a specimen of this simulator become one with it.
-        apart = []
-        for group, theirs in found:
-            if theirs.isdisjoint(own):
-                apart.append((group, theirs))
+    """Return indices of simulators, in groups that share specimens, even through a third one."""
+    joined: list[tuple[list[int], set[int]]] = []
+    for k, number in enumerate(specimens(nodes)[0]):
+        labels = frozenset(number.tolist())
+        members, shared = [k], set(labels)
+        separate = []
+        for group, group_labels in joined:
+            if group_labels.isdisjoint(labels):
+                separate.append((group, group_labels))
             else:
-                members = members + group
-                shared = shared | theirs
-        joined = (sorted(members), shared)
-        found = [*apart, joined]
-    return sorted(members for members, _ in found)
+                members, shared = members + group, shared | group_labels
+        joined = [*separate, (sorted(members), shared)]
+    return sorted(members for members, _ in joined)
 
 
 def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
-    """Return names with those of simulators that share specimens, or are of groups of the same.
-
-    They share a design.
-    """
-    found = set(names)
+    """Return names with those of simulators that share a design, by specimens or groups."""
+    result = set(names)
     for group in [*groups(nodes), *families(nodes)]:
-        together = {nodes[k].name for k in group}
-        if together & found:
-            found |= together
-    return found
+        members = {nodes[k].name for k in group}
+        if members & result:
+            result |= members
+    return result
 
 
 def families(nodes: Sequence[Node]) -> list[list[int]]:
-    """Return simulators by position, those together whose specimens are of groups of the same."""
-    found: dict[int, list[int]] = {}
+    """Return indices of simulators whose specimens are of the same groups, together."""
+    by_inputs: dict[int, list[int]] = {}
     for k, node in enumerate(nodes):
         if node.group:
-            found.setdefault(id(node.bound.inputs), []).append(k)
-    return list(found.values())
+            by_inputs.setdefault(id(node.bound.inputs), []).append(k)
+    return list(by_inputs.values())
 
 
 def aligned(nodes: Sequence[Node]) -> bool:
     """Return whether the i-th points of all simulators' populations are the same specimen."""
-    return all(_same_specimens(node, nodes[0]) for node in nodes)
+    first = nodes[0]
+    inputs = [id(x) for x in first.bound.inputs.aleatory]
+    return all(
+        [id(x) for x in node.bound.inputs.aleatory] == inputs
+        and type(node.bound) is type(first.bound)
+        and node.propagation == first.propagation
+        and node.bound.same_points(first.bound)
+        for node in nodes
+    )
 
 
-def _same_specimens(node: Node, other: Node) -> bool:
-    """Return whether two simulators have the same inputs at the same points."""
-    bound = node.bound
-    theirs = other.bound
-    inputs = [id(x) for x in bound.inputs.aleatory]
-    others = [id(x) for x in theirs.inputs.aleatory]
-    if inputs != others:
-        return False
-    if type(bound) is not type(theirs):
-        return False
-    if node.propagation != other.propagation:
-        return False
-    return bound.same_points(theirs)
+def _require_aligned(nodes: Sequence[Node]) -> None:
+    if not aligned(nodes):
+        names = ", ".join(n.name for n in nodes)
+        raise ValueError(
+            f"specimens: got the same labels in {names} with different inputs or designs, "
+            "expected the same .dist() objects, n and seed in all; then the model says how "
+            "responses of one specimen depend on each other"
+        )
+
+
+# -- parametric bootstrap --------------------------------------------------------------------------
 
 
 def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
     """Draw data sets of the observed sizes from the populations at theta (parametric bootstrap).
 
-    Specimens without a response (NaN) cannot be observed, and those that failed (+inf) only where
-    the metric counts them. Of populations of more than 2^15 points that many, the first of a Sobol
-    sequence, stand for all. Repeated observations of one specimen within a simulator are equal, as
-    the model has them.
+    Specimens without a response (NaN) cannot be observed, and failed ones (+inf) only if the metric
+    counts them. Of populations of more than 2^15 points that many, the first of a Sobol sequence,
+    are used. Repeated observations of one specimen within a simulator are equal, as in the model.
 
     Raises
     ------
     ValueError
         If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or
-        whose designs differ, so that the model does not say how their responses depend on each
-        other.
+        whose designs differ, so that the model does not define the dependence of their responses.
     """
-    populations = []
-    for k, node in enumerate(evaluator.nodes):
-        values, weights = evaluator.populations(theta[None], k)
-        population = thinned(values, weights, node)
-        populations.append(population)
-    points = simulated_points(evaluator, populations, n_sets, seed)
-    return sets_at(evaluator, populations, points)
+    populations = [
+        thinned(*evaluator.populations(theta[None], k), node)
+        for k, node in enumerate(evaluator.nodes)
+    ]
+    return sets_at(evaluator, populations, simulated_points(evaluator, populations, n_sets, seed))
 
 
-def stored_populations(evaluator: Evaluator, thetas: Floats) -> list[tuple[Floats, Floats]]:
+def stored_populations(evaluator: Evaluator, thetas: Floats) -> list[_Population]:
     """Return stored responses by simulator, (1, n), as `sets_at` takes them."""
-    populations = []
-    for k in range(len(evaluator.nodes)):
-        responses, _ = evaluator.populations(thetas[:1], k)
-        populations.append((responses, np.empty(0)))
-    return populations
+    nodes = range(len(evaluator.nodes))
+    return [(evaluator.populations(thetas[:1], k)[0], np.empty(0)) for k in nodes]
 
 
 def points_along(
@@ -177,48 +164,35 @@ def points_along(
         As `simulated_sets`.
     """
     nodes = evaluator.nodes
-    n_specimens = specimens(nodes)[1]
-    size = (len(thetas), n_specimens)
+    size = (len(thetas), specimens(nodes)[1])
     populations = stored_populations(evaluator, thetas)
     points: dict[int, NDArray[np.intp]] = {}
     for group in groups(nodes):
-        _refuse_unlike([nodes[k] for k in group])
-        finite = _observable_together(nodes, populations, group)
+        _require_aligned([nodes[k] for k in group])
+        is_observable = _observable_together(nodes, populations, group)
         uniform = rng.random(size)
-        drawn = _drawn_along(evaluator, group[0], thetas, finite, uniform)
-        points |= dict.fromkeys(group, drawn)
+        drawn = np.empty(size, dtype=np.intp)
+        at_once = max(1, AT_ONCE // is_observable.size)
+        for first in range(0, len(thetas), at_once):
+            _, weights = evaluator.populations(thetas[first : first + at_once], group[0])
+            below = np.cumsum(weights * is_observable, axis=1)
+            for i, sums in enumerate(below, start=first):
+                # On the right of equal sums, so that no point without weight is drawn.
+                drawn[i] = np.searchsorted(sums, uniform[i] * sums[-1], side="right")
+        # A product may be rounded up to the whole.
+        points |= dict.fromkeys(group, np.minimum(drawn, is_observable.size - 1))
     return [points[k] for k in range(len(nodes))]
-
-
-def _drawn_along(
-    evaluator: Evaluator, k: int, thetas: Floats, finite: NDArray[np.bool_], uniform: Floats
-) -> NDArray[np.intp]:
-    """Return the points of the specimens of each theta, (n, specimens), by inverted sums."""
-    at_once = max(1, AT_ONCE // finite.size)
-    drawn = np.empty(uniform.shape, dtype=np.intp)
-    for first in range(0, len(thetas), at_once):
-        rows = slice(first, first + at_once)
-        _, weights = evaluator.populations(thetas[rows], k)
-        below = np.cumsum(weights * finite, axis=1)
-        for i, sums in enumerate(below, start=first):
-            height = uniform[i] * sums[-1]
-            # On the right of equal sums, so that no point without weight is drawn.
-            drawn[i] = np.searchsorted(sums, height, side="right")
-    # A product may be rounded up to the whole.
-    return np.minimum(drawn, finite.size - 1)
 
 
 def simulated_points(
     evaluator: Evaluator,
-    populations: list[tuple[Floats, Floats]],
+    populations: list[_Population],
     n_sets: int,
     seed: int = 0,
     *,
     more: int = 0,
 ) -> list[NDArray[np.intp]]:
-    """Draw the specimens of data sets.
-
-    By simulator the points of its population, (n_sets, specimens + more).
+    """Draw the specimens of data sets: points of populations, (n_sets, specimens + more) each.
 
     Parameters
     ----------
@@ -227,136 +201,87 @@ def simulated_points(
         By simulator: responses and weights, shapes (1, n).
     n_sets, seed : int
     more : int
-        Specimens besides those observed.
+        Number of specimens besides those observed.
     """
     nodes = evaluator.nodes
     rng = np.random.default_rng([seed, 1])
-    _, total = specimens(nodes)
-    size = (n_sets, total + more)
-    draws: dict[int, NDArray[np.intp]] = {}
+    size = (n_sets, specimens(nodes)[1] + more)
+    points: dict[int, NDArray[np.intp]] = {}
     for group in groups(nodes):
-        members = [nodes[k] for k in group]
-        _refuse_unlike(members)
-        # All that share specimens have the same points, with the same weights.
-        finite = _observable_together(nodes, populations, group)
-        _, weights = populations[group[0]]
-        drawn = _draw(weights[0], finite, size, rng)
-        draws |= dict.fromkeys(group, drawn)
-    return [draws[k] for k in range(len(nodes))]
+        _require_aligned([nodes[k] for k in group])
+        # Simulators that share specimens have the same points, with the same weights.
+        is_observable = _observable_together(nodes, populations, group)
+        mass = np.where(is_observable, populations[group[0]][1][0], 0.0)
+        probability = mass / mass.sum()
+        points |= dict.fromkeys(group, rng.choice(probability.size, size=size, p=probability))
+    return [points[k] for k in range(len(nodes))]
 
 
 def sets_at(
-    evaluator: Evaluator, populations: list[tuple[Floats, Floats]], points: list[NDArray[np.intp]]
+    evaluator: Evaluator, populations: list[_Population], points: list[NDArray[np.intp]]
 ) -> DataSets:
     """Return the data sets that are measured on specimens, given by `simulated_points`."""
     numbers, _ = specimens(evaluator.nodes)
-    values = []
-    weights = []
+    values, weights = [], []
     for k, node in enumerate(evaluator.nodes):
         responses = populations[k][0][0]
-        finite = observable(responses, node.target)
-        # The place of each point among those that can be observed.
-        place = np.cumsum(finite) - 1
-        measured = place[points[k][:, numbers[k]]]
-        seen = responses[finite]
-        patterns, own = _patterns(node.target.observed)
-        if len(patterns) > 1:
-            measured, seen = _seen(measured, seen, patterns, own)
-        counted = _counted(
-            measured,
-            node.target.weights,
-            size=len(seen),
-        )
-        values.append(seen)
-        weights.append(counted)
+        is_observable = observable(responses, node.target)
+        # The index of each point among those that can be observed.
+        index = np.cumsum(is_observable) - 1
+        cells = index[points[k][:, numbers[k]]]
+        occurring = responses[is_observable]
+        observed = node.target.observed
+        if observed.ndim > 1:
+            # Each specimen has the outputs of the observed one in its place, NaN for the rest.
+            patterns, row = np.unique(~np.isnan(observed), axis=0, return_inverse=True)
+            if len(patterns) > 1:
+                size = len(occurring)
+                pairs, places = np.unique(cells + size * row.ravel(), return_inverse=True)
+                cells = places.reshape(cells.shape)
+                occurring = np.where(patterns[pairs // size], occurring[pairs % size], np.nan)
+        values.append(occurring)
+        weights.append(_summed_weights(cells, node.target.weights, len(occurring)))
     return DataSets(values, weights)
 
 
-def _seen(
-    measured: NDArray[np.intp],
-    values: Floats,
-    patterns: NDArray[np.bool_],
-    own: NDArray[np.intp],
-) -> tuple[NDArray[np.intp], Floats]:
-    """Return places, (n_sets, N), and the values there, with NaN for outputs not measured.
-
-    Each specimen shows the outputs that the observed one in its place shows.
-    """
-    size = len(values)
-    cells, places = np.unique(measured + size * own, return_inverse=True)
-    shown = np.where(patterns[cells // size], values[cells % size], np.nan)
-    return places.reshape(measured.shape), shown
+def _summed_weights(cells: NDArray[np.intp], weights: Floats, size: int) -> Floats:
+    """Add up the observations' weights at the cells drawn, (n_sets, n) -> (n_sets, size)."""
+    n_sets = len(cells)
+    # All data sets in one row, one after the other.
+    stacked = cells + (size * np.arange(n_sets))[:, None]
+    count = np.bincount(stacked.ravel(), np.tile(weights, n_sets), n_sets * size)
+    return np.asarray(count.reshape(n_sets, size))
 
 
 def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
     """Return which points can be observed, (n,) or (n, m) -> (n,).
 
-    A specimen that failed is observed as such, if the metric counts failures.
+    A failed specimen is observed as such, if the metric counts failures.
     """
-    known = ~np.isnan(responses) if target.metric.counts_failures else np.isfinite(responses)
-    return known if known.ndim == 1 else known.all(axis=1)
+    is_known = ~np.isnan(responses) if target.metric.counts_failures else np.isfinite(responses)
+    return is_known if is_known.ndim == 1 else is_known.all(axis=1)
 
 
 def _observable_together(
-    nodes: Sequence[Node], populations: list[tuple[Floats, Floats]], group: list[int]
+    nodes: Sequence[Node], populations: list[_Population], group: list[int]
 ) -> NDArray[np.bool_]:
-    """Return which points can be observed by all of some simulators, (n,)."""
-    seen = [observable(populations[k][0][0], nodes[k].target) for k in group]
-    return np.asarray(np.all(seen, axis=0))
-
-
-def _patterns(observed: Floats) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
-    """Return which outputs are measured together, (p, m), and the pattern of each specimen, (N,).
-
-    Of one output there is one pattern.
-    """
-    if observed.ndim == 1:
-        return np.ones((1, 1), dtype=bool), np.zeros(len(observed), dtype=np.intp)
-    patterns, own = np.unique(~np.isnan(observed), axis=0, return_inverse=True)
-    return patterns, own.ravel()
-
-
-def _counted(places: NDArray[np.intp], own: Floats, *, size: int) -> Floats:
-    """Add up the observations' own weights at the places drawn, (n_sets, n) -> (n_sets, size)."""
-    n_sets = len(places)
-    # All data sets in one row, one after the other.
-    begin = size * np.arange(n_sets)
-    cells = places + begin[:, None]
-    repeated = np.tile(own, n_sets)
-    count = np.bincount(cells.ravel(), repeated, n_sets * size)
-    return np.asarray(count.reshape(n_sets, size))
+    """Return which points can be observed by all simulators of a group, (n,)."""
+    columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
+    return np.asarray(np.all(columns, axis=0))
 
 
 def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
     """Return the first 2^15 points, of equal weights, of resimulated populations, (k, n) each."""
-    if node.bound.stored or values.shape[1] <= _MOST_POINTS:
+    if node.bound.stored or values.shape[1] <= _MAX_POINTS:
         return values, weights
-    equal = np.broadcast_to(1 / _MOST_POINTS, (len(values), _MOST_POINTS))
-    return values[:, :_MOST_POINTS], equal
-
-
-def _refuse_unlike(nodes: Sequence[Node]) -> None:
-    if not aligned(nodes):
-        names = ", ".join(n.name for n in nodes)
-        raise ValueError(
-            f"specimens: got the same labels in {names} with different inputs or designs, "
-            "expected the same .dist() objects, n and seed in all; then the model says how "
-            "responses of one specimen depend on each other"
-        )
-
-
-def _draw(
-    weights: Floats, finite: NDArray[np.bool_], size: tuple[int, int], rng: np.random.Generator
-) -> NDArray[np.intp]:
-    observable = np.where(finite, weights, 0.0)
-    probability = observable / observable.sum()
-    return rng.choice(probability.size, size=size, p=probability)
+    equal = np.broadcast_to(1 / _MAX_POINTS, (len(values), _MAX_POINTS))
+    return values[:, :_MAX_POINTS], equal
 
 
 def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) -> dict[str, Floats]:
     """Draw one data set from the populations at theta by calling the response.
 
-    Specimens that cannot be observed are replaced by others, as in `simulated_sets`.
+    Specimens that cannot be observed are replaced, as in `simulated_sets`.
 
     Raises
     ------
@@ -365,57 +290,39 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
     """
     nodes = evaluator.nodes
     numbers, total = specimens(nodes)
-    together = groups(nodes)
-    generators = rng.spawn(len(together))
+    node_groups = groups(nodes)
     data = {}
-    for group, generator in zip(together, generators, strict=True):
-        _refuse_unlike([nodes[k] for k in group])
+    for group, generator in zip(node_groups, rng.spawn(len(node_groups)), strict=True):
+        members = [nodes[k] for k in group]
+        _require_aligned(members)
         columns = []
-        for k in group:
-            # Four for each that is needed, in case three of four responses are not finite.
-            column = _responses(evaluator, theta, k, 4 * total, generator)
-            columns.append(column)
-        # What one simulator of a specimen cannot measure, none of them has.
-        targets = [nodes[k].target for k in group]
-        finite = np.all(list(map(observable, columns, targets)), axis=0)
-        for k, column in zip(group, columns, strict=True):
-            node = nodes[k]
-            _refuse_few(node, finite, total)
-            drawn = column[finite][numbers[k]]
+        for k, node in zip(group, members, strict=True):
+            sampler = PopulationSampler(node.bound.inputs)
+            roots = evaluator.roots(theta[None], k)
+            # Four for each specimen; the same for all simulators of the group.
+            aleatory, epistemic = sampler(roots, 4 * total, copy.deepcopy(generator))
+            columns.append(np.asarray(node.bound.responses(aleatory, epistemic)[0]))
+        # A specimen that one simulator cannot measure is measured by none.
+        targets = [node.target for node in members]
+        is_observable = np.all(list(map(observable, columns, targets)), axis=0)
+        for k, node, column in zip(group, members, columns, strict=True):
+            if is_observable.sum() < total:
+                raise ValueError(
+                    f"{node.name}: got {is_observable.sum()} responses that can be observed of "
+                    f"{is_observable.size}, expected at least {total}"
+                )
+            drawn = column[is_observable][numbers[k]]
             data[node.name] = np.where(np.isnan(node.target.observed), np.nan, drawn)
     return {node.name: data[node.name] for node in nodes}
 
 
-def _responses(
-    evaluator: Evaluator, theta: Floats, k: int, size: int, generator: np.random.Generator
-) -> Floats:
-    """Return responses of new specimens, (size,) or (size, m); the same for the same generator."""
-    bound = evaluator.nodes[k].bound
-    sampler = PopulationSampler(bound.inputs)
-    roots = evaluator.roots(theta[None], k)
-    again = copy.deepcopy(generator)
-    aleatory, epistemic = sampler(roots, size, again)
-    responses = bound.responses(aleatory, epistemic)
-    return np.asarray(responses[0])
-
-
-def _refuse_few(node: Node, finite: NDArray[np.bool_], expected: int) -> None:
-    count = finite.sum()
-    if count < expected:
-        raise ValueError(
-            f"{node.name}: got {count} responses that can be observed of {finite.size}, expected "
-            f"at least {expected}"
-        )
+# -- the observed data -----------------------------------------------------------------------------
 
 
 def observed_set(evaluator: Evaluator) -> DataSets:
     """Return the observed responses as the only data set."""
-    values = []
-    weights = []
-    for node in evaluator.nodes:
-        values.append(node.target.observed)
-        weights.append(node.target.weights[None])
-    return DataSets(values, weights)
+    targets = [node.target for node in evaluator.nodes]
+    return DataSets([t.observed for t in targets], [t.weights[None] for t in targets])
 
 
 def one_set(
@@ -423,22 +330,22 @@ def one_set(
 ) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """Return the i-th data set as it would be measured: values and their weights, by simulator.
 
-    Specimens that count alike are repeated where a value occurs several times.
+    Specimens of equal weights are repeated if a value occurs several times.
     """
-    observed: dict[str, Floats] = {}
-    counted: dict[str, Floats] = {}
+    data: dict[str, Floats] = {}
+    data_weights: dict[str, Floats] = {}
     for node, values, weights in zip(evaluator.nodes, sets.values, sets.weights, strict=True):
-        own = node.target.weights
-        seen = np.flatnonzero(weights[i])
-        times = weights[i, seen] / own[0]
-        whole = np.rint(times).astype(np.intp)
-        if np.ptp(own) == 0 and np.allclose(times, whole):
-            seen = np.repeat(seen, whole)
-            counted[node.name] = np.full(seen.size, own[0])
+        unit = node.target.weights
+        rows = np.flatnonzero(weights[i])
+        times = weights[i, rows] / unit[0]
+        repeats = np.rint(times).astype(np.intp)
+        if np.ptp(unit) == 0 and np.allclose(times, repeats):
+            rows = np.repeat(rows, repeats)
+            data_weights[node.name] = np.full(rows.size, unit[0])
         else:
-            counted[node.name] = weights[i, seen]
-        observed[node.name] = values[seen]
-    return observed, counted
+            data_weights[node.name] = weights[i, rows]
+        data[node.name] = values[rows]
+    return data, data_weights
 
 
 def dirichlet_weights(

@@ -377,7 +377,7 @@ class Metric(ABC):
         """Return the comparison of the same outputs by another metric of one output."""
         return metric
 
-    def beside(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
+    def with_design(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
         """Return the discrepancy with projections of the data and a design of responses together.
 
         By default they are those of the data alone.

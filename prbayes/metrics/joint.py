@@ -102,7 +102,7 @@ class Joint(LiftedMetric):
             positive_integer(self.components, "components")
         positive_integer(self.random_seed, "random_seed", minimum=0)
 
-    def beside(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
+    def with_design(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
         """Return the discrepancy with principal components of data and design together.
 
         Inputs fewer than the outputs matter as well.

@@ -1,4 +1,4 @@
-"""What is kept of work that stops before its end, so that it can go on."""
+"""State after an interruption, from which the same call can continue."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from prbayes.response.budget import BudgetError
 
 @contextmanager
 def designs_as_before(evaluator: Evaluator) -> Iterator[Callable[[], None]]:
-    """Give designs that have grown inside their first size back, where the work is interrupted.
+    """Restore the designs if the work is interrupted: the same call then starts from them again.
 
-    The same call then begins where this one began, and finds the responses. The function that is
-    yielded does the same, for work that a budget ended with a part of its result.
+    Its responses are reused. The function that is yielded restores them as well, for work that a
+    budget ended with a part of its result.
     """
     designs = [(bound, bound.design) for bound in evaluator.reweighted.values()]
 
@@ -34,9 +34,9 @@ def designs_as_before(evaluator: Evaluator) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def explained(model: pm.Model, caller: str, *also: str) -> Iterator[None]:
-    """Say, where a budget was spent before there was a result, what is kept and what to do.
+    """Explain a budget that was spent before there was a result.
 
-    ``also`` is what is kept besides responses.
+    ``also`` names what is kept besides responses.
     """
     try:
         yield
@@ -48,7 +48,7 @@ def explained(model: pm.Model, caller: str, *also: str) -> Iterator[None]:
 
 
 def kept(model: pm.Model, *also: str) -> str:
-    """Say what is kept, for the next time."""
+    """Return what the next call can reuse, as a phrase."""
     used = list(simulators(model).values())
     stores = [simulator.responses.folder for simulator in used]
     folders = {str(folder) for folder in stores if folder is not None}

@@ -13,7 +13,7 @@ from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.model.random_variable import computed_node, simulators
 from prbayes.model.specimen_preparation import first_run_count, is_prepared, prepared
 from prbayes.model.specimen_variable import measurements_of, require_simulator, specimen_likelihoods
-from prbayes.propagation.specimen_points import first_runs
+from prbayes.propagation.specimen_emulation import first_runs
 from prbayes.response.budget import Cost, RunCost, SimulatorCost
 from prbayes.response.inputs import model_on_context
 

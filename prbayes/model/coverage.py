@@ -22,42 +22,38 @@ class Level:
     tails: bool  # whether 5% and 95% quantiles of the mean raw weight are bounded, or the median
 
 
-# Where an answer is made: the optimiser and the samplers, whose designs grow until it holds. A mean
-# weight of 0.8 to 1.25 is a fifth of the population's mass either way. Half the effective sample
-# size moves an optimum by .05 standard errors; twice is more than 1024 points give with two inputs
-# (docs/constants.md).
+# Of the optimiser and the samplers, whose designs grow until it holds. A mean weight of 0.8 to 1.25
+# is a fifth of the population's mass either way. Half the effective sample size moves an optimum by
+# .05 standard errors; twice is more than 1024 points give with two inputs (docs/constants.md).
 ENOUGH = Level(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
-# Where an answer is used: designs do not grow for a prediction. By judgement: laxer, as draws at
-# the edge of a posterior are less well supported than its centre, and resampling needs no
-# derivative.
+# Of predictions, whose designs do not grow. Laxer: draws at the edge of a posterior are less well
+# supported than its centre, and resampling needs no derivative.
 TOLERABLE = Level(ess=0.5, lowest_ess=0.0, mass=(0.7, 1.4), tails=False)
-# Where a population is drawn. By judgement: a curve may be worse than an estimate; of fewer than
-# ten responses, a fifth of the least that a design asks for, it shows the design and no population.
+# Of plots: a curve may be worse than an estimate. A curve of fewer than ten responses, a fifth of
+# the smallest requirement, would show the design.
 VISIBLE = Level(ess=0.2, lowest_ess=0.2, mass=(0.5, 2.0), tails=False)
 
 
 @dataclass(frozen=True)
 class Shortcoming:
-    """In what a design does not support populations; it can be said as text."""
+    """Requirements that a design does not meet for populations; false if it meets all."""
 
     # Share of a population's weight on points without response, at the 95% quantile, if too much.
     lost: float | None
     # Weight effective sample size, 5% quantile and median, if too small.
     ess: tuple[float, float] | None
-    # Mean raw weight, lowest and highest that count, if one of them is out of bounds.
-    mass: tuple[float, float] | None
-    max_lost: float  # the share that may be lost
-    required_ess: float  # what the design asks for
+    mass: tuple[float, float] | None  # mean raw weight, lowest and highest, if out of bounds
+    max_lost: float
+    required_ess: float
     n_points: int
     level: Level
 
     def __bool__(self) -> bool:
-        """Whether the design falls short at all."""
-        shortcomings = (self.lost, self.ess, self.mass)
-        return any(found is not None for found in shortcomings)
+        """Whether the design falls short of a requirement."""
+        return any(value is not None for value in (self.lost, self.ess, self.mass))
 
     def __str__(self) -> str:
-        """Return what is wrong, and what was expected, as the end of a sentence."""
+        """Return what was got and expected, as the end of a sentence."""
         if self.lost is not None:
             return (
                 f"lost mass: {self.lost:.1%} of a population's weight is on points whose response "
@@ -82,27 +78,24 @@ class Shortcoming:
 
 
 def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
-    """Return, by simulator, in what its design does not support populations at thetas, (P, d)."""
-    found = {}
+    """Return how designs fall short for populations at thetas, (P, d), by simulator."""
+    result = {}
     for name, support in evaluator.support(thetas).items():
         bound = evaluator.reweighted[name]
         short = shortcoming(support, bound.required_ess, bound.max_lost, bound.n_points, ENOUGH)
         if short:
-            found[name] = short
-    return found
+            result[name] = short
+    return result
 
 
 def supports_each(
     support: dict[str, Floats], required_ess: float, max_lost: float, level: Level
 ) -> NDArray[np.bool_]:
-    """Return which populations a design supports, each by itself, shape (P,).
-
-    Parameters are those of `shortcoming`.
-    """
+    """Return which populations a design supports, shape (P,); parameters as in `shortcoming`."""
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
     least, most = level.mass
     covered = (mass >= least) & (mass <= most)
-    # A sum of weights that is zero may be rounded.
+    # A sum of zero weights may be rounded.
     lost_little = lost <= max(max_lost, 1e-12)
     return np.asarray((ess >= level.ess * required_ess) & covered & lost_little)
 
@@ -114,19 +107,9 @@ def shortcoming(
     n_points: int,
     level: Level,
 ) -> Shortcoming:
-    """Return in what a design falls short; it is false where it does not.
+    """Return how a design of n points falls short of its required effective sample size.
 
-    Parameters
-    ----------
-    support : dict
-        ``weight_ess``, ``mean_weight`` and ``lost_mass`` of each population, arrays of shape (P,).
-    required_ess : float
-        Weight effective sample size that the design asks for.
-    max_lost : float
-        Largest share of a population's weight on points without response.
-    n_points : int
-    level : Level
-        `ENOUGH`, `TOLERABLE` or `VISIBLE`.
+    ``support`` has ``weight_ess``, ``mean_weight`` and ``lost_mass`` of the populations, (P,).
     """
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
     # Single populations far out may fall short.
@@ -135,15 +118,13 @@ def shortcoming(
     mass_low, mass_high = np.quantile(mass, at)
     most_lost = float(np.quantile(lost, 0.95))
     least, most = level.mass
-    # A comparison with NaN is false, and falls short.
-    many_in_the_middle = middle >= level.ess * required_ess
-    many_at_the_low_end = low >= level.lowest_ess * required_ess
-    many = many_in_the_middle and many_at_the_low_end
-    covered = mass_low >= least and mass_high <= most
+    # A comparison with NaN is false: the design falls short.
+    has_ess = middle >= level.ess * required_ess and low >= level.lowest_ess * required_ess
+    is_covered = mass_low >= least and mass_high <= most
     return Shortcoming(
         lost=most_lost if most_lost > max_lost else None,
-        ess=(float(low), float(middle)) if not many else None,
-        mass=(float(mass_low), float(mass_high)) if not covered else None,
+        ess=(float(low), float(middle)) if not has_ess else None,
+        mass=(float(mass_low), float(mass_high)) if not is_covered else None,
         max_lost=max_lost,
         required_ess=required_ess,
         n_points=n_points,

@@ -27,7 +27,7 @@ from prbayes.model.specimen_variable import measurements_of, specimen_likelihood
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import new_specimens
-from prbayes.propagation.specimen_points import Surface
+from prbayes.propagation.specimen_emulation import Surface
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs

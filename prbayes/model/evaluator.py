@@ -278,7 +278,7 @@ class Evaluator:
             target = (metric or node.metric).against(observed, counted)
             bound = node.bound
             dimensions = bound.inputs.dimensions
-            targets.append(target.metric.beside(target, bound.first_responses, dimensions))
+            targets.append(target.metric.with_design(target, bound.first_responses, dimensions))
         return self.with_targets(targets)
 
     def roots(self, thetas: Floats, k: int) -> list[Floats]:

@@ -23,7 +23,7 @@ from prbayes.model.parameters import Hyperparameters
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.population_density import PopulationDensity
-from prbayes.propagation.specimen_points import Emulation, PointOptions
+from prbayes.propagation.specimen_emulation import Emulation, PointOptions
 from prbayes.response.distributions import prior_draws
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs

@@ -160,7 +160,7 @@ class Node:
             raise type(error)(f"{self.name}: {error}") from None
         bound = self.bound.copied()
         dimensions = bound.inputs.dimensions
-        bound.target = target.metric.beside(target, bound.first_responses, dimensions)
+        bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
         changed = replace(self, target=bound.target, bound=bound)
         if has_default_epsilon(self):
             changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
@@ -216,7 +216,7 @@ class Specification:
             bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
             dimensions = bound.inputs.dimensions
             metric = self.target.metric
-            bound.target = metric.beside(self.target, bound.first_responses, dimensions)
+            bound.target = metric.with_design(self.target, bound.first_responses, dimensions)
         responses.on_start = None
         warn_out_of_range(
             self.name, self.target.observed, bound.first_responses, self.outputs.names

@@ -30,7 +30,8 @@ from prbayes.model.population_draws import Populations
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.response_share import ResponseShare, response_share
-from prbayes.propagation.specimen_points import Emulation, SpecimenPoints, draw_points, emulate
+from prbayes.propagation.specimen_emulation import Emulation, emulate
+from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
 from prbayes.response.budget import duration
 from prbayes.response.inputs import aleatory_names
 from prbayes.response.response import Responses

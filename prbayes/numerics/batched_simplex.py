@@ -75,9 +75,15 @@ def _one_descent(
     converged = np.zeros(n_rows, dtype=bool)
     # In 60 iterations for each parameter a simplex shrinks about a millionfold.
     for _ in range(60 * r):
+        best = values[:, 0]
+        with np.errstate(invalid="ignore"):  # infinite less infinite counts as nothing
+            gains = np.where(np.isfinite(first), first, best) - best
+            spread = values[:, -1] - best
+        # At a parabola's minimum a thousandth of the mean gain is 3% of the distance.
+        is_level = spread <= 1e-3 * float(np.nan_to_num(gains).mean())
+        length = np.abs(points - points[:, :1]).max(axis=(1, 2))
         # Rows that have converged stay as they are.
-        gain = _mean_gain(first, values[:, 0])
-        converged |= _is_small(points, values, gain, abs(size))
+        converged |= is_level | (length <= 1e-3 * abs(size))
         rows = np.flatnonzero(~converged)
         if not rows.size:
             break
@@ -85,31 +91,11 @@ def _one_descent(
     return points[:, 0], values[:, 0], converged
 
 
-def _is_small(points: Floats, values: Floats, gain: float, size: float) -> NDArray[np.bool_]:
-    """Return which simplices, (B,), are short, or have about equal values.
-
-    At a parabola's minimum a thousandth of the gain is 3% of the distance.
-    """
-    with np.errstate(invalid="ignore"):
-        is_level = values[:, -1] - values[:, 0] <= 1e-3 * gain
-    length = np.abs(points - points[:, :1]).max(axis=(1, 2))
-    return np.asarray(is_level | (length <= 1e-3 * size))
-
-
 def _sorted(points: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Return simplices with their best point first."""
     order = np.argsort(values, axis=1, kind="stable")
     ordered = np.take_along_axis(values, order, axis=1)
     return np.take_along_axis(points, order[..., None], axis=1), ordered
-
-
-def _mean_gain(first: Floats, values: Floats) -> float:
-    """Return the mean gain over the first values; zero where these are not finite."""
-    start = np.where(np.isfinite(first), first, values)
-    # Infinite less infinite counts as nothing.
-    with np.errstate(invalid="ignore"):
-        gains = start - values
-    return float(np.nan_to_num(gains).mean())
 
 
 def _step(

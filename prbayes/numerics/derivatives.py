@@ -20,7 +20,8 @@ def slopes(values: Floats, step: Floats) -> Floats:
 
     Where one of two neighbours is not finite, as at the edge of a support, they are one-sided.
     """
-    center, up, down = np.split(np.moveaxis(values, 0, -1), [1, 1 + step.size], axis=-1)
+    last = np.moveaxis(values, 0, -1)
+    center, up, down = np.split(last, [1, 1 + step.size], axis=-1)
     with np.errstate(invalid="ignore"):
         forward = (up - center) / step
         backward = (center - down) / step
@@ -60,21 +61,27 @@ def stencil(r: int) -> Floats:
     """
     unit = np.eye(r)
     rows = list(cross(np.zeros(r), np.ones(r)))
-    for i, j in zip(*np.tril_indices(r, -1), strict=True):
-        a, b = unit[i], unit[j]
+    for i, j in np.stack(np.tril_indices(r, -1), axis=-1):
+        a = unit[i]
+        b = unit[j]
         rows += [a + b, a - b, b - a, -a - b]
     return np.array(rows)
 
 
 def hessian_of(values: Floats, r: int) -> Floats:
     """Return the Hessian, (r, r), from values at the points of `stencil`, by unit differences."""
-    _, up, down, corners = np.split(values, [1, 1 + r, 1 + 2 * r])
+    center = values[0]
+    ends = [1, 1 + r, 1 + 2 * r]
+    _, up, down, corners = np.split(values, ends)
     # Values that are not finite give NaN, which callers judge.
     with np.errstate(invalid="ignore"):
-        hessian = np.diag(up - 2 * values[0] + down)
-        pairs = zip(*np.tril_indices(r, -1), corners.reshape(-1, 4), strict=True)
-        for i, j, (pp, pm, mp, mm) in pairs:
-            hessian[i, j] = hessian[j, i] = (pp - pm - mp + mm) / 4
+        hessian = np.diag(up - 2 * center + down)
+        rows, columns = np.tril_indices(r, -1)
+        for i, j, around in zip(rows, columns, corners.reshape(-1, 4), strict=True):
+            pp, pm, mp, mm = around
+            mixed = (pp - pm - mp + mm) / 4
+            hessian[i, j] = mixed
+            hessian[j, i] = mixed
     return hessian
 
 

@@ -39,9 +39,6 @@ _SIMPLEX_EVALUATIONS = 60
 # far starts half and twice lead to the same optima (benchmarks/landscapes.py).
 OVERLAP = 0.02
 OVERLAP_ENOUGH = 0.5
-# Largest difference between optima of independent designs, in standard errors: a tenth adds half a
-# percent to the width of an interval.
-AGREE = 0.1
 
 
 class Result(Enum):

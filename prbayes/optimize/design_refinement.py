@@ -11,18 +11,17 @@ import numpy as np
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local
+from prbayes.inference.asymptotics import Information, Local
+from prbayes.inference.checks.identification import unidentified_findings
+from prbayes.inference.design_error import DesignErrors, design_error
 from prbayes.inference.identifiability import oriented
-from prbayes.inference.refits import DesignErrors, SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import sampling_obstacle
 from prbayes.inference.resampling import families, siblings
-from prbayes.inference.sandwich import Information
 from prbayes.model.coverage import Shortcoming, shortcomings
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.parameters import THETAS
-from prbayes.optimize.caveats import not_identified
 from prbayes.optimize.convergence import (
-    AGREE,
     OVERLAP_ENOUGH,
     Fit,
     Search,
@@ -40,6 +39,9 @@ _log = logging.getLogger("prbayes")
 MAX_ROUNDS = 8
 # Share of it for points and for emulators: together they then have it all.
 _SHARE = np.sqrt(0.5)
+# Largest difference between optima of independent designs, in standard errors: a tenth adds half a
+# percent to the width of an interval.
+AGREE = 0.1
 # Error of an emulator, in the response's spread, that makes it another response.
 _POOR_EMULATOR = 0.25
 # Data sets for noise floors that only end a pilot or compare optima.
@@ -71,7 +73,8 @@ def refine_designs(
     short = shortcomings(evaluator, nearby) or shortcomings(evaluator, fit.theta[None])
     if short and round_ == MAX_ROUNDS:
         # A minimiser follows what is not identified until no design supports it.
-        refuse(short, evaluator, [] if fit.local is None else not_identified(evaluator, fit.local))
+        findings = [] if fit.local is None else unidentified_findings(evaluator, fit.local)
+        refuse(short, evaluator, findings)
     if short:
         return fit, _cover(search, fit, nearby, seed)
     is_apart = apart_from_data(evaluator, fit.theta)
@@ -84,7 +87,7 @@ def refine_designs(
             return fit, Restart(theta, fit.cloud, fit.ridge, alternative)
     if is_apart or fit.sampling is None:
         return fit, None
-    errors = fit.sampling.design_error()
+    errors = design_error(fit.sampling)
     fit = replace(fit, design_error=errors.whole)
     if not errors.whole > AGREE:
         return fit, None

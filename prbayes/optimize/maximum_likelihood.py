@@ -363,7 +363,7 @@ def _prior_ends(
         below = float((prior[:, i] <= theta[i]).mean())
         if 0.05 <= below <= 0.95:
             continue
-        value, bound = end_of_range(evaluator, theta, i, up=below > 0.5)
+        value, bound = end_of_range(evaluator, theta, i, is_upper=below > 0.5)
         if not np.isfinite(bound):
             continue
         start = theta.copy()

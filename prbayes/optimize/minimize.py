@@ -26,7 +26,11 @@ from prbayes._validate import (
     real_array,
     seed_number,
 )
-from prbayes.inference.checks.smoothing_bias import wide_kernels
+from prbayes.inference.checks.flat_edge import breakdown_findings, elements_at_edge
+from prbayes.inference.checks.metric_suitability import data_between_runs, heavy_tails
+from prbayes.inference.checks.smoothing_bias import smoothing_bias
+from prbayes.inference.design_error import design_error
+from prbayes.inference.refits import jumping_simulators
 from prbayes.inference.resampling import SETS
 from prbayes.model.budgets import explained, kept
 from prbayes.model.coverage import shortcomings
@@ -35,13 +39,6 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_variable import specimen_likelihoods
-from prbayes.optimize.caveats import (
-    between_runs,
-    breakdown,
-    caveats,
-    elements_at_edge,
-    heavy_tails,
-)
 from prbayes.optimize.convergence import Fit, Search, Trace, approach, minimise, settle
 from prbayes.optimize.design_refinement import (
     MAX_ROUNDS,
@@ -53,6 +50,7 @@ from prbayes.optimize.design_refinement import (
     refuse_lost,
     sampling_distribution,
 )
+from prbayes.optimize.findings import optimum_findings
 from prbayes.optimize.local_optima import Rival, find_rivals
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
 from prbayes.optimize.methods import Method
@@ -485,7 +483,7 @@ def _settle(problem: _Problem, fit: Fit) -> Fit:
         fit = replace(fit, sampling=sampling)
     if fit.sampling is None or not (np.isnan(fit.design_error) or shift.any()):
         return fit
-    return replace(fit, design_error=fit.sampling.design_error().whole)
+    return replace(fit, design_error=design_error(fit.sampling).whole)
 
 
 # -- report ----------------------------------------------------------------------------------------
@@ -508,7 +506,7 @@ def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = 
             tolerance=search.tolerance,
             seed=problem.settings.random_seed,
         )
-        at_jump = tuple(evaluator.nodes[k].name for k in fit.sampling.unsettled())
+        at_jump = tuple(evaluator.nodes[k].name for k in jumping_simulators(fit.sampling))
         if at_edge or at_jump:
             fit, rivals = replace(fit, sampling=None), []
     record = SearchRecord(
@@ -533,16 +531,11 @@ def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = 
         return replace(optimum, findings=report(finding))
     refuse_lost(evaluator, {name: each["lost_mass"] for name, each in optimum.support.items()})
     findings = report(
-        *breakdown(at_edge, at_jump),
+        *breakdown_findings(at_edge, at_jump),
         *heavy_tails(evaluator, fit.theta),
-        *between_runs(evaluator, fit.theta),
-        *wide_kernels(evaluator, fit.theta, fit.scales, fit.local),
-        *caveats(
-            evaluator,
-            fit.sampling,
-            [rival.theta for rival in rivals if rival.comparable],
-            fit.design_error,
-        ),
+        *data_between_runs(evaluator, fit.theta),
+        *smoothing_bias(evaluator, fit.theta, fit.scales, fit.local),
+        *optimum_findings(evaluator, fit.sampling, rivals, fit.design_error),
     )
     records = tuple(rival.record(evaluator) for rival in rivals)
     return replace(optimum, design_error=fit.design_error, rivals=records, findings=findings)

@@ -13,7 +13,8 @@ from prbayes._display import view
 from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.checks.flat_edge import breakdown_findings, no_information
+from prbayes.inference.refits import SamplingDistribution, sampling_of_functions
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
@@ -39,7 +40,6 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.caveats import breakdown, no_information
 from prbayes.optimize.convergence import Fit, Result, Search, apart_from_data
 
 # A smaller share is displayed as 0.0%.
@@ -304,7 +304,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
     stopped the search.
     """
     evaluator, theta, scales = search.evaluator, fit.theta, fit.scales
-    functions = None if fit.sampling is None else fit.sampling.of_functions
+    functions = None if fit.sampling is None else sampling_of_functions(fit.sampling)
     point, stderr = point_and_stderr(evaluator, theta, fit.covariance, functions)
     is_affordable = not (record.stopped and evaluator.responses_per_theta)
     record = replace(record, result=_final_result(search, fit, record, is_affordable=is_affordable))
@@ -420,7 +420,7 @@ def plain(value: Any) -> Any:
 
 def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     """Return the optimum, or raise if it is at the edge of a support or at a jump."""
-    findings = breakdown(optimum.search.at_edge, optimum.search.at_jump)
+    findings = breakdown_findings(optimum.search.at_edge, optimum.search.at_jump)
     if findings:
         reasons = " ".join(map(str, findings))
         raise ValueError(

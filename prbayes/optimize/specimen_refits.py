@@ -23,7 +23,8 @@ from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
 from prbayes.model.specimen_likelihood import arrays, draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
-from prbayes.propagation.specimen_points import draw_points, specimen_roots
+from prbayes.propagation.specimen_emulation import specimen_roots
+from prbayes.propagation.specimen_points import draw_points
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
 
 

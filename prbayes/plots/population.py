@@ -1,24 +1,31 @@
-"""The calibrated population of each input."""
+"""The calibrated population of each aleatory input, by margins."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 import xarray as xr
+from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import share
+from prbayes._validate import Floats, called, share
+from prbayes.model.elements import element_name, variable_of
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, SOLID, Canvas, Panel, refuse_look
+from prbayes.plots._curves import GRID_POINTS, central_range, smooth_densities
 from prbayes.plots._ensemble import Calibrated, Ensemble, read_result
 from prbayes.plots._labels import named, refuse_labels
-from prbayes.plots._margins import Margin, margin_densities, margins, select_margins
 from prbayes.plots._regions import outlines
-from prbayes.response.distributions import PopulationSampler
+from prbayes.response.compile import compile_batched
+from prbayes.response.distributions import PopulationSampler, is_mvnormal
+from prbayes.response.inputs import Inputs, aleatory_names
 
 
 @locked
@@ -132,3 +139,162 @@ def _draw_pair(panel: Panel, ensemble: Ensemble, x: Margin, y: Margin, prob: flo
         panel.line(visual, across, up, BLUE, style=style, width=1.5, legend=text)
     correlations: Any = np.corrcoef(points.T)
     return float(correlations[0, 1])
+
+
+# -- margins ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Margin:
+    """One number that varies from specimen to specimen."""
+
+    # Name of the distribution, or of the response's argument; with the index of an element.
+    name: str
+    dist: TensorVariable  # the ``.dist()``
+    node: int  # index of the simulator
+    position: int  # among the simulator's aleatory inputs
+    index: tuple[int, ...]  # element of a multivariate input
+    group: str = ""  # the group whose population it is, if there are groups
+
+    @property
+    def axis(self) -> Hashable:
+        """A key of margins with the same range of the axis: those of groups."""
+        return (self.dist, self.index) if self.group else self.name
+
+    @property
+    def discrete(self) -> bool:
+        """Whether it takes whole numbers only."""
+        return not self.dist.dtype.startswith("float")
+
+
+def margins(evaluator: Evaluator) -> list[Margin]:
+    """Return the margins of all aleatory inputs; an input of several simulators counts once."""
+    out: list[Margin] = []
+    taken = {str(variable.name) for variable in evaluator.model.basic_RVs}
+    for k, node in enumerate(evaluator.simulators):
+        inputs = node.inputs
+        names = aleatory_names(inputs, node.responses.function)
+        group = [node.group] if node.group else []
+        for position, (name, dist) in enumerate(zip(names, inputs.aleatory, strict=True)):
+            if any(margin.dist is dist and margin.group == node.group for margin in out):
+                continue
+            if element_name(name, group) in taken:
+                name = f"{name} of {node.name}"
+            taken.add(element_name(name, group))
+            for index in np.ndindex(inputs.event_shapes[position]):
+                element = element_name(name, [*group, *index])
+                out.append(Margin(element, dist, k, position, index, node.group))
+    return out
+
+
+def select_margins(available: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:
+    """Return margins by name, with or without index, or by ``.dist()``; all by default.
+
+    Raise a `KeyError` if there is no such input.
+    """
+    if inputs is None:
+        return available
+    if isinstance(inputs, str | TensorVariable):
+        inputs = [inputs]
+    names = [margin.name for margin in available]
+    if not isinstance(inputs, list | tuple) or not inputs:
+        raise TypeError(
+            f"inputs: got {called(inputs)}, expected a list of names or .dist() objects, such as "
+            f"{names[:2]}"
+        )
+    selected: list[Margin] = []
+    for x in inputs:
+        if isinstance(x, str):
+            matches = [m for m in available if x in (m.name, variable_of(m.name))]
+        else:
+            matches = [m for m in available if m.dist is x]
+        if not matches:
+            raise KeyError(f"inputs: got {x}, expected some of {names}, or their .dist() objects")
+        selected += [margin for margin in matches if margin not in selected]
+    return selected
+
+
+def margin_densities(
+    evaluator: Evaluator, shown: list[Margin], thetas: Floats
+) -> dict[str, tuple[Floats, Floats]]:
+    """Return by margin a grid, shape (g,), and densities at thetas, shape (P, g); or probabilities.
+
+    They are exact where the input has an elementwise density or is a multivariate normal, otherwise
+    kernel densities, or shares, of random draws. No response is computed. The populations of
+    several groups have one grid.
+    """
+    nodes = sorted({margin.node for margin in shown})
+    samplers = {k: PopulationSampler(evaluator.simulators[k].inputs) for k in nodes}
+    roots = {k: evaluator.roots(thetas, k) for k in nodes}
+
+    # The range of each axis, from specimens of some populations
+    ranges: dict[Any, tuple[float, float]] = {}
+    step = max(1, len(thetas) // 40)
+    few = {
+        k: samplers[k]([root[::step] for root in roots[k]], 400, np.random.default_rng(0))[0]
+        for k in nodes
+    }
+    for margin in shown:
+        values = _values(few[margin.node], margin)
+        first, last = central_range(values, np.full(values.shape, 1 / values.shape[1]), tail=0.002)
+        low, high = ranges.get(margin.axis, (first, last))
+        ranges[margin.axis] = min(low, first), max(high, last)
+
+    many: dict[int, Any] = {}  # specimens of all populations, drawn only where they are needed
+    densities = {}
+    for margin in shown:
+        k = margin.node
+        inputs = evaluator.simulators[k].inputs
+        low, high = ranges[margin.axis]
+        grid = np.linspace(low, high, GRID_POINTS)
+        if margin.discrete:
+            grid = np.arange(np.floor(low), np.ceil(high) + 1)
+        y = None if inputs.nested else _exact(inputs, margin, roots[k], grid)
+        if y is None:
+            if k not in many:
+                many[k] = samplers[k](roots[k], 1600, np.random.default_rng(1))[0]
+            values = _values(many[k], margin)
+            if margin.discrete:
+                y = np.column_stack([(values == x).mean(axis=1) for x in grid])
+            else:
+                weights = np.full(values.shape, 1 / values.shape[1])
+                y = smooth_densities(values, weights, grid)
+        densities[margin.name] = grid, y
+    return densities
+
+
+def _values(draws: Any, margin: Margin) -> Floats:
+    """Return the draws of a margin, shape (P, n)."""
+    element = (slice(None), slice(None), *margin.index)
+    return np.asarray(draws[margin.position][element], dtype=np.float64)
+
+
+def _exact(inputs: Inputs, margin: Margin, roots: list[Floats], grid: Floats) -> Floats | None:
+    """Return the densities, shape (P, g), or None where PyMC has no density of one element."""
+    symbols = inputs.placeholders()
+    dists, *_ = inputs.rebuilt(symbols)
+    dist: Any = dists[margin.position]
+    x = pt.lvector("x") if margin.discrete else pt.dvector("x")
+    logp = _log_density(dist, margin.index, x)
+    if logp is None:
+        return None
+    function = compile_batched(symbols, [pt.exp(logp)], extra=[x])
+    (density,) = function(*roots, grid.astype(x.dtype))
+    return np.broadcast_to(np.nan_to_num(density), (len(roots[0]), grid.size))
+
+
+def _log_density(dist: Any, index: tuple[int, ...], x: Any) -> Any:
+    """Return the log-density of an element at x, shape (g,), or None where there is none."""
+    if is_mvnormal(dist):
+        mean, covariance = dist.owner.op.dist_params(dist.owner)
+        (i,) = index
+        return pm.logp(pm.Normal.dist(mean[i], pt.sqrt(covariance[i, i])), x)
+    # All elements at the same value
+    columns = pt.shape_padright(x, dist.type.ndim)
+    try:
+        logp = pm.logp(dist, columns + pt.zeros_like(dist), warn_rvs=False)
+    except NotImplementedError:
+        return None
+    if logp.type.ndim != 1 + dist.type.ndim:
+        return None  # a density of all elements together
+    return logp[(slice(None), *index)]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.inference.identifiability import unidentified_directions
+from prbayes.inference.refits import is_prepared_by_data, refit, refit_prepared
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum, require_refits
@@ -117,9 +118,9 @@ def _minimisers(
         data = simulated_sets(evaluator, optimum.theta, draws, seed)
     else:
         data = reweighted_sets(evaluator, draws, seed)
-    x, converged = sampling.refit(data)
-    if sampling.prepares:
-        x, converged = sampling.refit_prepared(data, x)
+    x, converged = refit(sampling, data)
+    if is_prepared_by_data(sampling.evaluator):
+        x, converged = refit_prepared(sampling, data, x)
     return sampling.thetas(x), converged
 
 

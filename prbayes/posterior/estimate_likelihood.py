@@ -41,78 +41,49 @@ from prbayes.posterior.saddlepoint import (
 
 @dataclass(frozen=True)
 class EstimateLikelihoodOptions:
-    """Options of the likelihood given an estimate.
-
-    Attributes
-    ----------
-    score : ScoreOptions
-    saddlepoint : SaddlepointOptions
-    rounds : int
-        Times that metrics are minimised again, with whitening and bandwidth of the population at
-        the estimate before. With zero they are those of the observed data.
-    few_specimens : int
-        Number of specimens below which metrics of one output are minimised again as well.
-    step : float
-        Step of differences of log weights, in standard deviations of the prior.
-    wide_step : float
-        The same if the support of an input moves.
-    resimulated_step : float
-        Step of differences of responses that are computed at each theta, in the same unit.
-    effective_responses : float
-        Smallest effective number of stored responses at the point of the score. An estimate at an
-        edge is moved inside until it is reached.
-    distance : float
-        Distance from the middle of the prior, in its standard deviations, beyond which an element
-        may be at an edge.
-    smallest_spread : float
-        Smallest standard deviation of an element's likelihood score there, relative to the largest
-        of all elements: less where a bounded prior ends.
-    """
+    """Options of the likelihood given an estimate; steps are in prior standard deviations."""
 
     score: ScoreOptions = field(default_factory=ScoreOptions)
     saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
+    # Times that metrics are minimised again, with whitening and bandwidth of the population at the
+    # previous estimate. With zero they are those of the observed data.
     rounds: int = 2
-    few_specimens: int = 10
-    step: float = 1e-5
-    wide_step: float = 0.05
-    resimulated_step: float = 1e-3
+    few_specimens: int = 10  # below, metrics of one output are minimised again as well
+    step: float = 1e-5  # of differences of log weights
+    wide_step: float = 0.05  # the same if the support of an input moves
+    resimulated_step: float = 1e-3  # of differences of responses that are computed at each theta
+    # Smallest effective number of stored responses at the point of the score. An estimate at an
+    # edge is moved inside until it is reached.
     effective_responses: float = 50.0
+    # Distance from the middle of the prior, beyond which an element may be at an edge; and smallest
+    # standard deviation of its likelihood score there, relative to the largest of all elements.
     distance: float = 3.0
     smallest_spread: float = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class EstimateLikelihood:
-    """The likelihood given the estimate.
-
-    Attributes
-    ----------
-    evaluator : Evaluator
-    starts : ndarray, shape (M, d)
-        The point of the score, and optima that are as good as the estimate.
-    groups : tuple of StoredScores and ResimulatedScores
-        One of each set of simulators that share specimens.
-    scale : ndarray, shape (d,)
-        Unit of each element for `laplace`: a standard deviation of the prior, or a hundred standard
-        errors of the element alone if these are less.
-    options : SaddlepointOptions
-    """
+    """The likelihood given the estimate."""
 
     evaluator: Evaluator
-    starts: Floats
+    starts: Floats  # (M, d): the point of the score, and optima that are as good as the estimate
+    # By set of simulators that share specimens.
     groups: tuple[StoredScores | ResimulatedScores, ...]
+    combinations: Floats  # (d, r): combinations of the scores that vary
+    # (d,): unit of `laplace`: a standard deviation of the prior, or a hundred standard errors if
+    # these are less. With a prior far wider than the population, its unit would miss all data.
     scale: Floats
     options: SaddlepointOptions
 
     @property
     def point(self) -> Floats:
-        """Where the score is taken, (d,): the estimate, or a point inside if it is at an edge."""
+        """The point of the score, (d,): the estimate, or a point inside if it is at an edge."""
         return np.asarray(self.starts[0])
 
     @one_thread()
     def log_likelihood(self, thetas: Floats) -> Floats:
         """Return the log-density of the score at the estimate, (S, d) -> (S,)."""
-        if self.groups[0].combinations.shape[1] == 0:
+        if self.combinations.shape[1] == 0:
             return np.zeros(len(thetas))
         rows = min(group.rows for group in self.groups)
         blocks = []
@@ -126,28 +97,15 @@ class EstimateLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class StoredScores:
-    """Scores of the stored responses of simulators that share specimens.
+    """Scores of the stored responses of simulators that share specimens."""
 
-    Attributes
-    ----------
-    simulator : int
-        The first of them.
-    is_observable : ndarray of bool, shape (M,)
-        Stored responses that could be observed by all.
-    scores : Scores
-        Of these.
-    combinations : ndarray, shape (d, r)
-        Combinations of the scores that vary.
-    """
-
-    simulator: int
-    is_observable: NDArray[np.bool_]
-    scores: Scores
-    combinations: Floats
+    simulator: int  # one of them
+    is_observable: NDArray[np.bool_]  # (M,): stored responses that all simulators can observe
+    scores: Scores  # of these
 
     @property
     def rows(self) -> int:
-        """Populations whose weights stay in the cache of the processor."""
+        """Number of populations whose weights stay in the cache of the processor."""
         return max(16, IN_CACHE // len(self.scores.values))
 
     def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
@@ -162,46 +120,32 @@ class StoredScores:
 
     def combined(self, combinations: Floats) -> StoredScores:
         """Return combinations of the scores, (d, r)."""
-        scores = Scores(self.scores.values @ combinations, self.scores.size)
-        return replace(self, scores=scores, combinations=combinations)
+        return replace(self, scores=Scores(self.scores.values @ combinations, self.scores.size))
 
 
 @dataclass(frozen=True, eq=False)
 class ResimulatedScores:
-    """Scores of responses that are computed at each theta, of simulators that share specimens.
+    """Scores of responses computed at each theta, of simulators that share specimens."""
 
-    Attributes
-    ----------
-    simulators : tuple of int
-    tables : tuple of callable
-        Responses to scores, by simulator.
-    mean : ndarray, shape (d,)
-        Of the observed specimens' scores.
-    size : int
-        Number of observed specimens.
-    combinations : ndarray, shape (d, r)
-    """
-
-    simulators: tuple[int, ...]
-    tables: tuple[Callable[[Floats], Floats], ...]
-    mean: Floats
-    size: int
-    combinations: Floats
+    tables: tuple[tuple[int, Callable[[Floats], Floats]], ...]  # simulators: responses to scores
+    mean: Floats  # (d,): of the observed specimens' scores
+    size: int  # number of observed specimens
+    combinations: Floats  # (d, r)
     rows: ClassVar[int] = 1
 
     def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
         """Return log weights of one population, (1, M'), and the scores of its responses."""
         values: Any = -self.mean
         is_observable: Any = True
-        for k, table in zip(self.simulators, self.tables, strict=True):
+        for k, table in self.tables:
             responses, _ = evaluator.populations(thetas, k)
             values = values + table(responses[0])
             is_observable &= observable(responses[0], evaluator.nodes[k].target)
         count = int(is_observable.sum())
-        log_weights = np.full((1, count), -np.log(max(count, 1)))
         if not count:
-            log_weights, values = np.full((1, 1), -np.inf), np.zeros((1, len(self.mean)))
-            is_observable = slice(None)
+            zeros = np.zeros((1, len(self.mean)))
+            return np.full((1, 1), -np.inf), Scores(zeros @ self.combinations, self.size)
+        log_weights = np.full((1, count), -np.log(count))
         return log_weights, Scores(values[is_observable] @ self.combinations, self.size)
 
     def combined(self, combinations: Floats) -> ResimulatedScores:
@@ -216,22 +160,9 @@ def estimate_likelihood(
 ) -> EstimateLikelihood:
     """Return the likelihood of the hyperparameters given the minimiser of their metrics.
 
-    Responses are stored, or computed at each theta from common random numbers.
-
-    Simulators that share specimens add the scores of a specimen. Independent simulators add their
-    cumulant functions.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-        Of a model whose simulators have metrics with ``additive``.
-    optimum : Optimum
-    options : EstimateLikelihoodOptions
-
-    Raises
-    ------
-    ValueError
-        If the gradient of the objective is no mean over specimens (`score_obstacle`).
+    Responses are stored, or computed at each theta from common random numbers. Simulators that
+    share specimens add the scores of a specimen; independent simulators add their cumulant
+    functions. Raises ValueError if the gradient of the objective is no mean over specimens.
     """
     obstacle = score_obstacle(evaluator)
     if obstacle is not None:
@@ -239,15 +170,20 @@ def estimate_likelihood(
     optima = optima_of(optimum, evaluator)
     point = move_inside(evaluator, optima[0], options)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
-    if _needs_population(evaluator, options):
+    # Whitening or bandwidths by few observed specimens would bias the estimate: if they happen to
+    # scatter little, the bandwidth is small and the weight in the sum of simulators large.
+    nodes = evaluator.nodes
+    has_several_outputs = any(node.target.event for node in nodes)
+    fewest = min(len(node.observed) for node in nodes)
+    if has_several_outputs or len(nodes) > 1 or fewest < options.few_specimens:
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
     evaluator = coarse_where_sufficient(evaluator, point)
-    parts = [
+    score_groups = [
         _group_scores(evaluator, members, point, scales, options)
         for members in groups(evaluator.nodes)
     ]
-    pairs = [part.population(evaluator, point[None]) for part in parts]
+    pairs = [group.population(evaluator, point[None]) for group in score_groups]
     log_weights, scores = zip(*pairs, strict=True)
     untilted = cumulants(log_weights, scores, np.zeros((1, len(point))))
     size = sum(score.size for score in scores)
@@ -255,48 +191,33 @@ def estimate_likelihood(
     return EstimateLikelihood(
         evaluator=evaluator,
         starts=np.vstack([point, optima[1:]]),
-        groups=tuple(part.combined(combinations) for part in parts),
-        scale=_unit(evaluator, point, optimum, options),
+        groups=tuple(group.combined(combinations) for group in score_groups),
+        combinations=combinations,
+        scale=_scale(evaluator, point, optimum, options),
         options=options.saddlepoint,
     )
 
 
-def _unit(
+def _scale(
     evaluator: Evaluator, point: Floats, optimum: Optimum, options: EstimateLikelihoodOptions
 ) -> Floats:
-    """Return a hundred standard errors of each element, or the prior's spread if that is less.
-
-    With a prior far wider than the population a step in its unit would miss all data.
-    """
+    """Return a hundred standard errors of each element, or the prior's spread if it is less."""
+    hyperparameters = evaluator.hyperparameters
     if all(node.bound.stored for node in evaluator.nodes):
         size = sum(len(node.observed) for node in evaluator.nodes)
         precision = _likelihood_spread(evaluator, point, options) * np.sqrt(size)
-        units = 100 / np.maximum(precision, 100)
-        return np.asarray(units * evaluator.hyperparameters.prior_sd)
-    order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
+        return np.asarray(100 / np.maximum(precision, 100) * hyperparameters.prior_sd)
+    order = [optimum.names.index(name) for name in hyperparameters.names]
     errors = np.sqrt(np.diag(optimum.covariance))[order]
-    return np.asarray(np.minimum(100 * errors, evaluator.hyperparameters.prior_sd))
-
-
-def _needs_population(evaluator: Evaluator, options: EstimateLikelihoodOptions) -> bool:
-    """Return whether whitening or bandwidths by the observed data would bias the estimate.
-
-    Simulators of few specimens that happen to scatter little would have a small bandwidth and a
-    large weight in the sum of all.
-    """
-    nodes = evaluator.nodes
-    has_several_outputs = any(node.target.event for node in nodes)
-    fewest = min(len(node.observed) for node in nodes)
-    return has_several_outputs or len(nodes) > 1 or fewest < options.few_specimens
+    return np.asarray(np.minimum(100 * errors, hyperparameters.prior_sd))
 
 
 def _minimised_on_population(
     evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
 ) -> tuple[Evaluator, Floats, Floats]:
-    """Return metrics with the whitening and bandwidths of the population, and their minimiser.
+    """Return metrics with whitening and bandwidths of the population, scales and minimiser.
 
-    With them come the scales of the simulators, (k,). A minimiser that stored responses do not
-    support is not taken.
+    A minimiser that stored responses do not support is not taken.
     """
     from scipy.optimize import minimize
 
@@ -308,19 +229,16 @@ def _minimised_on_population(
     unset = np.isnan(prepared.epsilon)
     if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
-    unit = evaluator.hyperparameters.prior_sd
+    prior_sd = evaluator.hyperparameters.prior_sd
 
     def objective(shift: Floats) -> tuple[float, Floats]:
-        step = 1e-4 * unit
-        axes = np.diag(step)
-        theta = point + shift * unit
-        thetas = np.vstack([theta, theta + axes, theta - axes])
+        thetas = _stencil(point + shift * prior_sd, 1e-4 * prior_sd)
         totals = prepared.total(thetas, scales)
-        value, up, down = np.split(totals, [1, 1 + len(theta)])
+        value, up, down = np.split(totals, [1, 1 + len(shift)])
         return float(value[0]), (up - down) / 2e-4
 
     minimum = minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
-    minimiser = move_inside(prepared, point + minimum.x * unit, options)
+    minimiser = move_inside(prepared, point + minimum.x * prior_sd, options)
     sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
     is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses
     return prepared, scales, minimiser if is_supported else point
@@ -339,15 +257,12 @@ def _group_scores(
     n = len(nodes[0].observed)
     observed = np.zeros((n, len(point)))
     functions = []
-    populations = []
+    populations: list[WeightSlopes | ShiftedResponses] = []
     for k, node in zip(members, nodes, strict=True):
-        # The gradient of the objective is a sum over specimens of these, by units of the prior.
+        # The gradient of the objective is a sum of these over specimens, in units of the prior.
         factor = evaluator.hyperparameters.prior_sd / (n * scales[k])
-        population: WeightSlopes | ShiftedResponses
-        if node.bound.stored:
-            population = _weight_slopes(evaluator, k, point, options)
-        else:
-            population = _shifted_responses(evaluator, k, point, options)
+        differences = _weight_slopes if node.bound.stored else _shifted_responses
+        population = differences(evaluator, k, point, options)
         populations.append(population)
         score = partial(
             specimen_scores, node.target, population, options=options.score, total=total
@@ -355,28 +270,22 @@ def _group_scores(
         observed += factor * score(node.observed[np.argsort(numbers[k])])
         functions.append((factor, score))
     mean = observed.mean(axis=0)
-    identity = np.eye(len(point))
     if not all(node.bound.stored for node in nodes):
         tables = []
-        for (factor, _), node, population in zip(functions, nodes, populations, strict=True):
+        for k, (factor, _), population in zip(members, functions, populations, strict=True):
             assert isinstance(population, ShiftedResponses)
+            node = evaluator.nodes[k]
             table = tabulated_scores(node.target, population, node.observed, options.score, total)
-            tables.append(partial(_scaled, table, factor))
-        return ResimulatedScores(
-            simulators=tuple(members),
-            tables=tuple(tables),
-            mean=mean,
-            size=n,
-            combinations=identity,
-        )
-    mask = np.ones(len(populations[0].responses), dtype=bool)
+            tables.append((k, partial(_scaled, table, factor)))
+        return ResimulatedScores(tuple(tables), mean, n, combinations=np.eye(len(point)))
+    is_observable = np.ones(len(populations[0].responses), dtype=bool)
     for node, population in zip(nodes, populations, strict=True):
-        mask &= observable(population.responses, node.target)
+        is_observable &= observable(population.responses, node.target)
     stored = -mean + sum(
-        factor * score(population.responses[mask])
+        factor * score(population.responses[is_observable])
         for (factor, score), population in zip(functions, populations, strict=True)
     )
-    return StoredScores(members[0], mask, Scores(stored, n), identity)
+    return StoredScores(members[0], is_observable, Scores(stored, n))
 
 
 def _scaled(table: Callable[[Floats], Floats], factor: Floats, responses: Floats) -> Floats:
@@ -384,14 +293,18 @@ def _scaled(table: Callable[[Floats], Floats], factor: Floats, responses: Floats
     return factor * table(responses)
 
 
+def _stencil(theta: Floats, steps: Floats) -> Floats:
+    """Return theta, and theta plus and minus a step along each element, (1 + 2 d, d)."""
+    axes = np.diag(steps)
+    return np.vstack([theta, theta + axes, theta - axes])
+
+
 def _shifted_responses(
     evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
 ) -> ShiftedResponses:
     """Return the k-th simulator's responses at theta and a step away along each element."""
     steps = options.resimulated_step * evaluator.hyperparameters.prior_sd
-    axes = np.diag(steps)
-    thetas = np.vstack([theta, theta + axes, theta - axes])
-    responses, _ = evaluator.populations(thetas, k)
+    responses, _ = evaluator.populations(_stencil(theta, steps), k)
     center, upper, lower = np.split(responses, [1, 1 + len(theta)])
     return ShiftedResponses(center[0], upper, lower, steps)
 
@@ -401,22 +314,15 @@ def _weight_slopes(
 ) -> WeightSlopes:
     """Return the k-th simulator's stored responses with weights, and their derivatives."""
     moves = evaluator.nodes[k].bound.support_moves
-    share = options.wide_step if moves else options.step
-    steps = share * evaluator.hyperparameters.prior_sd
-    axes = np.diag(steps)
-    thetas = np.vstack([theta, theta + axes, theta - axes])
-    responses, weights = evaluator.populations(thetas, k)
+    steps = (options.wide_step if moves else options.step) * evaluator.hyperparameters.prior_sd
+    responses, weights = evaluator.populations(_stencil(theta, steps), k)
     center, up, down = np.split(weights, [1, 1 + len(theta)])
     # Log weights are nearly parabolas, whose differences are right at any step. A weight that
     # vanishes within the step has none.
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = np.log(up) - np.log(down)
-        relative = center * ratios
-    is_finite = np.isfinite(relative)
-    differences = np.where(is_finite, relative, up - down)
-    lengths = 2 * steps
-    slopes = differences / lengths[:, None]
-    return WeightSlopes(responses[0], center[0], slopes)
+        relative = center * (np.log(up) - np.log(down))
+    differences = np.where(np.isfinite(relative), relative, up - down)
+    return WeightSlopes(responses[0], center[0], differences / (2 * steps)[:, None])
 
 
 def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
@@ -428,20 +334,17 @@ def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihood
     """
     if not all(node.bound.stored for node in evaluator.nodes):
         return theta
-    middle = np.median(evaluator.hyperparameters.prior_points(256, 0), axis=0)
-    way = middle - theta
-    is_far = np.abs(way) > options.distance * evaluator.hyperparameters.prior_sd
-    way[~is_far] = 0
-    for share in np.linspace(0, 1, 33):
-        point = theta + share * way
+    hyperparameters = evaluator.hyperparameters
+    direction = np.median(hyperparameters.prior_points(256, 0), axis=0) - theta
+    is_far = np.abs(direction) > options.distance * hyperparameters.prior_sd
+    direction[~is_far] = 0
+    for fraction in np.linspace(0, 1, 33):
+        point = theta + fraction * direction
         spread = _likelihood_spread(evaluator, point, options)
-        smallest = options.smallest_spread * spread.max()
-        is_still = is_far & (spread < smallest)
+        is_at_edge = is_far & (spread < options.smallest_spread * spread.max())
         support = evaluator.support(point[None])
-        sizes = [design["weight_ess"] for design in support.values()]
-        effective = np.min(sizes)
-        is_inside = not is_still.any()
-        if is_inside and effective >= options.effective_responses:
+        effective = np.min([design["weight_ess"] for design in support.values()])
+        if not is_at_edge.any() and effective >= options.effective_responses:
             return point
     return theta
 
@@ -452,8 +355,7 @@ def _likelihood_spread(
     """Return standard deviations of the derivatives of log weights, in units of the prior, (d,)."""
     variance = np.zeros(len(theta))
     for k in range(len(evaluator.nodes)):
-        population = _weight_slopes(evaluator, k, theta, options)
-        variance += population.spread**2
+        variance += _weight_slopes(evaluator, k, theta, options).spread ** 2
     return np.asarray(np.sqrt(variance) * evaluator.hyperparameters.prior_sd)
 
 

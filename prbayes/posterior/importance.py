@@ -1,9 +1,9 @@
 """Importance sampling of a density from Laplace approximations of its modes.
 
 The first proposal is a mixture of multivariate t distributions with five degrees of freedom, one
-for each mode. Where it is not enough, further rounds fit mixtures to all weighted points. Draws of
-the prior cover what these points have not seen. The weights are those of the mixture of all
-proposals (adaptive multiple importance sampling: Cornuet et al. 2012, Scand. J. Stat. 39(4)).
+for each mode. If it does not suffice, further rounds fit mixtures to all weighted points. Draws of
+the prior cover regions without points. The weights are those of the mixture of all proposals
+(adaptive multiple importance sampling: Cornuet et al. 2012, Scand. J. Stat. 39(4)).
 Pareto-smoothed importance sampling judges them (Vehtari et al. 2024, J. Mach. Learn. Res. 25(72)).
 """
 
@@ -25,46 +25,20 @@ LogDensity = Callable[[Floats], Floats]  # (S, d) -> (S,)
 
 @dataclass(frozen=True)
 class ImportanceOptions:
-    """Sizes and limits of importance sampling.
+    """Sizes and limits of importance sampling."""
 
-    Attributes
-    ----------
-    oversampling : int
-        Points of the proposal for each draw.
-    degrees : float
-        Degrees of freedom of the proposal's t distributions.
-    pareto_k : float
-        Largest shape of the weights' tail with which the draws are trusted (Vehtari et al. 2024).
-    effective : float
-        Smallest effective sample size, as a share of the draws.
-    rounds : int
-        Largest number of proposals. The r-th fitted one has r / 2 points for each draw.
-    components : int
-        Components of a fitted mixture.
-    prior_share : float
-        Share of the prior in the points of a fitted proposal; half in the first.
-    """
-
-    oversampling: int = 2
-    degrees: float = 5.0
-    pareto_k: float = 0.7
-    effective: float = 0.5
-    rounds: int = 6
-    components: int = 4
-    prior_share: float = 0.1
+    oversampling: int = 2  # points of the first proposal for each draw
+    degrees: float = 5.0  # of freedom of the proposal's t distributions
+    pareto_k: float = 0.7  # largest shape of the weights' tail of reliable draws (Vehtari et al.)
+    effective: float = 0.5  # smallest effective sample size of reliable draws, for each draw
+    rounds: int = 6  # largest number of proposals; the r-th fitted one has r / 2 points a draw
+    components: int = 4  # of a fitted mixture
+    prior_share: float = 0.1  # of the points of a fitted proposal; half in the first
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The prior as a proposal.
-
-    Attributes
-    ----------
-    draws : callable
-        ``draws(size, seed)``, shape (size, d).
-    log_density : callable
-        (S, d) -> (S,).
-    """
+    """The prior as a proposal: ``draws(size, seed)``, (size, d), and its log-density."""
 
     draws: Callable[[int, int], Floats]
     log_density: LogDensity
@@ -72,47 +46,24 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Laplace:
-    """A mode of a log-density with the inverse of its negative Hessian.
+    """A mode of a log-density with the inverse of its negative Hessian."""
 
-    Attributes
-    ----------
-    mode : ndarray, shape (d,)
-    covariance : ndarray, shape (d, d)
-    log_mass : float
-        Logarithm of the mass by Laplace's approximation.
-    converged : bool
-    """
-
-    mode: Floats
-    covariance: Floats
-    log_mass: float
+    mode: Floats  # (d,)
+    covariance: Floats  # (d, d)
+    log_mass: float  # logarithm of the mass by Laplace's approximation
     converged: bool
 
 
 @dataclass(frozen=True, eq=False)
 class ImportanceSample:
-    """Equally weighted draws by resampling, with diagnostics of the weights.
+    """Equally weighted draws by resampling, with diagnostics of the weights."""
 
-    Attributes
-    ----------
-    draws : ndarray, shape (n, d)
-    log_density : ndarray, shape (n,)
-    pareto_k : float
-        Shape of the tail of the weights.
-    efficiency : float
-        Effective sample size as a share of the points.
-    n_points : int
-        Points of all proposals.
-    log_evidence : float
-        Logarithm of the integral of the density.
-    """
-
-    draws: Floats
-    log_density: Floats
-    pareto_k: float
-    efficiency: float
-    n_points: int
-    log_evidence: float
+    draws: Floats  # (n, d)
+    log_density: Floats  # (n,)
+    pareto_k: float  # shape of the tail of the weights
+    efficiency: float  # effective sample size for each point
+    n_points: int  # of all proposals
+    log_evidence: float  # logarithm of the integral of the density
 
     @property
     def effective_size(self) -> float:
@@ -128,20 +79,11 @@ class ImportanceSample:
 def laplace(
     log_density: LogDensity, starts: Floats, scale: Floats, steps: int = 20
 ) -> list[Laplace]:
-    """Return the modes near starts by damped Newton steps, with differences of the log-density.
+    """Return the modes near starts, (M, d), by damped Newton steps with finite differences.
 
-    Parameters
-    ----------
-    log_density : callable
-    starts : ndarray, shape (M, d)
-    scale : ndarray, shape (d,)
-        Standard deviations of the prior. Less curvature than a hundredth of theirs counts as that.
-    steps : int
-
-    Raises
-    ------
-    ValueError
-        If the log-density is not finite around a mode, as at the end of a support.
+    ``scale``, (d,), are standard deviations of the prior; the curvature is at least a hundredth of
+    that of a normal prior. Raises ValueError if the log-density is not finite around a mode, as at
+    the end of a support.
     """
     modes = np.array(starts)
     count, d = modes.shape
@@ -149,7 +91,6 @@ def laplace(
     lengths = np.array([2.0, 1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.003])
     for _ in range(steps):
         value, gradient, hessian = _derivatives(log_density, modes, 0.05 * sd)
-        # In units of the prior.
         values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
         # Absolute values: a step away from a saddle, and Newton's at a mode.
         size = np.maximum(np.abs(values), 0.01)
@@ -161,20 +102,20 @@ def laplace(
         ratio = new_sd / sd
         same_step = ((ratio < 2) & (ratio > 0.5)).all(axis=1)
         is_maximum = values.min(axis=1) > -0.01
-        settled = same_step & (decrement < 1e-3) & is_maximum
-        if settled.all():
+        converged = same_step & (decrement < 1e-3) & is_maximum
+        if converged.all():
             break
         sd = np.minimum(new_sd, 10 * sd)
         trials = modes[:, None] + lengths[:, None] * direction[:, None]
         heights = np.nan_to_num(log_density(trials.reshape(-1, d)), nan=-np.inf)
         heights = heights.reshape(count, -1)
         best = heights.argmax(axis=1)
-        rises = ~settled & (heights[np.arange(count), best] > value)
+        rises = ~converged & (heights[np.arange(count), best] > value)
         modes[rises] = trials[rises, best[rises]]
     _, log_det = np.linalg.slogdet(covariance)
     log_mass = value + log_det / 2 + d / 2 * np.log(2 * np.pi)
-    parts = zip(modes, covariance, log_mass.tolist(), settled.tolist(), strict=True)
-    return [Laplace(*part) for part in parts]
+    results = zip(modes, covariance, log_mass.tolist(), converged.tolist(), strict=True)
+    return [Laplace(*result) for result in results]
 
 
 def _derivatives(
@@ -211,18 +152,9 @@ def importance_sample(
     options: ImportanceOptions = ImportanceOptions(),
     prior: Prior | None = None,
 ) -> ImportanceSample:
-    """Return draws of a density by importance sampling around its modes.
+    """Return ``size`` draws of a density by importance sampling around its modes.
 
-    Parameters
-    ----------
-    log_density : callable
-    modes : sequence of Laplace
-    size : int
-        Number of draws.
-    seed : int
-    options : ImportanceOptions
-    prior : Prior, optional
-        Part of the proposals after the first.
+    The prior is part of the proposals after the first.
     """
     masses = np.array([mode.log_mass for mode in modes])
     # A mode whose mass the approximation gets wrong still has points.
@@ -234,7 +166,7 @@ def importance_sample(
         options.degrees,
     )
     points = proposal.draws(options.oversampling * size, seed)
-    # A few points show whether the others are worth their time.
+    # A few points show whether the rest are worth their time.
     pilot = min(max(len(points) // 8, 512), len(points))
     log_p = log_density(points[:pilot])
     log_ratio = log_p - logsumexp(proposal.log_densities(points[:pilot]), axis=1)
@@ -244,39 +176,37 @@ def importance_sample(
         points = points[:pilot]
     elif pilot < len(points):
         log_p = np.concatenate([log_p, log_density(points[pilot:])])
-    proposals, counts = [proposal], [len(points)]
-    from_prior = 0
+    proposals, n_prior = [(proposal, len(points))], 0
     rng = np.random.default_rng([seed, 1])
     for round_ in range(1, options.rounds + 1):
         terms = [
-            logsumexp(mixture.log_densities(points), axis=1) + np.log(count / len(points))
-            for mixture, count in zip(proposals, counts, strict=True)
+            logsumexp(mixture.log_densities(points), axis=1) + np.log(n / len(points))
+            for mixture, n in proposals
         ]
-        if prior is not None and from_prior:
-            terms.append(prior.log_density(points) + np.log(from_prior / len(points)))
+        if prior is not None and n_prior:
+            terms.append(prior.log_density(points) + np.log(n_prior / len(points)))
         log_ratio = log_p - logsumexp(terms, axis=0)
-        sample = _weighted(points, log_p, log_ratio, size, seed)
+        sample = _resampled(points, log_p, log_ratio, size, seed)
         # Too few effective points have no moments.
         is_lost = round_ > 2 and sample.effective_size < 10 * points.shape[1]
-        # Fitted proposals look better than they are until the points have seen all regions.
+        # Fitted proposals look better than they are until the points are in all regions.
         is_enough = round_ == 1 or sample.effective_size >= size
         if (sample.is_reliable(options) and is_enough) or round_ == options.rounds or is_lost:
             break
-        proposal = _fitted(points, log_ratio, options, rng)
+        proposal = _fitted_mixture(points, log_ratio, options, rng)
         count = round_ * size // 2
         share = 0.0 if prior is None else 0.5 if round_ == 1 else options.prior_share
-        added = int(share * count)
-        parts = [proposal.draws(count - added, seed + round_)]
+        n_added = int(share * count)
+        new = proposal.draws(count - n_added, seed + round_)
         if prior is not None:
-            parts.append(prior.draws(added, seed + round_))
-        new = np.concatenate(parts)
+            new = np.concatenate([new, prior.draws(n_added, seed + round_)])
         points, log_p = np.concatenate([points, new]), np.concatenate([log_p, log_density(new)])
-        proposals, counts = [*proposals, proposal], [*counts, count - added]
-        from_prior += added
+        proposals.append((proposal, count - n_added))
+        n_prior += n_added
     return sample
 
 
-def _fitted(
+def _fitted_mixture(
     points: Floats, log_ratio: Floats, options: ImportanceOptions, rng: np.random.Generator
 ) -> _Mixture:
     """Return a mixture of t distributions fitted to weighted points by the EM algorithm.
@@ -290,32 +220,32 @@ def _fitted(
             break
     points, weights = points[weights > 0], weights[weights > 0]
     d, m, nu = points.shape[1], options.components, options.degrees
-    away = points - weights @ points
-    covariance = (away * weights[:, None]).T @ away
+    deviations = points - weights @ points
+    covariance = (deviations * weights[:, None]).T @ deviations
     ridge = 1e-9 * np.diag(np.diag(covariance))
     root = np.linalg.cholesky(covariance + ridge)
-    # Centers far from each other.
-    standard = np.linalg.solve(root, away.T)
+    # The first centers are far from each other (k-means++).
+    standard = np.linalg.solve(root, deviations.T)
     squares = (standard**2).sum(axis=0)
-    chosen: list[int] = []
+    first: list[int] = []
     for _ in range(m):
         chances = weights * squares
-        chosen.append(int(rng.choice(len(points), p=chances / chances.sum())))
-        to_last = ((standard - standard[:, chosen[-1:]]) ** 2).sum(axis=0)
-        squares = to_last if len(chosen) == 1 else np.minimum(squares, to_last)
-    mixture = _Mixture(points[chosen], np.tile(root / np.sqrt(m), (m, 1, 1)), np.full(m, 1 / m), nu)
+        first.append(int(rng.choice(len(points), p=chances / chances.sum())))
+        to_last = ((standard - standard[:, first[-1:]]) ** 2).sum(axis=0)
+        squares = to_last if len(first) == 1 else np.minimum(squares, to_last)
+    mixture = _Mixture(points[first], np.tile(root / np.sqrt(m), (m, 1, 1)), np.full(m, 1 / m), nu)
     for _ in range(15):
-        by_component = mixture.log_densities(points)
-        by_component -= logsumexp(by_component, axis=1, keepdims=True)
-        masses = (np.exp(by_component) * weights[:, None]).T
+        logs = mixture.log_densities(points)
+        logs -= logsumexp(logs, axis=1, keepdims=True)
+        masses = (np.exp(logs) * weights[:, None]).T
         shares = masses.sum(axis=1, keepdims=True)
         rows = masses / np.maximum(shares, 1e-300)
         # The expected precision of a t distribution's normal variable, given the point.
         precise = rows * (nu + d) / (nu + mixture.squares(points))
         centers = precise @ points / precise.sum(axis=1, keepdims=True)
-        away = points - centers[:, None]
-        within = (away * precise[..., None]).swapaxes(1, 2) @ away
-        # Few effective points leave the covariance that of all, of an m-th of the volume.
+        deviations = points - centers[:, None]
+        within = (deviations * precise[..., None]).swapaxes(1, 2) @ deviations
+        # With few effective points: the covariance of all, scaled to an m-th of the volume.
         effective = 1 / (rows**2).sum(axis=1)
         trust = (effective / (effective + 2 * d))[:, None, None]
         roots = np.linalg.cholesky(trust * within + (1 - trust) * covariance / m + ridge)
@@ -324,30 +254,28 @@ def _fitted(
     return replace(mixture, shares=shares / shares.sum())
 
 
-def _weighted(
+def _resampled(
     points: Floats, log_p: Floats, log_ratio: Floats, size: int, seed: int
 ) -> ImportanceSample:
-    """Return draws by smoothed weights and systematic resampling."""
+    """Return draws by Pareto-smoothed weights and systematic resampling."""
     stats: Any = import_module("arviz_stats")
-    log_evidence = float(logsumexp(log_ratio) - np.log(len(log_ratio)))
     # ArviZ takes log-likelihoods, whose negatives are log weights of leave-one-out.
     smoothed, pareto_k = stats.base.array_stats.psislw(-log_ratio)
     weights = np.exp(smoothed - logsumexp(smoothed))
-    efficiency = float(1 / (weights**2).sum() / len(weights))
     rng = np.random.default_rng(seed)
     # In random order: every fourth point of a Sobol sequence is in the same quarter.
     order = rng.permutation(len(weights))
     positions = (np.arange(size) + rng.random()) / size
-    chosen = np.searchsorted(np.cumsum(weights[order]), positions)
-    # Copies of a point are next to each other.
-    rows = rng.permutation(order[chosen.clip(max=len(weights) - 1)])
+    places = np.searchsorted(np.cumsum(weights[order]), positions)
+    # In random order again: copies of a point are next to each other.
+    rows = rng.permutation(order[places.clip(max=len(weights) - 1)])
     return ImportanceSample(
         points[rows],
         log_p[rows],
-        float(pareto_k),
-        efficiency,
-        len(points),
-        log_evidence,
+        pareto_k=float(pareto_k),
+        efficiency=float(1 / (weights**2).sum() / len(weights)),
+        n_points=len(points),
+        log_evidence=float(logsumexp(log_ratio) - np.log(len(log_ratio))),
     )
 
 
@@ -364,13 +292,12 @@ class _Mixture:
         """Return Sobol points of the mixture, (size, d), with each component's share of them."""
         d = self.centers.shape[1]
         u = sobol(size, d + 2, seed)
-        component = np.searchsorted(np.cumsum(self.shares), u[:, d + 1]).clip(
-            max=len(self.shares) - 1
-        )
+        component = np.searchsorted(np.cumsum(self.shares), u[:, d + 1])
+        component = component.clip(max=len(self.shares) - 1)
         radius = np.sqrt(self.degrees / chdtri(self.degrees, u[:, d]))
         standard = ndtri(u[:, :d]) * radius[:, None]
-        away = np.einsum("sde,se->sd", self.roots[component], standard)
-        return np.asarray(self.centers[component] + away)
+        shifts = np.einsum("sde,se->sd", self.roots[component], standard)
+        return np.asarray(self.centers[component] + shifts)
 
     def log_densities(self, points: Floats) -> Floats:
         """Return log(share times density) of each component, (S, M)."""
@@ -382,6 +309,6 @@ class _Mixture:
 
     def squares(self, points: Floats) -> Floats:
         """Return squared standardised distances from the centers, (M, S)."""
-        away = points - self.centers[:, None]
-        standard = np.linalg.solve(self.roots, away.swapaxes(1, 2))
+        deviations = points - self.centers[:, None]
+        standard = np.linalg.solve(self.roots, deviations.swapaxes(1, 2))
         return np.asarray(np.einsum("mds,mds->ms", standard, standard))

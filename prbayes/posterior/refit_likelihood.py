@@ -25,7 +25,7 @@ from scipy.special import logsumexp, ndtri
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.inference.batched_objective import BatchObjective
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import (
     DataSets,
     groups,
@@ -49,60 +49,33 @@ from prbayes.posterior.saddlepoint import (
     SaddlepointOptions,
     Scores,
     cumulants,
-    density_at,
-    minimum,
+    saddlepoint_density,
 )
 
 
 @dataclass(frozen=True)
 class RefitLikelihoodOptions:
-    """Options of the likelihood given an estimate, from refits.
+    """Options of the likelihood given an estimate, from refits."""
 
-    Attributes
-    ----------
-    n_sets : int
-        Number of synthetic data sets.
-    n_starts : int
-        Points around the estimate, the best of which a refit starts from if there are other optima.
-    rounds : int
-        Rounds that share the data sets. Those of the first are drawn around the estimate, those of
-        others around the posterior before.
-    radius : float
-        Radius of the ball that the first ones are drawn in, in standard errors.
-    inflation : float
-        Standard deviations of the others, relative to the posterior's.
-    weakest : float
-        Standard error in prior standard deviations up to which a direction is identified.
-    tail : float
-        Squared distance of the observed estimate from its mean, in standard deviations, at which
-        the normal distribution takes over.
-    prior_sets : float
-        Data sets that a standard error in place of the weighted estimates counts for, for each
-        element of the estimate and one more.
-    reach : float
-        Largest distance of an estimate from the observed one, in standard errors.
-    far : float
-        Largest share of estimates beyond.
-    converged : float
-        Smallest share of refits that have to converge.
-    whitenings : int
-        Times that metrics of several outputs are minimised again, whitened by the population at
-        the estimate before.
-    seed : int
-    saddlepoint : SaddlepointOptions
-    """
-
-    n_sets: int = 1024
-    n_starts: int = 64
+    n_sets: int = 1024  # synthetic data sets
+    n_starts: int = 64  # points around the estimate as starts of refits, with local optima
+    # Rounds that share the data sets. The first ones are drawn in a ball of ``radius`` standard
+    # errors around the estimate, later ones from the previous posterior, ``inflation`` times wider.
     rounds: int = 2
     radius: float = 4.0
     inflation: float = 1.5
-    weakest: float = 10.0
+    weakest: float = 10.0  # standard error in prior sd up to which a direction is identified
+    # Squared distance of the observed estimate from its mean, in standard deviations, at which the
+    # normal distribution takes over.
     tail: float = 40.0
+    # Number of data sets, for each element of the estimate and one more, that a standard error
+    # counts for in the moments.
     prior_sets: float = 1.0
-    reach: float = 10.0
-    far: float = 0.1
-    converged: float = 0.9
+    reach: float = 10.0  # largest distance of an estimate from the observed one, in standard errors
+    far: float = 0.1  # largest share of estimates beyond
+    converged: float = 0.9  # smallest share of refits that converge
+    # Times that metrics of several outputs are minimised again, whitened by the population at the
+    # previous estimate.
     whitenings: int = 2
     seed: int = 0
     saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
@@ -110,47 +83,25 @@ class RefitLikelihoodOptions:
 
 @dataclass(frozen=True, eq=False)
 class SyntheticSets:
-    """Synthetic data sets with their estimates.
+    """Synthetic data sets with their estimates, in coordinates of the sampling distribution."""
 
-    Attributes
-    ----------
-    counts : tuple of csr_array, shapes (R, M_j)
-        Specimens of each data set at the stored responses, by set of simulators that share them.
-    log_mixture : ndarray, shape (R,)
-        Log-density of each data set in the mixture of the populations that they are drawn from.
-    estimates : ndarray, shape (R, r)
-        In coordinates of the sampling distribution.
-    """
-
-    counts: tuple[csr_array, ...]
-    log_mixture: Floats
-    estimates: Floats
+    x: Floats  # (R, r): populations that they are drawn from
+    counts: tuple[csr_array, ...]  # (R, M_j): specimens at the stored responses, by group
+    estimates: Floats  # (R, r)
 
 
 @dataclass(frozen=True, eq=False)
 class RefitLikelihood:
-    """The likelihood given the estimate, for `importance_sample` and `laplace`.
-
-    Attributes
-    ----------
-    evaluator : Evaluator
-    centers : tuple of SamplingDistribution
-        At the estimate and at optima that are as good; in coordinates of the continuation.
-    continuation : Continuation
-    starts : ndarray, shape (M, d)
-        Thetas of these, moved within the ends of the prior.
-    scale : ndarray, shape (d,)
-        Unit of each element for `laplace`.
-    sets : SyntheticSets
-    options : RefitLikelihoodOptions
-    """
+    """The likelihood given the estimate, for `importance_sample` and `laplace`."""
 
     evaluator: Evaluator
+    # At the estimate and at optima that are as good; in coordinates of the continuation.
     centers: tuple[SamplingDistribution, ...]
     continuation: Continuation
-    starts: Floats
-    scale: Floats
+    starts: Floats  # (M, d): thetas of the centers, moved within the ends of the prior
+    scale: Floats  # (d,): unit of each element for `laplace`
     sets: SyntheticSets
+    log_mixture: Floats  # (R,): log-density of each data set in the mixture of all populations
     options: RefitLikelihoodOptions
 
     @property
@@ -171,26 +122,31 @@ class RefitLikelihood:
         x = self.sampling.coordinates(self.continuation.coordinates(thetas))
         largest = max(count.shape[1] for count in self.sets.counts)
         rows = max(16, AT_ONCE // max(largest, len(self.sets.estimates)))
-        blocks = [self._block(x[first : first + rows]) for first in range(0, len(x), rows)]
+        blocks = [self._log_likelihood(x[first : first + rows]) for first in range(0, len(x), rows)]
         return np.concatenate(blocks)
 
-    def _block(self, x: Floats) -> Floats:
+    def _log_likelihood(self, x: Floats) -> Floats:
+        """Return the log-density at coordinates, (S, r) -> (S,)."""
         result = np.full(len(x), -np.inf)
         logs = self.log_weights(x)
         is_supported = np.isfinite(logs).any(axis=1)
         if is_supported.any():
-            logs = logs[is_supported]
-            away = nearest(self.centers, self.sampling.thetas(x[is_supported]))[1]
+            shifts = nearest(self.centers, self.sampling.thetas(x[is_supported]))[1]
             result[is_supported] = extended_log_density(
-                logs, self.sets.estimates, away, self.options
+                logs[is_supported], self.sets.estimates, shifts, self.options
             )
         return result
 
     def log_weights(self, x: Floats) -> Floats:
         """Return log weights of the data sets at coordinates, (S, r) -> (S, R); they sum to one."""
-        logs = _log_likelihoods(self.sampling, self.sets.counts, x) - self.sets.log_mixture
+        logs = _log_likelihoods(self.sampling, self.sets.counts, x) - self.log_mixture
         with np.errstate(invalid="ignore"):
             return np.asarray(logs - logsumexp(logs, axis=1, keepdims=True))
+
+    def with_sets(self, sets: SyntheticSets) -> RefitLikelihood:
+        """Return the likelihood from these data sets."""
+        logs = _log_likelihoods(self.sampling, sets.counts, sets.x)
+        return replace(self, sets=sets, log_mixture=logsumexp(logs, axis=0))
 
 
 def nearest(
@@ -198,36 +154,28 @@ def nearest(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Return the nearest center of each theta, (S,), and coordinates around it, (S, r)."""
     x = np.stack([center.coordinates(thetas) for center in centers])
-    distances = np.linalg.norm(x, axis=2)
-    chosen = distances.argmin(axis=0)
-    return chosen, x[chosen, np.arange(len(thetas))]
+    index = np.linalg.norm(x, axis=2).argmin(axis=0)
+    return index, x[index, np.arange(len(thetas))]
 
 
 def extended_log_density(
-    log_weights: Floats, estimates: Floats, away: Floats, options: RefitLikelihoodOptions
+    log_weights: Floats, estimates: Floats, shifts: Floats, options: RefitLikelihoodOptions
 ) -> Floats:
-    """Return the log-density of an estimate of zero, (S,).
+    """Return the log-density of an estimate of zero, (S,), given log weights (S, R) of estimates.
 
-    The cumulant function is that of the weighted estimates, mixed with that of a normal
+    The cumulant function is that of the weighted estimates, (R, r), mixed with that of a normal
     distribution with their moments. A few data sets with one standard error join the moments, which
-    matters where few of the synthetic ones have weights.
-
-    Parameters
-    ----------
-    log_weights : ndarray, shape (S, R)
-    estimates : ndarray, shape (R, r)
-    away : ndarray, shape (S, r)
-        Where the populations are, relative to the observed estimate.
-    options : RefitLikelihoodOptions
+    matters if few of the synthetic ones have weights. ``shifts``, (S, r), are the populations
+    relative to the observed estimate.
     """
     r = estimates.shape[1]
     scores = [Scores(estimates, 1)]
-    untilted = cumulants([log_weights], scores, np.zeros_like(away))
+    untilted = cumulants([log_weights], scores, np.zeros_like(shifts))
     effective = 1 / np.exp(2 * log_weights).sum(axis=1)
     part = effective / (effective + options.prior_sets * (r + 1))
     # Beyond all data sets the mean is as far away as the population.
     lengths = np.linalg.norm(untilted.gradients, axis=1)
-    ratios = np.linalg.norm(away, axis=1) / np.maximum(lengths, 1e-300)
+    ratios = np.linalg.norm(shifts, axis=1) / np.maximum(lengths, 1e-300)
     factors = np.maximum(ratios, 1) ** (1 - part)
     mean = factors[:, None] * untilted.gradients
     covariance = part[:, None, None] * untilted.hessians
@@ -250,8 +198,7 @@ def extended_log_density(
             weight[:, None, None] * empirical.hessians + hessians,
         )
 
-    points = minimum(function, away.shape, 1, options.saddlepoint)
-    mixed = density_at(points, 1, options.saddlepoint)
+    mixed = saddlepoint_density(function, shifts.shape, 1, options.saddlepoint)
     normal = -(distance + np.linalg.slogdet(covariance)[1]) / 2
     return np.where(np.isfinite(mixed), mixed, normal)
 
@@ -263,65 +210,70 @@ def refit_likelihood(
 ) -> RefitLikelihood:
     """Return the likelihood of the hyperparameters given the minimiser of any metrics.
 
-    Parameters
-    ----------
-    evaluator : Evaluator
-        Of a model whose simulators have stored responses.
-    optimum : Optimum
-    options : RefitLikelihoodOptions
-
-    Raises
-    ------
-    ValueError
-        If the estimate is at an edge, stored responses do not support populations around it, or
-        refits do not converge.
+    Responses are stored. Raises ValueError if the estimate is at an edge, stored responses do not
+    support populations around it, or refits do not converge.
     """
     if optimum.search.at_edge:
         raise ValueError(_at_edge(", ".join(optimum.search.at_edge)))
     thetas = optima_of(optimum, evaluator)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     continuation = continuation_of(evaluator, thetas[:1])
-    start, *others = continuation.coordinates(thetas)
+    start, *rest = continuation.coordinates(thetas)
     for _ in range(options.whitenings):
         evaluator, start = _whitened(evaluator, continuation, start, scales, options)
     continued = _continued(evaluator, continuation)
     sampling = _at_minimiser(continued, start, scales, options)
     _require_inside(sampling, options)
-    centers = [sampling]
-    for other in others:
-        center = SamplingDistribution.of(continued, other, scales, options.weakest)
-        if center.stderr.size == sampling.stderr.size:
-            centers.append(center)
+    local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
+    centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
     # Identified directions are known from all stored responses; an eighth is enough for the rest.
     evaluator = coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0])
     places = np.array([center.theta for center in centers])
+    r = sampling.stderr.size
     likelihood = RefitLikelihood(
         evaluator=evaluator,
         centers=tuple(centers),
         continuation=continuation,
         starts=continuation.within(places, margin=0.05),
         scale=_scale(evaluator, sampling, continuation),
-        sets=SyntheticSets((), np.empty(0), np.empty((0, sampling.stderr.size))),
+        sets=SyntheticSets(np.empty((0, r)), (), np.empty((0, r))),
+        log_mixture=np.empty(0),
         options=options,
     )
-    if not sampling.stderr.size:
+    if not r:
         return likelihood
     number = options.n_sets // options.rounds
-    drawn = _draw(centers, _balls(centers, number, options), options, seed=0)
+    balls = [
+        sampling.coordinates(center.thetas(_ball(number // len(centers), r, options, i)))
+        for i, center in enumerate(centers)
+    ]
+    sets = _draw(centers, np.concatenate(balls), options, seed=0)
     for i in range(1, options.rounds):
-        likelihood = replace(likelihood, sets=_pooled(sampling, drawn))
-        x = _posterior_points(likelihood, number)
-        drawn = drawn.joined(_draw(centers, x, options, seed=i))
-    return replace(likelihood, sets=_pooled(sampling, drawn))
+        x = _posterior_points(likelihood.with_sets(sets), number)
+        new = _draw(centers, x, options, seed=i)
+        pairs = zip(sets.counts, new.counts, strict=True)
+        sets = SyntheticSets(
+            np.concatenate([sets.x, new.x]),
+            tuple(vstack(pair, format="csr") for pair in pairs),
+            np.concatenate([sets.estimates, new.estimates]),
+        )
+    return likelihood.with_sets(sets)
+
+
+def _ball(number: int, r: int, options: RefitLikelihoodOptions, shift: int = 0) -> Floats:
+    """Return evenly spread points of a ball around the estimate, (number, r)."""
+    u = sobol(number, r + 1, options.seed + shift)
+    directions = ndtri(u[:, :r])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(options.radius * u[:, r:] ** (1 / r) * directions)
 
 
 def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
     """Return coordinates of draws from the posterior, spread out around each optimum, (n, r)."""
-    options = likelihood.options
-    evaluator = likelihood.evaluator
+    options, evaluator = likelihood.options, likelihood.evaluator
 
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
@@ -331,36 +283,12 @@ def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
     sample = importance_sample(density, modes, number, options.seed)
     thetas = likelihood.continuation.coordinates(sample.draws)
     x = likelihood.sampling.coordinates(thetas)
-    chosen, _ = nearest(likelihood.centers, thetas)
-    for i in np.unique(chosen):
-        members = chosen == i
-        middle = np.median(x[members], axis=0)
-        x[members] = middle + options.inflation * (x[members] - middle)
+    center_of, _ = nearest(likelihood.centers, thetas)
+    for i in np.unique(center_of):
+        members = center_of == i
+        median = np.median(x[members], axis=0)
+        x[members] = median + options.inflation * (x[members] - median)
     return x
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """Data sets drawn at coordinates, with their estimates."""
-
-    x: Floats  # (R, r)
-    counts: tuple[csr_array, ...]
-    estimates: Floats  # (R, r)
-
-    def joined(self, other: _Drawn) -> _Drawn:
-        """Return these and others."""
-        pairs = zip(self.counts, other.counts, strict=True)
-        counts = [vstack(pair, format="csr") for pair in pairs]
-        return _Drawn(
-            np.concatenate([self.x, other.x]),
-            tuple(counts),
-            np.concatenate([self.estimates, other.estimates]),
-        )
-
-
-def _pooled(sampling: SamplingDistribution, drawn: _Drawn) -> SyntheticSets:
-    logs = _log_likelihoods(sampling, drawn.counts, drawn.x)
-    return SyntheticSets(drawn.counts, logsumexp(logs, axis=0), drawn.estimates)
 
 
 def _draw(
@@ -368,23 +296,26 @@ def _draw(
     x: Floats,
     options: RefitLikelihoodOptions,
     seed: int,
-) -> _Drawn:
+) -> SyntheticSets:
     """Draw a data set at each of some coordinates, (R, r), and refit it."""
     sampling = centers[0]
     evaluator = sampling.evaluator
     thetas = sampling.thetas(x)
-    supported = _is_supported(evaluator, thetas)
-    if supported.mean() < 0.5:
+    is_supported = np.ones(len(thetas), dtype=bool)
+    for name, support in evaluator.support(thetas).items():
+        bound = evaluator.reweighted[name]
+        is_supported &= supports_each(support, bound.required_ess, bound.max_lost, TOLERABLE)
+    if is_supported.mean() < 0.5:
         raise ValueError(
-            f"got stored responses that support {supported.mean():.0%} of the populations around "
-            "the estimate, expected at least half; widen the prior, or use prb.sample_smc"
+            f"got stored responses that support {is_supported.mean():.0%} of the populations "
+            "around the estimate, expected at least half; widen the prior, or use prb.sample_smc"
         )
-    x, thetas = x[supported], thetas[supported]
+    x, thetas = x[is_supported], thetas[is_supported]
     rng = np.random.default_rng([options.seed, seed])
     points = points_along(evaluator, thetas, rng)
-    sets = sets_at(evaluator, stored_populations(evaluator, thetas), points)
-    starts = x if len(centers) == 1 else _best_starts(centers, sets, options)
-    estimates, converged = sampling.refit(sets, starts, roughly=True)
+    data = sets_at(evaluator, stored_populations(evaluator, thetas), points)
+    starts = x if len(centers) == 1 else _best_starts(centers, data, options)
+    estimates, converged = refit(sampling, data, starts, is_rough=True)
     if converged.mean() < options.converged:
         raise ValueError(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
@@ -398,21 +329,15 @@ def _draw(
     counts = []
     for members in groups(evaluator.nodes):
         columns = np.unique(np.concatenate([numbers[k] for k in members]))
-        first = members[0]
-        size = evaluator.nodes[first].bound.n_points
-        chosen = points[first][np.ix_(converged, columns)]
-        counts.append(_counted(chosen, size))
-    return _Drawn(x[converged], tuple(counts), estimates[converged])
-
-
-def _counted(points: NDArray[np.intp], size: int) -> csr_array:
-    """Return how often each stored response is a specimen of each data set, (R, M)."""
-    count, each = points.shape
-    ends = each * np.arange(count + 1)
-    ones = np.ones(points.size)
-    result = csr_array((ones, points.ravel(), ends), shape=(count, size))
-    result.sum_duplicates()
-    return result
+        places = points[members[0]][np.ix_(converged, columns)]
+        # How often each stored response is a specimen of each data set.
+        n_sets, n = places.shape
+        shape = (n_sets, evaluator.nodes[members[0]].bound.n_points)
+        ends = n * np.arange(n_sets + 1)
+        count = csr_array((np.ones(places.size), places.ravel(), ends), shape=shape)
+        count.sum_duplicates()
+        counts.append(count)
+    return SyntheticSets(x[converged], tuple(counts), estimates[converged])
 
 
 def _log_likelihoods(
@@ -423,66 +348,34 @@ def _log_likelihoods(
     thetas = sampling.thetas(x)
     total = np.zeros((len(x), counts[0].shape[0]))
     for members, count in zip(groups(evaluator.nodes), counts, strict=True):
-        mask = np.ones(count.shape[1], dtype=bool)
+        is_observable = np.ones(count.shape[1], dtype=bool)
         for k in members:
             responses, weights = evaluator.populations(thetas, k)
-            mask &= observable(responses[0], evaluator.nodes[k].target)
-        rows = np.where(mask, weights, 0.0)
+            is_observable &= observable(responses[0], evaluator.nodes[k].target)
+        rows = np.where(is_observable, weights, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             logs = np.log(rows / rows.sum(axis=1, keepdims=True))
         total += (count @ np.ascontiguousarray(logs.T)).T
     return total
 
 
-def _is_supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
-    """Return at which thetas stored responses support the populations, (S,)."""
-    supported = np.ones(len(thetas), dtype=bool)
-    for name, support in evaluator.support(thetas).items():
-        bound = evaluator.reweighted[name]
-        supported &= supports_each(support, bound.required_ess, bound.max_lost, TOLERABLE)
-    return supported
-
-
-def _balls(
-    centers: Sequence[SamplingDistribution], number: int, options: RefitLikelihoodOptions
-) -> Floats:
-    """Return points of balls of standard errors around estimates, in coordinates of the first."""
-    sampling = centers[0]
-    r = sampling.stderr.size
-    points = []
-    for i, center in enumerate(centers):
-        ball = _ball(number // len(centers), r, options, options.seed + i)
-        x = sampling.coordinates(center.thetas(ball))
-        points.append(x)
-    return np.concatenate(points)
-
-
-def _ball(number: int, r: int, options: RefitLikelihoodOptions, seed: int) -> Floats:
-    """Return evenly spread points of a ball, (number, r)."""
-    u = sobol(number, r + 1, seed)
-    directions = ndtri(u[:, :r])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    radii = options.radius * u[:, r:] ** (1 / r)
-    return np.asarray(radii * directions)
-
-
 def _best_starts(
-    centers: Sequence[SamplingDistribution], sets: DataSets, options: RefitLikelihoodOptions
+    centers: Sequence[SamplingDistribution], data: DataSets, options: RefitLikelihoodOptions
 ) -> Floats:
     """Return the best of some points around the estimate for each data set, (R, r).
 
     Points nearer to another optimum are left out: all refits are minimisers near the estimate.
     """
     sampling = centers[0]
-    ball = _ball(options.n_starts, sampling.stderr.size, options, options.seed)
+    ball = _ball(options.n_starts, sampling.stderr.size, options)
     thetas = sampling.thetas(ball)
-    chosen, _ = nearest(centers, thetas)
-    ball, thetas = ball[chosen == 0], thetas[chosen == 0]
-    objective = BatchObjective.of(sampling.evaluator, sampling.scales, sets)
-    best = []
-    for first in range(0, objective.n_sets, 16):
-        values = objective(thetas[None], slice(first, first + 16))
-        best.append(values.argmin(axis=1))
+    is_nearest = nearest(centers, thetas)[0] == 0
+    ball, thetas = ball[is_nearest], thetas[is_nearest]
+    objective = BatchObjective.of(sampling.evaluator, sampling.scales, data)
+    best = [
+        objective(thetas[None], slice(first, first + 16)).argmin(axis=1)
+        for first in range(0, objective.n_sets, 16)
+    ]
     return np.asarray(ball[np.concatenate(best)])
 
 
@@ -499,9 +392,8 @@ def _at_minimiser(
     for _ in range(5):
         sampling = SamplingDistribution.of(evaluator, start, scales, options.weakest)
         moved = _moved_to_minimiser(sampling)
-        x = sampling.coordinates(moved.theta)
         start = moved.theta
-        if np.abs(x).max(initial=0.0) < 0.5:
+        if np.abs(sampling.coordinates(start)).max(initial=0.0) < 0.5:
             return moved
     raise ValueError(
         "got an estimate that still moves by half a standard error when it is minimised again, "
@@ -511,7 +403,7 @@ def _at_minimiser(
 
 def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
     """Return the sampling distribution with the minimiser for the observed responses as theta."""
-    (x,), _ = sampling.refit(observed_set(sampling.evaluator))
+    (x,), _ = refit(sampling, observed_set(sampling.evaluator))
     return replace(sampling, theta=sampling.thetas(x))
 
 
@@ -542,21 +434,21 @@ def _require_inside(sampling: SamplingDistribution, options: RefitLikelihoodOpti
     if not local.unidentified.size:
         return
     evaluator = sampling.evaluator
-    middle = np.median(evaluator.hyperparameters.prior_points(THETAS, 0), axis=0)
-    shift = (middle - sampling.theta) / local.prior_sd
+    median = np.median(evaluator.hyperparameters.prior_points(THETAS, 0), axis=0)
+    shift = (median - sampling.theta) / local.prior_sd
     along = local.identified @ (local.identified.T @ shift)
     inside = sampling.theta + (shift - along) * local.prior_sd
-    there = SamplingDistribution.of(evaluator, inside, sampling.scales, options.weakest)
-    if there.stderr.size > sampling.stderr.size:
+    at_median = SamplingDistribution.of(evaluator, inside, sampling.scales, options.weakest)
+    if at_median.stderr.size > sampling.stderr.size:
         names = np.array(evaluator.hyperparameters.readable_names)
         is_flat = (local.unidentified**2).sum(axis=1) > 0.5
         raise ValueError(_at_edge(", ".join(names[is_flat])))
 
 
-def _at_edge(what: str) -> str:
+def _at_edge(subject: str) -> str:
     return (
-        f"got {what} at an edge, as where a standard deviation is about zero, where estimates pile "
-        "up and have no density; use prb.LogLikelihood(), or prb.sample_smc"
+        f"got {subject} at an edge, as where a standard deviation is about zero, where estimates "
+        "pile up and have no density; use prb.LogLikelihood(), or prb.sample_smc"
     )
 
 

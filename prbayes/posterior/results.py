@@ -293,8 +293,8 @@ def _support(evaluator: Evaluator, draws: Draws) -> dict[str, Any]:
 
 def share_of_lossy(lost: Floats, max_lost: float) -> float:
     """Return the share of draws that have lost too much of a population; NaN are left out."""
-    known = lost[~np.isnan(lost)]
-    return float((known > max_lost).mean()) if known.size else 0.0
+    lost = lost[~np.isnan(lost)]
+    return float((lost > max_lost).mean()) if lost.size else 0.0
 
 
 # -- groups for ArviZ ------------------------------------------------------------------------------
@@ -347,7 +347,7 @@ def _log_likelihood(evaluator: Evaluator, thetas: Floats, log_likelihood: Floats
     for that of each specimen, as in `loo_expectations`.
     """
     chains, draws, d = thetas.shape
-    other = evaluator.log_other(thetas.reshape(-1, d)).reshape(chains, draws)
+    other_terms = evaluator.log_other(thetas.reshape(-1, d)).reshape(chains, draws)
     observed = observed_dataset(evaluator)
     specimens = list(dict.fromkeys(str(observed[node.name].dims[0]) for node in evaluator.nodes))
     shape = (chains, draws, *[1] * len(specimens))
@@ -361,8 +361,8 @@ def _log_likelihood(evaluator: Evaluator, thetas: Floats, log_likelihood: Floats
     return xr.Dataset(
         {
             # ArviZ functions that need a number for each observation show these names.
-            "one_number_for_all_specimens": (dims, (log_likelihood - other).reshape(shape)),
-            "other_terms": (dims, other.reshape(shape)),
+            "one_number_for_all_specimens": (dims, (log_likelihood - other_terms).reshape(shape)),
+            "other_terms": (dims, other_terms.reshape(shape)),
         },
         coords={"chain": np.arange(chains), "draw": np.arange(draws)},
         attrs={"note": note},
@@ -455,10 +455,10 @@ def require_names(var_names: object, model: pm.Model) -> list[str] | None:
     names = [var_names] if isinstance(var_names, str) else var_names
     if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
         raise TypeError(f"var_names: got {called(var_names)}, expected names of variables")
-    known = [str(variable.name) for variable in model.unobserved_RVs]
-    unknown = [name for name in names if name not in known]
+    expected = [str(variable.name) for variable in model.unobserved_RVs]
+    unknown = [name for name in names if name not in expected]
     if unknown or not names:
-        raise KeyError(f"var_names: got {unknown or 'none'}, expected some of {known}")
+        raise KeyError(f"var_names: got {unknown or 'none'}, expected some of {expected}")
     return list(names)
 
 

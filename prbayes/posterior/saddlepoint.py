@@ -23,76 +23,36 @@ from prbayes._validate import Floats
 
 @dataclass(frozen=True)
 class SaddlepointOptions:
-    """Limits of the Newton iteration and of the density.
+    """Limits of the Newton iteration and of the density."""
 
-    Attributes
-    ----------
-    iterations : int
-        Largest number of Newton steps.
-    tolerance : float
-        Largest gradient of the cumulant function by specimen, in standard deviations of the score.
-    smallest_variance : float
-        Smallest determinant of the tilted covariance, to the power of one over its dimension, in
-        units of the covariance at the estimate. Below, the tilted distribution is nearly one atom
-        and the approximation has no meaning.
-    smallest_value : float
-        Smallest value of the cumulant function, in nats. Below, the density counts as zero.
-    smallest_eigenvalue : float
-        Combinations of scores with smaller eigenvalues of their correlation matrix are dropped.
-    """
-
-    iterations: int = 40
-    tolerance: float = 1e-5
+    iterations: int = 40  # largest number of Newton steps
+    tolerance: float = 1e-5  # largest gradient by specimen, in standard deviations of the score
+    # Smallest determinant of the tilted covariance, to the power of one over its dimension,
+    # relative to that at the estimate. Below, the tilted distribution is nearly one atom.
     smallest_variance: float = 1e-4
-    smallest_value: float = -1000.0
-    smallest_eigenvalue: float = 1e-6
+    smallest_value: float = -1000.0  # of the cumulant function; below, the density is zero
+    smallest_eigenvalue: float = 1e-6  # of the correlation matrix of scores that vary
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Scores of stored responses, and the number of specimens that they stand for.
-
-    Attributes
-    ----------
-    values : ndarray, shape (M, r)
-        Less the mean over the observed specimens.
-    size : int
-        Number of observed specimens.
-    """
+    """Scores of stored responses, (M, r), less the mean over the ``size`` observed specimens."""
 
     values: Floats
     size: int
 
-    @property
-    def rank(self) -> int:
-        """The number of combinations of scores, r."""
-        return int(self.values.shape[1])
-
-    @cached_property
-    def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The elements of the upper triangle of a covariance."""
-        first, second = np.triu_indices(self.rank)
-        return first, second
-
     @cached_property
     def powers(self) -> Floats:
         """Ones, scores and products of two scores, (1 + r + r (r + 1) / 2, M)."""
-        first, second = self.pairs
         scores = self.values.T
+        first, second = np.triu_indices(len(scores))
         ones = np.ones((1, scores.shape[1]))
         return np.concatenate([ones, scores, scores[first] * scores[second]])
 
 
 @dataclass(frozen=True, eq=False)
 class Cumulants:
-    """The cumulant function with its derivatives, at S tilts.
-
-    Attributes
-    ----------
-    values : ndarray, shape (S,)
-    gradients : ndarray, shape (S, r)
-    hessians : ndarray, shape (S, r, r)
-    """
+    """The cumulant function at S tilts, (S,), with gradients, (S, r), and Hessians, (S, r, r)."""
 
     values: Floats
     gradients: Floats
@@ -103,37 +63,16 @@ class Cumulants:
 CumulantFunction = Callable[[Floats, NDArray[np.intp]], Cumulants]
 
 
-@dataclass(frozen=True, eq=False)
-class Saddlepoints:
-    """Minima of cumulant functions.
-
-    Attributes
-    ----------
-    tilts : ndarray, shape (S, r)
-    cumulants : Cumulants
-    converged : ndarray of bool, shape (S,)
-    """
-
-    tilts: Floats
-    cumulants: Cumulants
-    converged: NDArray[np.bool_]
-
-
 def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Floats) -> Cumulants:
-    """Return the sum of N_j K_j(a) over simulators, with gradient and Hessian.
+    """Return the sum of N_j K_j(a) over simulators at tilts, (S, r).
 
-    Parameters
-    ----------
-    log_weights : sequence of ndarray, shapes (S, M_j)
-        Log weights of the stored responses of each simulator; the weights of a row sum to one.
-    scores : sequence of Scores
-    tilts : ndarray, shape (S, r)
+    Log weights of the stored responses have shapes (S, M_j); the weights of a row sum to one.
     """
     count, r = tilts.shape
     values = np.zeros(count)
     gradients = np.zeros((count, r))
     hessians = np.zeros((count, r, r))
-    first, second = scores[0].pairs
+    first, second = np.triu_indices(r)
     for logs, score in zip(log_weights, scores, strict=True):
         exponents = tilts @ score.powers[1 : 1 + r]
         exponents += logs
@@ -144,58 +83,20 @@ def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Fl
         sums = (score.powers @ weights.T).T
         totals = sums[:, :1]
         means, products = np.split(sums[:, 1:] / totals, [r], axis=1)
-        squares = means[:, first] * means[:, second]
-        cumulant = np.log(totals[:, 0]) + largest
-        covariances = products - squares
-        values += score.size * cumulant
+        values += score.size * (np.log(totals[:, 0]) + largest)
         gradients += score.size * means
-        hessians[:, first, second] += score.size * covariances
+        hessians[:, first, second] += score.size * (products - means[:, first] * means[:, second])
     hessians[:, second, first] = hessians[:, first, second]
     return Cumulants(values, gradients, hessians)
 
 
-def saddlepoints(
-    log_weights: Sequence[Floats],
-    scores: Sequence[Scores],
-    options: SaddlepointOptions = SaddlepointOptions(),
-) -> Saddlepoints:
-    """Minimise the cumulant functions of means of scores.
-
-    Parameters
-    ----------
-    log_weights : sequence of ndarray, shapes (S, M_j)
-        Each row has a finite element.
-    scores : sequence of Scores
-    options : SaddlepointOptions
-    """
-
-    def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
-        if len(rows) == len(log_weights[0]):
-            return cumulants(log_weights, scores, tilts)
-        return cumulants([logs[rows] for logs in log_weights], scores, tilts)
-
-    shape = len(log_weights[0]), scores[0].rank
-    size = sum(score.size for score in scores)
-    return minimum(function, shape, size, options)
-
-
 def minimum(
-    function: CumulantFunction,
-    shape: tuple[int, int],
-    size: int,
-    options: SaddlepointOptions = SaddlepointOptions(),
-) -> Saddlepoints:
-    """Minimise convex cumulant functions by Newton steps no longer than 1 + |a|.
+    function: CumulantFunction, shape: tuple[int, int], size: int, options: SaddlepointOptions
+) -> tuple[Cumulants, NDArray[np.bool_]]:
+    """Minimise S convex cumulant functions of r tilts by Newton steps no longer than 1 + |a|.
 
-    Parameters
-    ----------
-    function : callable
-        ``function(tilts, rows)``, shapes (A, r), (A,): cumulant functions ``rows``.
-    shape : tuple of int
-        Number of functions S, and of elements of a tilt r.
-    size : int
-        Number of observed specimens.
-    options : SaddlepointOptions
+    ``size`` is the number of observed specimens. Return the values at the minima, and which
+    converged.
     """
     count, r = shape
     ridge = 1e-8 * size * np.eye(r)
@@ -208,21 +109,31 @@ def minimum(
         rows = np.flatnonzero(~converged & (state.values > options.smallest_value))
         if rows.size == 0:
             break
-        hessians = state.hessians[rows] + ridge
-        gradients = state.gradients[rows, :, None]
-        steps = np.linalg.solve(hessians, gradients)
+        steps = np.linalg.solve(state.hessians[rows] + ridge, state.gradients[rows, :, None])
         steps = steps[:, :, 0]
         lengths = np.linalg.norm(steps, axis=1)
         longest = 1 + np.linalg.norm(tilts[rows], axis=1)
-        factors = longest / np.maximum(lengths, longest)
-        tilts[rows] -= steps * factors[:, None]
-        step = function(tilts[rows], rows)
-        state.values[rows] = step.values
-        state.gradients[rows] = step.gradients
-        state.hessians[rows] = step.hessians
-        sizes = np.linalg.norm(step.gradients, axis=1)
-        converged[rows] = sizes < limit
-    return Saddlepoints(tilts, state, converged)
+        tilts[rows] -= steps * (longest / np.maximum(lengths, longest))[:, None]
+        new = function(tilts[rows], rows)
+        state.values[rows] = new.values
+        state.gradients[rows] = new.gradients
+        state.hessians[rows] = new.hessians
+        converged[rows] = np.linalg.norm(new.gradients, axis=1) < limit
+    return state, converged
+
+
+def saddlepoint_density(
+    function: CumulantFunction, shape: tuple[int, int], size: int, options: SaddlepointOptions
+) -> Floats:
+    """Return the log-density of a mean of zero, up to a constant, (S,); arguments as `minimum`.
+
+    It is -inf without a saddlepoint: then zero is outside of the convex hull of the scores.
+    """
+    state, converged = minimum(function, shape, size, options)
+    signs, log_dets = np.linalg.slogdet(state.hessians / size)
+    smallest = shape[1] * np.log(options.smallest_variance)
+    is_usable = converged & (signs > 0) & (log_dets > smallest)
+    return np.where(is_usable, state.values - log_dets / 2, -np.inf)
 
 
 def log_density(
@@ -232,76 +143,38 @@ def log_density(
 ) -> Floats:
     """Return the log-density of a mean score of zero, up to a constant, (S,).
 
-    It is -inf without a saddlepoint: then zero is outside of the convex hull of the scores.
-
-    Parameters
-    ----------
-    log_weights : sequence of ndarray, shapes (S, M_j)
-        -inf or NaN throughout a row if no stored response supports its population.
-    scores : sequence of Scores
-        In units in which their covariance is about one.
-    options : SaddlepointOptions
+    Log weights have shapes (S, M_j); -inf or NaN throughout a row if no stored response supports
+    its population. Scores are in units in which their covariance is about one.
     """
-    size = sum(score.size for score in scores)
     result = np.full(len(log_weights[0]), -np.inf)
-    is_supported = np.ones(len(result), dtype=bool)
-    for logs in log_weights:
-        largest = logs.max(axis=1)
-        is_supported &= np.isfinite(largest)
+    is_supported = np.all([np.isfinite(logs.max(axis=1)) for logs in log_weights], axis=0)
     if not is_supported.any():
         return result
     supported = [logs[is_supported] for logs in log_weights]
-    points = saddlepoints(supported, scores, options)
-    result[is_supported] = density_at(points, size, options)
+
+    def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
+        if len(rows) == len(supported[0]):
+            return cumulants(supported, scores, tilts)
+        return cumulants([logs[rows] for logs in supported], scores, tilts)
+
+    shape = len(supported[0]), scores[0].values.shape[1]
+    size = sum(score.size for score in scores)
+    result[is_supported] = saddlepoint_density(function, shape, size, options)
     return result
 
 
-def density_at(points: Saddlepoints, size: int, options: SaddlepointOptions) -> Floats:
-    """Return log-densities up to a constant, (S,): -inf without a saddlepoint.
-
-    Parameters
-    ----------
-    points : Saddlepoints
-    size : int
-        Number of observed specimens.
-    options : SaddlepointOptions
-    """
-    smallest = points.tilts.shape[1] * np.log(options.smallest_variance)
-    covariances = points.cumulants.hessians / size
-    signs, log_dets = np.linalg.slogdet(covariances)
-    is_usable = points.converged & (signs > 0)
-    is_usable &= log_dets > smallest
-    log_densities = points.cumulants.values - log_dets / 2
-    log_densities[~is_usable] = -np.inf
-    return np.asarray(log_densities)
-
-
 def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Floats:
-    """Return the standardised combinations of scores that vary, (d, r).
+    """Return the standardised combinations of scores that vary, (d, r), by their covariance.
 
     A hyperparameter without influence has a score of zero, and two that only act together have
-    proportional scores. Neither enters the density, so their posterior is their prior given the
-    rest.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (d, d)
-        Of the scores.
-    options : SaddlepointOptions
+    proportional scores. Neither enters the density: their posterior is their prior given the rest.
     """
     tolerance = options.smallest_eigenvalue
-    variances = np.diag(covariance)
-    spread = np.sqrt(variances)
-    largest = spread.max()
-    if not largest > 0:
+    spread = np.sqrt(np.diag(covariance))
+    if not spread.max() > 0:
         return np.zeros((len(spread), 0))
-    varies = spread > tolerance * largest
-    units = np.where(varies, spread, 1.0)
-    scaling = np.diag(1 / units)
-    scaling = scaling[:, varies]
-    correlation = scaling.T @ covariance @ scaling
-    eigenvalues, vectors = np.linalg.eigh(correlation)
+    varies = spread > tolerance * spread.max()
+    scaling = np.diag(1 / np.where(varies, spread, 1.0))[:, varies]
+    eigenvalues, vectors = np.linalg.eigh(scaling.T @ covariance @ scaling)
     is_large = eigenvalues > tolerance
-    sizes = np.sqrt(eigenvalues[is_large])
-    standardised = vectors[:, is_large] / sizes
-    return np.asarray(scaling @ standardised)
+    return np.asarray(scaling @ (vectors[:, is_large] / np.sqrt(eigenvalues[is_large])))

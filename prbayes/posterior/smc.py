@@ -90,9 +90,9 @@ def sample_smc(
 ) -> xr.DataTree:
     r"""Draw from the posterior by sequential Monte Carlo from the prior.
 
-    It samples the same posterior as `sample`, also where that has several modes. With
-    ``adjustment=None`` it samples the pseudo-posterior of approximate Bayesian computation, whose
-    density is proportional to the prior times :math:`\exp(-\sum_k d_k / \epsilon_k)`.
+    It samples the same posterior as `sample`, also with several modes. With ``adjustment=None`` it
+    samples the pseudo-posterior of approximate Bayesian computation, whose density is proportional
+    to the prior times :math:`\exp(-\sum_k d_k / \epsilon_k)`.
 
     Parameters
     ----------
@@ -103,78 +103,79 @@ def sample_smc(
     model : pymc.Model, optional
         The one on the context by default.
     epsilon : float or dict, optional
-        With ``adjustment=None``, for this run. By default the simulators' own, calibrated where
-        unset (`calibrate_epsilon`).
+        With ``adjustment=None``, for this run. By default the simulators' own, calibrated if unset
+        (`calibrate_epsilon`).
     optimum : Optimum, optional
-        The estimate that the posterior is given, and where to calibrate epsilon; `minimize` finds
-        it if needed.
+        The estimate that the posterior is given, and where to calibrate epsilon; by default from
+        `minimize`, if needed.
     adjustment : {"estimate", None}
         With "estimate" the posterior is that given the metrics' own estimate, whose width follows
-        from the number of specimens. With None it is as wide as epsilon makes it. The
-        log-likelihood by specimen has one posterior.
+        from the number of specimens. With None epsilon determines the width. The log-likelihood by
+        specimen has one posterior.
     threshold : float
-        Share of the effective sample size that a stage keeps; higher means more stages.
+        Effective sample size after a stage, as a share; higher means more stages.
     refine : bool
         Whether designs of `Reweighted` that do not support the posterior get more points.
     start : mapping or sequence of mapping, optional
-        Particles to begin with, for all chains or for each: arrays, (draws, ...), by the names of
-        the free variables, or of their transformed values, such as ``sigma_log__``. They have to
-        be draws of the prior, as they are by default: others lead to another posterior.
+        Initial particles, for all chains or by chain: arrays, (draws, ...), by the names of the
+        free variables, or of their transformed values, such as ``sigma_log__``. They must be draws
+        of the prior, as by default; otherwise the posterior is another one.
     cores : int, optional
-        Most threads that linear algebra takes. Particles are evaluated in batches in this process,
-        one chain after the other; responses are computed by a propagation's ``executor``.
+        Largest number of threads of linear algebra. Particles are evaluated in batches in this
+        process, one chain after the other; a propagation's ``executor`` computes responses.
     return_inferencedata : bool
         With False a ``pymc.backends.base.MultiTrace`` of the draws alone.
     idata_kwargs : dict, optional
         ``log_likelihood=False`` and ``log_prior=False`` leave these groups out; ``dims`` and
         ``coords`` name dimensions and coordinates that the model does not name.
     var_names : sequence of str, optional
-        Variables and deterministics that the result has; all by default. Without a free variable
-        nothing can be predicted from it.
+        Variables and deterministics of the result; all by default. Predictions require all free
+        variables.
     max_stages : int, optional
-        Largest number of stages of a chain. If it is reached, or another budget is spent, the
-        finished chains are returned, if there are any; the attribute ``stopped`` and a warning say
-        so. Designs that grew for them are then as before. The same call with a larger budget and
-        the same ``checkpoint`` goes on, and gives the draws that it would have given at once.
+        Largest number of stages of a chain. If a budget is spent, the finished chains are returned,
+        if there are any; the attribute ``stopped`` and a warning report it, and designs that grew
+        are restored. The same call with a larger budget and the same ``checkpoint`` continues, and
+        returns the draws of an uninterrupted run.
     max_seconds : float, optional
-        Seconds after which nothing new is begun.
+        Seconds after which no new work begins.
     max_runs : int, optional
-        Largest number of responses to compute, the first runs included; those found in a store
-        do not count.
+        Largest number of responses to compute, the first runs included; those from a store do not
+        count.
     checkpoint : path-like, optional
-        A file that keeps the state after every stage: a run that was killed goes on from there when
-        it is called again, and gives the same draws. Give the propagations a ``store`` as well, so
-        that the search for the optimum computes nothing again.
+        A file with the state after every stage: a run that was killed continues there when it is
+        called again, and returns the same draws. Give the propagations a ``store`` as well, so that
+        the search for the optimum computes no response again.
     random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
 
     Returns
     -------
     xarray.DataTree
-        Groups ``posterior`` (chain, draw), ``sample_stats`` (chain, stage; NaN after the last
-        stage), ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw
-        weight, lost mass, of 64 draws if it costs responses, ``lossy_draws``: the share of draws
-        with more lost mass than ``max_lost``; ``discrepancy_error``: the Monte Carlo error of the
-        discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it,
-        ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and predictive draws
-        (``posterior_predictive``, ``prior_predictive``) of simulators whose responses are stored,
-        and ``log_likelihood`` for power-scaling, with one number for each
-        draw. Attributes of
-        ``posterior``: ``adjustment``; ``log_marginal_likelihood``, from all chains, and
-        ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
-        with one metric and one epsilon, and with no others.
+        For ArviZ; ``to_netcdf`` saves it. Groups:
+
+        - ``posterior`` (chain, draw), with the attributes ``adjustment``,
+          ``log_marginal_likelihood``, from all chains, to compare models with one metric and one
+          epsilon, and ``log_marginal_likelihood_sd``, the spread between chains.
+        - ``sample_stats`` (chain, stage), NaN after the last stage.
+        - ``calibration``, by simulator: discrepancy, epsilon, effective sample size of the weights,
+          mean raw weight, lost mass (of 64 draws if it costs responses), ``lossy_draws``, the share
+          of draws with more lost mass than ``max_lost``, and ``discrepancy_error``, the Monte Carlo
+          error of the discrepancy at the best draw.
+        - ``observed_data``, ``prior``, ``log_prior``, and ``log_likelihood`` for power-scaling,
+          with one number for each draw.
+        - ``posterior_predictive`` and ``prior_predictive`` of simulators with stored responses.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, no prior draw has a finite density, or nothing is known
-        around the optimum (``search.at_edge`` and ``search.at_jump``) and it is needed.
+        If an argument is not as described, no prior draw has a finite density, or the optimum is
+        needed and at an edge or a jump (``search.at_edge``, ``search.at_jump``).
     DesignError
         If a design does not support the posterior after refinement.
     StoreError
         If the checkpoint is damaged, or belongs to another run.
     BudgetError
-        If a budget is spent before there is a chain to return.
+        If a budget is spent before a chain is finished.
 
     References
     ----------
@@ -475,10 +476,9 @@ def _sample_kernel(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
             groups = {}
             if settings.with_groups:
                 kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
-                other = evaluator.log_other(
-                    draws.thetas.reshape(-1, evaluator.hyperparameters.size)
-                )
-                logs = kernels.sum(axis=-1) + other.reshape(draws.thetas.shape[:2])
+                rows = draws.thetas.reshape(-1, evaluator.hyperparameters.size)
+                other_terms = evaluator.log_other(rows).reshape(draws.thetas.shape[:2])
+                logs = kernels.sum(axis=-1) + other_terms
                 draws = replace(draws, log_likelihood=logs)
                 groups = arviz_groups(evaluator, draws, settings.random_seed)
             tree = posterior_tree(
@@ -505,11 +505,11 @@ def _sample_kernel(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
 @contextmanager
 def _epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
     """Restore the epsilons of the simulators afterwards."""
-    before = evaluator.epsilon
+    epsilons = evaluator.epsilon
     try:
         yield
     finally:
-        for node, value in zip(evaluator.nodes, before, strict=True):
+        for node, value in zip(evaluator.nodes, epsilons, strict=True):
             node.epsilon.set_value(np.asarray(value))
 
 

@@ -38,12 +38,11 @@ from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import is_missing
 from prbayes.response.response import Responses, check_call_settings
 
-# Parts of a population's points whose differences tell its error: few enough that each is a design
-# of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
+# Parts of a population's points whose differences estimate its error. Each is a design itself, and
+# the standard error of their spread is about a quarter, 1 / sqrt(2 (8 - 1)).
 N_BLOCKS = 8
 
-# Share of a population's weight, at an answer, that may fall on points without response. By
-# judgement: as much as one may choose to overlook; whoever knows better passes another.
+# Default of the largest share of a population's weight, at an answer, on points without response.
 MAX_LOST = 0.05
 
 
@@ -53,7 +52,7 @@ class DesignError(RuntimeError):
 
 @dataclass(frozen=True, eq=False)
 class Missing:
-    """Shares of populations of which there are no numbers, shapes (k,)."""
+    """Shares of populations without numbers, shapes (k,)."""
 
     lost: Floats  # of the weight, on points without response (NaN)
     failed: Floats  # of the weight that is not lost, on specimens that failed (+inf)
@@ -64,15 +63,13 @@ class Missing:
 
         A specimen failed if an output of it did.
         """
-        unknown = np.isnan(values)
-        broken = np.isposinf(values)
+        is_lost, has_failed = np.isnan(values), np.isposinf(values)
         if values.ndim > weights.ndim:
-            unknown = unknown.any(axis=-1)
-            broken = broken.any(axis=-1)
-        lost = np.where(unknown, weights, 0.0).sum(axis=-1)
-        failed = np.where(broken, weights, 0.0).sum(axis=-1)
-        known = np.maximum(1 - lost, np.finfo(float).tiny)
-        return cls(lost, failed / known)
+            is_lost, has_failed = is_lost.any(axis=-1), has_failed.any(axis=-1)
+        lost = np.where(is_lost, weights, 0.0).sum(axis=-1)
+        failed = np.where(has_failed, weights, 0.0).sum(axis=-1)
+        rest = np.maximum(1 - lost, np.finfo(float).tiny)
+        return cls(lost, failed / rest)
 
 
 class Bound(ABC):
@@ -273,7 +270,7 @@ def valid_roots(bound: Bound, params: Sequence[Floats]) -> list[Floats]:
 
 @dataclass(frozen=True, kw_only=True)
 class Propagation(ABC):
-    """How a population of inputs becomes responses, and all that concerns calling the response."""
+    """How a population of inputs becomes responses, with options of calling the response."""
 
     executor: Executor | None = field(default=None, repr=False)
     store: str | PathLike[str] | None = field(default=None, repr=False)
@@ -281,7 +278,7 @@ class Propagation(ABC):
     on_failure: OnFailure = field(default_factory=Abort, repr=False)
     retry_failed: bool = field(default=False, repr=False)
     timeout: float | None = field(default=None, repr=False)
-    # Whether every evaluation draws specimens, so that the discrepancy is random.
+    # Whether every evaluation draws specimens: the discrepancy is then random.
     is_random: ClassVar[bool] = False
     # Whether the response itself is called where an emulator could answer.
     calls_response: ClassVar[bool] = False
@@ -295,7 +292,7 @@ class Propagation(ABC):
         """Refuse options that the log-likelihood by specimen does not use."""
 
     def check(self) -> None:
-        """Refuse what is no executor, folder or policy."""
+        """Refuse arguments that are no executor, folder or policy."""
         check_call_settings(self.executor, self.store, self.version, self.on_failure)
         flag(self.retry_failed, "retry_failed")
         refuse_timeout(self.timeout, self.executor)
@@ -308,13 +305,7 @@ class Propagation(ABC):
     def check_simulator(  # noqa: B027 (one of a user's own may take all)
         self, name: str, inputs: Inputs, target: Discrepancy
     ) -> None:
-        """Refuse inputs or a metric that this propagation does not take; computes no response.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If it does not take them.
-        """
+        """Refuse inputs or a metric that this propagation does not take, without a response."""
 
     @abstractmethod
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
@@ -322,7 +313,7 @@ class Propagation(ABC):
 
 
 def refuse_max_lost(max_lost: object, name: str) -> None:
-    """Raise if it is no share of a population's weight: from 0 on, and below 1."""
+    """Raise if ``max_lost`` is not a number from 0 to below 1."""
     if isinstance(max_lost, bool) or max_lost != 0:
         number = positive_number(max_lost, f"{name}: max_lost")
         if number >= 1:
@@ -346,13 +337,7 @@ def cost_by_evaluation(n: int) -> RunCost:
 
 
 def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:
-    """Call the response at a few points of the prior, shape (2, 8), so that mistakes show at once.
-
-    Raises
-    ------
-    ResponseError
-        If the response raises, has the wrong shape, or is NaN everywhere.
-    """
+    """Return a trial of the response at points of the prior, (2, 8), and their inputs."""
     draws = prior_draws(bound.inputs.roots, 64, seed)  # a few of them at least are valid
     two = [draw[:2] for draw in valid_roots(bound, draws)]
     aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))

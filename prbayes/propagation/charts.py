@@ -25,38 +25,24 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class ReferencePopulation:
-    """Normal population in which inputs are whitened, x = mean + root z.
+    """Normal population in which inputs are whitened, x = mean + root z."""
 
-    Attributes
-    ----------
-    mean : ndarray, shape (d,)
-    root : ndarray, shape (d, d)
-        Lower Cholesky factor of the covariance.
-    """
-
-    mean: Floats
-    root: Floats
+    mean: Floats  # (d,)
+    root: Floats  # (d, d): lower Cholesky factor of the covariance
 
     @classmethod
-    def from_sample(cls, x: Floats, weights: Floats | None = None) -> ReferencePopulation:
-        """Return the population with the mean and covariance of a sample.
+    def from_sample(cls, x: Floats) -> ReferencePopulation:
+        """Return the population with the mean and covariance of a sample, (n, d).
 
         For the predictive population of posterior draws, let `x` be inputs drawn for each draw of
         theta. A Laplace approximation in place of draws is too narrow if the posterior is skewed.
-
-        Parameters
-        ----------
-        x : ndarray, shape (n, d)
-        weights : ndarray, shape (n,), optional
-            Positive, of any sum.
 
         Raises
         ------
         ValueError
             If the covariance is singular.
         """
-        weights = np.ones(len(x)) if weights is None else weights
-        weights = weights / weights.sum()
+        weights = np.full(len(x), 1 / len(x))
         mean = weights @ x
         centred = x - mean
         covariance = (centred.T * weights) @ centred
@@ -81,13 +67,7 @@ class ReferencePopulation:
         return ReferencePopulation(self.mean, np.linalg.cholesky(total))
 
     def with_errors(self, outputs: int) -> ReferencePopulation:
-        """Return the population of inputs and standard normal reading errors, of d + m inputs.
-
-        Parameters
-        ----------
-        outputs : int
-            Number m of reading errors, as `with_error` adds them to a response.
-        """
+        """Return the population of d inputs and the standard normal errors of m outputs."""
         d = len(self.mean)
         root = np.eye(d + outputs)
         root[:d, :d] = self.root
@@ -100,21 +80,12 @@ class Fibres:
 
     g is the response divided by `unit`, as a function of z. No number of this class depends on
     more than one specimen, and all of them are free of the units of inputs and outputs.
-
-    Attributes
-    ----------
-    response : Response
-    population : ReferencePopulation
-    unit : ndarray, shape (m,)
-        Spread of the outputs in the reference population.
-    y : ndarray, shape (N, m)
-        Measured outputs, divided by `unit`.
     """
 
     response: Response
     population: ReferencePopulation
-    unit: Floats
-    y: Floats
+    unit: Floats  # (m,): spread of the outputs in the reference population
+    y: Floats  # (N, m): measured outputs, divided by `unit`
 
     @classmethod
     def of(cls, response: Response, y: Floats, population: ReferencePopulation) -> Fibres:
@@ -140,9 +111,8 @@ class Fibres:
             values = values / self.unit
             jacobian = (jacobian / self.unit[:, None]) @ self.population.root
             # Determinants of larger numbers overflow.
-            usable = (np.abs(values) < 1e12).all(axis=1) & (np.abs(jacobian) < 1e12).all(
-                axis=(1, 2)
-            )
+            usable = (np.abs(values) < 1e12).all(axis=1)
+            usable &= (np.abs(jacobian) < 1e12).all(axis=(1, 2))
         values = np.where(usable[:, None], values, np.nan)
         return values, np.where(usable[:, None, None], jacobian, np.nan)
 
@@ -162,20 +132,10 @@ class Fibres:
         step, in units of the population: a tolerance relative to the range of y depends on the
         batch, and counted points of two charts twice. Steps of 1e-6 leave an error of their square.
 
-        Parameters
-        ----------
-        specimen : ndarray, shape (n,)
-        z : ndarray, shape (n, d)
-        directions : ndarray, shape (n, d, m), optional
-            Span of the steps; by default that of the Jacobian's rows (steps of least norm).
-        solution : tuple of ndarray, shapes (n, d) and (n, m, d), optional
-            Points of the fibres and Jacobians there. Steps that come within .01 of these points
-            have converged to them, and others are not searched for.
-
-        Returns
-        -------
-        tuple
-            Points (n, d), Jacobians there (n, m, d), and which of them converged (n,).
+        ``directions``, (n, d, m), are the span of the steps, by default that of the Jacobian's rows
+        (steps of least norm). ``solution`` has points of the fibres, (n, d), and Jacobians there:
+        steps that come within .01 of these points have converged to them. Returns points, Jacobians
+        there, (n, m, d), and which of them converged.
         """
         z = z.copy()
         jacobian = np.zeros((len(z), self.y.shape[1], z.shape[1]))
@@ -207,8 +167,7 @@ class Fibres:
             z[active] += step / np.maximum(length, 1)[:, None]
             is_done = length < 1e-6
             if solution is not None:
-                away = np.abs(z[active] - solution[0][active]).max(axis=1)
-                is_done |= away < 0.01
+                is_done |= np.abs(z[active] - solution[0][active]).max(axis=1) < 0.01
             converged[active] = is_done
             active = active[~is_done]
         return z, jacobian, converged
@@ -255,14 +214,7 @@ class Charts:
         shapes = (d,), (d, k), (d, m), (k,)
         centre, free, solved, location = (np.zeros((n, charts, *shape)) for shape in shapes)
         scale = np.tile(np.eye(k), (n, charts, 1, 1))
-        return cls(
-            centre=centre,
-            free=free,
-            solved=solved,
-            location=location,
-            scale=scale,
-            share=np.zeros((n, charts)),
-        )
+        return cls(centre, free, solved, location, scale, np.zeros((n, charts)))
 
     @classmethod
     def concatenated(cls, parts: list[Charts]) -> Charts:
@@ -300,8 +252,8 @@ class Charts:
 
     def coordinates(self, specimen: Indices, slot: Indices, z: Floats) -> Floats:
         """Return the free coordinates (n, d - m) of points z, (n, d)."""
-        away = z - self.centre[specimen, slot]
-        return (away[:, None, :] @ self.free[specimen, slot])[:, 0]
+        centred = z - self.centre[specimen, slot]
+        return (centred[:, None, :] @ self.free[specimen, slot])[:, 0]
 
     def reach(
         self,
@@ -323,17 +275,7 @@ class Charts:
 
         The density is with respect to the fibre's volume over sqrt(det J J'), the same measure in
         every chart: the sum of share t(u) |det(J solved)| over the charts that reach the point.
-
-        Parameters
-        ----------
-        fibres : Fibres
-        specimen, slot : ndarray, shape (n,)
-            Chart that the point was drawn from.
-        z, jacobian : ndarray, shapes (n, d) and (n, m, d)
-
-        Returns
-        -------
-        ndarray, shape (n,)
+        ``specimen`` and ``slot``, (n,), are the chart that the point was drawn from.
         """
         k = self.location.shape[-1]
         inverse = np.linalg.inv(self.scale)
@@ -350,8 +292,8 @@ class Charts:
         for c in range(charts):
             rows = np.flatnonzero(self.share[specimen, c] > 0)
             i, j = specimen[rows], np.full(len(rows), c)
-            away = self.coordinates(i, j, z[rows]) - self.location[i, c]
-            scaled = inverse[i, c] @ away[..., None]
+            centred = self.coordinates(i, j, z[rows]) - self.location[i, c]
+            scaled = inverse[i, c] @ centred[..., None]
             distance = (scaled[..., 0] ** 2).sum(axis=1)
             with np.errstate(divide="ignore"):
                 projected = jacobian[rows] @ self.solved[i, c]
@@ -365,8 +307,8 @@ class Charts:
         for c in range(charts):
             rows = np.flatnonzero((terms[:, c] > -np.inf) & (slot != c))
             j = np.full(len(rows), c)
-            reached = self.reach(fibres, specimen[rows], j, z[rows], jacobian[rows])
-            terms[rows[~reached], c] = -np.inf
+            is_reached = self.reach(fibres, specimen[rows], j, z[rows], jacobian[rows])
+            terms[rows[~is_reached], c] = -np.inf
         return np.asarray(logsumexp(terms, axis=1))
 
 
@@ -395,15 +337,7 @@ def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
     """Return charts at the modes of the reference population on the fibres.
 
     Levenberg-Marquardt from z = 0 and Sobol points finds the modes. Modes within 8 nats of the
-    best, and .7 apart from better ones, get a chart: at most four for a specimen.
-
-    Parameters
-    ----------
-    fibres : Fibres
-    starts : int
-        For each specimen.
-    charts : int
-        Largest number of charts of a specimen.
+    best, and .7 apart from better ones, get a chart: at most four of ``charts`` for a specimen.
     """
     n, m = fibres.y.shape
     d = len(fibres.population.mean)
@@ -474,14 +408,9 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
     chart: |det(J solved)| >= .3 sqrt(det J J'). The most probable point that no chart covers gets
     a chart. Other sheets are detected thus, and turns, where the weights of a chart diverge.
 
-    Parameters
-    ----------
-    fibres : Fibres
-    charts : Charts
-    normal : ndarray, shape (N, tries, d)
-        Standard normal numbers. The first half of the tries start from them, the others within
-        .5 of the first mode: random points miss the far side of a small closed fibre beside an
-        extremum.
+    ``normal``, (N, tries, d), are standard normal numbers. The first half of the tries start from
+    them, the others within .5 of the first mode: random points miss the far side of a small closed
+    fibre beside an extremum.
     """
     n, tries, d = normal.shape
     specimen = np.repeat(np.arange(n), tries)
@@ -505,11 +434,11 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
         i = specimen[rows]
         projected = jacobian[rows] @ charts.solved[i, slot]
         cosine = np.abs(np.linalg.det(projected)) / volume[rows]
-        covered = cosine >= 0.3
-        near, near_slot = rows[covered], slot[covered]
-        covered[covered] = charts.reach(fibres, specimen[near], near_slot, z[near], jacobian[near])
-        remaining: Indices = rows[~covered]
-        return remaining
+        is_covered = cosine >= 0.3
+        near, near_slot = rows[is_covered], slot[is_covered]
+        is_reached = charts.reach(fibres, specimen[near], near_slot, z[near], jacobian[near])
+        is_covered[is_covered] = is_reached
+        return np.asarray(rows[~is_covered])
 
     for c in range(present.shape[1]):
         has_chart = present[specimen[rows], c]
@@ -562,11 +491,5 @@ def _charts_at(fibres: Fibres, z: Floats, jacobian: Floats) -> Charts:
     covariance = (axes * variance[:, None, :]) @ axes.transpose(0, 2, 1)
     shift = (covariance @ slope[..., None])[..., 0]
     shift /= np.maximum(np.sqrt((shift**2).sum(axis=1, keepdims=True)), 1)
-    return Charts(
-        centre=z,
-        free=free,
-        solved=solved,
-        location=shift,
-        scale=np.linalg.cholesky(Charts.inflation * covariance),
-        share=np.ones(n),
-    )
+    scale = np.linalg.cholesky(Charts.inflation * covariance)
+    return Charts(z, free, solved, shift, scale, np.ones(n))

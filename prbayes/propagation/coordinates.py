@@ -63,7 +63,7 @@ class Coordinates:
         center = (low + high) / 2
         z = (flat - center) / half_width
         ends = [z.min(axis=0), z.max(axis=0)]
-        # Specimens in blocks, so that memory stays constant.
+        # Specimens in blocks: memory stays constant.
         block = max(1, 16 * AT_ONCE // (populations * len(center)))
         for first in range(1, n, block):
             flat = draw(min(block, n - first))
@@ -73,13 +73,7 @@ class Coordinates:
             z = z[np.isfinite(z).all(axis=1)]
             ends += [z.min(axis=0), z.max(axis=0)]
         bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
-        return cls(
-            shapes=inputs.event_shapes,
-            is_log=is_log,
-            center=center,
-            half_width=half_width,
-            bounds=bounds,
-        )
+        return cls(inputs.event_shapes, is_log, center, half_width, bounds)
 
     @property
     def size(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
@@ -14,7 +14,6 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.propagation.base import N_BLOCKS
-from prbayes.propagation.exponential_families import PointDensity, normalise
 from prbayes.propagation.importance import (
     SIZES,
     CoarseResponse,
@@ -27,6 +26,7 @@ from prbayes.propagation.importance import (
 )
 from prbayes.propagation.moving_support import averaged_log_density, cells_around, moving_inputs
 from prbayes.propagation.points import Mixture, MixtureSampler
+from prbayes.propagation.population_density import PopulationDensity, normalise
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import Inputs
@@ -152,32 +152,23 @@ class Design:
         return f"{text} It follows the coarse response{share}."
 
 
-class DesignOptions(Protocol):
-    """Options of `prb.Reweighted` that determine the points of a design."""
-
-    @property
-    def random_seed(self) -> int:
-        """Seed of the points."""
-
-    @property
-    def emulator(self) -> Any:
-        """The surface or regressor that emulates the response between the runs, or "auto"."""
-
-    def emulates(self, inputs: Inputs) -> bool:
-        """Return whether responses between the runs are emulated."""
-
-
 class DesignSampler:
-    """Draws the points of designs: runs, and emulated points between them."""
+    """Draws the points of designs: runs, and emulated points if there is an emulator."""
 
     def __init__(
-        self, name: str, inputs: Inputs, options: DesignOptions, coarse: CoarseResponse | None
+        self,
+        name: str,
+        inputs: Inputs,
+        random_seed: int,
+        emulator: Any,
+        coarse: CoarseResponse | None,
     ) -> None:
         self.name = name
         self.inputs = inputs
-        self.options = options
+        self.random_seed = random_seed
+        self.emulator = emulator
         self.coarse = coarse
-        self.density = PointDensity(inputs)
+        self.density = PopulationDensity(inputs)
         self._mixtures = MixtureSampler(name, inputs, self.density)
 
     def with_runs(
@@ -186,7 +177,7 @@ class DesignSampler:
         """Return a design with n more runs at points from populations at roots, (k, *shape)."""
         n_batches = 0 if design is None else len(design.batch_sizes)
         # A prime: seeds 0, 1, 2, ... of a user share no batch.
-        seed = self.options.random_seed + 7919 * n_batches
+        seed = self.random_seed + 7919 * n_batches
         on_line = is_line(self.inputs)
         draw = self._mixtures.equal_mass if on_line else self._mixtures.draw
         points, mixture = draw(components, n, seed)
@@ -233,18 +224,18 @@ class DesignSampler:
         # The prior, the populations before, and these.
         groups = (*design.groups[:1], *design.groups[1:][-1:], tuple(components))
         design = replace(design.runs_alone(), groups=groups)
-        if not self.options.emulates(self.inputs):
+        if self.emulator is None:
             return design
         # 32 populations determine the mixing weight of the emulator.
         weights = self._weights(runs, spread_over(components, 32))
         if emulator is None:
-            emulator = fit_emulator(self.options.emulator, runs, weights, design.coarse)
+            emulator = fit_emulator(self.emulator, runs, weights, design.coarse)
         else:
             emulator = emulator.for_populations(weights)
         if emulator is None:
             return design
         # Another prime: no emulated sample shares points with a batch.
-        seed = self.options.random_seed + 104_729 * (1 + design.n_emulated_samples)
+        seed = self.random_seed + 104_729 * (1 + design.n_emulated_samples)
         populations, shares = mixture_of(groups, design.emulated_size)
         points, mixture = self._mixtures.draw(populations, design.emulated_size, seed, shares)
         log_g = self._mixtures.log_density(mixture, points)
@@ -292,7 +283,7 @@ def _responses_at(points: Sequence[Floats], responses: Responses, design: Design
 class WeightFunction:
     """Log weights log p(x given theta) - log g(x) of a design's points, compiled once."""
 
-    def __init__(self, inputs: Inputs, density: PointDensity) -> None:
+    def __init__(self, inputs: Inputs, density: PopulationDensity) -> None:
         self.inputs = inputs
         self._density = density
         self._function: Any = None

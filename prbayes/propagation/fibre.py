@@ -25,8 +25,8 @@ The sum is over the charts that map u_j = F_j'(z - z*_j) to the point.
 
 **Accuracy.** Errors of specimens add up, so effective sample sizes do not show the error of the
 log-likelihood. Use K = 256 first, then compare two sets of points with different seeds, and join
-more of them until they agree. Theta far outside the reference population needs a new one: let its
-moments come from weighted posterior draws (`ReferencePopulation.from_sample`, `moments_of`), twice.
+more of them until they agree. Theta far outside the reference population needs a new one: fit it to
+inputs of posterior draws (`ReferencePopulation.from_sample`), twice.
 A small closed fibre beside an extremum of the response can be missed, and no number shows it.
 
 Papadimas and Dodwell [3]_ integrate over the inputs of specimens by an emulator and quadrature.
@@ -47,8 +47,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import gammaincinv, logsumexp, ndtri, stdtrit
+from scipy.special import gammaincinv, ndtri, stdtrit
 
 from prbayes._validate import Floats
 from prbayes.numerics.points import sobol
@@ -61,17 +60,6 @@ from prbayes.propagation.charts import (
     charts_at_modes,
     cover,
 )
-
-__all__ = [
-    "FibrePoints",
-    "FibreProposal",
-    "ReferencePopulation",
-    "Response",
-    "fit_fibres",
-    "joined",
-    "moments_of",
-    "with_error",
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,35 +74,20 @@ class FibrePoints:
         Inputs; the mean of the reference population for points of weight zero.
     log_a : ndarray, shape (N, K)
         Logarithms of the importance numbers, minus log K; -inf for points of weight zero.
-    failed_share : float
-        Share of Newton solves without a solution, of specimens that have charts.
-    chart : ndarray of int, shape (N, K)
-        Chart of the specimen that made the point.
     """
 
     x: Floats
     log_a: Floats
-    failed_share: float
-    chart: Indices
-
-    @property
-    def has_points(self) -> NDArray[np.bool_]:
-        """Whether a specimen has points on its fibre, (N,); its likelihood is zero if not."""
-        return np.isfinite(self.log_a).any(axis=1)
 
     def without_errors(self, outputs: int) -> FibrePoints:
         """Return points over the inputs alone, with log N(e; 0, 1) added to `log_a`.
 
-        For points over inputs and reading errors, from a response with `with_error`.
-
-        Parameters
-        ----------
-        outputs : int
-            Number m of reading errors e, which are the last m inputs.
+        For points over inputs and reading errors e, from a response with `with_error`: the last
+        ``outputs`` inputs.
         """
         e = self.x[..., -outputs:]
         log_normal = -(e**2).sum(axis=-1) / 2 - outputs / 2 * np.log(2 * np.pi)
-        return replace(self, x=self.x[..., :-outputs], log_a=self.log_a + log_normal)
+        return FibrePoints(self.x[..., :-outputs], self.log_a + log_normal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,11 +107,6 @@ class FibreProposal:
     charts: Charts
     numbers: Indices
 
-    @property
-    def charts_per_specimen(self) -> Indices:
-        """Number of charts of each specimen, (N,); zero if no point of the fibre was reached."""
-        return (self.charts.share > 0).sum(axis=1)
-
     def draw(self, points: int, seed: int, after: int = 0) -> FibrePoints:
         """Draw points on all fibres.
 
@@ -149,26 +117,15 @@ class FibreProposal:
         seed : int
         after : int
             Points of the same seed that are left out, as they were drawn before.
-
-        Returns
-        -------
-        FibrePoints
         """
-        if points < 1:
-            raise ValueError(f"points: got {points}, expected at least 1")
         n, d = len(self.fibres.y), len(self.fibres.population.mean)
         x = np.empty((n, points, d))
         log_a = np.empty((n, points))
-        chart = np.empty((n, points), dtype=np.intp)
         for block in _blocks(n, points):
-            numbers = self.numbers[block]
-            parts = self.fibres.subset(block), self.charts.subset(block)
-            sample = _draw(*parts, points, (1, seed), numbers, after)
-            x[block] = sample.x
-            log_a[block] = sample.log_a
-            chart[block] = sample.chart
-        failed = ~np.isfinite(log_a[self.charts_per_specimen > 0])
-        return FibrePoints(x, log_a, float(failed.mean()) if failed.size else 0.0, chart)
+            fibres, charts = self.fibres.subset(block), self.charts.subset(block)
+            sample = _draw(fibres, charts, points, (1, seed), self.numbers[block], after)
+            x[block], log_a[block] = self.fibres.population.inputs(sample.z), sample.log_a
+        return FibrePoints(x, log_a)
 
 
 def fit_fibres(
@@ -212,15 +169,6 @@ def fit_fibres(
         Numbers of the specimens, by default 0 to N - 1. A specimen has the same points alone as in
         a batch if its number is the same.
 
-    Returns
-    -------
-    FibreProposal
-
-    Raises
-    ------
-    ValueError
-        If there are as many outputs as inputs, or the shapes disagree.
-
     Examples
     --------
     The radius of two standard normal inputs has a Rayleigh distribution.
@@ -237,16 +185,8 @@ def fit_fibres(
     >>> np.allclose(likelihood, [0.5 * np.exp(-0.125), 2 * np.exp(-2)], rtol=0.02)
     True
     """
-    y = np.asarray(y, dtype=float)
     d = len(population.mean)
-    if y.ndim != 2 or not 0 < y.shape[1] < d:
-        raise ValueError(
-            f"y: got shape {y.shape}, expected (N, m) with fewer outputs m than the {d} inputs: "
-            "with as many outputs as inputs the roots of f(x) = y are points"
-        )
-    numbers = np.arange(len(y)) if numbers is None else np.asarray(numbers)
-    if numbers.shape != (len(y),):
-        raise ValueError(f"numbers: got shape {numbers.shape}, expected ({len(y)},)")
+    numbers = np.arange(len(y)) if numbers is None else numbers
     fibres = Fibres.of(response, y, population)
     parts = [Charts.empty(0, most_charts, d, y.shape[1])]
     for block in _blocks(len(y), 256):
@@ -265,77 +205,14 @@ def fit_fibres(
     return FibreProposal(fibres, Charts.concatenated(parts), numbers)
 
 
-def moments_of(points: FibrePoints, log_weights: Floats) -> ReferencePopulation:
-    """Return the population with the mean and covariance of the specimens' inputs.
-
-    The weights of a specimen are normalised for each draw of theta, so the result is the average
-    over draws and specimens of p(x | y_i, theta). Specimens without points are left out.
-    Few specimens make it narrower than the predictive population: by 5 % with 50 specimens, by 20 %
-    with 8. `ReferencePopulation.from_sample` of predictive inputs is not.
-
-    Parameters
-    ----------
-    points : FibrePoints
-    log_weights : ndarray, shape (N, K) or (S, N, K)
-        log p(x_ik | theta) + log_a_ik, for one theta or S draws of theta.
-
-    Raises
-    ------
-    ValueError
-        If the covariance is singular, as it is with few specimens.
-    """
-    has_points = np.isfinite(log_weights.reshape(-1, *points.log_a.shape)).any(axis=2).all(axis=0)
-    log_weights = log_weights[..., has_points, :]
-    weights = np.exp(log_weights - logsumexp(log_weights, axis=-1, keepdims=True))
-    weights = weights.reshape(-1, *weights.shape[-2:]).mean(axis=0)
-    d = points.x.shape[-1]
-    return ReferencePopulation.from_sample(points.x[has_points].reshape(-1, d), weights.ravel())
-
-
-def joined(*sets: FibrePoints) -> FibrePoints:
-    """Return several independent sets of points of the same specimens as one set.
-
-    Parameters
-    ----------
-    *sets : FibrePoints
-        Each with K points for a specimen, drawn with different seeds.
-
-    Raises
-    ------
-    ValueError
-        If the sets differ in shape.
-    """
-    shapes = [s.x.shape for s in sets]
-    if len(set(shapes)) != 1:
-        raise ValueError(f"sets: got points of shapes {shapes}, expected one shape")
-    return FibrePoints(
-        np.concatenate([s.x for s in sets], axis=1),
-        np.concatenate([s.log_a for s in sets], axis=1) - np.log(len(sets)),
-        float(np.mean([s.failed_share for s in sets])),
-        np.concatenate([s.chart for s in sets], axis=1),
-    )
-
-
 def with_error(response: Response, error: Floats) -> Response:
     """Return the response with the reading's error, f(x) + error e, of d + m inputs (x, e).
 
     Use it with `ReferencePopulation.with_errors` and `FibrePoints.without_errors`. The number of
     outputs may then be that of the inputs or more.
 
-    Parameters
-    ----------
-    response : Response
-    error : ndarray, shape (m,)
-        Positive standard deviations of the reading, in units of the outputs.
-
-    Raises
-    ------
-    ValueError
-        If a standard deviation is not positive.
+    The errors, (m,), are positive standard deviations of the reading, in units of the outputs.
     """
-    error = np.atleast_1d(np.asarray(error, dtype=float))
-    if not (error > 0).all():
-        raise ValueError(f"error: got {error}, expected positive standard deviations")
     m = len(error)
 
     def response_with_error(x: Floats) -> tuple[Floats, Floats]:
@@ -351,10 +228,9 @@ def with_error(response: Response, error: Floats) -> Response:
 class _Sample:
     """Points of a block of specimens, with what the adaptation of charts needs."""
 
-    x: Floats  # (n, K, d)
+    z: Floats  # (n, K, d): whitened inputs
     log_a: Floats  # (n, K)
     chart: Indices  # (n, K)
-    z: Floats  # (n, K, d): x, whitened
     jacobian: Floats  # (n, K, m, d): with respect to z
 
 
@@ -392,10 +268,9 @@ def _draw(
     log_a[rows] = log_units - np.log(points) - log_density
     z = np.where(converged[:, None], z, 0.0)
     return _Sample(
-        fibres.population.inputs(z).reshape(n, points, -1),
+        z.reshape(n, points, -1),
         log_a.reshape(n, points),
         slot.reshape(n, points),
-        z.reshape(n, points, -1),
         np.where(converged[:, None, None], jacobian, 0.0).reshape(n, points, *jacobian.shape[1:]),
     )
 
@@ -410,15 +285,12 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
     d, k = charts.free.shape[2:]
     m = d - k
     log_weight = sample.log_a - (sample.z**2).sum(axis=2) / 2
-    top = log_weight.max(axis=1, keepdims=True)
-    weight = np.exp(log_weight - np.where(np.isfinite(top), top, 0))
+    largest = log_weight.max(axis=1, keepdims=True)
+    weight = np.exp(log_weight - np.where(np.isfinite(largest), largest, 0))
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
     free, solved = charts.free.copy(), charts.solved.copy()
-    location, scale, share = (
-        charts.location.copy(),
-        charts.scale.copy(),
-        np.zeros_like(charts.share),
-    )
+    location, scale = charts.location.copy(), charts.scale.copy()
+    share = np.zeros_like(charts.share)
     for c in range(share.shape[1]):
         w = np.where(sample.chart == c, weight, 0)
         share[:, c] = w.sum(axis=1)
@@ -427,8 +299,9 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
         squares = weight[i] ** 2 * (sample.chart[i] == c)
         size = share[i, c] ** 2 / squares.sum(axis=1)
 
-        turned = i[(size > d) & turn]
-        mean_jacobian = np.einsum("nk,nkmd->nmd", w[(size > d) & turn], sample.jacobian[turned])
+        turns = (size > d) & turn
+        turned = i[turns]
+        mean_jacobian = np.einsum("nk,nkmd->nmd", w[turns], sample.jacobian[turned])
         right = np.linalg.svd(mean_jacobian)[2].transpose(0, 2, 1)
         solved[turned, c] = right[..., :m]
         free[turned, c] = right[..., m:]
@@ -442,15 +315,13 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
             root @ root.transpose(0, 2, 1) / Charts.inflation + np.eye(k) - rotation @ transposed
         )
 
-        away = sample.z[i] - charts.centre[i, None, c]
-        u = away @ free[i, c]
-        old = 4.0 * k / (size + 4 * k)
-        new = size / (size + 4 * k)
-        weighted_mean = (w[:, None, :] @ u)[:, 0]
-        mean = new[:, None] * weighted_mean + old[:, None] * present_location
+        u = (sample.z[i] - charts.centre[i, None, c]) @ free[i, c]
+        old = (4.0 * k / (size + 4 * k))[:, None]
+        new = (size / (size + 4 * k))[:, None]
+        mean = new * (w[:, None, :] @ u)[:, 0] + old * present_location
         centred = u - mean[:, None]
         covariance = (centred * w[..., None]).transpose(0, 2, 1) @ centred
-        covariance = new[:, None, None] * covariance + old[:, None, None] * present
+        covariance = new[..., None] * covariance + old[..., None] * present
         location[i, c] = mean
         scale[i, c] = np.linalg.cholesky(Charts.inflation * covariance)
     has_chart = charts.share > 0

@@ -21,24 +21,20 @@ from prbayes.metrics.readings import Readings
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.fibre import (
-    FibreProposal,
-    ReferencePopulation,
-    fit_fibres,
-    with_error,
-)
+from prbayes.propagation.charts import ReferencePopulation
+from prbayes.propagation.fibre import FibreProposal, fit_fibres, with_error
 from prbayes.propagation.guards import half_difference
 from prbayes.propagation.roots import Response
-from prbayes.propagation.specimen_points import (
+from prbayes.propagation.specimen_emulation import (
     Emulation,
     PointOptions,
-    SpecimenPoints,
     extended,
     first_runs,
     require_accurate,
     spread_out,
     typical_sd,
 )
+from prbayes.propagation.specimen_points import SpecimenPoints, joined
 
 
 class Draws(Protocol):
@@ -55,14 +51,7 @@ class Draws(Protocol):
         """Return coordinates of specimens, (n, d)."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Points:
-    """Points of all specimens."""
-
-    z: Floats  # (N, K, d)
-    outputs: Floats  # (N, K, m)
-    log_a: Floats  # (N, K)
-    log_proposal: Floats  # (N, K)
+type Posterior = Callable[[Floats, Floats, Floats | None], Draws]
 
 
 def fibre_points(
@@ -70,7 +59,7 @@ def fibre_points(
     readings: Readings,
     bounds: Floats,
     prior_specimens: Floats,
-    posterior: Callable[[Floats, Floats, Floats | None], Draws],
+    posterior: Posterior,
     options: PointOptions,
     *,
     n: int | None = None,
@@ -105,7 +94,6 @@ def fibre_points(
     """
     d = bounds.shape[1]
     n = first_runs(d) if n is None else n
-    spread = readings.spread()
     population = ReferencePopulation.from_sample(prior_specimens)
     # Wider than the population by half; even points of a box would be in its corners.
     first = np.clip(population.inputs(1.5 * ndtri(sobol(n, d, seed))), *bounds)
@@ -122,11 +110,10 @@ def fibre_points(
             break
         fresh = _fresh(points, draws, batch_size, bounds, rng)
         half = batch_size // 2
-        emulation = extended(emulation, run, fresh, readings, options, spread, name, half)
+        emulation = extended(emulation, run, fresh, readings, options, name, half)
     require_accurate(emulation, readings, options, name)
     # Points on fibres cost more than those around roots, and their error falls more slowly.
     unit = options.half_difference * _per_hyperparameter(draws)
-    goal, largest = 2 * unit, 3 * unit
     count = 128
     proposals = [
         FibreProposals.fitted(emulation, readings, population, 100 + seed + half) for half in (0, 1)
@@ -135,51 +122,36 @@ def fibre_points(
     while True:
         difference = _difference(*(draws.log_likelihoods(p.z, p.log_a) for p in halves))
         is_last = 4 * count > options.most_points
-        if difference <= (largest if is_last else goal):
+        largest = 3 * unit if is_last else 2 * unit
+        if difference <= largest:
             break
         if is_last:
             raise _monte_carlo_error(name, 2 * count, difference, largest)
         halves = [
-            _joined(half, proposal.draw(count, after=count))
+            joined(half, proposal.draw(count, after=count))
             for half, proposal in zip(halves, proposals, strict=True)
         ]
         count *= 2
-    joint = _joined(*halves)
-    return emulation, SpecimenPoints(
-        joint.z,
-        joint.outputs,
-        joint.log_a,
-        joint.log_proposal,
-        np.zeros(len(readings), dtype=np.intp),
-        difference,
-    )
+    return emulation, replace(joined(*halves), difference=difference)
 
 
 def _reliable_draws(
     emulation: Emulation,
     readings: Readings,
     population: ReferencePopulation,
-    posterior: Callable[[Floats, Floats, Floats | None], Draws],
+    posterior: Posterior,
     count: int,
     options: PointOptions,
     seed: int,
     name: str,
-    largest: float = 1.0,
-) -> tuple[_Points, Draws]:
-    """Return points and draws at which both halves of the points agree.
+) -> tuple[SpecimenPoints, Draws]:
+    """Return points, at first ``count``, and draws at which both halves of the points agree.
 
     Where points lie farther apart than populations are wide, the likely populations are those
     where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
     have a smooth log-likelihood. They narrow the reference population, in which points are drawn
-    anew, until it narrows no more; then points are doubled.
-
-    Parameters
-    ----------
-    count : int
-        Points at first.
-    largest : float
-        Half difference in nats that shifts the posterior of four hyperparameters by about half of
-        their standard deviations.
+    again, until it narrows no more; then points are doubled. A half difference of one nat shifts
+    the posterior of four hyperparameters by about half of their standard deviations.
     """
     free = population.root.shape[0] - int(readings.is_measured.sum(axis=1).min())
     narrows = False
@@ -187,16 +159,11 @@ def _reliable_draws(
         points = FibreProposals.fitted(emulation, readings, population, seed).draw(count)
         if not narrows:
             draws = posterior(points.z, points.log_a, None)
-            half = count // 2
-            parts = (
-                (points.z[:, :half], points.log_a[:, :half]),
-                (
-                    points.z[:, half:],
-                    points.log_a[:, half:],
-                ),
+            halves = slice(count // 2), slice(count // 2, None)
+            difference = _difference(
+                *(draws.log_likelihoods(points.z[:, k], points.log_a[:, k]) for k in halves)
             )
-            difference = _difference(*(draws.log_likelihoods(*part) for part in parts))
-            limit = largest * _per_hyperparameter(draws)
+            limit = _per_hyperparameter(draws)
             if difference <= limit:
                 return points, draws
             if 2 * count > options.most_points:
@@ -233,28 +200,9 @@ def _difference(first: Floats, second: Floats) -> float:
     return half_difference(first[finite], second[finite]) if finite.any() else np.inf
 
 
-def _joined(first: _Points, second: _Points) -> _Points:
-    """Return two sets of points as one; each counts half."""
-    return _Points(
-        np.concatenate([first.z, second.z], axis=1),
-        np.concatenate([first.outputs, second.outputs], axis=1),
-        np.concatenate([first.log_a, second.log_a], axis=1) - np.log(2),
-        np.concatenate([first.log_proposal, second.log_proposal], axis=1) + np.log(2),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class FibreProposals:
-    """Proposals on the fibres of specimens, by the pattern of outputs that were measured.
-
-    Attributes
-    ----------
-    emulation : Emulation
-    readings : Readings
-    population : ReferencePopulation
-    seed : int
-    patterns : list of _Pattern
-    """
+    """Proposals on the fibres of specimens, by the pattern of outputs that were measured."""
 
     emulation: Emulation
     readings: Readings
@@ -273,12 +221,12 @@ class FibreProposals:
         has_error = readings.is_measured & ((readings.error > 0) | (readings.step > 0))
         both = np.concatenate([readings.is_measured, has_error], axis=1)
         patterns, which = np.unique(both, axis=0, return_inverse=True)
-        fitted = []
+        proposals = []
         for k, pattern in enumerate(patterns):
             rows = np.flatnonzero(which.ravel() == k)
             columns = np.flatnonzero(pattern[:m])
             if not len(columns):
-                fitted.append(_Pattern(rows, columns))
+                proposals.append(_Pattern(rows, columns))
                 continue
             response = _columns(emulation, columns)
             y = readings.values[np.ix_(rows, columns)]
@@ -289,11 +237,11 @@ class FibreProposals:
                 response = with_error(response, error)
                 reference = population.with_errors(len(columns))
             proposal = fit_fibres(response, y, reference, seed=seed, numbers=rows)
-            fitted.append(_Pattern(rows, columns, proposal, error))
-        return cls(emulation, readings, population, seed, fitted)
+            proposals.append(_Pattern(rows, columns, proposal, error))
+        return cls(emulation, readings, population, seed, proposals)
 
     @one_thread()
-    def draw(self, count: int, after: int = 0) -> _Points:
+    def draw(self, count: int, after: int = 0) -> SpecimenPoints:
         """Draw points of all specimens, other ones than the first `after`."""
         n, m = self.readings.values.shape
         d = len(self.population.mean)
@@ -316,8 +264,8 @@ class FibreProposals:
             z[rows] = points.x
             values, _ = _columns(self.emulation, columns)(points.x.reshape(-1, d))
             y = self.readings.values[np.ix_(rows, columns)]
-            away = (y[:, None] - values.reshape(len(rows), count, -1)) / pattern.error
-            log_normal = -0.5 * away**2 - np.log(pattern.error) - 0.5 * np.log(2 * np.pi)
+            residual = (y[:, None] - values.reshape(len(rows), count, -1)) / pattern.error
+            log_normal = -0.5 * residual**2 - np.log(pattern.error) - 0.5 * np.log(2 * np.pi)
             log_proposal[rows] = log_normal.sum(axis=-1) - points.log_a
         outputs = self.emulation.values(z.reshape(-1, d)).reshape(n, count, m)
         readings, error = self.readings, self.emulation.error
@@ -327,7 +275,8 @@ class FibreProposals:
             readings.log_density(outputs, error) - log_proposal,
             exact + censored.log_density(outputs, error),
         )
-        return _Points(z, outputs, np.where(np.isnan(log_a), -np.inf, log_a), log_proposal)
+        log_a = np.where(np.isnan(log_a), -np.inf, log_a)
+        return SpecimenPoints(z, outputs, log_a, log_proposal, np.zeros(n, dtype=np.intp))
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,8 +295,7 @@ def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
     def response(z: Floats) -> tuple[Floats, Floats]:
         values, jacobian = emulation(z)
         low, high = emulation.box
-        is_beyond = (z < low - 0.5) | (z > high + 0.5)
-        outside = is_beyond.any(axis=1)
+        outside = ((z < low - 0.5) | (z > high + 0.5)).any(axis=1)
         values, jacobian = values[:, columns], jacobian[:, columns]
         # The emulator has no runs there.
         values[outside], jacobian[outside] = np.nan, np.nan
@@ -376,7 +324,7 @@ def _population_points(
 
 
 def _fresh(
-    points: _Points,
+    points: SpecimenPoints,
     draws: Draws,
     count: int,
     bounds: Floats,
@@ -384,19 +332,20 @@ def _fresh(
 ) -> Floats:
     """Return points for new runs: half a sample of the specimens' inputs, half spread out."""
     specimens = draws.specimens()
-    _, each, d = points.z.shape
+    _, n_points, d = points.z.shape
     # Weights of the points under the normal population of the draws.
     mean, covariance = specimens.mean(axis=0), np.cov(specimens.T).reshape(d, d)
-    away = points.z - mean
-    log_w = -0.5 * np.einsum("nkd,de,nke->nk", away, np.linalg.inv(covariance), away) + points.log_a
+    centred = points.z - mean
+    square = np.einsum("nkd,de,nke->nk", centred, np.linalg.inv(covariance), centred)
+    log_w = -0.5 * square + points.log_a
     finite = np.isfinite(log_w).any(axis=1)
     log_w = log_w[finite]
     weights = np.exp(log_w - log_w.max(axis=1, keepdims=True))
     weights /= weights.sum(axis=1, keepdims=True)
     cumulative = np.cumsum(weights, axis=1)
-    chosen = []
+    samples = []
     for _ in range(max(1, -(-2 * count // len(weights)))):
-        k = (cumulative < rng.random((len(weights), 1))).sum(axis=1).clip(max=each - 1)
-        chosen.append(points.z[finite][np.arange(len(k)), k])
-    z = np.clip(np.concatenate(chosen), bounds[0], bounds[1])
+        k = (cumulative < rng.random((len(weights), 1))).sum(axis=1).clip(max=n_points - 1)
+        samples.append(points.z[finite][np.arange(len(k)), k])
+    z = np.clip(np.concatenate(samples), bounds[0], bounds[1])
     return spread_out(z, bounds, count, count // 2, rng)

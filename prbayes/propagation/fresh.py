@@ -75,13 +75,7 @@ class Fresh(Propagation):
 
 
 class FreshBound(Bound):
-    """New random draws at every evaluation.
-
-    Attributes
-    ----------
-    draws : int
-        Number of evaluations so far; with the seeds and the roots it determines the next draws.
-    """
+    """New random draws at every evaluation, from seeds, roots and the number of evaluations."""
 
     random: ClassVar[bool] = True
 
@@ -108,27 +102,23 @@ class FreshBound(Bound):
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""
         self.draws += 1
-        rng = np.random.default_rng([self._seed, self._stream, self.draws, _digest_of(params)])
+        digest = hashlib.blake2b(digest_size=8)  # of the roots, the same in all processes
+        for values in params:
+            digest.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+        number = int.from_bytes(digest.digest(), "little")
+        rng = np.random.default_rng([self._seed, self._stream, self.draws, number])
         aleatory, epistemic = self._sampler(params, self.n_per_theta, rng)
-        values = self.responses(aleatory, epistemic)
-        equal = np.broadcast_to(1 / self.n_per_theta, (len(values), self.n_per_theta))
-        return values, equal
+        responses = self.responses(aleatory, epistemic)
+        shape = len(responses), self.n_per_theta
+        return responses, np.broadcast_to(1 / self.n_per_theta, shape)
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
         """Draw responses of new specimens at one value of the roots."""
-        at = [np.asarray(p)[None] for p in params]
-        if not self.valid(at).all():
+        roots = [np.asarray(p)[None] for p in params]
+        if not self.valid(roots).all():
             return np.full((size, *self.target.event), np.nan)
-        aleatory, epistemic = self._sampler(at, size, rng)
+        aleatory, epistemic = self._sampler(roots, size, rng)
         return np.asarray(self.responses(aleatory, epistemic)[0])
-
-
-def _digest_of(params: Sequence[Any]) -> int:
-    """Return a number of the roots' values, the same in all processes."""
-    content = hashlib.blake2b(digest_size=8)
-    for values in params:
-        content.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
-    return int.from_bytes(content.digest(), "little")
 
 
 class FreshOp(OwnOp):
@@ -145,13 +135,9 @@ class FreshOp(OwnOp):
         """Draw, call the response, compare."""
         batch = batch_shape(inputs, self.event_ndims)
         full = broadcast_batch(inputs, self.event_ndims, batch)
-        leading = len(batch)
-        params = []
-        for values in full:
-            event_shape = values.shape[leading:]
-            params.append(values.reshape(-1, *event_shape))
-        found = self.bound.discrepancies(params, self.bound.target)
-        outputs[0][0] = found.reshape(batch)
+        params = [values.reshape(-1, *values.shape[len(batch) :]) for values in full]
+        discrepancies = self.bound.discrepancies(params, self.bound.target)
+        outputs[0][0] = discrepancies.reshape(batch)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse by name.

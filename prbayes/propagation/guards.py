@@ -27,29 +27,10 @@ def missing_share(
 
     Inputs x* are uniform in the box of the runs. Only responses near the data count. As x* is a
     draw from its own posterior under a flat population, the share estimates the missing posterior
-    mass.
-    0 of 128 means less than 2.3 % (95 %).
+    mass. 0 of 128 means less than 2.3 % (95 %).
 
-    Parameters
-    ----------
-    find_roots : callable
-        Returns the roots of responses (n, m), an array (roots, d) for each.
-    response : callable
-        The emulator: responses (n, m) at inputs (n, d).
-    box : ndarray, shape (2, d)
-        Lower and upper ends of the runs.
-    y : ndarray, shape (N, m)
-        Measured responses. Specimens with values that are not finite are left out.
-    n : int
-        Largest number of simulated specimens.
-    seed : int
-    tolerance : float
-        Largest difference of a root from x*, relative to the box.
-
-    Returns
-    -------
-    float
-        NaN if no response in the box is near the data.
+    NaN if no response in the box is near the data. A root may differ from x* by ``tolerance`` of
+    the box. Responses of at most n specimens are (n, m); ``y`` are the measured ones, (N, m).
     """
     low, high = box
     y = y[np.isfinite(y).all(axis=1)]
@@ -58,20 +39,17 @@ def missing_share(
     responses = response(inputs)
     margin = 0.1 * np.ptp(y, axis=0)
     near = (responses >= y.min(axis=0) - margin) & (responses <= y.max(axis=0) + margin)
-    chosen = np.flatnonzero(near.all(axis=1))
+    rows = np.flatnonzero(near.all(axis=1))
     # Outputs in the range of the data may be far from all specimens together.
     unit = np.where(y.std(axis=0) > 0, y.std(axis=0), 1.0)
-    squares = [(((y - value) / unit) ** 2).sum(axis=1).min() for value in responses[chosen]]
-    chosen = chosen[np.array(squares) < 1][:n]
-    if not len(chosen):
+    squares = [(((y - value) / unit) ** 2).sum(axis=1).min() for value in responses[rows]]
+    rows = rows[np.array(squares) < 1][:n]
+    if not len(rows):
         return np.nan
-    roots = find_roots(responses[chosen])
-    is_missing = [
-        not (np.abs(np.reshape(root, (-1, len(low))) - x) < tolerance * (high - low))
-        .all(axis=1)
-        .any()
-        for root, x in zip(roots, inputs[chosen], strict=True)
-    ]
+    is_missing = []
+    for roots, x in zip(find_roots(responses[rows]), inputs[rows], strict=True):
+        distance = np.abs(np.reshape(roots, (-1, len(low))) - x)
+        is_missing.append(not (distance < tolerance * (high - low)).all(axis=1).any())
     return float(np.mean(is_missing))
 
 
@@ -88,11 +66,8 @@ def half_difference(log_likelihoods_a: Floats, log_likelihoods_b: Floats) -> flo
     points. It is a single number from two halves: single data sets with a large error are missed
     in up to .71 where these are rare (<= .07).
 
-    Parameters
-    ----------
-    log_likelihoods_a, log_likelihoods_b : ndarray, shape (S, N)
-        By posterior draw and specimen; 32 draws suffice. A specimen without a point in one of the
-        halves, as beside a region without response, is left out.
+    Both have shape (S, N), by posterior draw and specimen; 32 draws suffice. A specimen without a
+    point in one of the halves, as beside a region without response, is left out.
     """
     is_finite = np.isfinite(log_likelihoods_a) & np.isfinite(log_likelihoods_b)
     with np.errstate(invalid="ignore"):
@@ -111,16 +86,9 @@ def predicted_bias(misfit: Floats, jacobian: Floats, x: Floats, size: int) -> Fl
     jump the prediction has .10 to .45 of the true size. Missing roots are not seen. Infinite if all
     runs have the same value of an input.
 
-    Parameters
-    ----------
-    misfit : ndarray, shape (n, m)
-        Run minus emulator at n fresh runs.
-    jacobian : ndarray, shape (n, m, d)
-        Of the emulator at these runs. Scale outputs of different units in misfit and Jacobian.
-    x : ndarray, shape (n, d)
-        Inputs of the fresh runs, a sample of the roots.
-    size : int
-        Number of specimens.
+    ``misfit`` is run minus emulator at n fresh runs, (n, m), whose inputs ``x``, (n, d), are a
+    sample of the roots of ``size`` specimens; the emulator's Jacobian there has shape (n, m, d).
+    Scale outputs of different units in misfit and Jacobian.
     """
     shift = -np.einsum("ndm,nm->nd", np.linalg.pinv(jacobian), misfit)
     sd = x.std(axis=0)

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.emulators.multifidelity import Following
+from prbayes.emulators.multifidelity import MultifidelityModel
 from prbayes.emulators.selection import (
     Runs,
-    candidates,
-    chosen,
-    emulated,
-    emulated_without_each,
-    share_of_runs,
+    candidate_surfaces,
+    mixing_weight,
+    predict_outputs,
+    predict_without_blocks,
+    select_surfaces,
 )
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import N_BLOCKS
@@ -114,20 +114,20 @@ class DesignEmulator:
     @property
     def n_following(self) -> int:
         """Number of outputs that follow a coarse response."""
-        return sum(isinstance(surface, Following) for surface in self.surfaces)
+        return sum(isinstance(surface, MultifidelityModel) for surface in self.surfaces)
 
     @one_thread()
     def at(self, points: EmulatedPoints) -> Floats:
         """Return the responses at points, (M,) or (M, m)."""
         x = columns(points.inputs)
-        values = emulated(self.surfaces, self.runs, x, coarse=points.coarse)
+        values = predict_outputs(self.surfaces, self.runs, x, coarse=points.coarse)
         return values.reshape(-1, *self.event)
 
     @one_thread()
     def without_each_block(self, points: EmulatedPoints) -> list[Floats]:
         """Return the responses by emulators that were fitted without one block of the runs."""
         x = columns(points.inputs)
-        by_block = emulated_without_each(self.surfaces, self.runs, x, points.coarse)
+        by_block = predict_without_blocks(self.surfaces, self.runs, x, points.coarse)
         return [values.reshape(-1, *self.event) for values in by_block]
 
     def joined(self, points: EmulatedPoints, log_density: Floats, runs: Sample) -> Sample:
@@ -163,8 +163,8 @@ def fit_emulator(
     y = runs.values.reshape(len(runs), -1)
     fitted = Runs(x, y, weights.mean(axis=0), runs.blocks, coarse)
     try:
-        surfaces = candidates(*x.shape) if isinstance(emulator, str) else [emulator]
-        best, left_out = chosen(surfaces, fitted)
+        surfaces = candidate_surfaces(*x.shape) if isinstance(emulator, str) else [emulator]
+        best, left_out = select_surfaces(surfaces, fitted)
     except np.linalg.LinAlgError:
         return None
     return _weighed(fitted, best, left_out, weights, runs.values.shape[1:])
@@ -178,7 +178,7 @@ def _weighed(
     event: tuple[int, ...],
 ) -> DesignEmulator | None:
     """Return an emulator with the share of the runs; None where they stay alone."""
-    share = share_of_runs(weights, runs.y, left_out, runs.blocks)
+    share = mixing_weight(weights, runs.y, left_out, runs.blocks)
     if share > SIZES.runs_alone:
         return None
     share = 0.0 if share < SIZES.runs_negligible else share

@@ -31,32 +31,27 @@ warnings.filterwarnings(
 class OwnOp(Op):
     """An operation on arrays (..., *event), which takes leading axes itself.
 
-    What ``__props__`` names has no equal but itself: two operations that hold it are the same.
-    Beside it stands ``__str__``, or PyTensor makes one of its own that shows all it holds.
+    Operations are equal if the objects that ``__props__`` names are the same. A subclass repeats
+    ``__str__``: PyTensor's own would show cells, values and functions.
     """
 
     __props__: tuple[str, ...] = ()
-    event_ndims: Sequence[int] = (1, 1)  # of each input: a sample, and what goes with it
+    event_ndims: Sequence[int] = (1, 1)  # of the inputs: a sample and its weights
     event_shape: tuple[int | None, ...] = ()  # of the result
 
     def __str__(self) -> str:
-        """Return the name, and what to do where a backend has no form of it: it shows nothing else.
-
-        Without the cells, values and functions that the operation holds.
-        """
+        """Return the name, and what to do where a backend has no form of it."""
         return (
             f"{type(self).__name__}, which is computed by NumPy: PyTensor's JAX mode and NumPyro "
             "take prb.Reweighted alone; use that, or nuts_sampler='nutpie' or 'pymc'"
         )
 
     def make_node(self, *inputs: Any) -> Apply[Any, Any]:
-        """Apply to arrays; the result has their leading axes, and its own event behind them."""
+        """Apply to arrays; the result has their leading axes before its own event."""
         tensors = [pt.as_tensor(x) for x in inputs]
         pairs = zip(tensors, self.event_ndims, strict=True)
         leading = max(t.type.ndim - event for t, event in pairs)
-        batch = (None,) * leading
-        shape = batch + self.event_shape
-        result = pt.tensor(dtype="float64", shape=shape)
+        result = pt.tensor(dtype="float64", shape=(None,) * leading + self.event_shape)
         return Apply(self, tensors, [result])
 
 
@@ -69,49 +64,38 @@ _vectorize_node.register(OwnOp, _on_batches)
 
 
 class ResponseOp(OwnOp):
-    """The response as an operation.
-
-    It has no gradient and is computed in one call for a whole batch.
-    """
+    """The response, which has no gradient, in one call for a whole batch."""
 
     __props__ = ("responses",)
     __str__ = OwnOp.__str__
 
     def __init__(self, responses: Responses) -> None:
         self.responses = responses
-        outputs = responses.outputs
-        self._event = () if outputs is None else outputs.event
-        self.event_shape = self._event
+        self.event_shape: tuple[int, ...] = ()
+        if responses.outputs is not None:
+            self.event_shape = responses.outputs.event
         inputs = responses.inputs
-        common = [e.type.ndim for e in inputs.epistemic]
-        self.event_ndims = [*inputs.event_ndims, *common]
+        self.event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
-        """Call the response, but not for populations that are invalid.
+        """Call the response for populations that are valid.
 
-        Their quantiles are not finite.
+        Others have an input that is finite at none of their specimens.
         """
         k = len(self.responses.inputs.aleatory)
         batch = batch_shape(inputs, self.event_ndims)
         full = broadcast_batch(inputs, self.event_ndims, batch)
-        aleatory = full[:k]
-        epistemic = full[k:]
-
-        # A population is left out if one of its inputs is finite at none of its specimens.
-        specimens = len(batch)
         valid = np.ones(batch[:-1], dtype=bool)
-        for x in aleatory:
-            event_axes = tuple(range(specimens, x.ndim))
-            finite = np.isfinite(x).all(axis=event_axes)
-            valid &= finite.any(axis=-1)
+        for x in full[:k]:
+            event_axes = tuple(range(len(batch), x.ndim))
+            valid &= np.isfinite(x).all(axis=event_axes).any(axis=-1)
         if valid.all():
             outputs[0][0] = self.responses(inputs[:k], inputs[k:])
             return
-        values = np.full(batch + self._event, np.nan)
+        values = np.full(batch + self.event_shape, np.nan)
         if valid.any():
-            valid_aleatory = [x[valid] for x in aleatory]
-            valid_epistemic = [x[valid] for x in epistemic]
-            values[valid] = self.responses(valid_aleatory, valid_epistemic)
+            rows = [x[valid] for x in full]
+            values[valid] = self.responses(rows[:k], rows[k:])
         outputs[0][0] = values
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
@@ -146,16 +130,15 @@ class DensityOp(OwnOp):
                 "use GaussianKDE, or prb.Reweighted"
             )
         sample, weights = inputs
-        (cotangent,) = cotangents
-        slope = CotangentOp(self.cells, 1)(sample, cotangent)
-        value = CotangentOp(self.cells, 0)(sample, cotangent)
+        slope = CotangentOp(self.cells, 1)(sample, *cotangents)
+        value = CotangentOp(self.cells, 0)(sample, *cotangents)
         return [weights * slope, value]
 
 
 class CotangentOp(OwnOp):
-    """A cotangent of a density on cells at the sample, (..., n), (..., m) -> (..., n).
+    """A cotangent of a density on cells at the sample, or its derivative.
 
-    Itself or its derivative.
+    (..., n), (..., m) -> (..., n).
     """
 
     __props__ = ("cells", "order")

@@ -12,8 +12,8 @@ import pytensor.tensor as pt
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.numerics.points import base_points, inside
-from prbayes.propagation.exponential_families import PointDensity
 from prbayes.propagation.moving_support import refuse_moving_atoms
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.inputs import Inputs
@@ -39,7 +39,7 @@ class MixtureSampler:
 
     name: str  # of the simulator, for messages
     inputs: Inputs
-    density: PointDensity
+    density: PopulationDensity
 
     def draw(
         self, components: Sequence[Floats], n: int, seed: int, shares: Floats | None = None

@@ -1,27 +1,178 @@
-"""Log-likelihoods of specimens in batches of populations, without a graph of the log-density.
+r"""Log-densities of populations at fixed points: a matrix product for exponential families.
 
-    log p(y_i | theta) = logsumexp_k(log p(x_ik | theta) + A_ik)
+The log-density of S populations at n points is
 
-Of exponential families the exponents of all points in all populations are one product of matrices,
-of sufficient statistics with A and natural parameters (`exponential_families`). Other inputs, and
-populations far narrower than their points, have PyMC's log-density.
+.. math:: \log p(x_i \mid \theta_s) = \sum_k H_{sk} T_k(x_i), \qquad T_0 = 1,
+
+where T are the sufficient statistics, and H the natural parameters and minus the log-normaliser.
+H follows from the log-density at as many anchor points as there are statistics: PyMC's own density
+serves every family. Other inputs, and populations far narrower than their points, have PyMC's
+log-density. The log-likelihood of a specimen is
+
+    log p(y_i | theta) = logsumexp_k(log p(x_ik | theta) + A_ik).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from scipy.linalg import qr
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.numerics.threads import one_thread
-from prbayes.propagation.exponential_families import ExponentialForm
-from prbayes.response.distributions import PopulationSampler, compiled_log_density
+from prbayes.response.distributions import PopulationSampler, compiled_log_density, is_mvnormal
 from prbayes.response.inputs import Inputs
+
+
+def _non_negative(x: Floats) -> Floats:
+    return np.where(x >= 0, x, np.nan)
+
+
+def _log_of_rest(x: Floats) -> Floats:
+    return np.asarray(np.log1p(-x))
+
+
+# Coordinates of an element, (n,) -> (n,), not finite outside of the support, and whether their
+# monomials of degree two are sufficient statistics as well. The supports do not depend on
+# parameters; that of the truncated normal is in the graph.
+_FAMILIES: dict[type, tuple[tuple[Callable[[Floats], Floats], ...], bool]] = {
+    type(pm.Normal.rv_op): ((np.positive,), True),
+    type(pm.HalfNormal.rv_op): ((_non_negative,), True),
+    type(pm.TruncatedNormal.rv_op): ((np.positive,), True),
+    type(pm.LogNormal.rv_op): ((np.log,), True),
+    type(pm.Gamma.rv_op): ((np.positive, np.log), False),
+    type(pm.InverseGamma.rv_op): ((np.reciprocal, np.log), False),
+    type(pm.Beta.rv_op): ((np.log, _log_of_rest), False),
+    type(pm.Exponential.rv_op): ((_non_negative,), False),
+}
+
+
+def _coordinates(dist: pt.TensorVariable, values: Floats) -> list[tuple[Floats, bool]] | None:
+    """Return coordinates (c, n) of each element at points (n, *event), and if they are quadratic.
+
+    None if the distribution is no exponential family with a fixed support.
+    """
+    if is_mvnormal(dist):
+        return [(values.T, True)]
+    op = dist.owner.op
+    if type(op) not in _FAMILIES:
+        return None
+    functions, is_quadratic = _FAMILIES[type(op)]
+    if isinstance(op, type(pm.TruncatedNormal.rv_op)):
+        _, _, lower, upper = op.dist_params(dist.owner)
+        if not isinstance(lower, pt.TensorConstant) or not isinstance(upper, pt.TensorConstant):
+            return None
+        is_inside = (values >= lower.data) & (values <= upper.data)
+        values = np.where(is_inside, values, np.nan)
+    elements = values.reshape(len(values), -1).T
+    with np.errstate(all="ignore"):
+        return [(np.stack([u(x) for u in functions]), is_quadratic) for x in elements]
+
+
+def _statistics(coordinates: Floats, is_quadratic: bool) -> Floats:
+    """Return sufficient statistics of standardised coordinates, (c, n) -> (q, n)."""
+    z = _standardised(coordinates)
+    if not is_quadratic:
+        return z
+    if len(z) == 1:
+        return np.concatenate([z, z * z])
+    axes, _, _ = np.linalg.svd(z, full_matrices=False)
+    z = _standardised(axes.T @ z)
+    first, second = np.triu_indices(len(z))
+    return np.concatenate([z, z[first] * z[second]])
+
+
+def _standardised(values: Floats) -> Floats:
+    """Return values (c, n) less their means, in standard deviations."""
+    size = values.shape[1]
+    centered = values - (values.sum(axis=1) / size)[:, None]
+    spread = np.sqrt(np.vecdot(centered, centered) / size)
+    spread[spread == 0] = 1.0
+    return np.asarray(centered / spread[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class ExponentialForm:
+    """Log-densities at n fixed points as a matrix product.
+
+    Attributes
+    ----------
+    statistics : ndarray, shape (q + 1, n)
+        Sufficient statistics of all inputs, the last of which is the constant; zero outside of the
+        support.
+    is_inside : ndarray of bool, shape (n,)
+        Points of the support.
+    anchors : tuple of ndarray, shapes (q + 1, *event)
+        Points at which the log-density determines the natural parameters.
+    inverse : ndarray, shape (q + 1, q + 1)
+        Inverse of the statistics at the anchors.
+    """
+
+    statistics: Floats
+    is_inside: NDArray[np.bool_]
+    anchors: tuple[Floats, ...]
+    inverse: Floats
+
+    @classmethod
+    def of(
+        cls, dists: Sequence[pt.TensorVariable], points: Sequence[Floats]
+    ) -> ExponentialForm | None:
+        """Return the form of independent inputs at points, (n, *event); None if they have none."""
+        coordinates: list[tuple[Floats, bool]] = []
+        for dist, values in zip(dists, points, strict=True):
+            of_input = _coordinates(dist, values)
+            if of_input is None:
+                return None
+            coordinates += of_input
+        with np.errstate(invalid="ignore"):
+            is_inside = np.isfinite(sum(u.sum(axis=0) for u, _ in coordinates))
+        inside = np.flatnonzero(is_inside)
+        if not inside.size:
+            return None
+        parts = [_statistics(u[:, inside], is_quadratic) for u, is_quadratic in coordinates]
+        at_inside = np.concatenate([*parts, np.ones((1, inside.size))])
+        size = len(at_inside)
+        if inside.size < 2 * size:
+            return None
+        # Anchors far from dependent, by pivoted QR. Among the half of the points near the middle:
+        # far away log-densities have larger roundings.
+        distance = (at_inside**2).sum(axis=0)
+        near = np.argsort(distance, kind="stable")[: inside.size // 2]
+        _, _, order = qr(at_inside[:, near], mode="economic", pivoting=True)
+        pivots = near[order[:size]]
+        at_anchors = at_inside[:, pivots]
+        # Points that coincide, or lie in a plane, determine no natural parameters.
+        if np.linalg.cond(at_anchors) > 1e6:
+            return None
+        statistics = np.zeros((size, is_inside.size))
+        statistics[:, inside] = at_inside
+        anchors = tuple(values[inside[pivots]] for values in points)
+        return cls(statistics, is_inside, anchors, np.linalg.inv(at_anchors))
+
+    def natural_parameters(self, at_anchors: Floats) -> Floats:
+        """Return H from log-densities at the anchors, (S, q + 1) -> (S, q + 1).
+
+        Its last column is minus the log-normaliser.
+        """
+        with np.errstate(invalid="ignore"):
+            return np.asarray(at_anchors @ self.inverse)
+
+
+def _is_rounded(at_anchors: Floats) -> NDArray[np.bool_]:
+    """Return which log-densities at points would be off by more than 1e-12, (S, q + 1) -> (S,).
+
+    Those of populations far narrower than the points, or far from them, and of invalid ones: they
+    are small differences of large numbers.
+    """
+    return ~(np.abs(at_anchors).max(axis=1) < 1000.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +201,13 @@ class WeightedPoints:
         return cls(x, log_a, ExponentialForm.of(inputs.aleatory, flat))
 
 
-@dataclass(frozen=True, eq=False)
 class PopulationDensity:
-    """Populations of some inputs, as far as they are compiled: log-densities and draws.
+    """Populations of some inputs, compiled once: log-densities and draws."""
 
-    Attributes
-    ----------
-    inputs : Inputs
-    """
-
-    inputs: Inputs
+    def __init__(self, inputs: Inputs) -> None:
+        self.inputs = inputs
+        # The last points with the form of their log-density.
+        self._form: tuple[Any, ExponentialForm | None] = (None, None)
 
     @cached_property
     def _log_density(self) -> Any:
@@ -70,6 +218,41 @@ class PopulationDensity:
         """Draws of specimens."""
         return PopulationSampler(self.inputs)
 
+    def at(self, params: Sequence[Any], points: Sequence[Floats]) -> Callable[[slice], Floats]:
+        """Return log p(x given theta), (k, n), as a function of the rows of the points.
+
+        For roots of shapes (k, *shape), and points (n, *event).
+        """
+        previous, form = self._form
+        if previous is not points[0]:
+            form = ExponentialForm.of(self.inputs.aleatory, points)
+            # At an end of a support PyMC's density may be finite, or infinite.
+            if form is not None and not form.is_inside.all():
+                form = None
+            self._form = points[0], form
+        if form is None:
+
+            def by_graph(rows: slice) -> Floats:
+                (logs,) = self._log_density(*params, *(x[rows] for x in points))
+                return np.array(logs)
+
+            return by_graph
+
+        (at_anchors,) = self._log_density(*params, *form.anchors)
+        parameters = form.natural_parameters(at_anchors)
+        is_rounded = _is_rounded(at_anchors)
+        narrow = [param[is_rounded] for param in params]
+
+        def by_product(rows: slice) -> Floats:
+            # In one thread: the points of a design do not depend on the number of threads.
+            with one_thread():
+                logs = parameters @ form.statistics[:, rows]
+            if is_rounded.any():
+                (logs[is_rounded],) = self._log_density(*narrow, *(x[rows] for x in points))
+            return np.asarray(logs)
+
+        return by_product
+
     @one_thread()
     def log_likelihoods(self, roots: Sequence[Floats], points: WeightedPoints) -> Floats:
         """Return log p(y_i | theta), (S, N), of populations at roots, shapes (S, *shape)."""
@@ -79,7 +262,7 @@ class PopulationDensity:
             return self._by_graph(roots, points)
         with np.errstate(all="ignore"):
             (at_anchors,) = self._log_density(*roots, *form.anchors)
-        is_rounded = form.is_rounded(at_anchors)
+        is_rounded = _is_rounded(at_anchors)
         natural = form.natural_parameters(np.where(is_rounded[:, None], 0.0, at_anchors))
         # A is a statistic whose parameter is one; -inf in a product may become NaN.
         base = np.where(form.is_inside, log_a.T.ravel(), -np.inf)
@@ -102,7 +285,7 @@ class PopulationDensity:
         return result.T
 
     def _by_graph(self, roots: Sequence[Floats], points: WeightedPoints) -> Floats:
-        """Return the same by the compiled log-density."""
+        """Return log-likelihoods by the compiled log-density."""
         log_a = points.log_a
         n, count = log_a.shape
         result = np.full((len(roots[0]), n), -np.inf)
@@ -126,3 +309,18 @@ def _log_sum_exp_first(exponents: Floats) -> Floats:
     np.exp(exponents, out=exponents)
     total = np.log(exponents.sum(axis=0)) + largest
     return np.where(largest < -1e299, -np.inf, total)
+
+
+def normalise(logs: Floats) -> Floats:
+    """Turn log weights, (S, n), into weights of sum one in place; return their log totals, (S,).
+
+    Rows without weight become NaN.
+    """
+    largest = logs.max(axis=1, keepdims=True)
+    largest = np.where(np.isfinite(largest), largest, 0.0)
+    logs -= largest
+    np.exp(logs, out=logs)
+    totals = logs.sum(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs /= totals
+        return np.asarray((np.log(totals) + largest)[:, 0])

@@ -1,4 +1,4 @@
-"""`Resimulated`: the same base points for every theta, and their responses computed anew."""
+"""`Resimulated`: responses at the same base points, which are computed for every theta."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from prbayes.response.response import Responses
 
 @dataclass(frozen=True)
 class Resimulated(Propagation):
-    """Fixed Sobol points through the inputs' inverse distribution functions, for each theta anew.
+    """Responses at fixed Sobol points through the inputs' inverse distribution functions.
 
     Parameters
     ----------
     n : int
-        Number of points, best a power of two; n responses are computed for each theta.
+        Number of points, best a power of two: n responses are computed for each theta.
     random_seed : int
         Seed of the scrambling.
     points : {"sobol", "monte_carlo"} or callable
@@ -81,25 +81,18 @@ class Resimulated(Propagation):
     def check_simulator(self, name: str, inputs: Inputs, target: Discrepancy) -> None:
         """Refuse inputs without inverse distribution functions; warn of too few responses."""
         refuse_nested(name, inputs)
-        self._warn_of_few_responses(name, target)
-        for dist, u in zip(inputs.aleatory, self.base_points(inputs), strict=True):
-            quantiles(name, dist, u)
-
-    def _warn_of_few_responses(self, name: str, target: Discrepancy) -> None:
         per_observation = target.metric.tail_responses
         enough = per_observation * target.n_effective
         if self.n < enough:
-            report(
-                Finding(
-                    "few-responses",
-                    f"{name}: the log-likelihood of {self.n} resimulated responses sees too "
-                    "little of the tails: its standard errors and posterior come out too "
-                    f"narrow, expected at least {enough:.0f} responses, {per_observation} for "
-                    "each observation; use prb.Reweighted(n), prb.KullbackLeibler() or a "
-                    "larger n.",
-                    "choose.md#how-many-responses",
-                )
+            text = (
+                f"{name}: the log-likelihood of {self.n} resimulated responses sees too little of "
+                "the tails: its standard errors and posterior come out too narrow, expected at "
+                f"least {enough:.0f} responses, {per_observation} for each observation; use "
+                "prb.Reweighted(n), prb.KullbackLeibler() or a larger n."
             )
+            report(Finding("few-responses", text, "choose.md#how-many-responses"))
+        for dist, u in zip(inputs.aleatory, self.base_points(inputs), strict=True):
+            quantiles(name, dist, u)
 
     def base_points(self, inputs: Inputs) -> list[Floats]:
         """Return points of the unit cube for each aleatory input, shapes (n, *event)."""
@@ -109,7 +102,7 @@ class Resimulated(Propagation):
         return points
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
-        """Lay out the base points and find out whether the response accepts PyTensor variables."""
+        """Draw the base points, and try the response on PyTensor variables."""
         return ResimulatedBound(name, inputs, target, responses, self)
 
 
@@ -128,27 +121,27 @@ class ResimulatedBound(Bound):
         self.n_per_theta = config.n
         self.max_lost = config.max_lost
         points = config.base_points(inputs)
-        # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too
-        # large to keep.
-        keep = config.n <= AT_ONCE
-        self._points: list[Any] = points if keep else [shared(u) for u in points]
-        tried = probe(self, PopulationSampler(inputs), config.random_seed)
-        self.symbolic = self._accepts_tensors(*tried)
+        # PyTensor evaluates constant parts of a graph once and keeps them: fast, unless they are
+        # large.
+        is_small = config.n <= AT_ONCE
+        self._points: list[Any] = points if is_small else [shared(u) for u in points]
+        trial = probe(self, PopulationSampler(inputs), config.random_seed)
+        self.symbolic = self._accepts_tensors(*trial)
 
     def copied(self) -> Self:
-        """Return the same propagation with its own count, which its compiled function knows."""
-        other = super().copied()
-        other.__dict__.pop("_values", None)
-        return other
+        """Return the same propagation with its own count, which its compiled function updates."""
+        copied = super().copied()
+        copied.__dict__.pop("_values", None)
+        return copied
 
     def _accepts_tensors(
         self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]
     ) -> bool:
-        """Try the response on PyTensor variables, and believe it only if the numbers agree."""
+        """Return whether the response of PyTensor variables is a graph with the same numbers."""
         if not self.responses.plain:
             return False
-        given = [*aleatory, *epistemic]
-        symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in given]
+        values = [*aleatory, *epistemic]
+        symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in values]
         k = len(aleatory)
         arguments = self.inputs.fill(symbols[:k], symbols[k:])
         try:
@@ -156,21 +149,18 @@ class ResimulatedBound(Bound):
             if not isinstance(graph, TensorVariable):
                 return False
             compiled = function(symbols, graph, mode=PLAIN, on_unused_input="ignore")
-            values = compiled(*given)
+            result = compiled(*values)
         except Exception:  # whatever it is: the response is then called with arrays
             return False
-        # The two ways differ by rounding at most.
-        same_shape = values.shape == expected.shape
-        return same_shape and np.allclose(values, expected, rtol=1e-9, equal_nan=True)
+        # Both differ by rounding at most.
+        same_shape = result.shape == expected.shape
+        return same_shape and np.allclose(result, expected, rtol=1e-9, equal_nan=True)
 
     def _response(self, params: Sequence[Any]) -> tuple[TensorVariable, TensorVariable]:
         """Return the graph of responses at the base points, and whether parameters are valid."""
         dists, epistemic = self.inputs.rebuilt(params)
-        placed = []
-        for dist, u in zip(dists, self._points, strict=True):
-            points = quantiles(self.name, dist, u)
-            placed.append(points)
-        aleatory = ninf_for_invalid(placed)
+        pairs = zip(dists, self._points, strict=True)
+        aleatory = ninf_for_invalid([quantiles(self.name, dist, u) for dist, u in pairs])
         common = [e[None] for e in epistemic]
         parameters_valid = valid(self.inputs, dists)
         if not self.symbolic:
@@ -183,8 +173,8 @@ class ResimulatedBound(Bound):
         """Return the discrepancy of the responses, +inf where parameters are invalid."""
         values, parameters_valid = self._response(params)
         weights = np.full(self.n_per_theta, 1 / self.n_per_theta)
-        found = symbolic_discrepancy(self.target, values, weights)
-        return pt.switch(parameters_valid, found, np.inf)
+        discrepancy = symbolic_discrepancy(self.target, values, weights)
+        return pt.switch(parameters_valid, discrepancy, np.inf)
 
     @cached_property
     def _values(self) -> Any:

@@ -26,26 +26,16 @@ from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
-from prbayes.propagation.specimen_points import Emulation, PointOptions, first_runs
+from prbayes.propagation.specimen_emulation import Emulation, PointOptions, first_runs
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseShare:
-    """Points from which the share of a population that has a response follows.
+    """Points from which the share of a population that has a response follows."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (M, d)
-        Coordinates; the points with a response first.
-    log_b : ndarray, shape (M,)
-        Minus the log of the proposal density of z, up to a constant.
-    with_response : int
-        Number of points with a response.
-    """
-
-    z: Floats
-    log_b: Floats
-    with_response: int
+    z: Floats  # (M, d): coordinates; the points with a response first
+    log_b: Floats  # (M,): minus the log of the proposal density of z, up to a constant
+    with_response: int  # number of points with a response
 
     def log_share(self, log_p: Floats) -> Floats:
         """Return log S of log-densities of the points, (..., M) -> (...).
@@ -94,7 +84,6 @@ def response_share(
     options: PointOptions,
     *,
     count: int = 1024,
-    most: int = 2**16,
     batches: int = 6,
     seed: int = 0,
     name: str = "response",
@@ -114,8 +103,8 @@ def response_share(
     posterior : callable
         Share -> draws of the hyperparameters.
     options : PointOptions
-    count, most : int
-        Points of each half at first, and at last.
+    count : int
+        Points of each half at first.
     batches : int
         Largest number of batches of runs at the boundary.
     seed : int
@@ -132,23 +121,23 @@ def response_share(
     largest = options.half_difference
     draws = posterior(None)
 
-    def drawn(number: int, half: int) -> ResponseShare:
+    def draw(number: int, half: int) -> ResponseShare:
         return _points(emulation, (prior_specimens(), draws.specimens()), number, 2 * seed + half)
 
-    share = drawn(count, 0)
+    share = draw(count, 0)
     if np.sqrt((draws.log_share(share) ** 2).mean()) <= largest:
         return emulation, None
     draws = posterior(share)
     batch = max(first_runs(emulation.z.shape[1]) // 2, options.fresh)
     for _ in range(batches):
         fresh = boundary_points(emulation, draws.specimens(), batch, seed)
-        before = draws.log_share(share)
+        previous = draws.log_share(share)
         if len(fresh):
             z = np.concatenate([emulation.z, fresh])
             y = np.concatenate([emulation.y, run(fresh)])
             emulation = replace(emulation, z=z, y=y)
-        share = drawn(count, 0)
-        change = float(np.std(draws.log_share(share) - before))
+        share = draw(count, 0)
+        change = float(np.std(draws.log_share(share) - previous))
         if change <= largest:
             break
     else:
@@ -160,10 +149,10 @@ def response_share(
         )
     draws = posterior(share)
     while True:
-        halves = [drawn(count, half) for half in (0, 1)]
+        halves = [draw(count, half) for half in (0, 1)]
         logs = [draws.log_share(half) for half in halves]
         difference = float(np.std(logs[0] - logs[1]) / 2)
-        if difference <= largest or 2 * count > most:
+        if difference <= largest or 2 * count > 2**16:
             break
         count *= 2
     if difference > largest:
@@ -183,14 +172,14 @@ def _points(
     emulation: Emulation, samples: tuple[Floats, ...], count: int, seed: int, degrees: float = 5.0
 ) -> ResponseShare:
     """Draw Sobol points from a mixture around samples: whitened, t distributed elements."""
-    each = count // len(samples)
+    size = count // len(samples)
     d = samples[0].shape[1]
     means = [sample.mean(axis=0) for sample in samples]
     covariances = [np.cov(sample.T).reshape(d, d) for sample in samples]
     roots = [np.linalg.cholesky(1.5 * covariance) for covariance in covariances]
     z = np.concatenate(
         [
-            mean + stdtrit(degrees, sobol(each, d, 1009 * seed + k)) @ root.T
+            mean + stdtrit(degrees, sobol(size, d, 1009 * seed + k)) @ root.T
             for k, (mean, root) in enumerate(zip(means, roots, strict=True))
         ]
     )
@@ -213,16 +202,8 @@ def boundary_points(emulation: Emulation, z: Floats, count: int, seed: int = 0) 
     """Return points for runs between runs with and without response, at most (count, d).
 
     A point is near the boundary if its distances to the nearest run with and to the nearest run
-    without a response differ by less than a factor of two. They are chosen one by one among
-    specimens, each farthest from all runs.
-
-    Parameters
-    ----------
-    emulation : Emulation
-    z : ndarray, shape (n, d)
-        Specimens of plausible populations.
-    count : int
-    seed : int
+    without a response differ by less than a factor of two. They are selected one by one among
+    specimens z of plausible populations, (n, d), each farthest from all runs.
     """
     from scipy.spatial import cKDTree
 
@@ -233,12 +214,12 @@ def boundary_points(emulation: Emulation, z: Floats, count: int, seed: int = 0) 
     )
     distance = np.minimum(with_response, without)
     near = np.flatnonzero(np.maximum(with_response, without) < 2 * distance)
-    # Some of them, so that the population decides where on the boundary the runs are.
+    # A sample: the population decides where on the boundary the runs are.
     near = np.random.default_rng(seed).permutation(near)[: 4 * count]
     candidates, distance = z[near] / width, distance[near]
-    chosen: list[int] = []
-    while len(chosen) < min(count, len(near)):
-        chosen.append(int(np.argmax(distance)))
-        away = np.sqrt(((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1))
-        distance = np.minimum(distance, away)
-    return z[near[chosen]]
+    rows: list[int] = []
+    while len(rows) < min(count, len(near)):
+        rows.append(int(np.argmax(distance)))
+        to_last = np.sqrt(((candidates - candidates[rows[-1]]) ** 2).sum(axis=1))
+        distance = np.minimum(distance, to_last)
+    return z[near[rows]]

@@ -34,7 +34,6 @@ from prbayes.propagation.base import (
     valid_roots,
 )
 from prbayes.propagation.design import Design, DesignSampler, WeightFunction, common_rows, is_line
-from prbayes.propagation.exponential_families import normalise
 from prbayes.propagation.importance import (
     SIZES,
     CoarseResponse,
@@ -44,6 +43,7 @@ from prbayes.propagation.importance import (
     fit_emulator,
 )
 from prbayes.propagation.ops import stored_discrepancy
+from prbayes.propagation.population_density import normalise
 from prbayes.response.budget import RunCost
 from prbayes.response.distributions import prior_draws, refuse_without_density
 from prbayes.response.inputs import Inputs
@@ -81,42 +81,41 @@ class Reweighted(Propagation):
     max_points : int, optional
         Largest number of responses, refinement included; 32 n by default.
     emulator : str, Surface or regressor, optional
-        What says the response between the runs, so that a few dozen or hundred of them are enough
-        for several inputs. ``"auto"`` takes the best of a few surfaces for each output, by their
-        errors at runs that were left out, mixed with the runs' own weights as far as these errors
-        ask for it; not with one input, discrete ones, or an n above 2000, where runs alone are as
-        good. Or a surface of ``prb.surrogate``, or any regressor with ``fit(X, y)`` and
-        ``predict(X)``. With None the runs stand alone.
+        Predicts the response between the runs: a few dozen or hundred runs are then enough for
+        several inputs. ``"auto"`` takes the best of a few surfaces for each output, by their errors
+        at runs that were left out, mixed with the weighted runs as far as these errors require;
+        not with one input, discrete ones, or an n above 2000, where runs alone are as good. Or a
+        surface of ``prb.surrogate``, or any regressor with ``fit(X, y)`` and ``predict(X)``. With
+        None the runs stand alone.
     coarse : callable, optional
-        A cheap response of the same inputs and outputs that is about the expensive one, such as
-        that of a coarser mesh: the emulator then tells what is between the
-        two, for each output as far as that makes errors at left-out runs smaller. It is called at
-        all runs, and at every one of thousands of points between them, on the same executor; none
-        of its calls is counted or stored. Where it raises, or is not finite, the emulator goes on
-        without it, and the log says so.
+        A cheap response of the same inputs and outputs that approximates the expensive one, such as
+        that of a coarser mesh. The emulator then models the difference of the two, for each output
+        where that makes errors at left-out runs smaller. It is called at all runs, and at thousands
+        of points between them, on the same executor; its calls are neither counted nor stored.
+        Where it raises, or is not finite, the emulator does without it, which is logged.
     executor : Executor, optional
         Where the response is computed: threads, processes, loky,
         ``dask.distributed.Client().get_executor()``, ``mpi4py.futures.MPIPoolExecutor()``. In this
         process by default.
     store : path-like, optional
-        A folder that keeps every computed response, by simulator: none is computed again, also in
-        another run; but one, at the first use of each simulator, to see that the response is still
-        the same one: code, or variables of a closure, may have changed, which is refused.
+        A folder with every computed response, by simulator: none is computed again, also in
+        another run. One response is recomputed at the first use of each simulator: a changed
+        response, by its code or by variables of a closure, is refused.
     version : str, optional
-        Names the response as it is, such as ``"2"`` or ``"mesh 3"``: runs of different versions are
-        kept apart in the store, as are those of other names or another order of several outputs,
-        and none is computed again. You then answer for a new name whenever the response changes;
-        needed for one that is random, or minutes long.
+        Name of the response as it is, such as ``"2"`` or ``"mesh 3"``: the store separates runs of
+        different versions, and of other names or another order of several outputs, and recomputes
+        none. You are then responsible for a new name whenever the response changes; necessary for
+        a response that is random, or minutes long.
     on_failure : Abort, Replace or Retry
-        What to do with a response that raises, and if asked for with one that is NaN: by default
-        that is a result, of a specimen without response.
+        Policy for a response that raises, and by option for one that is NaN: by default NaN is a
+        specimen without response.
     retry_failed : bool
-        Whether points that the store has as failed are computed again. Under `Abort` they are in
-        any case: a failure is no result.
+        Whether points that failed according to the store are computed again. Under `Abort` they
+        are in any case: a failure is no result.
     timeout : float, optional
-        Seconds that a response may take before it is one that failed; with executors of processes
-        only, Dask's among them, as nothing else ends one that hangs. What hangs outside Python ends
-        with its worker, half as long again and a second later; Dask then tries it on other workers.
+        Seconds after which a response has failed; with executors of processes only, Dask's among
+        them, as nothing else ends a response that hangs. What hangs outside Python ends with its
+        worker, half as long again and a second later; Dask then tries it on other workers.
 
     References
     ----------
@@ -143,7 +142,13 @@ class Reweighted(Propagation):
         positive_integer(self.random_seed, "Reweighted: random_seed", minimum=0)
         refuse_max_lost(self.max_lost, "Reweighted")
         _refuse_emulator(self.emulator)
-        _refuse_coarse(self.coarse, self.emulator)
+        if self.coarse is not None:
+            refuse_coarse("Reweighted: coarse", self.coarse)
+            if self.emulator is None:
+                raise ValueError(
+                    "Reweighted: coarse: got a coarse response and no emulator to follow it, "
+                    'expected emulator="auto", or a surface, beside it'
+                )
         if (
             self.max_points is not None
             and positive_integer(self.max_points, "Reweighted: max_points") < self.n
@@ -174,13 +179,13 @@ class Reweighted(Propagation):
     def check_simulator(self, name: str, inputs: Inputs, target: Discrepancy) -> None:
         """Refuse inputs and metrics that stored responses cannot serve, and idle emulators."""
         if inputs.epistemic:
-            each = [str(e.name or e) for e in inputs.epistemic]
-            names = ", ".join(each)
+            labels = [str(e.name or e) for e in inputs.epistemic]
+            names = ", ".join(labels)
             if not any(above in inputs.roots for above in ancestors(inputs.epistemic)):
                 raise TypeError(
                     f"{name}: {names} goes into the response as data whose value may change, while "
                     "responses are stored; pass the value itself, such as "
-                    f"{each[0]}.get_value(), or use propagation=prb.Resimulated()"
+                    f"{labels[0]}.get_value(), or use propagation=prb.Resimulated()"
                 )
             raise TypeError(
                 f"{name}: {names} goes into the response as a model variable (epistemic), so "
@@ -194,10 +199,23 @@ class Reweighted(Propagation):
                 "in a FunctionMetric write function(simulated, observed, weights) with "
                 "weighted=True, or use propagation=prb.Resimulated()"
             )
-        if self.emulator is not None and not isinstance(self.emulator, str):
-            self._refuse_emulating(name, inputs)
+        is_custom = self.emulator is not None and not isinstance(self.emulator, str)
+        if is_custom and not has_points_between_runs(inputs):
+            kinds = ", ".join(f"{x.dtype}, {x.type.ndim} dimensions" for x in inputs.aleatory)
+            raise TypeError(
+                f"{name}: emulator: got {type(self.emulator).__name__} for aleatory inputs "
+                f"({kinds}), expected several continuous numbers for each specimen; of one number "
+                "the runs are a quadrature rule, and discrete ones are computed: leave emulator= "
+                "out"
+            )
         if self.coarse is not None:
-            self._refuse_following(name, inputs)
+            if not self.emulates(inputs):
+                raise TypeError(
+                    f"{name}: coarse: got a coarse response for {inputs.dimensions} aleatory "
+                    f"number(s) and n = {self.n}, expected several continuous numbers for each "
+                    f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
+                    "leave coarse= out"
+                )
             refuse_wrong_arity(f"{name}: coarse", self.coarse, inputs)
 
     def check_likelihood(self, name: str) -> None:
@@ -211,34 +229,13 @@ class Reweighted(Propagation):
                     f"metric=prb.ProbabilityResidual(), or leave {option}= out"
                 )
 
-    def _refuse_emulating(self, name: str, inputs: Inputs) -> None:
-        """Raise if a user's emulator has nothing to do."""
-        if has_points_between_runs(inputs):
-            return
-        kinds = ", ".join(f"{x.dtype}, {x.type.ndim} dimensions" for x in inputs.aleatory)
-        raise TypeError(
-            f"{name}: emulator: got {type(self.emulator).__name__} for aleatory inputs "
-            f"({kinds}), expected several continuous numbers for each specimen; of one number the "
-            "runs are a quadrature rule, and discrete ones are computed: leave emulator= out"
-        )
-
-    def _refuse_following(self, name: str, inputs: Inputs) -> None:
-        """Raise if there is no emulator that could follow a coarse response."""
-        if not self.emulates(inputs):
-            raise TypeError(
-                f"{name}: coarse: got a coarse response for {inputs.dimensions} aleatory "
-                f"number(s) and n = {self.n}, expected several continuous numbers for each "
-                f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
-                "leave coarse= out"
-            )
-
     def emulates(self, inputs: Inputs) -> bool:
         """Return whether responses between the runs are emulated."""
         if self.emulator is None:
             return False
-        # Whoever asks for more than an emulator takes has a response that costs little.
-        wanted = not isinstance(self.emulator, str) or self.n <= MOST_RUNS
-        return wanted and has_points_between_runs(inputs)
+        # With more runs the response is cheap.
+        is_worthwhile = not isinstance(self.emulator, str) or self.n <= MOST_RUNS
+        return is_worthwhile and has_points_between_runs(inputs)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Compute the responses at the first design points."""
@@ -267,18 +264,6 @@ def _refuse_emulator(emulator: Any) -> None:
             f'Reweighted: emulator: got {type(emulator).__name__}, expected "auto", None, a '
             "surface such as prb.surrogate.RadialBasis(), or a regressor with fit(X, y) and "
             "predict(X)"
-        )
-
-
-def _refuse_coarse(coarse: Any, emulator: Any) -> None:
-    """Raise if it is no coarse response, or nothing would follow it."""
-    if coarse is None:
-        return
-    refuse_coarse("Reweighted: coarse", coarse)
-    if emulator is None:
-        raise ValueError(
-            "Reweighted: coarse: got a coarse response and no emulator to follow it, expected "
-            'emulator="auto", or a surface, beside it'
         )
 
 
@@ -319,7 +304,8 @@ class ReweightedBound(Bound):
         coarse = None
         if config.coarse is not None:
             coarse = CoarseResponse(config.coarse, responses, config.executor)
-        self._sampler = DesignSampler(name, inputs, config, coarse)
+        emulator = config.emulator if config.emulates(inputs) else None
+        self._sampler = DesignSampler(name, inputs, config.random_seed, emulator, coarse)
         self._log_weights = WeightFunction(inputs, self._sampler.density)
         self._data = {key: np.array(data.get_value()) for key, data in inputs.data.items()}
         # Arrays of PyMC's graphs, once there is one.
@@ -528,7 +514,7 @@ class ReweightedBound(Bound):
     def _graph_basis(self, values: Floats) -> Basis:
         """Return the basis for compiled graphs; its form stays the same while the design grows."""
         most = self.config.most
-        if self.config.emulates(self.inputs):
+        if self._sampler.emulator is not None:
             most = max(most, SIZES.largest)
         return self.target.basis(values, _MAX_BASIS * len(values) / most)
 

@@ -55,6 +55,8 @@ def find_roots(
 ) -> Roots:
     """Find the roots of each specimen from several starts.
 
+    Specimens whose starts all have no response have no root.
+
     Parameters
     ----------
     response : callable
@@ -67,11 +69,6 @@ def find_roots(
         Bounds of the search.
     gap : float
         Largest misfit above the specimen's best, in nats.
-
-    Returns
-    -------
-    Roots
-        Specimens whose starts all have no response have none.
 
     References
     ----------
@@ -120,17 +117,10 @@ def find_roots(
         # A misfit of 1e-8 nats is zero; a rejected step that is this short is rounding.
         unfinished = (misfit[active] > 1e-8) & (length > 1e-11) & (damping[active] < 1e11)
         active = active[unfinished]
-    kept = _distinct(specimen, z, misfit, jacobian, gap, width)
+    rows = _distinct(specimen, z, misfit, jacobian, gap, width)
     # By place: misfits of nearly zero are in an order of rounding.
-    order = np.lexsort((*z[kept].T[::-1], specimen[kept]))
-    kept = kept[order]
-    return Roots(
-        specimen=specimen[kept],
-        z=z[kept],
-        misfit=misfit[kept],
-        residual=residual[kept],
-        jacobian=jacobian[kept],
-    )
+    rows = rows[np.lexsort((*z[rows].T[::-1], specimen[rows]))]
+    return Roots(specimen[rows], z[rows], misfit[rows], residual[rows], jacobian[rows])
 
 
 def _damped_step(jacobian: Floats, residual: Floats, damping: Floats, width: Floats) -> Floats:
@@ -159,25 +149,31 @@ def _distinct(
     np.minimum.at(least, specimen, misfit)
     candidates = np.flatnonzero(np.isfinite(misfit) & (misfit <= least[specimen] + gap))
     candidates = candidates[np.lexsort((misfit[candidates], specimen[candidates]))]
-    count = np.bincount(specimen[candidates], minlength=len(least))
-    if not count.any():
+    if not len(candidates):
         return candidates
-    slot = np.arange(len(candidates)) - np.repeat(np.cumsum(count) - count, count)
-    table = np.full((len(least), count.max()), -1)
-    table[specimen[candidates], slot] = candidates
-    kept = table >= 0
+    slots = rows_by_specimen(specimen[candidates])
+    table = np.where(slots >= 0, candidates[slots], -1)
+    is_root = table >= 0
     for k in range(1, table.shape[1]):
         # Each specimen's k-th candidate, beside the better ones.
         better = table[:, :k]
-        away = z[table[:, k], None] - z[better]
+        difference = z[table[:, k], None] - z[better]
         # In units of the box, and in standard deviations of the Gauss-Newton approximation.
-        distance = np.abs(away / width).max(axis=2)
-        standard = np.einsum("nkmd,nkd->nkm", jacobian[better], away)
+        distance = np.abs(difference / width).max(axis=2)
+        standard = np.einsum("nkmd,nkd->nkm", jacobian[better], difference)
         is_within_error = (standard**2).sum(axis=2) < 1.0
         is_same = (distance < 1e-6) | (is_within_error & (distance < 1e-2))
-        is_distinct = ~(is_same & kept[:, :k]).any(axis=1)
-        kept[:, k] &= is_distinct
-    return table[kept]
+        is_root[:, k] &= ~(is_same & is_root[:, :k]).any(axis=1)
+    return table[is_root]
+
+
+def rows_by_specimen(specimen: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the rows of each specimen, (N, most), filled up with -1; specimens are ascending."""
+    count = np.bincount(specimen)
+    slot = np.arange(len(specimen)) - np.repeat(np.cumsum(count) - count, count)
+    table = np.full((len(count), count.max()), -1)
+    table[specimen, slot] = np.arange(len(specimen))
+    return table
 
 
 def gabriel_neighbours(z: Floats, most: int = 32) -> NDArray[np.bool_]:
@@ -215,12 +211,12 @@ def nearest_starts(
     First the runs whose outputs are nearer to the specimen's than those of all their neighbours:
     each root lies in the basin of such a run, unless it lies between runs. Then the runs with the
     nearest outputs. S is `count`, or the largest number of the former if that is larger. The
-    spread, (m,) or (N, m), is infinite for outputs that were not measured.
+    spread, (m,) or (N, m), is infinite for outputs without a reading.
     """
     unit = np.broadcast_to(spread, y.shape)
     distance = np.zeros((len(y), len(run_y)))
-    for column, other, of_column in zip(y.T, run_y.T, unit.T, strict=True):
-        distance += ((column[:, None] - other) / of_column[:, None]) ** 2
+    for measured, simulated, scale in zip(y.T, run_y.T, unit.T, strict=True):
+        distance += ((measured[:, None] - simulated) / scale[:, None]) ** 2
     nearest = [distance[:, row].min(axis=1, initial=np.inf) for row in neighbours]
     least = np.array(nearest).T
     is_minimum = distance <= least

@@ -1,4 +1,4 @@
-"""Reports: results of any origin become sections, which are data, and these a document."""
+"""Reports of results: sections as data, written as documents."""
 
 from prbayes.reports.section import Section
 

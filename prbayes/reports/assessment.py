@@ -19,6 +19,7 @@ from prbayes.reports.numbers import (
     percentage,
     plus_minus,
     probability,
+    rows_table,
     sample_sd,
     shown,
     span,
@@ -27,7 +28,6 @@ from prbayes.reports.numbers import (
 from prbayes.reports.schema import CALLED, kind_of_decision
 from prbayes.reports.section import Section
 from prbayes.reports.summary import verdict
-from prbayes.reports.tables import rows_table
 from prbayes.results.diagnose import Diagnosis
 from prbayes.validation.area_test import ValidityTest, u_values
 from prbayes.validation.conditions import DIRECTION, Comparable, comparables
@@ -53,9 +53,9 @@ def diagnostics(m: Material) -> list[Section]:
     if rows:
         about = (
             "Responses were computed once, and weighted for each set of hyperparameters. "
-            "The effective sample size of the weights says on how many of them an answer rests; "
+            "The effective sample size of the weights is the number of responses behind an answer; "
             "the mean weight is 1 where the design covers the population; "
-            "lost mass is that of points without a response."
+            "lost mass is the probability of points without a response."
         )
         sections.append(Section("Support by stored responses", about, rows_table(rows), level=3))
     return sections
@@ -63,7 +63,7 @@ def diagnostics(m: Material) -> list[Section]:
 
 def _sentences(diagnosis: Diagnosis | None) -> tuple[str, ...]:
     if diagnosis is None:
-        return ("not looked at, because that needs the model, which was not given.",)
+        return ("not diagnosed, because that needs the model, which was not given.",)
     clear = diagnosis.all_clear
     messages = diagnosis.messages or (f"{clear[0].lower()}{clear[1:]}",)
     return (*messages, *diagnosis.notes, *diagnosis.untested)
@@ -134,8 +134,8 @@ def failures(m: Material) -> list[Section]:
     if not rows:
         return []
     first = list(rows.values())[:20]
-    about = f"{len(rows)} responses failed; what took their place is no result."
-    more = "" if len(first) == len(rows) else f" The first {len(first)} are told."
+    about = f"{len(rows)} responses failed; the values that replaced them are no results."
+    more = "" if len(first) == len(rows) else f" The first {len(first)} are shown."
     return [Section("Failed responses", about + more, rows_table(first), level=3)]
 
 
@@ -157,14 +157,14 @@ def validity(m: Material) -> list[Section]:
         "between 0 and 1. "
         "The statistic is the area between the distribution of the u-values and the uniform one; "
         "a larger area than the critical value rejects the model. "
-        "Of u the area sees a wrong mean, of |2u - 1| a wrong spread. "
-        "That a model is not rejected does not prove it."
+        "The area of u detects a wrong mean, that of |2u - 1| a wrong spread. "
+        "A model that is not rejected is not proved."
     )
     if any(in_directions(test) for test in m.tests.values()):
         about += (
-            " Several outputs of a specimen are seen in some directions of the predicted ones, in "
-            "which a wrong correlation is a wrong spread; the statistic is the mean over these of "
-            "the areas of u and of |2u - 1|."
+            " Several outputs of a specimen are projected on directions of the predicted ones, in "
+            "which a wrong correlation is a wrong spread; the statistic is the mean over the "
+            "directions of the areas of u and of |2u - 1|."
         )
     if n_tests > 1:
         alpha = min(sum(test.alpha for test in m.tests.values()), 1.0)
@@ -173,7 +173,7 @@ def validity(m: Material) -> list[Section]:
             f"{percentage(alpha)} of cases."
         )
     verdicts = [verdict(label, test, m) for label, test in m.tests.items()]
-    nulls = dict.fromkeys(f"Held to be true: {test.null}." for test in m.tests.values())
+    nulls = dict.fromkeys(f"Null hypothesis: {test.null}." for test in m.tests.values())
     section = Section("Validity", (*verdicts, about, *nulls), rows_table(rows))
     return [section, *_validation_data(m)]
 
@@ -203,8 +203,8 @@ def _validation_data(m: Material) -> list[Section]:
     if not rows:
         return []
     about = (
-        "Specimens that the calibration has not seen, and what was predicted of them: the median "
-        f"and the range that holds {INTERVAL:.0%} of the predicted responses. ∞ is a failure."
+        "Specimens that were not used in the calibration, and their prediction: the median and "
+        f"the range with {INTERVAL:.0%} of the predicted responses. ∞ is a failure."
     )
     return [Section("Data of the test", about, rows_table(with_zeros(rows)), level=3)]
 
@@ -246,7 +246,7 @@ def specimens(m: Material) -> list[Section]:
         "near 0 or 1 is at the edge of what was predicted."
     )
     if len(rows) > 40:
-        about += f" The first 40 of {len(rows)} values are told."
+        about += f" The first 40 of {len(rows)} values are shown."
     return [Section("Specimens of the test", about, rows_table(rows[:40]), level=3)]
 
 

@@ -10,22 +10,21 @@ import xarray as xr
 
 from prbayes.plots._labels import named
 from prbayes.reports.material import Material
-from prbayes.reports.numbers import number, percentage, plus_minus
+from prbayes.reports.numbers import number, percentage, plus_minus, rows_table
 from prbayes.reports.schema import kind_of_decision
 from prbayes.reports.section import Section
-from prbayes.reports.tables import rows_table
 
 
 def decision(m: Material) -> list[Section]:
     """Return the answers for a decision, a table for each kind of question."""
     if not m.decisions:
         return []
-    about = ["These answers count that the hyperparameters are uncertain, as the posterior says."]
+    about = ["These answers include the uncertainty of the hyperparameters by the posterior."]
     if m.rejected:
         about.insert(
             0,
-            "The calibrated model was rejected, see Validity: these are the answers of a model "
-            "that data contradict, and not to be relied on.",
+            "The calibrated model was rejected, see Validity: these answers are of a model that "
+            "data contradict. Do not rely on them.",
         )
     sections = [Section("Decision", about)]
     for kind, (title, text, rows_of) in _KINDS.items():

@@ -17,9 +17,9 @@ import xarray as xr
 
 from prbayes._validate import called, file_path, flag, folder_path, plain_text
 from prbayes.optimize.optimum import Optimum
+from prbayes.reports.numbers import cells
 from prbayes.reports.section import Section
 from prbayes.reports.sections import sections_of
-from prbayes.reports.tables import cells
 from prbayes.validation.area_test import ValidityTest
 
 # Markup of Markdown, or of HTML inside it (CommonMark 0.31, 2.4; tables and strikethrough of

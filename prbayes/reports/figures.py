@@ -187,8 +187,7 @@ ILLUSTRATIONS = (
         title="Pairs of outputs",
         alt="Measured specimens as points, one panel per pair of outputs, with outlines of the "
         "calibrated population.",
-        caption="Measured specimens, and regions that hold 50% and 89% of the calibrated "
-        "population.",
+        caption="Measured specimens, and regions with 50% and 89% of the calibrated population.",
     ),
     Illustration(
         after="Optimum",
@@ -196,7 +195,7 @@ ILLUSTRATIONS = (
         request=_optimizer,
         title="Path of the optimiser",
         alt="Objective, and hyperparameters, against the number of evaluations.",
-        caption="The objective at the points that the optimiser asked for.",
+        caption="The objective at the points that the optimiser evaluated.",
     ),
     Illustration(
         after="Optimum",
@@ -204,7 +203,7 @@ ILLUSTRATIONS = (
         request=_landscape,
         title="Objective around the optimum",
         alt="Objective over the hyperparameters, with the optimum marked.",
-        caption="How the objective rises around the optimum.",
+        caption="The objective around the optimum.",
     ),
     Illustration(
         after="Posterior",
@@ -212,7 +211,7 @@ ILLUSTRATIONS = (
         request=_posterior,
         title="Marginal posteriors",
         alt="Posterior density of each hyperparameter, with its interval.",
-        caption="What is known of each hyperparameter after the calibration.",
+        caption="Posterior distribution of each hyperparameter after the calibration.",
     ),
     Illustration(
         after="Posterior",
@@ -220,7 +219,7 @@ ILLUSTRATIONS = (
         request=_population,
         title="Calibrated population of the inputs",
         alt="Distribution of each input over the specimens, with a band for its uncertainty.",
-        caption="How the inputs vary from specimen to specimen.",
+        caption="Variation of the inputs from specimen to specimen.",
     ),
     Illustration(
         after="Posterior",
@@ -229,7 +228,7 @@ ILLUSTRATIONS = (
         title="Stages of the sampler",
         alt="Tempering, acceptance rate and moves against the stages of the sampler, "
         "one line per chain.",
-        caption="How the sampler went from the prior to the posterior.",
+        caption="Stages of the sampler from the prior to the posterior.",
     ),
     Illustration(
         after="Comparison",
@@ -246,8 +245,8 @@ ILLUSTRATIONS = (
         title="Measured and predicted responses",
         alt="Distribution functions of the measured responses, as steps, and of the predicted ones "
         "with a band, one panel per condition or output.",
-        caption="Specimens that were not used in the calibration, beside what was predicted of "
-        "them; the band holds 89% of the populations that the calibration leaves possible.",
+        caption="Specimens that were not used in the calibration, beside their prediction; the "
+        "band contains 89% of the populations of the posterior.",
     ),
     Illustration(
         after="Validity",
@@ -256,11 +255,11 @@ ILLUSTRATIONS = (
         title="Distribution of the u-values",
         alt="Step curve of the sorted u-values against the diagonal, "
         "with the area between them, and of one output an acceptance band.",
-        caption="Where the measured responses stand in the predicted distribution. "
-        "A right model keeps near the diagonal; the shaded area is the statistic. "
-        "Of one output, the band holds the whole curve of a right model in all but a share of "
-        "cases as large as the test's level; of several there is a line for each direction in "
-        "which they are seen, and no band. Curves of a model that is rejected are red.",
+        caption="Places of the measured responses in the predicted distribution. "
+        "A right model is near the diagonal; the shaded area is the statistic. "
+        "With one output, the band contains the whole curve of a right model with probability one "
+        "minus the test's level; several outputs have a line for each direction, and no band. "
+        "Curves of a rejected model are red.",
     ),
     Illustration(
         after="Decision",
@@ -269,8 +268,9 @@ ILLUSTRATIONS = (
         title="Shares of hyperparameters and inputs",
         alt="Share of each hyperparameter in the variance of the decision quantity, and of each "
         "input in that of the response.",
-        caption="What moves the decision: a dot is the share of a factor by itself, a diamond what "
-        "is left when all others are known, with two standard errors to either side.",
+        caption="Sensitivity of the decision: a dot is the share of a factor by itself, a diamond "
+        "the share that is left when all others are known, with two standard errors to either "
+        "side.",
     ),
 )
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from prbayes._validate import plain_text
-from prbayes.reports.tables import cells
+from prbayes.reports.numbers import cells
 
 # Beginnings of files (PNG: ISO/IEC 15948, 5.2; JPEG: ITU T.81, B.1, marker SOI).
 _BEGINNINGS = (

@@ -30,16 +30,17 @@ from prbayes.reports.material import Material, gather
 from prbayes.reports.numbers import (
     NOTHING,
     alike,
+    correlation_table,
     counted,
     described,
     number,
     places,
+    rows_table,
     sample_sd,
     with_zeros,
 )
 from prbayes.reports.section import Section
 from prbayes.reports.summary import answers, next_steps, summary
-from prbayes.reports.tables import rows_table
 from prbayes.response.outputs import SINGLE_OUTPUT
 
 
@@ -71,8 +72,7 @@ def sections_of(*, pictures: bool, **results: Any) -> tuple[Section, ...]:
 def _summary(m: Material) -> list[Section]:
     if not (m.results or m.tests or m.description):
         return []
-    rows = answers(m)
-    sections = [Section("Summary", summary(m), rows_table(rows) if rows else None)]
+    sections = [Section("Summary", summary(m), rows_table(answers(m)))]
     steps = next_steps(m)
     if steps:
         sections.append(Section("What to do next", steps, level=3))
@@ -128,7 +128,7 @@ def data(m: Material) -> list[Section]:
             continue
         n = len(_shown_columns(y))
         if n < y.shape[1]:
-            text.append(f"{name}: {n} of {y.shape[1]} outputs are told.")
+            text.append(f"{name}: {n} of {y.shape[1]} outputs are shown.")
         if y.shape[1] > 1:
             correlations.append(_correlations(name, m))
     table = rows_table(with_zeros(rows))
@@ -161,25 +161,20 @@ def _shown_columns(y: Floats) -> list[int]:
 
 
 def _correlations(name: str, m: Material) -> Section:
-    """Return the correlations of outputs."""
-    y = m.observed[name]
-    names = m.outputs[name].names
-    columns = _shown_columns(y)
-    rows = []
-    for i in columns:
-        row = {"": names[i]}
-        for j in columns:
-            pairs = y[:, [i, j]]
-            pairs = pairs[np.isfinite(pairs).all(axis=1)]
-            r = correlation(pairs, np.ones(len(pairs))) if len(pairs) > 2 else math.nan
-            text = NOTHING if math.isnan(r) else f"{r + 0.0:.3f}"
-            row[names[j]] = "1" if i == j else text
-        rows.append(row)
+    """Return the correlations of outputs, each of the specimens that have both."""
+    y = m.observed[name][:, _shown_columns(m.observed[name])]
+    r = np.full((y.shape[1], y.shape[1]), np.nan)
+    for i, j in np.ndindex(r.shape):
+        pairs = y[:, [i, j]]
+        pairs = pairs[np.isfinite(pairs).all(axis=1)]
+        if len(pairs) > 2:
+            r[i, j] = correlation(pairs, np.ones(len(pairs)))
+    names = [m.outputs[name].names[j] for j in _shown_columns(m.observed[name])]
     about = (
         f"Correlations of the measured outputs of {name}, each of the specimens that have both; "
         "those that failed are in none."
     )
-    return Section(f"Correlations of {name}", about, rows_table(rows), level=3)
+    return Section(f"Correlations of {name}", about, correlation_table(names, r, 3), level=3)
 
 
 def _values(m: Material) -> Section:
@@ -228,7 +223,7 @@ def metric(m: Material) -> list[Section]:
     lines = [f"{name}: {metric}." for name, metric in metrics.items()]
     compared = [line for table in m.calibrations.values() for line in compared_in(table)]
     text = (about, *lines, *dict.fromkeys(compared))
-    return [Section("Metric and epsilon", text, rows_table(rows) if rows else None)]
+    return [Section("Metric and epsilon", text, rows_table(rows))]
 
 
 def _log_likelihood(rows: list[dict[str, Any]]) -> Section:
@@ -355,7 +350,7 @@ def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any], names: Se
     if rival["comparable"]:
         judged = "the data could as well come from there"
     else:
-        judged = "the data fit it less well; a posterior tells how much it counts"
+        judged = "the data fit it less well; a posterior gives its weight"
     return f"Another optimum is at {at}, with discrepancy {discrepancy}: {judged}."
 
 
@@ -381,11 +376,12 @@ def posteriors(m: Material) -> list[Section]:
         title = _titled("Posterior", label, m.posteriors)
         table = rows_table(_posterior_rows(tree, list(values), names))
         sections.append(Section(title, text, table))
-        rows = _correlation_rows({name: values[name] for name in names})
-        if rows:
-            about = "Correlations of the draws: what is 1 or -1 the data hardly tell apart."
+        varying = [name for name in names if np.ptp(values[name]) > 0]
+        if 2 <= len(varying) <= 8:  # more do not fit on a page
+            r = np.corrcoef([values[name] for name in varying])
+            about = "Correlations of the draws: the data hardly distinguish a pair near 1 or -1."
             title = _titled("Correlations of the hyperparameters", label, m.posteriors)
-            sections.append(Section(title, about, rows_table(rows), level=3))
+            sections.append(Section(title, about, correlation_table(varying, r, 2), level=3))
     return sections
 
 
@@ -438,21 +434,6 @@ def _posterior_rows(
     return rows
 
 
-def _correlation_rows(draws: dict[str, Floats]) -> list[dict[str, str]]:
-    """Return the correlations of draws; none of one variable, or of more than fit on a page."""
-    names = [name for name, values in draws.items() if np.ptp(values) > 0]
-    if not 2 <= len(names) <= 8:
-        return []
-    r = np.corrcoef([draws[name] for name in names])
-    rows = []
-    for i, name in enumerate(names):
-        row = {"": name}
-        for j, column in enumerate(names):
-            row[column] = "1" if i == j else f"{r[i, j] + 0.0:.2f}"
-        rows.append(row)
-    return rows
-
-
 # -- comparison ------------------------------------------------------------------------------
 
 
@@ -480,7 +461,7 @@ def comparison(m: Material) -> list[Section]:
     if scores:
         about = (
             "Discrepancy of the population at each estimate, under each metric, "
-            "whatever it was calibrated with."
+            "whichever metric it was calibrated with."
         )
         sections.append(Section("Scores under each metric", about, rows_table(scores), level=3))
     return sections

@@ -61,13 +61,7 @@ def budget() -> Budget:
 
 @contextmanager
 def limited(max_seconds: float | None, max_runs: int | None) -> Iterator[None]:
-    """Limit the time and runs of the block; a spent budget raises `BudgetError`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a limit is not a positive number.
-    """
+    """Limit the time and runs of the block; a spent budget raises `BudgetError`."""
     if max_seconds is not None:
         positive_number(max_seconds, "max_seconds")
     if max_runs is not None:
@@ -88,24 +82,12 @@ def unlimited() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class RunCost:
-    """Runs of the response that a propagation needs.
+    """Runs of the response that a propagation needs."""
 
-    Attributes
-    ----------
-    first : int
-        Runs at the first use of the model.
-    per_theta : int
-        Runs for each value of the hyperparameters.
-    most : int or None
-        Largest number of runs; None without a limit.
-    growth : str
-        The condition for more runs, as a clause.
-    """
-
-    first: int
-    per_theta: int
-    most: int | None
-    growth: str
+    first: int  # at the first use of the model
+    per_theta: int  # for each value of the hyperparameters
+    most: int | None  # in all; None without a limit
+    growth: str  # condition for more runs, as a clause
 
 
 @dataclass(frozen=True)

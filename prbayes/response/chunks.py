@@ -76,13 +76,7 @@ class Tally:
     failed: dict[bytes, Failure] = field(default_factory=dict)  # by inputs
 
     def aligned(self, chunk: Chunk) -> Floats:
-        """Return the responses of a chunk, with columns in the order of the first mapping's keys.
-
-        Raises
-        ------
-        ResponseError
-            If mappings have other keys than the first one.
-        """
+        """Return the responses of a chunk, with columns in the order of the first chunk."""
         if chunk.named is None:
             return chunk.values
         if self.named is None:
@@ -123,14 +117,7 @@ def respond(
     """Return responses at points, shape (n, *event), from the store or computed and then stored.
 
     After the first chunk ``on_start`` is called with the number of missing runs and the seconds
-    that one of them takes.
-
-    Raises
-    ------
-    ResponseError
-        If a response fails and the policy does not go on, or if it is no response.
-    StoreError
-        If the store holds other values than the response gives.
+    that one of them takes. `ResponseError` and `StoreError` end the calculation.
     """
     policy = settings.on_failure
     _verify_store(settings, points, tally)
@@ -315,15 +302,8 @@ def chunks(
 ) -> Iterator[list[Finished]]:
     """Compute the responses at some rows of the points, and yield chunks as they are finished.
 
-    After a failure that is not tolerated, or a spent budget, no chunk begins; those that have begun
-    are yielded.
-
-    Raises
-    ------
-    ResponseError
-        After all chunks, if a worker was lost, or a result is no response.
-    BudgetError
-        After all chunks, if a budget was spent.
+    After a failure that is not tolerated, a lost worker, or a spent budget, no chunk begins; those
+    that have begun are yielded before the error is raised.
     """
     work = _work(settings)
     limits = capacity(settings.executor)

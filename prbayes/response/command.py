@@ -43,7 +43,7 @@ def command(
         The program and its arguments. A program without a folder is looked up on the path, once.
     inputs : sequence of str
         Names of the simulator's inputs, in their order. ``{name}`` or ``{name:.6e}`` in an argument
-        or a template stands for the value; other braces are left alone.
+        or a template is replaced by the value; other braces are left alone.
     read : callable
         ``read(folder)`` returns the response, in the unit of the observed values, from the files in
         the folder: a number, or for several outputs an array, shape (m,), or a mapping of numbers
@@ -202,17 +202,7 @@ class Program:
                     ) from None
 
     def __call__(self, *values: float) -> float | Floats | dict[str, float | Floats]:
-        """Run the program for one specimen, and read the response.
-
-        Raises
-        ------
-        RuntimeError
-            If the program ends with another code than zero, or its results cannot be read.
-        TimeoutError
-            If it takes too long; it is ended then, with all that it started.
-        ValueError
-            If there are more or fewer inputs than names.
-        """
+        """Run the program for one specimen, and read the response."""
         if len(values) != len(self.inputs):
             hint = ""
             if len(values) == 1 and np.size(values[0]) == len(self.inputs):

@@ -203,10 +203,7 @@ def _structure(
 ) -> tuple[Hashable, ...]:
     """Return the operations, constants and connections of a graph, without names.
 
-    Raises
-    ------
-    _NotCacheableError
-        If the graph has random numbers, operations outside PyTensor, or many constants.
+    Graphs with random numbers, operations outside PyTensor or many constants are not cacheable.
     """
     number: dict[Variable, int] = {}
     structure: list[Hashable] = []

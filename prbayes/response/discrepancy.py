@@ -15,16 +15,7 @@ from prbayes.response.call import scalar
 
 
 class ModelDiscrepancy(ABC):
-    """The error of a response over a condition such as time, temperature or load.
-
-    Parameters
-    ----------
-    seen : array_like, shape (n,)
-        Conditions under which there are data, in any unit; its ends count.
-    shape : callable, optional
-        ``shape(condition)`` of shape (...) for one coefficient, or (..., m) for m; by default a
-        straight line from 0 at the lower end of ``seen`` to 1 at the upper one.
-    """
+    """The error of a response over a condition such as time, temperature or load."""
 
     def __init__(self, seen: ArrayLike, shape: Callable[[Floats], Any] | None = None) -> None:
         label = f"prb.response.{type(self).__name__}"

@@ -154,11 +154,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     """Return the inverse distribution function of ``dist`` at u, shape (n, *event).
 
     A multivariate normal takes its mean plus Cholesky factor times standard normal quantiles.
-
-    Raises
-    ------
-    TypeError
-        If the distribution is discrete or has no inverse distribution function in PyMC.
+    Discrete distributions and those without one in PyMC are refused.
     """
     op = dist.owner.op
     other = "use propagation=prb.Reweighted() or prb.Fresh()"
@@ -279,13 +275,7 @@ def prior_draws(roots: Sequence[TensorVariable], k: int, seed: int) -> list[Floa
 
 
 class PriorPoints:
-    """Points of the unit cube mapped to the prior, each variable given those that it depends on.
-
-    Raises
-    ------
-    TypeError
-        If a variable has no inverse distribution function.
-    """
+    """Points of the unit cube mapped to the prior, each variable given those that it depends on."""
 
     @untraced()
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
@@ -350,19 +340,10 @@ class PopulationSampler:
     def __call__(
         self, params: Sequence[Any], n: int, rng: np.random.Generator
     ) -> tuple[list[Floats], list[Floats]]:
-        """Draw n specimens from each of k populations.
+        """Draw n specimens from each of k populations, at roots (k, *shape).
 
-        Parameters
-        ----------
-        params : sequence of ndarray, shapes (k, *shape)
-            Values of the roots.
-        n : int
-        rng : Generator
-
-        Returns
-        -------
-        aleatory : list of ndarray, shapes (k, n, *event)
-        epistemic : list of ndarray, shapes (k, 1, *event), or (*event) where they depend on no root
+        Aleatory inputs have shapes (k, n, *event); epistemic ones (k, 1, *event), or (*event) where
+        they depend on no root.
         """
         _seed(self._function, rng)
         try:

@@ -88,7 +88,7 @@ def refuse_timeout(timeout: object, executor: Executor | None) -> None:
 
 
 class _AlarmError(TimeoutError):
-    """Raised inside a late response; a class of its own, as responses have time limits."""
+    """Raised inside a late response; different from time limits in the response itself."""
 
 
 @contextmanager
@@ -114,7 +114,7 @@ def time_limit(seconds: float | None) -> Iterator[None]:
         except _AlarmError:
             raise TimeoutError(message) from None
         except Exception as error:
-            # Compiled code replaces the alarm by an exception of its own.
+            # Compiled code may replace the alarm by another exception.
             if time.monotonic() - start < seconds:
                 raise
             raise TimeoutError(message) from error
@@ -272,12 +272,9 @@ class Pool:
         return future
 
     def done(self, futures: Iterable[Future[Any]]) -> set[Future[Any]]:
-        """Wait until a future is finished, and return those that are; log a long silence.
+        """Return the finished futures, at least one of them; log a long silence.
 
-        Raises
-        ------
-        ResponseError
-            If there has been no worker for ten minutes.
+        Ten minutes without any worker are an error.
         """
         waiting = list(futures)
         silent, absences = 0.0, 0

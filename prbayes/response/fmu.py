@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from multiprocessing.util import Finalize
 from os import PathLike
 from pathlib import Path
@@ -132,10 +132,7 @@ def fmu(
     flag(reset, "fmu: reset")
     unit, description = _read_unit(file)
     grid = _time_grid(description, times, start_time, stop_time, step)
-
-    def variable(name: str, argument: str) -> Variable:
-        return _variable(description, name, argument)
-
+    variable = partial(_variable, description)
     parameter_values = []
     for name, value in values.items():
         parameter = variable(name, "parameters")
@@ -293,21 +290,23 @@ class Variable:
 
     def converted(self, value: Value, label: str) -> Value:
         """Return a value in the type of the variable, or raise `ValueError`."""
-        expected = "a number"
+        is_text = isinstance(value, str)
         if self.kind == "String":
-            if isinstance(value, str):
-                return value
             expected = "a text"
+            if is_text:
+                return value
         elif self.kind == "Boolean":
+            expected = "0 or 1"
             if value in (0, 1):
                 return bool(value)
-            expected = "0 or 1"
-        elif not isinstance(value, str):
-            if self.kind in _REALS:
+        elif self.kind in _REALS:
+            expected = "a number"
+            if not is_text:
                 return float(value)
-            if float(value).is_integer():
-                return int(value)
+        else:
             expected = "a whole number"
+            if not is_text and float(value).is_integer():
+                return int(value)
         raise ValueError(f"{label}: got {value!r} for {self.name}, expected {expected}")
 
 
@@ -392,19 +391,14 @@ class _TimeGrid:
 def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -> _TimeGrid:
     """Return the points of communication, from the user's arguments and the unit's defaults."""
     interface = description.coSimulation
-    default = description.defaultExperiment
 
-    def number(value: Any, name: str, key: str) -> float | None:
-        if value is None:
-            value = getattr(default, key, None)
-            return None if value is None else float(value)
-        array = real_array(value, f"fmu: {name}")
-        if array.ndim or not np.isfinite(array):
-            raise ValueError(f"fmu: {name}: got {value!r:.60}, expected a finite number")
-        return float(array)
+    def default(key: str) -> float | None:
+        value = getattr(description.defaultExperiment, key, None)
+        return None if value is None else float(value)
 
-    begin = number(start, "start_time", "startTime") or 0.0
-    end = number(stop, "stop_time", "stopTime")
+    begin = default("startTime") if start is None else _finite(start, "start_time")
+    begin = begin or 0.0
+    end = default("stopTime") if stop is None else _finite(stop, "stop_time")
     if times is not None:
         marks = _increasing_times(times, begin, end if stop is not None else None)
     elif end is None or end <= begin:
@@ -414,8 +408,7 @@ def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -
         marks = (end,)
     # 500 steps where neither the user nor the unit states a step, as FMPy does.
     longest = (marks[-1] - begin) / 500
-    size = None if step is None else positive_number(step, "fmu: step")
-    size = number(size, "step", "stepSize")
+    size = default("stepSize") if step is None else float(positive_number(step, "fmu: step"))
     internal = getattr(interface, "fixedInternalStepSize", None)
     is_even = not interface.canHandleVariableCommunicationStepSize
     if size is None and internal is not None:
@@ -434,8 +427,14 @@ def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -
             f"{begin:g} do not reach, expected multiples of the step, as {description.modelName} "
             "takes steps of one size only; pass other times, or step="
         )
-    tolerance = number(None, "", "tolerance")
-    return _TimeGrid(begin, marks, times is not None, size, is_even, tolerance)
+    return _TimeGrid(begin, marks, times is not None, size, is_even, default("tolerance"))
+
+
+def _finite(value: Any, name: str) -> float:
+    array = real_array(value, f"fmu: {name}")
+    if array.ndim or not np.isfinite(array):
+        raise ValueError(f"fmu: {name}: got {value!r:.60}, expected a finite number")
+    return float(array)
 
 
 def _increasing_times(times: Any, begin: float, end: float | None) -> tuple[float, ...]:
@@ -475,17 +474,7 @@ class Simulation:
         return self.unit.name
 
     def __call__(self, *values: float) -> float | Floats | dict[str, Any]:
-        """Simulate one specimen: a number, a curve, or a mapping of these.
-
-        Raises
-        ------
-        RuntimeError
-            If the unit reports a failure, or ends too early.
-        TimeoutError
-            If it takes too long.
-        ValueError
-            If there are more or fewer inputs than variables, or they are of another kind.
-        """
+        """Simulate one specimen: a number, a curve, or a mapping of these."""
         if len(values) != len(self.inputs):
             self._refuse_inputs(self.unit.name, [1] * len(values))
         start_values = [*self.parameters]

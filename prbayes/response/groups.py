@@ -1,4 +1,4 @@
-"""Groups of specimens, such as suppliers or batches, with hyperparameters of their own."""
+"""Groups of specimens, such as suppliers or batches, with their hyperparameters."""
 
 from __future__ import annotations
 
@@ -158,13 +158,7 @@ def refuse_groups(name: str, roots: Iterable[Variable]) -> None:
 
 
 def group_indices(name: str, observed: Any, groups: Groups) -> tuple[NDArray[np.intp], Any]:
-    """Return the number of each specimen's group, (N,), and the observed values without groups.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are no labels of groups, unknown ones, or groups without specimens.
-    """
+    """Return the number of each specimen's group, (N,), and the observed values without groups."""
     labels, values = _labels_and_values(f"{name}: observed", observed, groups.dim)
     texts = [str(label) for label in labels]
     place = {text: i for i, text in enumerate(groups.names)}

@@ -122,10 +122,7 @@ class Inputs:
 def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     """Sort the inputs of a response into aleatory, epistemic and constant ones.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If one is none of the three, if none is aleatory, or if none depends on a model variable.
+    One has to be aleatory, and one to depend on a model variable.
     """
     model_variables: set[Variable] = set(model.basic_RVs)
     arguments: list[Any] = []

@@ -14,24 +14,13 @@ from prbayes._validate import Floats, real_array
 
 @dataclass(frozen=True)
 class Outputs:
-    """The outputs of one specimen, in the order of the columns of ``observed``.
+    """The outputs of one specimen, in the order of the columns of ``observed``."""
 
-    Attributes
-    ----------
-    labels : tuple
-        A text for each output, or a number where the outputs are a curve; none if a run gives one
-        number.
-    dim : str
-        Name of their dimension in results.
-    keys : tuple of (str, int or None)
-        Keys of a response that returns a mapping, and how many outputs each has; None for one
-        number without an axis. Empty where outputs have no names.
-    units : tuple of str
-        Units of the outputs, where they are known.
-    """
-
+    # Texts, or numbers where the outputs are a curve; none if a run gives one number.
     labels: tuple[Any, ...] = ()
-    dim: str = "output"
+    dim: str = "output"  # name of their dimension in results
+    # Keys of a response that returns a mapping, and the number of outputs of each, None for one
+    # number without an axis. Empty where outputs have no names.
     keys: tuple[tuple[str, int | None], ...] = ()
     units: tuple[str, ...] = ()
 
@@ -56,13 +45,7 @@ class Outputs:
         return arrays
 
     def assembled(self, result: Mapping[str, Any]) -> Any:
-        """Return a mapping's arrays as one, outputs in the last axis.
-
-        Raises
-        ------
-        KeyError
-            If the mapping has other keys.
-        """
+        """Return a mapping's arrays as one, outputs in the last axis; other keys are a KeyError."""
         if not self.keys:
             raise KeyError(
                 f"the response returned a mapping with the keys {list(result)}, expected an array; "
@@ -104,19 +87,9 @@ def outputs_of_keys(keys: Sequence[tuple[str, int | None]]) -> Outputs:
 def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     """Return observed responses, (N,) or (N, m), and their outputs.
 
-    Parameters
-    ----------
-    name : str
-        Of the simulator, for messages.
-    observed : array_like, DataFrame, DataArray or mapping
-        One dimension for one output. With two, the first are specimens and the second outputs: a
-        DataFrame's columns and a DataArray's coordinate name them. A mapping has an array for each
-        output, or group of outputs.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is none of these.
+    One dimension is one output. With two, the first are specimens and the second outputs: a
+    DataFrame's columns and a DataArray's coordinate name them. A mapping has an array for each
+    output, or group of outputs.
     """
     label = f"{name}: observed"
     if isinstance(observed, Mapping):

@@ -79,7 +79,7 @@ def refuse_wrong_arity(name: str, function: object, inputs: Inputs) -> None:
 def check_call_settings(
     executor: object, store: object, version: object, on_failure: object
 ) -> None:
-    """Raise if an argument that says how a response is called has the wrong type."""
+    """Raise if a setting of the calls of a response has the wrong type."""
     executes(executor, "executor")
     if store is not None:
         folder_path(store, "store")
@@ -133,37 +133,8 @@ class Responses:
     """The user's response: a function of inputs, and how it is called.
 
     A function of whole batches without other settings is called once for each batch (``plain``).
-    Every other one goes through `respond`: on an executor, in chunks, with a store and a failure
-    policy.
-
-    Parameters
-    ----------
-    name : str
-        Name of the simulator, for messages.
-    function : callable or scalar
-        ``function(*inputs)``, one array per input, any leading batch shape.
-    inputs : Inputs
-    executor : concurrent.futures.Executor, optional
-    store : path-like, optional
-        A folder.
-    version : str, optional
-        Of the function, for the store.
-    on_failure : OnFailure, optional
-    retry_failed : bool
-    timeout : float, optional
-        Seconds.
-    outputs : Outputs, optional
-        Outputs of a run; one number by default, and with None those of the first run.
-
-    Attributes
-    ----------
-    count : int
-        Runs that were needed so far, whether computed here or found in the store.
-    scatters : bool or None
-        Whether the response has different values at the same point; None while it is not known.
-    on_start : callable or None
-        ``on_start(runs, seconds)``, called with the number of runs of a call, and the time of one
-        run as soon as it is known: NaN before a function is called for a whole batch.
+    Every other one goes through `respond`: on an executor, in chunks, with a store (a folder) and a
+    failure policy. ``outputs`` of None are those of the first run.
     """
 
     def __init__(
@@ -204,8 +175,10 @@ class Responses:
             and policy == Abort()
             and not isinstance(function, scalar)
         )
-        self.count = 0
+        self.count = 0  # runs that were needed, whether computed here or found in the store
+        # Whether the response has different values at the same point; None while it is not known.
         self.scatters: bool | None = None
+        # Called with the number of runs of a call, and the seconds of one: NaN before a batch.
         self.on_start: Callable[[int, float], None] | None = None
         self.runs = Runs()
         self._checks_batches = self.plain
@@ -281,13 +254,7 @@ class Responses:
         return True
 
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
-        """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event).
-
-        Raises
-        ------
-        ResponseError
-            If the response raises, or if its result is not real numbers in the batch shape.
-        """
+        """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event)."""
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
         responses = self.runs.repeated(values)
         if responses is not None:
@@ -401,7 +368,7 @@ class Responses:
             # or another order over specimens by about one.
             if not (np.abs(rows[first] - single) > 0.01 * rows[finite].std(axis=0)).any():
                 return
-            # A response with scatter of its own is no mixing.
+            # A random response does not mix its specimens.
             if (np.abs(alone() - single) > 1e-6 * np.abs(single)).any():
                 return
         except ResponseError:  # it takes no batch of one
@@ -448,18 +415,10 @@ class KnownPoints:
 def deduplicated_responses(
     responses: Responses, points: Sequence[Floats], known: KnownPoints | None
 ) -> Floats:
-    """Return the responses at points, (n,) or (n, m); each different point is computed once.
+    """Return the responses at points (n, *event), (n,) or (n, m), each different point once.
 
     Discrete inputs have few values, and a censored input repeats its bounds. If four points that
-    are computed again differ, the response has scatter of its own and is computed at all points.
-
-    Parameters
-    ----------
-    responses : Responses
-        Without epistemic inputs.
-    points : sequence of ndarray, shapes (n, *event)
-        One for each aleatory input.
-    known : KnownPoints, optional
+    are computed again differ, the response is random and is computed at all points.
     """
     n = len(points[0])
     known_values = np.empty(0) if known is None else known.values

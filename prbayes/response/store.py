@@ -72,8 +72,8 @@ class Store:
     name : str
         Of the simulator.
     columns : int, optional
-        Number of values that the inputs of one point are made of. By default that of the stored
-        responses, of which there must be one.
+        Number of values that make the inputs of one point. By default that of the stored
+        responses; there must be one.
     version : str, optional
         Of the response; those of each version are kept apart, as are those without one.
     outputs : int, optional
@@ -274,22 +274,23 @@ class Store:
 
     def _response(self, connection: sqlite3.Connection) -> tuple[int, int]:
         """Return number and columns of the store's response in the file; add it if it is new."""
+        # A row of the table that another process adds first is taken.
         name = self.name, self.version
         responses = _responses(connection)
         if name not in responses and self.columns is not None:
             self._refuse_older_files()
             row = (self.name, self.columns, self.version)
+            insert = (
+                "INSERT INTO response (name, columns, version, checksum) SELECT ?, ?, ?, ? "
+                "WHERE NOT EXISTS (SELECT 1 FROM response WHERE name = ? AND version IS ?)"
+            )
             with transaction(connection):
-                values = (*row, checksum(*row), self.name, self.version)
-                connection.execute(_INSERT_RESPONSE, values)
-            responses = _responses(connection)  # another process may have been faster
+                connection.execute(insert, (*row, checksum(*row), *name))
+            responses = _responses(connection)
         if name not in responses:
-            texts = [
-                repr(n) if v is None else f"{n!r}, version {v!r}" for n, v in [name, *responses]
-            ]
             raise _FileError(
-                f"which holds no responses of simulator {texts[0]}",
-                f"one of [{', '.join(texts[1:])}]",
+                f"which holds no responses of simulator {_name_text(*name)}",
+                f"one of [{', '.join(_name_text(*known) for known in responses)}]",
                 "look at name, version and folder",
             )
         _, columns = responses[name]
@@ -314,7 +315,11 @@ class Store:
 
     def _read_new_runs(self, session: _Session) -> None:
         """Read the runs that the session has not read; numbers and checksums have to match."""
-        with closing(session.connection.execute(_SELECT_RUNS, (session.n_read,))) as runs:
+        select = (
+            "SELECT id, response, key, state, reason, value, checksum FROM run "
+            "WHERE id > ? ORDER BY id"
+        )
+        with closing(session.connection.execute(select, (session.n_read,))) as runs:
             for number, *row, stored_checksum in runs:
                 if number != session.n_read + 1:
                     raise _damaged(f"run {session.n_read + 1} is missing")
@@ -382,15 +387,8 @@ _TABLES = (
     "CREATE TABLE run (id INTEGER PRIMARY KEY, response INTEGER NOT NULL, key BLOB NOT NULL, "
     "state TEXT NOT NULL, reason TEXT, value BLOB NOT NULL, checksum INTEGER NOT NULL)",
 )
-_INSERT_RESPONSE = (
-    "INSERT INTO response (name, columns, version, checksum) SELECT ?, ?, ?, ? "
-    "WHERE NOT EXISTS (SELECT 1 FROM response WHERE name = ? AND version IS ?)"
-)
 INSERT_RUN = (
     "INSERT INTO run (response, key, state, reason, value, checksum) VALUES (?, ?, ?, ?, ?, ?)"
-)
-_SELECT_RUNS = (
-    "SELECT id, response, key, state, reason, value, checksum FROM run WHERE id > ? ORDER BY id"
 )
 
 

@@ -201,19 +201,7 @@ class RemoteModel:
         return self.model
 
     def __call__(self, *inputs: Any) -> float | Floats:
-        """Return the outputs of one specimen: a number, or an array of them, shape (m,).
-
-        Raises
-        ------
-        ConnectionError
-            If the server is away for longer than ``patience``, or is lost three times.
-        TimeoutError
-            If the response takes too long.
-        RuntimeError
-            If the server or the model reports an error, or returns no numbers.
-        ValueError
-            If the inputs do not fill the model's vectors.
-        """
+        """Return the outputs of one specimen: a number, or an array of them, shape (m,)."""
         parts = [np.ravel(x).astype(np.float64) for x in inputs]
         self._refuse_inputs(self.model, [part.size for part in parts])
         vectors = np.split(np.concatenate(parts), np.cumsum(self.inputs)[:-1])
@@ -345,14 +333,8 @@ def _known(url: str, path: str, request: Any) -> dict[str, Any]:
 def _exchange(url: str, path: str, request: Any, seconds: float | None) -> tuple[int, str]:
     """Return status and text of the answer to a request.
 
-    Raises
-    ------
-    TimeoutError
-        If there is no complete answer in time.
-    ProtocolError
-        If the connection is lost after the request was sent.
-    HTTPError, OSError
-        If there is no connection.
+    `TimeoutError` means no complete answer in time, `ProtocolError` a connection that was lost
+    after the request, another `HTTPError` or `OSError` no connection.
     """
     end = None if seconds is None else time.monotonic() + seconds
     try:

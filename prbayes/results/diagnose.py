@@ -14,8 +14,13 @@ import xarray as xr
 from prbayes._display import view
 from prbayes._finding import Finding, from_json
 from prbayes._validate import Floats
-from prbayes.inference.disagreement import disagreement
-from prbayes.inference.goodness_of_fit import UNLIKELY, Refitted, of_another_family, of_held_away
+from prbayes.inference.checks.metric_suitability import small_simulators
+from prbayes.inference.goodness_of_fit import (
+    UNLIKELY,
+    FittedSets,
+    output_misfits,
+    population_misfit,
+)
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import refit_obstacle
 from prbayes.inference.resampling import SETS
@@ -30,7 +35,6 @@ from prbayes.model.elements import (
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
-from prbayes.optimize.caveats import small_simulators
 from prbayes.optimize.optimum import (
     NO_RESPONSE,
     SMALLEST_SHARE,
@@ -214,20 +218,18 @@ def _check_family(optimum: Optimum) -> tuple[list[Finding], tuple[Finding, ...]]
         return [], _not_tested(obstacle)
     if evaluator.responses_per_theta:
         return [], _not_tested("it would take responses")
-    refitted: Refitted | None
+    fitted: FittedSets | None
     if optimum.prior:
         scales = np.array(list(optimum.scales.values()))
         sampling = SamplingDistribution.of(evaluator, optimum.theta, scales)
-        refitted = Refitted.there(sampling, SETS, 0)
-        probability = refitted.probability
-        findings = of_held_away(probability)
+        fitted = FittedSets.at_theta(sampling, SETS, 0)
     else:
-        refitted = Refitted.of(optimum.sampling(), SETS, 0)
-        probability = np.nan if refitted is None else refitted.probability
-        if refitted is None or np.isnan(probability):
-            return [], _not_tested("the data tell too little, or too few refits converge")
-        findings = of_another_family(probability)
-    return findings, tuple(disagreement(refitted)) if probability < UNLIKELY else ()
+        fitted = FittedSets.of(optimum.sampling(), SETS, 0)
+    p_value = np.nan if fitted is None else fitted.p_value
+    if fitted is None or np.isnan(p_value):
+        return [], _not_tested("the data tell too little, or too few refits converge")
+    misfits = tuple(output_misfits(fitted)) if p_value < UNLIKELY else ()
+    return population_misfit(p_value, with_prior=optimum.prior), misfits
 
 
 def _compared_outputs(result: xr.DataTree) -> tuple[Finding, ...]:

@@ -1,6 +1,6 @@
 """Checks of results of the log-likelihood by specimen: population, prior, modes, influence.
 
-Each check returns findings, or a note that says why it was not run. No response is computed.
+Each check returns findings, or the reason why it was not run. No response is computed.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class CheckOptions:
         Of the tests: 199 suffice (likelihood_guards, section 2.4).
     prior_draws, specimens : int
         Draws of the prior, and specimens of each from which its information is computed.
-    apart : float
+    separation : float
         Within-chain standard deviations between the means of two chains that are in different
         modes. Chains of one mode with ten independent draws each differ by one.
     pull : float
@@ -69,7 +69,7 @@ class CheckOptions:
     replicates: int = 199
     prior_draws: int = 500
     specimens: int = 256
-    apart: float = 2.0
+    separation: float = 2.0
     pull: float = 0.5
 
 
@@ -78,15 +78,15 @@ _OPTIONS = CheckOptions()
 
 @dataclass(frozen=True)
 class Checked:
-    """What checks report.
+    """Reports of checks.
 
     Attributes
     ----------
     findings : tuple of Finding
     remarks : tuple of Finding
-        What was tested, and with which power.
+        Tests without a finding, with their power.
     untested : tuple of str
-        What was not tested, and why.
+        Tests that were not run, and why.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -102,16 +102,23 @@ class Checked:
         )
 
 
-# Of optima that live: the tests take seconds, and reports ask for them as well.
-_DONE: WeakKeyDictionary[Optimum, Checked] = WeakKeyDictionary()
+def _not_tested(subject: str, reason: str) -> Checked:
+    return Checked(untested=(f"{subject} was not tested: {reason}.",))
+
+
+_FAMILY = "The family of the population"
+_CONFLICT = "The conflict of prior and data"
+
+# By optimum while it lives: the tests take seconds, and reports repeat them.
+_CACHE: WeakKeyDictionary[Optimum, Checked] = WeakKeyDictionary()
 
 
 def check_optimum(optimum: Optimum) -> Checked:
-    """Return what the emulator and the test of the population report of an optimum."""
-    if optimum not in _DONE:
+    """Return the reports of the emulator and the test of the population about an optimum."""
+    if optimum not in _CACHE:
         emulators = Checked(remarks=emulator_remarks(optimum.evaluator))
-        _DONE[optimum] = emulators + _population(optimum)
-    return _DONE[optimum]
+        _CACHE[optimum] = emulators + _check_population(optimum)
+    return _CACHE[optimum]
 
 
 def emulator_remarks(evaluator: Evaluator) -> tuple[Finding, ...]:
@@ -119,8 +126,7 @@ def emulator_remarks(evaluator: Evaluator) -> tuple[Finding, ...]:
     remarks = []
     for likelihood in evaluator.likelihoods:
         emulation, points = prepared(likelihood).emulation, prepared(likelihood).points
-        roots = points.n_roots
-        low, high = int(roots.min()), int(roots.max())
+        low, high = int(points.n_roots.min()), int(points.n_roots.max())
         count = f"{low} root(s)" if low == high else f"{low} to {high} roots"
         remarks.append(
             Finding(
@@ -137,45 +143,50 @@ def emulator_remarks(evaluator: Evaluator) -> tuple[Finding, ...]:
 # -- population ------------------------------------------------------------------------------
 
 
-def _population(optimum: Optimum) -> Checked:
+def _check_population(optimum: Optimum) -> Checked:
     """Test whether the family of the population fits the inputs of the specimens."""
+    evaluator = optimum.evaluator
+    likelihoods = evaluator.likelihoods
     reason = _population_obstacle(optimum)
     if reason:
-        return _not_tested(reason)
-    evaluator = optimum.evaluator
+        return _not_tested(_FAMILY, reason)
+    scores = [NormalScores.of(likelihood.inputs) for likelihood in likelihoods]
+    for likelihood, score in zip(likelihoods, scores, strict=True):
+        if score.function is None:
+            reason = f"PyMC has no distribution function of an input of {likelihood.name}"
+            return _not_tested(_FAMILY, reason)
     refits = specimen_refits(optimum, "diagnose", simulated=True)
-    scores = [_Scores.of(each.inputs) for each in evaluator.likelihoods]
-    observed = [
+    data = [
         ([x.get_value() for x in points], log_a.get_value())
-        for points, log_a in (arrays(each) for each in evaluator.likelihoods)
+        for points, log_a in map(arrays, likelihoods)
     ]
-    samples = _points(evaluator, scores, optimum.theta, observed)
+    samples = scored_specimens(evaluator, scores, optimum.theta, data)
     null: list[list[Floats]] = [[] for _ in samples]
     for refit in refits.simulated(_OPTIONS.replicates, seed=0):
-        if not refit.converged:
-            continue
-        replicates = _points(evaluator, scores, refit.theta, refit.data)
-        for statistics, (z, weights) in zip(null, replicates, strict=True):
-            statistics.append(population_statistics(z, weights))
+        if refit.converged:
+            replicates = scored_specimens(evaluator, scores, refit.theta, refit.data)
+            for statistics, (z, weights) in zip(null, replicates, strict=True):
+                statistics.append(population_statistics(z, weights))
     if len(null[0]) < _OPTIONS.replicates / 2:
-        return _not_tested(f"{len(null[0])} of {_OPTIONS.replicates} refits converged")
-    findings: list[Finding] = []
-    remarks = []
-    threshold = 0.05 / len(samples)
-    for likelihood, (z, weights), statistics in zip(
-        evaluator.likelihoods, samples, null, strict=True
-    ):
-        labels = _labels(likelihood.inputs, likelihood.measurements[0].responses.function)
-        misfit = population_findings(
-            population_test(z, weights, statistics), labels, threshold=threshold
-        )
-        findings += misfit
-        outputs = likelihood.readings.values.shape[1]
+        reason = f"{len(null[0])} of {_OPTIONS.replicates} refits converged"
+        return _not_tested(_FAMILY, reason)
+    checked = Checked()
+    for likelihood, (z, weights), statistics in zip(likelihoods, samples, null, strict=True):
+        inputs = likelihood.inputs
+        labels = []
+        names = aleatory_names(inputs, likelihood.measurements[0].responses.function)
+        for name, shape in zip(names, inputs.event_shapes, strict=True):
+            size = int(np.prod(shape, dtype=int))
+            labels += [f"{name}[{i}]" for i in range(size)] if shape else [name]
+        test = population_test(z, weights, statistics)
+        misfit = population_findings(test, labels, threshold=0.05 / len(samples))
+        remarks: tuple[Finding, ...] = ()
         if not misfit:
-            power = power_text(len(z), z.shape[-1], outputs)
+            power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
             text = f"{likelihood.name}: the test of the population found no misfit. {power}"
-            remarks.append(Finding("population-tested", text))
-    return Checked(tuple(findings), tuple(remarks))
+            remarks = (Finding("population-tested", text),)
+        checked += Checked(misfit, remarks)
+    return checked
 
 
 def _population_obstacle(optimum: Optimum) -> str:
@@ -195,38 +206,19 @@ def _population_obstacle(optimum: Optimum) -> str:
                 f"{likelihood.name} has fewer outputs ({outputs}) than inputs "
                 f"({likelihood.coordinates.size}), with which the test has no power"
             )
-        if not _Scores.of(likelihood.inputs).is_known:
-            return f"PyMC has no distribution function of an input of {likelihood.name}"
     return ""
 
 
-def _not_tested(reason: str) -> Checked:
-    return Checked(untested=(f"The family of the population was not tested: {reason}.",))
-
-
-def _labels(inputs: Inputs, function: Any) -> list[str]:
-    """Return a label for each number of a specimen."""
-    names = []
-    for name, shape in zip(aleatory_names(inputs, function), inputs.event_shapes, strict=True):
-        size = int(np.prod(shape, dtype=int))
-        names += [name] if not shape else [f"{name}[{i}]" for i in range(size)]
-    return names
-
-
 @dataclass(frozen=True, eq=False)
-class _Scores:
+class NormalScores:
     """Compiled normal scores and log-densities of inputs at points of populations."""
 
     function: Any  # (*roots, *points) -> distribution functions by input; None if unknown
     log_density: Any
 
-    @property
-    def is_known(self) -> bool:
-        return self.function is not None
-
     @classmethod
-    def of(cls, inputs: Inputs) -> _Scores:
-        """Compile them; of dependent inputs they are not known."""
+    def of(cls, inputs: Inputs) -> NormalScores:
+        """Compile them; scores of dependent inputs are unknown."""
         symbols = inputs.placeholders()
         dists, _ = inputs.rebuilt(symbols)
         points = [
@@ -254,9 +246,8 @@ class _Scores:
         """Return scores (N, K, d) and posterior weights (N, K) of points (N, K, *event)."""
         n, count = log_a.shape
         flat = [x.reshape(n * count, *x.shape[2:]) for x in points]
-        values = self.function(*roots, *flat)
         columns = []
-        for dist, value, x in zip(inputs.aleatory, values, flat, strict=True):
+        for dist, value, x in zip(inputs.aleatory, self.function(*roots, *flat), flat, strict=True):
             value = np.broadcast_to(value, (1, *x.shape))[0].reshape(n * count, -1)
             columns.append(value if is_mvnormal(dist) else normal_scores(np.exp(value)))
         (log_p,) = self.log_density(*roots, *flat)
@@ -271,9 +262,9 @@ class _Scores:
         return np.where(np.isfinite(z), z, 0.0), weights
 
 
-def _points(
+def scored_specimens(
     evaluator: Evaluator,
-    scores: Sequence[_Scores],
+    scores: Sequence[NormalScores],
     theta: Floats,
     data: Sequence[tuple[list[Floats], Floats]],
 ) -> list[tuple[Floats, Floats]]:
@@ -284,8 +275,8 @@ def _points(
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
             roots = roots_of(evaluator.hyperparameters, theta[None], likelihood.inputs, place)
-            of_group = [x[rows] for x in points]
-            z[rows], weights[rows] = score.at(likelihood.inputs, roots, of_group, log_a[rows])
+            in_group = [x[rows] for x in points]
+            z[rows], weights[rows] = score.at(likelihood.inputs, roots, in_group, log_a[rows])
         result.append((z, weights))
     return result
 
@@ -294,12 +285,12 @@ def _points(
 
 
 def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None) -> Checked:
-    """Return what the checks of draws report.
+    """Return the reports of the checks of draws.
 
     Parameters
     ----------
     evaluator : Evaluator or None
-        None where the model is not given.
+        None without the model.
     result : DataTree
     thetas : ndarray, shape (chains, draws, d), or None
         Draws in unconstrained space.
@@ -316,9 +307,9 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
     checked += Checked(failing_region_findings(evaluator, center), emulator_remarks(evaluator))
     obstacle = simulation_obstacle(evaluator)
     if obstacle is not None:
-        return checked + _not_tested(obstacle) + _conflict_not_tested(obstacle)
+        return checked + _not_tested(_FAMILY, obstacle) + _not_tested(_CONFLICT, obstacle)
     optimum = find_optimum(evaluator, Minimisation())
-    return checked + _population(optimum) + _conflict(optimum, thetas)
+    return checked + _check_population(optimum) + _check_conflict(optimum, thetas)
 
 
 def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
@@ -332,11 +323,11 @@ def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
     if len(thetas) < 2 or thetas.shape[1] < 4:
         return ()
     within = np.sqrt(thetas.var(axis=1).mean(axis=0))
-    apart = np.ptp(thetas.mean(axis=1), axis=0) / np.where(within > 0, within, np.inf)
-    far = np.flatnonzero(apart > _OPTIONS.apart)
+    separation = np.ptp(thetas.mean(axis=1), axis=0) / np.where(within > 0, within, np.inf)
+    far = np.flatnonzero(separation > _OPTIONS.separation)
     if not far.size:
         return ()
-    listed = ", ".join(f"{apart[j]:.1f} for {names[j]}" for j in far.tolist())
+    listed = ", ".join(f"{separation[j]:.1f} for {names[j]}" for j in far.tolist())
     return (
         Finding(
             "chains-in-different-modes",
@@ -354,8 +345,7 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
         return ()
     stats: Any = import_module("arviz_stats")
     findings = []
-    group = result["log_likelihood"].to_dataset()
-    for name, values in group.data_vars.items():
+    for name, values in result["log_likelihood"].to_dataset().data_vars.items():
         if values.ndim != 3 or values.shape[-1] < 2:  # of all specimens together
             continue
         limit = min(0.7, 1 - 1 / np.log10(max(values.sizes["chain"] * values.sizes["draw"], 11)))
@@ -366,12 +356,12 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
         k = np.atleast_1d(k)
         high = np.flatnonzero(k > limit)
         if high.size:
-            places = ", ".join(map(str, high[:5])) + (", ..." if high.size > 5 else "")
+            listed = ", ".join(map(str, high[:5])) + (", ..." if high.size > 5 else "")
             findings.append(
                 Finding(
                     "influential-specimens",
                     f"{name}: Pareto k of leave-one-out is above {limit:.2f} for {high.size} of "
-                    f"{k.size} specimens (indices {places}; largest {k.max():.2f}): the posterior "
+                    f"{k.size} specimens (indices {listed}; largest {k.max():.2f}): the posterior "
                     "depends on them, and az.loo is not reliable; look at these specimens, or use "
                     "prb.cross_validate.",
                     "likelihood.md#leave-one-out",
@@ -380,21 +370,21 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def _conflict_not_tested(reason: str) -> Checked:
-    return Checked(untested=(f"The conflict of prior and data was not tested: {reason}.",))
+# -- prior and data --------------------------------------------------------------------------
 
 
-def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
+def _check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
     """Report hyperparameters whose prior pulls the posterior away from the data."""
     evaluator = optimum.evaluator
     if not (optimum.converged and np.isfinite(optimum.covariance).all()):
-        return _conflict_not_tested("nothing is known of the sampling distribution of the optimum")
+        reason = "nothing is known of the sampling distribution of the optimum"
+        return _not_tested(_CONFLICT, reason)
     if any(rival["comparable"] for rival in optimum.rivals):
-        return _conflict_not_tested("the likelihood has several modes")
-    draws = thetas.reshape(-1, evaluator.hyperparameters.size)
-    errors = np.sqrt(np.diag(optimum.covariance))
-    pulls = np.abs(draws.mean(axis=0) - optimum.theta) / errors
+        return _not_tested(_CONFLICT, "the likelihood has several modes")
     names = evaluator.hyperparameters.names
+    mean = thetas.reshape(-1, evaluator.hyperparameters.size).mean(axis=0)
+    errors = np.sqrt(np.diag(optimum.covariance))
+    pulls = np.abs(mean - optimum.theta) / errors
     j = int(pulls.argmax())
     shift = (
         f"The posterior mean of {names[j]} is {pulls[j]:.2f} standard errors from the estimate "
@@ -406,20 +396,12 @@ def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
     prior = evaluator.hyperparameters.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)
     if np.isfinite(predictive).all(axis=1).mean() < 0.5:
-        return _conflict_not_tested(
-            "the information of most populations of the prior is not finite"
-        )
-    findings = conflict_findings(
-        names,
-        prior,
-        optimum.theta,
-        errors,
-        draws.mean(axis=0),
-        predictive,
-    )
+        reason = "the information of most populations of the prior is not finite"
+        return _not_tested(_CONFLICT, reason)
+    findings = conflict_findings(names, prior, optimum.theta, errors, mean, predictive)
     if findings:
-        return Checked(findings=findings)
-    n = sum(len(each.readings) for each in evaluator.likelihoods)
+        return Checked(findings)
+    n = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
     power = np.interp(np.log(n), np.log([10, 20, 50]), [0.86, 0.98, 1.0])
     text = (
         f"{shift}; no hyperparameter is in conflict with its prior (p > .05). With {n} specimens "
@@ -429,32 +411,30 @@ def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
 
 
 def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
-    """Return estimates of data sets simulated at draws of the prior, (S, d); NaN where unknown.
+    """Return estimates of data sets simulated at draws of the prior, (S, d); NaN if unknown.
 
     They are normal around a draw. Their covariance is the inverse of the information of the
-    specimens' inputs, in the ratio that the curvature at the optimum has to it there.
+    specimens' inputs, times its ratio to the covariance at the optimum.
     """
     rng = np.random.default_rng(31)
     evaluator = optimum.evaluator
     compiled = [
-        (PopulationSampler(each.inputs), compiled_log_density(each.inputs))
-        for each in evaluator.likelihoods
+        (PopulationSampler(likelihood.inputs), compiled_log_density(likelihood.inputs))
+        for likelihood in evaluator.likelihoods
     ]
-    complete = _covariance(evaluator, compiled, optimum.theta, rng)
+    complete = _complete_covariance(evaluator, compiled, optimum.theta, rng)
     ratio = np.sqrt(np.diag(optimum.covariance) / np.diag(complete))
     estimates = np.full(prior.shape, np.nan)
     for row, theta in zip(estimates, prior, strict=True):
-        covariance = _covariance(evaluator, compiled, theta, rng)
+        covariance = _complete_covariance(evaluator, compiled, theta, rng)
         if np.isfinite(covariance).all():
             values, vectors = np.linalg.eigh(covariance)
-            noise = oriented(vectors) @ (
-                np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(theta))
-            )
-            row[:] = theta + ratio * noise
+            scaled = np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(theta))
+            row[:] = theta + ratio * (oriented(vectors) @ scaled)
     return estimates
 
 
-def _covariance(
+def _complete_covariance(
     evaluator: Evaluator,
     compiled: Sequence[tuple[PopulationSampler, Any]],
     theta: Floats,
@@ -464,19 +444,18 @@ def _covariance(
     step = 1e-3 * evaluator.hyperparameters.prior_sd
     around = cross(theta, step)
     information = np.zeros((theta.size, theta.size))
+    n = _OPTIONS.specimens
     for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
         for place, rows in likelihood.by_group:
             roots = roots_of(evaluator.hyperparameters, around, likelihood.inputs, place)
-            specimens, _ = sampler([root[:1] for root in roots], _OPTIONS.specimens, rng)
+            specimens, _ = sampler([root[:1] for root in roots], n, rng)
             (log_p,) = log_density(*roots, *[x[0] for x in specimens])
-            log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))
             with np.errstate(invalid="ignore"):
-                scores = slopes(log_p, step)
-            information += len(rows) / _OPTIONS.specimens * scores.T @ scores
-    nothing = np.full_like(information, np.nan)
-    if not np.isfinite(information).all():
-        return nothing
-    try:
-        return np.linalg.inv(information)
-    except np.linalg.LinAlgError:
-        return nothing
+                scores = slopes(np.broadcast_to(log_p, (len(around), n)), step)
+            information += len(rows) / n * scores.T @ scores
+    if np.isfinite(information).all():
+        try:
+            return np.linalg.inv(information)
+        except np.linalg.LinAlgError:
+            pass
+    return np.full_like(information, np.nan)

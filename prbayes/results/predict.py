@@ -1,4 +1,4 @@
-"""Responses of the calibrated population, for any response and condition: `predict`."""
+"""Posterior prediction: responses of the calibrated population, for any response."""
 
 from __future__ import annotations
 
@@ -120,11 +120,11 @@ def predict(
         depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
         ``source`` (how specimens were made), ``responses``
         (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
-        square error of runs that are left out), ``nan`` (how many values are NaN), ``caveats``
-        (what the response says of itself, such as that its inadequacy extrapolates),
+        square error of runs that are left out), ``nan`` (how many values are NaN), ``findings``
+        (as JSON, such as that a model discrepancy extrapolates),
         ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
-        ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration, by
-        which `area_test` knows them), ``identity`` (of the problem that was calibrated).
+        ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration,
+        which `area_test` compares), ``identity`` (of the problem that was calibrated).
 
     Raises
     ------
@@ -164,58 +164,66 @@ def predict(
     if name is not None:
         plain_text(name, "name")
     check_call_settings(executor, store, version, Abort())
-    label = _label(response, name, store)
+    label = name or str(getattr(response, "__name__", type(response).__name__))
+    if store is not None and name is None and not label.isidentifier():
+        raise ValueError(
+            f"name: got a store for a function called {label}, expected a name to keep its "
+            "responses by"
+        )
     model = model_of(result, model, "prb.predict")
     points, coords = populations_of(result, model, n_draws, "prb.predict")
-    sorted_inputs = read_inputs(label, inputs, model)
+    inputs_read = read_inputs(label, inputs, model)
     simulators = population_simulators(model)
-    before = sum(each.responses.count for each in simulators)
+    before = sum(simulator.responses.count for simulator in simulators)
     responses = Responses(
         label,
         response,
-        sorted_inputs,
+        inputs_read,
         executor=executor,
         store=store,
         version=version,
         outputs=known_outputs(simulators, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
-    rng = np.random.default_rng(seed)
     simulator = serving(simulators, responses) if stored else None
-    groups = sorted_inputs.groups
     with shown(progressbar):
-        drawn = _drawn(simulator, responses, _in_groups(points, sorted_inputs), n_samples, rng)
+        drawn = _predicted(simulator, responses, points, n_samples, np.random.default_rng(seed))
     allowed = [each.max_lost for each in simulators] if max_lost is None else [max_lost]
     missing = _count_missing(label, drawn.values, max(allowed, default=MAX_LOST))
-    _report_rough_surface(label, drawn)
-    among = () if groups is None else (len(groups.labels),)
-    event = drawn.values.shape[2 + len(among) :]
+    _report_rough_emulator(label, drawn)
+    groups = inputs_read.groups
+    group_coords = {} if groups is None else {groups.dim: list(groups.labels)}
+    event = drawn.values.shape[2 + len(group_coords) :]
     outputs = responses.outputs or Outputs(tuple(range(event[0] if event else 0)))
-    last = {outputs.dim: list(outputs.labels)} if event else {}
-    own = {} if groups is None else {groups.dim: list(groups.labels)}
-    leading = (len(coords["chain"]), len(coords["draw"]), *among)
+    output_coords = {outputs.dim: list(outputs.labels)} if event else {}
+    leading = drawn.values.shape[1 : 1 + len(group_coords)]
+    sizes = (len(coords["chain"]), len(coords["draw"]), *leading)
+    n_computed = responses.count - before + sum(each.responses.count for each in simulators)
     return xr.DataArray(
-        drawn.values.reshape(*leading, n_samples, *event),
-        dims=("chain", "draw", *own, "sample", *last),
-        coords={**coords, **own, "sample": np.arange(n_samples), **last},
+        drawn.values.reshape(*sizes, n_samples, *event),
+        dims=("chain", "draw", *group_coords, "sample", *output_coords),
+        coords={**coords, **group_coords, "sample": np.arange(n_samples), **output_coords},
         name=label,
         attrs={
             "source": drawn.source,
-            "responses": responses.count + sum(e.responses.count for e in simulators) - before,
+            "responses": n_computed,
             **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
             "nan": missing,
             "specimens_id": _digest(*drawn.specimens),
             "random_seed": str(seed),
             "findings": as_json(findings_of(response)),
-            **_calibration(result, model),
+            **_calibration_attributes(result, model),
             **as_attributes(identity_in(result) or identity_of_model(model)),
             **versions(),
         },
     )
 
 
+# -- populations -----------------------------------------------------------------------------------
+
+
 def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
-    """Return the model of a result, the one given, or on the context; raise if it is another's."""
+    """Return the model of a result, the one passed, or on the context; raise if it differs."""
     if model is None and isinstance(result, Optimum):
         model = result.model
     model = model_on_context(model, caller)
@@ -225,89 +233,10 @@ def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
     return model
 
 
-def _in_groups(points: dict[str, Floats], inputs: Inputs) -> list[dict[str, Floats]]:
-    """Return the populations of each group, or all as they are where there are none."""
-    if inputs.groups is None:
-        return [points]
-    size = len(next(iter(points.values())))
-    (index,) = [str(root.name) for root in inputs.roots if is_group(root)]
-    places = range(len(inputs.groups.labels))
-    return [{**points, index: np.full(size, place)} for place in places]
-
-
-def _drawn(
-    simulator: PopulationSimulator | None,
-    responses: Responses,
-    of_groups: list[dict[str, Floats]],
-    n: int,
-    rng: np.random.Generator,
-) -> _Drawn:
-    """Return responses of n specimens from each population, of one group after the other."""
-    each: list[_Drawn] = []
-    emulated: EmulatedResponse | None = None
-    for points in of_groups:
-        if simulator is None:
-            each.append(_new_responses(responses.name, responses, points, n, rng))
-        elif simulator.is_emulated:
-            emulated = emulated or simulator.emulator(responses)
-            each.append(_emulated_responses(simulator, emulated, responses, points, n, rng))
-        else:
-            each.append(_resampled_responses(simulator, responses, points, n, rng))
-    if len(each) == 1:
-        return each[0]
-    specimens = [x for one in each for x in one.specimens]
-    values = np.stack([one.values for one in each], axis=1)
-    return replace(each[0], values=values, specimens=specimens)
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """Responses of specimens."""
-
-    # (k, n), or (k, n, m) of several outputs: by population; of groups (k, groups, n) and so on.
-    values: Floats
-    specimens: list[Floats]  # (k, n, *event): aleatory inputs
-    source: str  # how specimens were made
-    error: Floats | None = None  # of an emulator, by output, (m,)
-
-
-def _label(response: Callable[..., Any], name: str | None, store: object) -> str:
-    """Return the name of the result: as given, or that of the response."""
-    label = name or str(getattr(response, "__name__", type(response).__name__))
-    if store is not None and name is None and not label.isidentifier():
-        raise ValueError(
-            f"name: got a store for a function called {label}, expected a name to keep its "
-            "responses by"
-        )
-    return label
-
-
-def _count_missing(label: str, values: Floats, max_lost: float) -> int:
-    """Return how many responses are NaN, said in the log; raise if too many are."""
-    nan = is_missing(values.reshape(-1, *values.shape[2:]))
-    missing = int(nan.sum())
-    if missing == nan.size:
-        raise ResponseError(
-            f"{label}: got NaN at all {missing} specimens, expected numbers; +inf is a specimen "
-            "that fails"
-        )
-    if missing > max_lost * nan.size:
-        raise DesignError(
-            f"{label}: lost mass: got {missing / nan.size:.1%} NaN among the predicted "
-            f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
-            "the specimens that have a response; repair it, return +inf for specimens that fail, "
-            "or pass a larger max_lost"
-        )
-    if missing:
-        text = f"{label}: {missing} of {nan.size} predicted responses are NaN."
-        report(Finding("missing-predictions", text))
-    return missing
-
-
 def populations_of(
     result: Any, model: pm.Model, draws: int, caller: str
 ) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
-    """Return the populations that a result stands for.
+    """Return the populations of a result: values of the free variables, and chain and draw.
 
     Parameters
     ----------
@@ -321,9 +250,7 @@ def populations_of(
     Returns
     -------
     points : dict of ndarray, shapes (k, *shape)
-        Values of the free variables, by name.
     coords : dict of ndarray
-        Chain and draw.
 
     Raises
     ------
@@ -332,7 +259,7 @@ def populations_of(
     """
     names = [str(rv.name) for rv in model.free_RVs]
     if isinstance(result, Optimum):
-        _refuse_incomplete(result.point, names, caller)
+        _require_variables(result.point, names, caller)
         points = {n: np.asarray(result.point[n], dtype=np.float64)[None] for n in names}
         return points, {"chain": np.arange(1), "draw": np.arange(1)}
     if not isinstance(result, xr.DataTree) or "posterior" not in result:
@@ -340,92 +267,155 @@ def populations_of(
             f"{caller}: got {type(result).__name__}, expected an Optimum from prb.minimize, or a "
             "DataTree with a posterior group, such as prb.sample_smc returns"
         )
-    thinned = _thinned(result["posterior"].to_dataset(), draws)
-    _refuse_incomplete(thinned, names, caller)
+    posterior = result["posterior"].to_dataset()
+    size = posterior.sizes["draw"]
+    by_chain = max(1, draws // posterior.sizes["chain"])
+    rows = np.linspace(0, size - 1, min(size, by_chain)).round().astype(int)
+    thinned = posterior.isel(draw=np.unique(rows))
+    _require_variables(thinned, names, caller)
     coords = {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
     return finite_draws(thinned, names), coords
 
 
-def _thinned(posterior: xr.Dataset, draws: int) -> xr.Dataset:
-    """Return at most so many draws of a posterior, over all chains, evenly spaced."""
-    size = posterior.sizes["draw"]
-    each = max(1, draws // posterior.sizes["chain"])
-    places = np.linspace(0, size - 1, min(size, each)).round()
-    return posterior.isel(draw=np.unique(places.astype(int)))
-
-
-def _refuse_incomplete(known: Any, names: list[str], caller: str) -> None:
+def _require_variables(values: Any, names: list[str], caller: str) -> None:
     """Raise if a result lacks a free variable of the model."""
-    missing = [name for name in names if name not in known]
+    missing = [name for name in names if name not in values]
     if missing:
         raise KeyError(
             f"{caller}: got a result without {missing}, expected the model's free variables {names}"
         )
 
 
+# -- responses -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Predicted:
+    """Responses of specimens."""
+
+    # (k, n), or (k, n, m) of several outputs: by population; of groups (k, groups, n) and so on.
+    values: Floats
+    specimens: list[Floats]  # (k, n, *event): aleatory inputs
+    source: str  # how specimens were made
+    error: Floats | None = None  # of an emulator, by output, (m,)
+
+
+def _predicted(
+    simulator: PopulationSimulator | None,
+    responses: Responses,
+    points: dict[str, Floats],
+    n: int,
+    rng: np.random.Generator,
+) -> _Predicted:
+    """Return responses of n specimens from each population, of one group after the other."""
+    inputs = responses.inputs
+    by_group = [points]
+    if inputs.groups is not None:
+        size = len(next(iter(points.values())))
+        (index,) = [str(root.name) for root in inputs.roots if is_group(root)]
+        places = range(len(inputs.groups.labels))
+        by_group = [{**points, index: np.full(size, place)} for place in places]
+    results: list[_Predicted] = []
+    emulated: EmulatedResponse | None = None
+    for group_points in by_group:
+        if simulator is None:
+            roots = [group_points[str(rv.name)] for rv in inputs.roots]
+            specimens, epistemic = new_specimens(responses.name, inputs, roots, n, rng)
+            values = responses(specimens, epistemic)
+            results.append(_Predicted(values, specimens, "new specimens"))
+        elif simulator.is_emulated:
+            roots = [group_points[str(rv.name)] for rv in inputs.roots]
+            emulated = emulated or simulator.emulator(responses)
+            results.append(_emulated_responses(simulator, emulated, responses, roots, n, rng))
+        else:
+            results.append(_resampled_responses(simulator, responses, group_points, n, rng))
+    if len(results) == 1:
+        return results[0]
+    specimens = [x for result in results for x in result.specimens]
+    values = np.stack([result.values for result in results], axis=1)
+    return replace(results[0], values=values, specimens=specimens)
+
+
+def _count_missing(label: str, values: Floats, max_lost: float) -> int:
+    """Return and report the number of responses that are NaN; raise if there are too many."""
+    is_nan = is_missing(values.reshape(-1, *values.shape[2:]))
+    missing = int(is_nan.sum())
+    if missing == is_nan.size:
+        raise ResponseError(
+            f"{label}: got NaN at all {missing} specimens, expected numbers; +inf is a specimen "
+            "that fails"
+        )
+    if missing > max_lost * is_nan.size:
+        raise DesignError(
+            f"{label}: lost mass: got {missing / is_nan.size:.1%} NaN among the predicted "
+            f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
+            "the specimens that have a response; repair it, return +inf for specimens that fail, "
+            "or pass a larger max_lost"
+        )
+    if missing:
+        text = f"{label}: {missing} of {is_nan.size} predicted responses are NaN."
+        report(Finding("missing-predictions", text))
+    return missing
+
+
 def known_outputs(
-    among: Sequence[PopulationSimulator], response: Callable[..., Any]
+    simulators: Sequence[PopulationSimulator], response: Callable[..., Any]
 ) -> Outputs | None:
-    """Return the outputs of a response that is a simulator's; None where its runs tell."""
-    for node in among:
-        if node.responses.function is response:
-            return node.outputs
-    return None
+    """Return the outputs of a response that is a simulator's; None if only a run shows them."""
+    nodes = (node for node in simulators if node.responses.function is response)
+    return next((node.outputs for node in nodes), None)
 
 
 def serving(
-    among: Sequence[PopulationSimulator], responses: Responses
+    simulators: Sequence[PopulationSimulator], responses: Responses
 ) -> PopulationSimulator | None:
-    """Return the simulator whose specimens have these inputs, if any.
-
-    Best is one with this very response.
-    """
-    able = [each for each in among if _serves(each, responses.inputs)]
-    for each in able:
-        if responses.same_as(each.responses):
-            return each
+    """Return the simulator with specimens of these inputs, if any, best with this response."""
+    able = [simulator for simulator in simulators if _serves(simulator, responses.inputs)]
+    for simulator in able:
+        if responses.same_as(simulator.responses):
+            return simulator
     return able[0] if able else None
 
 
-def _serves(simulator: PopulationSimulator, wanted: Inputs) -> bool:
+def _serves(simulator: PopulationSimulator, inputs: Inputs) -> bool:
     """Return whether a simulator has stored or emulated specimens with all of these inputs."""
-    if not simulator.has_specimens or wanted.epistemic:
+    if not simulator.has_specimens or inputs.epistemic:
         return False
-    known = simulator.inputs.aleatory
-    return all(any(x is y for y in known) for x in wanted.aleatory)
+    aleatory = simulator.inputs.aleatory
+    return all(any(x is y for y in aleatory) for x in inputs.aleatory)
 
 
 def _emulated_responses(
     simulator: EmulatedSimulator,
     emulated: EmulatedResponse,
     responses: Responses,
-    points: dict[str, Floats],
+    roots: list[Floats],
     n: int,
     rng: np.random.Generator,
-) -> _Drawn:
+) -> _Predicted:
     """Return emulated responses of n new specimens for each population."""
-    inputs = responses.inputs
-    roots = [points[str(rv.name)] for rv in inputs.roots]
-    specimens, _ = new_specimens(responses.name, inputs, roots, n, rng)
+    specimens, _ = new_specimens(responses.name, responses.inputs, roots, n, rng)
     flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
     values = emulated(flat).reshape(len(roots[0]), n, *emulated.event)
     runs = len(emulated.z)
-    is_own = responses.same_as(simulator.responses)
-    source = (
-        f"new specimens, by the emulator of {simulator.name} ({runs} runs)"
-        if is_own
-        else f"new specimens, by an interpolant through {runs} runs at those of {simulator.name}"
-    )
-    return _Drawn(values, specimens, source, emulated.error)
+    if responses.same_as(simulator.responses):
+        source = f"new specimens, by the emulator of {simulator.name} ({runs} runs)"
+    else:
+        source = (
+            f"new specimens, by an interpolant through {runs} runs at those of {simulator.name}"
+        )
+    return _Predicted(values, specimens, source, emulated.error)
 
 
-def _report_rough_surface(label: str, drawn: _Drawn) -> None:
-    """Report an emulator whose error is visible beside the scatter of the predicted responses."""
+def _report_rough_emulator(label: str, drawn: _Predicted) -> None:
+    """Report an emulator with an error above 5 % of the scatter of the predicted responses."""
     if drawn.error is None:
         return
     flat = drawn.values.reshape(-1, drawn.error.size)
-    good = np.isfinite(flat).all(axis=1)
-    spread = flat[good].std(axis=0) if good.any() else np.full(drawn.error.shape, np.nan)
+    is_finite = np.isfinite(flat).all(axis=1)
+    spread = np.full(drawn.error.shape, np.nan)
+    if is_finite.any():
+        spread = flat[is_finite].std(axis=0)
     share = float(np.max(drawn.error / np.where(spread > 0, spread, np.inf)))
     if share > 0.05:
         report(
@@ -445,8 +435,11 @@ def _resampled_responses(
     points: dict[str, Floats],
     n: int,
     rng: np.random.Generator,
-) -> _Drawn:
-    """Return responses of n design points for each population."""
+) -> _Predicted:
+    """Return responses of n design points for each population, in random order.
+
+    Systematic resampling: the number of copies of a point is its weight times n, to one.
+    """
     bound = node.reweighted
     assert bound is not None
     roots = [points[str(rv.name)] for rv in bound.inputs.roots]
@@ -456,35 +449,23 @@ def _resampled_responses(
         with designs_restored([bound]):
             bound.design = bound.design.runs_alone()
             return _resampled_responses(node, responses, points, n, rng)
-    chosen = _resampled(node.name, bound, roots, n, rng)
-    values = values[chosen]
-    specimens = [x[chosen] for x in bound.points_of(responses.inputs)]
-    what = "design points" if responses.count else "stored responses"
-    return _Drawn(values, specimens, f"{what} of {node.name}")
-
-
-def _resampled(
-    name: str, design: ReweightedBound, roots: list[Floats], n: int, rng: np.random.Generator
-) -> NDArray[np.intp]:
-    """Return design points of n specimens for each population, shape (k, n), in random order.
-
-    Systematic resampling: as many of each point as its weight says, but for one.
-    """
-    refuse_unsupported(name, design, roots)
-    _, weights = design.populations(roots)
-    places = (np.arange(n) + rng.random((len(weights), 1))) / n
-    found = reached(np.nan_to_num(weights), places, normalized=True)
-    return rng.permuted(found, axis=1)
+    refuse_unsupported(node.name, bound, roots)
+    _, weights = bound.populations(roots)
+    levels = (np.arange(n) + rng.random((len(weights), 1))) / n
+    rows = rng.permuted(reached(np.nan_to_num(weights), levels, normalized=True), axis=1)
+    specimens = [x[rows] for x in bound.points_of(responses.inputs)]
+    kind = "design points" if responses.count else "stored responses"
+    return _Predicted(values[rows], specimens, f"{kind} of {node.name}")
 
 
 def refuse_unsupported(name: str, design: ReweightedBound, roots: list[Floats]) -> None:
     """Raise if the design does not support most of the populations."""
     support = design.support(roots)
-    ess = np.median(support["weight_ess"])
-    mass = np.median(support["mean_weight"])
-    # Points without response become NaN, which are counted and said by themselves.
+    # Points without response become NaN, which are counted and reported separately.
     if not shortcoming(support, design.required_ess, 1.0, design.n_points, TOLERABLE):
         return
+    ess = np.median(support["weight_ess"])
+    mass = np.median(support["mean_weight"])
     raise DesignError(
         f"{name}: got a weight effective sample size of {ess:.0f} and a mean raw weight of "
         f"{mass:.2f} (medians over the populations), expected {design.required_ess:.0f} and 1; "
@@ -493,38 +474,24 @@ def refuse_unsupported(name: str, design: ReweightedBound, roots: list[Floats]) 
     )
 
 
-def _new_responses(
-    label: str,
-    responses: Responses,
-    points: dict[str, Floats],
-    n: int,
-    rng: np.random.Generator,
-) -> _Drawn:
-    """Return responses of n new specimens from each population."""
-    inputs = responses.inputs
-    roots = [points[str(rv.name)] for rv in inputs.roots]
-    specimens, epistemic = new_specimens(label, inputs, roots, n, rng)
-    values = responses(specimens, epistemic)
-    return _Drawn(values, specimens, "new specimens")
+# -- the data of the calibration -------------------------------------------------------------------
 
 
 def specimen_names(labels: ArrayLike) -> list[str]:
     """Return labels as text, the same for 3 and 3.0."""
-    names = []
-    for label in np.asarray(labels).tolist():
-        if isinstance(label, float) and label.is_integer():
-            label = int(label)
-        names.append(str(label))
-    return names
+    return [
+        str(int(label) if isinstance(label, float) and label.is_integer() else label)
+        for label in np.asarray(labels).tolist()
+    ]
 
 
 def data_digest(observed: Floats) -> str:
-    """Return what identifies a set of measured values, (n,) or (n, m), in any order."""
+    """Return a digest of measured values, (n,) or (n, m), in any order."""
     return _digest(observed[in_order(observed)])
 
 
 def in_order(observed: Floats) -> NDArray[np.intp]:
-    """Return the order of measured values, of several outputs by the first, then by the others."""
+    """Return the order of measured values, of several outputs lexicographic."""
     if observed.ndim == 1:
         return np.argsort(observed, kind="stable")
     return np.lexsort(observed.T[::-1])
@@ -532,32 +499,26 @@ def in_order(observed: Floats) -> NDArray[np.intp]:
 
 def _digest(*arrays: Floats) -> str:
     """Return 16 hexadecimal digits of the bytes of arrays."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for array in arrays:
-        found.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
-    return found.hexdigest()[:16]
+        digest.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
+    return digest.hexdigest()[:16]
 
 
-def _calibration(result: Optimum | xr.DataTree, model: pm.Model) -> dict[str, list[str]]:
-    """Return attributes that tell on what data the result was calibrated."""
+def _calibration_attributes(result: Optimum | xr.DataTree, model: pm.Model) -> dict[str, list[str]]:
+    """Return digests and labels of the data of the calibration: the result's own if it has them."""
+    stored: Any = {}
+    if isinstance(result, xr.DataTree) and "observed_data" in result:
+        stored = result["observed_data"]
     is_optimum = isinstance(result, Optimum)
     simulators = result.evaluator.simulators if is_optimum else population_simulators(model)
-    # As a set that keeps its order.
-    labels: dict[str, None] = {}
+    labels: dict[str, None] = {}  # in their order, without duplicates
     digests = []
     for node in simulators:
-        digests.append(data_digest(_calibration_data(result, node)))
+        observed = stored.get(node.name, node.observed)
+        digests.append(data_digest(np.asarray(observed)))
         if node.specimens is not None:
             labels |= dict.fromkeys(specimen_names(node.specimens))
-    found = {"calibration_data": digests, "calibration_specimens": list(labels)}
+    attributes = {"calibration_data": digests, "calibration_specimens": list(labels)}
     # netCDF has no empty lists.
-    return {key: value for key, value in found.items() if value}
-
-
-def _calibration_data(result: Optimum | xr.DataTree, node: PopulationSimulator) -> Floats:
-    """Return what a simulator was calibrated on: the result's own data where it has them."""
-    if isinstance(result, xr.DataTree) and "observed_data" in result:
-        kept = result["observed_data"]
-        if node.name in kept:
-            return np.asarray(kept[node.name])
-    return node.observed
+    return {key: value for key, value in attributes.items() if value}

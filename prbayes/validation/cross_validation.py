@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
+from prbayes.inference.refits import refit
 from prbayes.inference.resampling import DataSets, specimens
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
@@ -99,7 +100,7 @@ def cross_validate(
         else:
             observed = [node.target.observed for node in evaluator.nodes]
             sampling = optimum.sampling()
-            x, converged = sampling.refit(DataSets(observed, kept))
+            x, converged = refit(sampling, DataSets(observed, kept))
             thetas = sampling.thetas(x)
     losses = _mean_log_losses if by_specimen else _discrepancies
     scores, weights = _scores(evaluator, thetas, held_out)
@@ -133,9 +134,7 @@ def _require_refits(optimum: Optimum) -> Optimum:
     if is_specimen_optimum(optimum):
         specimen_refits(optimum, "cross_validate")
         return optimum
-    return require_refits(
-        optimum, "cross_validate", ", so that the model cannot be calibrated anew"
-    )
+    return require_refits(optimum, "cross_validate", "; the model cannot be calibrated anew")
 
 
 def _folds(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats, called, positive_integer
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
 from prbayes.model.coverage import shortcomings
 from prbayes.model.fingerprint import Level, require_same
@@ -83,7 +83,7 @@ class JointNull(Null):
     random_seed: int = 0
 
     def __post_init__(self) -> None:
-        advice = ", so that the model cannot be calibrated anew; use prb.validation.PosteriorNull()"
+        advice = "; the model cannot be calibrated anew: use prb.validation.PosteriorNull()"
         require_refits(self.optimum, "JointNull", advice)
         _require_responses(self.responses)
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
@@ -138,7 +138,7 @@ class JointNull(Null):
         points = simulated_points(
             evaluator, populations, self.replicates, self.random_seed, more=n_new
         )
-        x, converged = sampling.refit(sets_at(evaluator, populations, points))
+        x, converged = refit(sampling, sets_at(evaluator, populations, points))
         # With fewer the replicates would be those of unusual data sets.
         if converged.mean() < 0.5:
             raise ValueError(
@@ -172,10 +172,10 @@ class JointNull(Null):
             )
         name = condition.base_name
         nodes = self.optimum.evaluator.nodes
-        given = self.responses
-        if isinstance(given, Mapping):
-            given = given.get(name)
-        if given is None:
+        tested = self.responses
+        if isinstance(tested, Mapping):
+            tested = tested.get(name)
+        if tested is None:
             names = [node.name for node in nodes]
             if len({c.base_name for c in case.conditions}) == len(names) == 1:
                 return _Tested(condition, 0, None)
@@ -185,7 +185,7 @@ class JointNull(Null):
                 f"JointNull: got the condition {name!r}, expected the name of a simulator, "
                 f"{names}; or pass responses={{{name!r}: (response, *inputs)}}"
             )
-        response, *inputs = given
+        response, *inputs = tested
         refuse_uncallable(condition.name, response)
         roots = read_inputs(condition.name, inputs, self.optimum.model)
         responses = Responses(condition.name, response, roots, outputs=None)

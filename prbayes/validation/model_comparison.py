@@ -96,8 +96,8 @@ def rank(
         folds = positive_integer(folds, "folds", minimum=2)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
-    given = [table.sizes["fold"] for table in candidates.values() if isinstance(table, xr.Dataset)]
-    number = folds or (given[0] if given else None)
+    passed = [table for table in candidates.values() if isinstance(table, xr.Dataset)]
+    number = folds or (passed[0].sizes["fold"] if passed else None)
     tables = {}
     for label, candidate in candidates.items():
         if isinstance(candidate, Optimum):

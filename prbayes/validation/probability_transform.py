@@ -60,9 +60,8 @@ def area(u: Floats) -> Floats:
     follows from that of :math:`|v|`, which is :math:`v |v| / 2`.
     """
     *leading, n = u.shape
-    zero = np.zeros((*leading, 1))
-    one = np.ones((*leading, 1))
-    ends = np.concatenate([zero, np.sort(u, axis=-1), one], axis=-1)
+    zeros, ones = np.zeros((*leading, 1)), np.ones((*leading, 1))
+    ends = np.concatenate([zeros, np.sort(u, axis=-1), ones], axis=-1)
     ecdf = np.arange(n + 1) / n
     above = ends[..., 1:] - ecdf
     below = ends[..., :-1] - ecdf

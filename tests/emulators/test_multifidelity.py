@@ -10,8 +10,14 @@ import pytest
 
 from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import GaussianProcess
-from prbayes.emulators.multifidelity import Following, followed, predicted
-from prbayes.emulators.selection import Runs, candidates, chosen, emulated, left_out
+from prbayes.emulators.multifidelity import MultifidelityModel, fit_multifidelity, predict
+from prbayes.emulators.selection import (
+    Runs,
+    candidate_surfaces,
+    left_out_predictions,
+    predict_outputs,
+    select_surfaces,
+)
 from prbayes.emulators.surfaces import Polynomial, RadialBasis
 
 X = np.random.default_rng(3).standard_normal((64, 2))
@@ -33,15 +39,15 @@ def runs(function: Any = fine, coarse: Any = rough) -> Runs:
 
 
 def error(known: Runs, function: Any = fine, coarse: Any = rough) -> float:
-    models, _ = chosen(candidates(*known.x.shape), known)
-    found = emulated(models, known, AT, coarse=coarse(AT).reshape(len(AT), -1))[:, 0]
+    models, _ = select_surfaces(candidate_surfaces(*known.x.shape), known)
+    found = predict_outputs(models, known, AT, coarse=coarse(AT).reshape(len(AT), -1))[:, 0]
     return float(np.std(found - function(AT)) / np.std(function(AT)))
 
 
 @pytest.mark.parametrize("joined", [False, True])
 @pytest.mark.parametrize("model", [RadialBasis(), Polynomial(2), GaussianProcess("matern")])
 def test_a_coarse_response_is_followed_with_its_sign(model: Any, joined: bool) -> None:
-    surface = followed(model, X, fine(X), rough(X), joined=joined)
+    surface = fit_multifidelity(model, X, fine(X), rough(X), joined=joined)
     if not joined:
         assert surface.rho == pytest.approx(-3, abs=0.2)
     off = surface(AT, rough(AT)) - fine(AT)
@@ -60,7 +66,7 @@ def test_what_varies_over_short_distances_tells_rho() -> None:
 
     tuned = GaussianProcess("matern", lengths=(1.0, 1.0), nugget=1e-6)
     for model in (tuned, RadialBasis()):
-        rho = followed(model, X, trend(X), coarse(X), joined=False).rho
+        rho = fit_multifidelity(model, X, trend(X), coarse(X), joined=False).rho
         assert rho == pytest.approx(1, abs=0.2)
     assert np.polyfit(coarse(X), trend(X), 1)[0] > 2
 
@@ -68,20 +74,20 @@ def test_what_varies_over_short_distances_tells_rho() -> None:
 @pytest.mark.parametrize("joined", [False, True])
 def test_rho_is_of_the_runs_that_are_kept(joined: bool) -> None:
     known = runs()
-    models = [Following(RadialBasis(), RadialBasis(), joined)]
-    said = left_out(models, known)
+    models = [MultifidelityModel(RadialBasis(), RadialBasis(), joined)]
+    said = left_out_predictions(models, known)
     block = known.blocks == 3
     other_y = np.where(block[:, None], 70.0, known.y)
     other = Runs(known.x, other_y, known.importance, known.blocks, known.coarse)
-    np.testing.assert_array_equal(left_out(models, other)[block], said[block])
+    np.testing.assert_array_equal(left_out_predictions(models, other)[block], said[block])
     assert np.abs(said - known.y).max() < 0.5 * np.ptp(known.y)
 
 
 def test_a_coarse_response_makes_errors_far_smaller() -> None:
     known = runs()
     alone = Runs(known.x, known.y, known.importance, known.blocks)
-    without, _ = chosen(candidates(*known.x.shape), alone)
-    off = emulated(without, alone, AT)[:, 0] - fine(AT)
+    without, _ = select_surfaces(candidate_surfaces(*known.x.shape), alone)
+    off = predict_outputs(without, alone, AT)[:, 0] - fine(AT)
     assert error(known) < 0.05 * off.std() / fine(AT).std()
 
 
@@ -90,7 +96,7 @@ def test_what_is_beside_may_depend_on_the_coarse_response() -> None:
         return np.exp(0.3 * x[:, 0]) * rough(x)
 
     known = runs(scaled)
-    models, _ = chosen(candidates(*known.x.shape), known)
+    models, _ = select_surfaces(candidate_surfaces(*known.x.shape), known)
     assert models[0].joined
     assert error(known, scaled) < 0.2
 
@@ -104,8 +110,8 @@ def test_one_that_tells_nothing_is_not_followed() -> None:
 
     known = runs(smooth, unrelated)
     alone = Runs(known.x, known.y, known.importance, known.blocks)
-    models, said = chosen(candidates(*known.x.shape), known)
-    without, same = chosen(candidates(*known.x.shape), alone)
+    models, said = select_surfaces(candidate_surfaces(*known.x.shape), known)
+    without, same = select_surfaces(candidate_surfaces(*known.x.shape), alone)
     assert models == without
     np.testing.assert_array_equal(said, same)
 
@@ -115,10 +121,10 @@ def test_each_output_has_a_rho_of_its_own() -> None:
         lambda x: np.stack([fine(x), x[:, 0]], axis=1),
         lambda x: np.stack([1e6 + 1e3 * rough(x), rough(x)], axis=1),
     )
-    models, _ = chosen(candidates(*known.x.shape), known)
-    assert isinstance(models[0], Following)
+    models, _ = select_surfaces(candidate_surfaces(*known.x.shape), known)
+    assert isinstance(models[0], MultifidelityModel)
     coarse = np.stack([1e6 + 1e3 * rough(AT), np.full(len(AT), 1e9)], axis=1)
-    found = emulated(models, known, AT, coarse=coarse)
+    found = predict_outputs(models, known, AT, coarse=coarse)
     assert np.std(found[:, 0] - fine(AT)) < 0.05 * fine(AT).std()
 
 
@@ -127,11 +133,11 @@ def test_where_there_is_no_coarse_response_the_surface_goes_on_without_it() -> N
         return np.where(x[:, 0] > 1, np.nan, rough(x))
 
     known = runs(coarse=partly)
-    models, _ = chosen(candidates(*known.x.shape), known)
-    assert isinstance(models[0], Following)
-    found = emulated(models, known, AT, coarse=partly(AT)[:, None])
+    models, _ = select_surfaces(candidate_surfaces(*known.x.shape), known)
+    assert isinstance(models[0], MultifidelityModel)
+    found = predict_outputs(models, known, AT, coarse=partly(AT)[:, None])
     without = AT[:, 0] > 1
-    alone = emulated([models[0].otherwise], known, AT)
+    alone = predict_outputs([models[0].otherwise], known, AT)
     # Up to the last digit, in which sums over fewer points at a time differ.
     np.testing.assert_allclose(found[without], alone[without], rtol=1e-12)
     assert np.std(found[~without, 0] - fine(AT[~without])) < 0.1 * fine(AT).std()
@@ -139,15 +145,15 @@ def test_where_there_is_no_coarse_response_the_surface_goes_on_without_it() -> N
 
 def test_too_few_coarse_responses_are_none() -> None:
     known = runs(coarse=lambda x: np.where(np.arange(len(x)) < 60, np.nan, rough(x)))
-    models, _ = chosen([Polynomial(2)], known)
+    models, _ = select_surfaces([Polynomial(2)], known)
     assert models == (Polynomial(2),)
 
 
 def test_a_constant_coarse_response_tells_nothing() -> None:
-    surface = followed(GaussianProcess(), X, fine(X), np.full(64, 3.0), joined=False)
+    surface = fit_multifidelity(GaussianProcess(), X, fine(X), np.full(64, 3.0), joined=False)
     assert surface.rho == pytest.approx(0, abs=1e-12)
     model = GaussianProcess("matern", lengths=(1.0, 1.0, 1.0), nugget=1e-6)
     constant = np.full(64, 3.0)
-    following = Following(model, model, joined=True)
-    found = predicted(following, X, fine(X), AT, constant, np.full(len(AT), 3.0))
+    following = MultifidelityModel(model, model, joined=True)
+    found = predict(following, X, fine(X), AT, constant, np.full(len(AT), 3.0))
     assert np.isfinite(found).all()

@@ -11,13 +11,13 @@ from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.selection import (
     Runs,
-    candidates,
-    chosen,
-    emulated,
-    emulated_without_each,
+    candidate_surfaces,
     has_enough_runs,
-    left_out,
-    share_of_runs,
+    left_out_predictions,
+    mixing_weight,
+    predict_outputs,
+    predict_without_blocks,
+    select_surfaces,
 )
 from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
 
@@ -33,32 +33,32 @@ def two(x: Floats) -> Floats:
 
 def test_a_run_that_is_left_out_is_not_seen() -> None:
     known = runs(two)
-    said = left_out([RadialBasis(), RadialBasis()], known)
+    said = left_out_predictions([RadialBasis(), RadialBasis()], known)
     block = known.blocks == 3
     other = Runs(known.x, np.where(block[:, None], 7.0, known.y), known.importance, known.blocks)
     np.testing.assert_array_equal(
-        left_out([RadialBasis(), RadialBasis()], other)[block], said[block]
+        left_out_predictions([RadialBasis(), RadialBasis()], other)[block], said[block]
     )
     assert np.abs(said - known.y).max() > 0
 
 
 def test_each_output_has_the_surface_that_is_best_for_it() -> None:
     known = runs(lambda x: np.stack([x[:, 0] ** 2, np.abs(x[:, 1]) + (x[:, 0] > 0)], axis=1))
-    models, said = chosen([Polynomial(2), GaussianProcess("matern")], known)
+    models, said = select_surfaces([Polynomial(2), GaussianProcess("matern")], known)
     assert isinstance(models[0], Polynomial)
     assert isinstance(models[1], GaussianProcess)
     assert models[1].lengths is not None
-    np.testing.assert_array_equal(said[:, 0], left_out(models, known)[:, 0])
+    np.testing.assert_array_equal(said[:, 0], left_out_predictions(models, known)[:, 0])
 
 
 def test_where_the_nearest_run_failed_there_is_no_number() -> None:
     known = runs(lambda x: np.where(x[:, :1] > 0.5, np.nan, x[:, :1]))
     at = np.array([[2.0, 0.0], [-1.0, 0.0]])
-    found = emulated([RadialBasis()], known, at)
+    found = predict_outputs([RadialBasis()], known, at)
     assert np.isnan(found[0]).all()
     assert found[1] == pytest.approx(-1, abs=1e-6)
     infinite = runs(lambda x: np.where(x[:, :1] > 0.5, np.inf, x[:, :1]))
-    assert np.isposinf(emulated([RadialBasis()], infinite, at)[0]).all()
+    assert np.isposinf(predict_outputs([RadialBasis()], infinite, at)[0]).all()
 
 
 def test_points_that_come_again_are_no_obstacle() -> None:
@@ -70,12 +70,14 @@ def test_points_that_come_again_are_no_obstacle() -> None:
         np.arange(128) * 8 // 128,
     )
     models = [RadialBasis(), RadialBasis()]
-    np.testing.assert_allclose(emulated(models, twice, known.x), known.y, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        predict_outputs(models, twice, known.x), known.y, rtol=1e-6, atol=1e-6
+    )
 
 
 def test_nothing_is_further_than_the_runs_are_from_each_other() -> None:
     known = runs(two)
-    found = emulated([RadialBasis("quintic")] * 2, known, np.full((1, 2), 1e3))
+    found = predict_outputs([RadialBasis("quintic")] * 2, known, np.full((1, 2), 1e3))
     assert (np.abs(found - known.y.mean(axis=0)) < 3 * np.ptp(known.y, axis=0)).all()
 
 
@@ -93,21 +95,21 @@ def test_of_too_many_runs_some_far_ones_are_kept(monkeypatch: pytest.MonkeyPatch
 def test_units_and_scales_do_not_matter() -> None:
     known = runs(two)
     other = Runs(1e6 * known.x + 5, 1e-9 * known.y, known.importance, known.blocks)
-    models, said = chosen(candidates(*known.x.shape), known)
-    others, again = chosen(candidates(*known.x.shape), other)
+    models, said = select_surfaces(candidate_surfaces(*known.x.shape), known)
+    others, again = select_surfaces(candidate_surfaces(*known.x.shape), other)
     assert [type(m) for m in models] == [type(m) for m in others]
     np.testing.assert_allclose(again * 1e9, said, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize(("n", "d"), [(16, 2), (32, 8), (256, 8), (200, 3)])
 def test_a_polynomial_has_a_third_as_many_terms_as_there_are_runs(n: int, d: int) -> None:
-    *_, spline = candidates(n, d)
+    *_, spline = candidate_surfaces(n, d)
     assert isinstance(spline, RadialBasis)
     assert spline.terms(d) <= n / 3 or spline.degree == 2
 
 
 def test_of_many_runs_only_processes_are_tried() -> None:
-    assert all(isinstance(model, GaussianProcess) for model in candidates(257, 2))
+    assert all(isinstance(model, GaussianProcess) for model in candidate_surfaces(257, 2))
 
 
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern"])
@@ -121,16 +123,19 @@ def test_a_process_without_a_block_is_that_of_the_other_runs(kernel: str, bad: f
         return np.where(x[:, :1] > 1, bad, np.sin(2 * x[:, :1]) + x[:, 1:])
 
     known = runs(response)
-    said = left_out([model], known)
+    said = left_out_predictions([model], known)
     at = np.random.default_rng(4).standard_normal((50, 2))
-    each = list(emulated_without_each([model], known, at))
+    each = list(predict_without_blocks([model], known, at))
     assert len(each) == 8
     for number, values in enumerate(each):
         block = known.blocks == number
-        alone = emulated([model], known, at, ~block)
+        alone = predict_outputs([model], known, at, ~block)
         np.testing.assert_allclose(values, alone, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(
-            said[block], emulated([model], known, known.x[block], ~block), rtol=1e-8, atol=1e-8
+            said[block],
+            predict_outputs([model], known, known.x[block], ~block),
+            rtol=1e-8,
+            atol=1e-8,
         )
 
 
@@ -138,7 +143,7 @@ def test_runs_that_determine_no_surface_are_told() -> None:
     assert not has_enough_runs(Polynomial(3), 20, 3)
     assert has_enough_runs(Polynomial(1), 20, 3)
     with pytest.raises(np.linalg.LinAlgError):
-        chosen([Polynomial(9)], runs(two))
+        select_surfaces([Polynomial(9)], runs(two))
 
 
 def test_a_surface_of_a_users_own_and_a_regressor_serve() -> None:
@@ -158,7 +163,7 @@ def test_a_surface_of_a_users_own_and_a_regressor_serve() -> None:
 
     known = runs(two)
     for model in (Mean(), Regressor()):
-        found = emulated([model, model], known, known.x)
+        found = predict_outputs([model, model], known, known.x)
         np.testing.assert_allclose(found, np.broadcast_to(known.y.mean(axis=0), (64, 2)))
         assert not hasattr(model, "value")
 
@@ -170,20 +175,20 @@ BLOCKS = np.arange(N) % 8
 
 
 def test_an_emulator_that_is_right_is_trusted() -> None:
-    assert share_of_runs(EVEN, Y, Y + 1e-9, BLOCKS) < 0.01
+    assert mixing_weight(EVEN, Y, Y + 1e-9, BLOCKS) < 0.01
 
 
 def test_scatter_around_the_response_is_no_bias() -> None:
     near = Y + 0.02 * np.random.default_rng(6).standard_normal((N, 1))
-    assert share_of_runs(EVEN, Y, near, BLOCKS) < 0.1
+    assert mixing_weight(EVEN, Y, near, BLOCKS) < 0.1
 
 
 def test_a_rounding_is_no_bias_where_many_specimens_have_one_value() -> None:
     capped = np.minimum(Y, 0.5)
     assert (capped == 0.5).mean() > 0.2
     off = 1e-3 * np.random.default_rng(7).standard_normal((N, 1))
-    assert share_of_runs(EVEN, capped, capped + off, BLOCKS) < 0.01
-    assert share_of_runs(EVEN, capped, capped + 0.5, BLOCKS) > 0.5
+    assert mixing_weight(EVEN, capped, capped + off, BLOCKS) < 0.01
+    assert mixing_weight(EVEN, capped, capped + 0.5, BLOCKS) > 0.5
 
 
 def test_levels_are_where_the_populations_are() -> None:
@@ -195,24 +200,24 @@ def test_levels_are_where_the_populations_are() -> None:
     blocks = np.arange(440) % 8
     wider = np.where(here, 3 * y, y)
     wrong_elsewhere = np.where(here, y, y + 2.0)
-    assert share_of_runs(weights, y, wider, blocks) > 0.5
-    assert share_of_runs(weights, y, wrong_elsewhere, blocks) < 0.01
+    assert mixing_weight(weights, y, wider, blocks) > 0.5
+    assert mixing_weight(weights, y, wrong_elsewhere, blocks) < 0.01
 
 
 def test_an_emulator_that_is_wrong_is_not_trusted() -> None:
-    assert share_of_runs(EVEN, Y, 0 * Y, BLOCKS) > 0.9
-    assert share_of_runs(EVEN, Y, Y + 1.0, BLOCKS) > 0.9
+    assert mixing_weight(EVEN, Y, 0 * Y, BLOCKS) > 0.9
+    assert mixing_weight(EVEN, Y, Y + 1.0, BLOCKS) > 0.9
 
 
 def test_few_runs_leave_more_to_the_emulator() -> None:
     uneven = np.zeros((1, N))
     uneven[:, :16] = 1 / 16
     biased = Y + 0.3
-    assert share_of_runs(uneven, Y, biased, BLOCKS) < share_of_runs(EVEN, Y, biased, BLOCKS)
+    assert mixing_weight(uneven, Y, biased, BLOCKS) < mixing_weight(EVEN, Y, biased, BLOCKS)
 
 
 @pytest.mark.parametrize("lost", [np.nan, np.inf])
 def test_a_failure_that_the_emulator_does_not_know_of_is_a_bias(lost: float) -> None:
     failed = np.where(Y > 0.5, lost, Y)
-    assert share_of_runs(EVEN, failed, Y, BLOCKS) >= 0.0
-    assert share_of_runs(EVEN, Y, failed, BLOCKS) > 0.5
+    assert mixing_weight(EVEN, failed, Y, BLOCKS) >= 0.0
+    assert mixing_weight(EVEN, Y, failed, BLOCKS) > 0.5

@@ -8,9 +8,15 @@ import pytest
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local, first_order_shifts, local_sampling
+from prbayes.inference.asymptotics import (
+    Information,
+    Local,
+    first_order_shifts,
+    local_sampling,
+    number_parts,
+    one_dimensional,
+)
 from prbayes.inference.resampling import DataSets
-from prbayes.inference.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 60)
@@ -154,3 +160,27 @@ def test_the_variance_of_a_function_across_what_is_identified_is_infinite() -> N
     local = Local(np.ones(2), direction, np.array([[-0.8], [0.6]]), np.array([[0.25]]))
     found = local.variance(np.array([[0.6, 0.8], [1.0, 0.0], [-0.8, 0.6]]))
     np.testing.assert_allclose(found, [0.25, np.inf, np.inf])
+
+
+# -- parts that see one number of a specimen --
+
+RNG = np.random.default_rng(1)
+
+
+def test_a_metric_of_one_output_sees_the_responses_themselves() -> None:
+    target = prb.AreaMetric().against(RNG.normal(size=20))
+    values = RNG.normal(size=(3, 50))
+    (seen,) = one_dimensional(target, values)
+    assert seen is values
+
+
+def test_a_joint_metric_sees_a_number_in_each_direction() -> None:
+    target = prb.Joint(prb.AreaMetric(), directions=5).against(RNG.normal(size=(20, 2)))
+    values = RNG.normal(size=(3, 50, 2))
+    seen = one_dimensional(target, values)
+    assert [numbers.shape for numbers in seen] == [(3, 50)] * 5
+
+
+def test_a_residual_of_correlations_sees_no_single_number() -> None:
+    target = prb.MarginalCorrelation(prb.AreaMetric()).against(RNG.normal(size=(20, 3)))
+    assert len(number_parts(target)) == 3

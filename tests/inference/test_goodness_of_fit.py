@@ -12,9 +12,8 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.goodness_of_fit import (
     UNLIKELY,
-    Refitted,
-    of_another_family,
-    of_held_away,
+    FittedSets,
+    population_misfit,
 )
 from prbayes.inference.refits import SamplingDistribution
 
@@ -39,9 +38,9 @@ def optimum(name: str, family: str, seed: int, n: int = 50, **keywords: Any) -> 
 
 
 def fit_probability(sampling: SamplingDistribution, n_sets: int = 200) -> float:
-    refitted = Refitted.of(sampling, n_sets, 0)
-    assert refitted is not None
-    return refitted.probability
+    fitted = FittedSets.of(sampling, n_sets, 0)
+    assert fitted is not None
+    return fitted.p_value
 
 
 def probabilities(name: str, family: str, sets: int) -> Floats:
@@ -176,5 +175,5 @@ def test_an_optimum_that_the_prior_holds_away_from_the_data_is_told() -> None:
 
 
 def test_where_nothing_is_known_nothing_is_said() -> None:
-    assert of_another_family(np.nan) == []
-    assert of_held_away(np.nan) == []
+    for with_prior in (False, True):
+        assert population_misfit(np.nan, with_prior=with_prior) == []

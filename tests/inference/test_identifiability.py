@@ -7,14 +7,13 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes.inference.asymptotics import Information, identified_by_area
 from prbayes.inference.identifiability import (
-    identified_by_area,
     identified_by_curvature,
     oriented,
     unidentified_directions,
     without,
 )
-from prbayes.inference.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)

@@ -13,8 +13,16 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference import refits as refit
-from prbayes.inference.refits import SamplingDistribution, _mean_hessian
+from prbayes.inference import design_error as design_errors
+from prbayes.inference import refits
+from prbayes.inference.design_error import design_error
+from prbayes.inference.refits import (
+    SamplingDistribution,
+    _mean_hessian,
+    is_prepared_by_data,
+    refit,
+    refit_prepared,
+)
 from prbayes.inference.resampling import (
     DataSets,
     observed_set,
@@ -23,6 +31,7 @@ from prbayes.inference.resampling import (
     simulated_sets,
 )
 from prbayes.model.evaluator import Evaluator
+from prbayes.propagation.design import Design
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 N = OBSERVED.size
@@ -92,7 +101,7 @@ def test_refits_are_minimisers(name: str) -> None:
     # Against a simplex on each data set by itself.
     sampling = neighbourhood(name)
     sets = reweighted_sets(sampling.evaluator, 6)
-    x, converged = sampling.refit(sets)
+    x, converged = refit(sampling, sets)
     assert converged.all()
     target = sampling.evaluator.nodes[0].target
     for found, weights in zip(x, sets.weights[0], strict=True):
@@ -114,9 +123,9 @@ def test_refits_are_minimisers(name: str) -> None:
 def test_where_refits_begin_makes_no_difference() -> None:
     sampling = neighbourhood("pr")
     sets = simulated_sets(sampling.evaluator, sampling.theta, 20)
-    x, converged = sampling.refit(sets)
+    x, converged = refit(sampling, sets)
     start = np.random.default_rng(1).normal(size=x.shape)
-    again, _ = sampling.refit(sets, start)
+    again, _ = refit(sampling, sets, start)
     assert converged.all()
     np.testing.assert_allclose(again, x, atol=0.05)
 
@@ -129,15 +138,15 @@ def test_clouds_come_closer_at_the_rate_of_their_dimension(monkeypatch: pytest.M
     evaluator = Evaluator.of(model)
     evaluator(np.zeros((1, 1)))
     sampling = SamplingDistribution.of(evaluator, np.zeros(1), np.ones(1))
-    monkeypatch.setattr(SamplingDistribution, "_of_clouds", True)
-    monkeypatch.setattr(SamplingDistribution, "_spread_of_parts", lambda *_: np.array([8.0]))
+    monkeypatch.setattr(Design, "is_emulated", True)
+    monkeypatch.setattr(design_errors, "_spread_of_parts", lambda *_: np.array([8.0]))
     # Eight parts, two inputs: 1/2 + 1/4 as the power of the size.
-    np.testing.assert_allclose(sampling._error_of_points(), 8 / 8**0.75)
+    np.testing.assert_allclose(design_errors._error_of_points(sampling), 8 / 8**0.75)
 
 
 def test_the_observed_responses_are_fitted_by_the_optimum() -> None:
     for name in ("kl", "pr"):
-        (x,), (converged,) = neighbourhood(name).refit(observed_set(neighbourhood(name).evaluator))
+        (x,), (converged,) = refit(neighbourhood(name), observed_set(neighbourhood(name).evaluator))
         assert converged
         np.testing.assert_allclose(x, 0, atol=0.02)
 
@@ -148,8 +157,8 @@ def test_first_order_without_a_design(name: str) -> None:
     # specimens are the same.
     sampling, first = neighbourhood(name), neighbourhood(name, design=False)
     sets = reweighted_sets(sampling.evaluator, 100)
-    a = sampling.thetas(sampling.refit(sets)[0]) - sampling.theta
-    b = first.thetas(first.refit(sets)[0]) - first.theta
+    a = sampling.thetas(refit(sampling, sets)[0]) - sampling.theta
+    b = first.thetas(refit(first, sets)[0]) - first.theta
     for i in range(2):
         assert np.corrcoef(a[:, i], b[:, i])[0, 1] > 0.9
         # A linear model of distribution functions knows the spread of other data to 30%, one of
@@ -162,9 +171,9 @@ def test_first_order_without_a_design(name: str) -> None:
 def test_blocks_of_data_sets_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     sampling = neighbourhood("kl")
     sets = simulated_sets(sampling.evaluator, sampling.theta, 23)
-    whole, _ = sampling.refit(sets)
-    monkeypatch.setattr(refit, "AT_ONCE", 5 * 5 * (256 + sets.values[0].size))
-    parts, converged = sampling.refit(sets)
+    whole, _ = refit(sampling, sets)
+    monkeypatch.setattr(refits, "AT_ONCE", 5 * 5 * (256 + sets.values[0].size))
+    parts, converged = refit(sampling, sets)
     assert converged.size == 23
     # Each block guesses its curvature from its own data sets, so that paths differ, but not where
     # they lead.
@@ -176,10 +185,10 @@ def test_two_simulators_are_weighed_by_their_scales() -> None:
     evaluator = pair()
     sampling = SamplingDistribution.of(evaluator, TRUTH, np.array([1 / N, 1e9]))
     sets = reweighted_sets(evaluator, 20)
-    only_a, _ = sampling.refit(sets)
+    only_a, _ = refit(sampling, sets)
     alone = Evaluator.of(build(METRICS["kl"], sd=0.5))
     by_itself = SamplingDistribution.of(alone, TRUTH, np.array([1 / N]))
-    expected, _ = by_itself.refit(DataSets(sets.values[:1], sets.weights[:1]))
+    expected, _ = refit(by_itself, DataSets(sets.values[:1], sets.weights[:1]))
     np.testing.assert_allclose(sampling.thetas(only_a), by_itself.thetas(expected), atol=0.003)
 
 
@@ -212,14 +221,14 @@ def test_a_minimiser_goes_where_its_data_go() -> None:
     above = (np.median(OBSERVED) < OBSERVED).astype(float)
     weights = np.array([above, 1 - above])
     weights /= weights.sum(axis=1, keepdims=True)
-    x, _ = sampling.refit(DataSets([OBSERVED], [weights]))
+    x, _ = refit(sampling, DataSets([OBSERVED], [weights]))
     up, down = sampling.thetas(x)[:, 0]
     np.testing.assert_allclose([up, down], weights @ OBSERVED, atol=0.05)
 
 
 def test_a_simulator_without_a_design_has_no_design_error() -> None:
     sampling = neighbourhood("pr", design=False)
-    assert np.isnan(sampling.design_error().whole)
+    assert np.isnan(design_error(sampling).whole)
 
 
 @pytest.mark.long
@@ -239,10 +248,10 @@ def test_data_that_tell_nothing_leave_nothing_to_refit() -> None:
     distribution = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
     assert distribution.stderr.size == 0
     sets = reweighted_sets(optimum.evaluator, 5, seed=0)
-    minimisers, converged = distribution.refit(sets)
+    minimisers, converged = refit(distribution, sets)
     assert minimisers.shape == (5, 0)
     assert converged.all()
-    assert distribution.design_error().whole == 0
+    assert design_error(distribution).whole == 0
 
 
 def test_rough_refits_are_around_the_exact_ones_where_hyperparameters_hang_together() -> None:
@@ -262,9 +271,9 @@ def test_rough_refits_are_around_the_exact_ones_where_hyperparameters_hang_toget
     stderr = np.sqrt(np.diag(covariance))
     along = replace(sampling, axes=np.eye(2), stderr=stderr)
     sets = simulated_sets(along.evaluator, sampling.theta, 300, seed=1)
-    exact, _ = along.refit(sets)
+    exact, _ = refit(along, sets)
     assert np.corrcoef(exact.T)[0, 1] < -0.9
-    rough, converged = along.refit(sets, roughly=True)
+    rough, converged = refit(along, sets, is_rough=True)
     assert converged.all()
     off = (rough - exact) / exact.std(axis=0)
     assert np.abs(off.mean(axis=0)).max() < 0.01
@@ -276,10 +285,9 @@ def test_a_variance_that_rounding_made_nothing_leaves_refits_their_axes() -> Non
     flat = replace(
         sampling, local=replace(sampling.local, covariance=0 * sampling.local.covariance)
     )
-    np.testing.assert_array_equal(flat._root, np.eye(2))
-    x, converged = flat.refit(observed_set(flat.evaluator))
+    x, converged = refit(flat, observed_set(flat.evaluator))
     assert converged.all()
-    np.testing.assert_allclose(x, sampling.refit(observed_set(flat.evaluator))[0], atol=1e-6)
+    np.testing.assert_allclose(x, refit(sampling, observed_set(flat.evaluator))[0], atol=1e-6)
 
 
 def test_where_all_descents_end_is_no_error_of_emulators(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,8 +305,8 @@ def test_where_all_descents_end_is_no_error_of_emulators(monkeypatch: pytest.Mon
     optimum = prb.minimize(model, starts=0)
     sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
     ends = iter([0.3, *[0.4] * 3, *[0.3] * 5])  # of the whole, and of eight that lack a block
-    monkeypatch.setattr(SamplingDistribution, "_only", lambda *_: np.array([next(ends)]))
-    assert sampling._error_of_emulators() == pytest.approx(np.sqrt(3) * 0.1)
+    monkeypatch.setattr(design_errors, "_minimum", lambda *_: np.array([next(ends)]))
+    assert design_errors._error_of_emulators(sampling) == pytest.approx(np.sqrt(3) * 0.1)
 
 
 # -- a metric prepared for each data set
@@ -330,12 +338,12 @@ def of_two_outputs(metric: prb.Metric = METRICS["kl"]) -> SamplingDistribution:
 def test_a_metric_prepared_anew_is_that_of_the_other_data(name: str) -> None:
     sampling = of_two_outputs(METRICS[name])
     sets = simulated_sets(sampling.evaluator, sampling.theta, 20, seed=4)
-    shared, _ = sampling.refit(sets)
-    found, converged = sampling.refit_prepared(sets, shared)
+    shared, _ = refit(sampling, sets)
+    found, converged = refit_prepared(sampling, sets, shared)
     for i in (0, 7):
         data, weights = one_set(sampling.evaluator, sets, i)
         other = sampling.evaluator.observing(data, weights=weights)
-        (expected,), _ = replace(sampling, evaluator=other).refit(observed_set(other))
+        (expected,), _ = refit(replace(sampling, evaluator=other), observed_set(other))
         # To a few hundredths of a standard error, and a kink of areas that is flat.
         np.testing.assert_allclose(found[i], expected, atol=0.1 if name == "kl" else 0.25)
     assert converged.all()
@@ -346,10 +354,10 @@ def test_a_metric_prepared_anew_is_that_of_the_other_data(name: str) -> None:
 def test_a_minimiser_that_ran_away_is_no_start() -> None:
     sampling = of_two_outputs()
     sets = simulated_sets(sampling.evaluator, sampling.theta, 4, seed=4)
-    shared, _ = sampling.refit(sets)
-    near, _ = sampling.refit_prepared(sets, shared)
+    shared, _ = refit(sampling, sets)
+    near, _ = refit_prepared(sampling, sets, shared)
     away = shared + np.array([0.0, 0.0, 25.0])
-    np.testing.assert_allclose(sampling.refit_prepared(sets, away)[0], near, atol=0.05)
+    np.testing.assert_allclose(refit_prepared(sampling, sets, away)[0], near, atol=0.05)
 
 
 def test_a_data_set_that_a_metric_cannot_be_prepared_for_keeps_its_minimiser() -> None:
@@ -359,7 +367,7 @@ def test_a_data_set_that_a_metric_cannot_be_prepared_for_keeps_its_minimiser() -
     weights[1] = 0.0
     weights[1, 5] = 1.0  # all specimens are alike
     alike = DataSets(sets.values, [weights])
-    found, converged = sampling.refit_prepared(alike, np.zeros((3, 3)))
+    found, converged = refit_prepared(sampling, alike, np.zeros((3, 3)))
     assert converged.tolist() == [True, False, True]
     np.testing.assert_array_equal(found[1], 0)
 
@@ -377,5 +385,5 @@ def test_where_a_metric_is_prepared_for_the_data_alone(case: str) -> None:
         sampling = of_two_outputs(prb.FunctionMetric(between, weighted=True))
     else:
         sampling = neighbourhood("kl", design=case == "one output")
-    assert not sampling.prepares
-    assert of_two_outputs().prepares
+    assert not is_prepared_by_data(sampling.evaluator)
+    assert is_prepared_by_data(of_two_outputs().evaluator)

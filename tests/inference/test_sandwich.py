@@ -10,8 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.inference.asymptotics import local_sampling
-from prbayes.inference.sandwich import Information
+from prbayes.inference.asymptotics import Information, local_sampling
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -241,7 +240,7 @@ def test_noise_of_gradients_with_tails_is_that_of_the_whole_population() -> None
     each = [information.gradients(values[b], np.eye(len(values[b]))) for b in batches]
     noise = np.cov(np.concatenate(each), rowvar=False, aweights=weights)
     size = np.sqrt(np.diag(noise))
-    found = information.sampling_covariance * information._target.n_effective
+    found = information.sampling_covariance * information.node.target.n_effective
     np.testing.assert_allclose(
         found / np.outer(size, size), noise / np.outer(size, size), atol=0.02
     )

@@ -49,13 +49,6 @@ def test_units_and_signs_of_outputs_do_not_matter() -> None:
         assert metric.against(y * scale)(x * scale) == pytest.approx(expected, rel=1e-9)
 
 
-def test_one_output_is_the_metric_itself() -> None:
-    x, y = sample(40, 0)[:, :1], sample(30, 1)[:, :1]
-    expected = AreaMetric().against(y[:, 0])(x[:, 0])
-    assert MarginalCorrelation(AreaMetric()).against(y)(x) == expected
-    assert MarginalCorrelation(AreaMetric()).against(y[:, 0])(x[:, 0]) == expected
-
-
 def test_a_correlation_has_the_specimens_that_have_both() -> None:
     x, y = sample(40, 0), sample(30, 1)
     y[:10, 0] = NAN

@@ -38,16 +38,6 @@ def test_the_likelihood_of_a_normal_density(
     np.testing.assert_allclose(LogLikelihood(density=GaussianKDE(a * h))(x, z), expected, rtol=3e-3)
 
 
-@pytest.mark.parametrize("observed", [[0.1], [0.1, 0.1], np.full(6, 0.1)])
-def test_equal_observed_values_need_a_bandwidth(draw: Draw, observed: Floats) -> None:
-    x, w, _, _ = draw(11)
-    expected = -np.log(w @ norm.pdf(x, 0.1, 0.4))
-    found = LogLikelihood(density=GaussianKDE(0.4))(x, observed, weights=w)
-    np.testing.assert_allclose(found, expected, rtol=1e-3)
-    with pytest.raises(ValueError, match=r"bandwidth: got 0 .*GaussianKDE\(bandwidth=.*AreaMetric"):
-        LogLikelihood(density=GaussianKDE())(x, observed)
-
-
 def test_with_a_histogram_it_is_the_frequency_of_each_bin() -> None:
     # Two bins of width 2; 3 of 4 simulated values in the first.
     expected = -(2 * np.log(3 / 8) + np.log(1 / 8)) / 3

@@ -88,9 +88,3 @@ def test_wrong_settings() -> None:
         ProbabilityResidual(GaussianKDE)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="density: got str 'kde', expected prb"):
         ProbabilityResidual("kde")  # type: ignore[arg-type]
-
-
-def test_equal_observed_values_need_a_bandwidth() -> None:
-    with pytest.raises(ValueError, match=r"bandwidth: got 0 .*GaussianKDE\(bandwidth=.*AreaMetric"):
-        ProbabilityResidual()([0.0, 1.0], [0.1, 0.1])
-    assert ProbabilityResidual(GaussianKDE(0.4))([0.1], [0.1, 0.1]) == pytest.approx(0, abs=1e-14)

@@ -12,6 +12,7 @@ from four_metrics import METRICS, R256, same
 from scipy.stats import norm
 
 import prbayes as prb
+from prbayes.inference.refits import refit
 from prbayes.inference.resampling import observed_set, one_set, reweighted_sets, simulated_sets
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -92,12 +93,12 @@ def test_several_outputs_are_looked_at_as_the_metric_is_prepared_for_them(parame
         sets = simulated_sets(evaluator, optimum.theta, 20, 3)
     else:
         sets = reweighted_sets(evaluator, 20, 3)
-    shared, _ = sampling.refit(sets)
+    shared, _ = refit(sampling, sets)
     draws = np.column_stack([found.posterior[name][0] for name in ("mu", "tau")])
     for i in (0, 9):
         data, weights = one_set(evaluator, sets, i)
         other = evaluator.observing(data, weights=weights)
-        own, _ = replace(sampling, evaluator=other).refit(observed_set(other))
+        own, _ = refit(replace(sampling, evaluator=other), observed_set(other))
         (expected,) = own_values(evaluator, sampling.thetas(own))
         np.testing.assert_allclose(draws[i], expected, rtol=0.02)
     as_measured = own_values(evaluator, sampling.thetas(shared))

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference.sandwich import Information
+from prbayes.inference.asymptotics import Information
 from prbayes.metrics.density import Histogram
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import has_default_epsilon, nodes

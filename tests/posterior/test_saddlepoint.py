@@ -28,7 +28,7 @@ from prbayes.posterior.saddlepoint import (
     Scores,
     cumulants,
     log_density,
-    saddlepoints,
+    minimum,
     varying_combinations,
 )
 from prbayes.posterior.target import Target
@@ -65,9 +65,12 @@ def test_derivatives_of_the_cumulant_function() -> None:
 
 def test_tilts_have_no_gradient_and_simulators_add() -> None:
     logs, values = atoms()
-    points = saddlepoints([logs], [Scores(values, 7)])
-    assert points.converged.all()
-    np.testing.assert_allclose(points.cumulants.gradients, 0, atol=7e-5)
+    scores = [Scores(values, 7)]
+    state, converged = minimum(
+        lambda tilts, rows: cumulants([logs[rows]], scores, tilts), (3, 2), 7, SaddlepointOptions()
+    )
+    assert converged.all()
+    np.testing.assert_allclose(state.gradients, 0, atol=7e-5)
     halves = [Scores(values, 3), Scores(values, 4)]
     np.testing.assert_allclose(
         log_density([logs, logs], halves), log_density([logs], [Scores(values, 7)])
@@ -253,7 +256,7 @@ def test_a_population_of_bounded_support() -> None:
         prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD)
     optimum = prb.minimize(model=model, progressbar=False)
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
-    assert likelihood.groups[0].combinations.shape == (2, 2)
+    assert likelihood.combinations.shape == (2, 2)
     sample = sample_of(likelihood)
     assert sample.pareto_k < 0.7
     draws = likelihood.evaluator.hyperparameters.constrained(sample.draws)
@@ -273,7 +276,7 @@ def test_an_estimate_at_the_end_of_a_prior_is_moved_inside() -> None:
     """The data are beyond the end: scores of an element there would vanish."""
     y = data() + 0.5
     likelihood = likelihood_of(normal_model(bounded, KLD, y))
-    assert likelihood.groups[0].combinations.shape == (2, 2)
+    assert likelihood.combinations.shape == (2, 2)
     require_close(moments_of(likelihood), exact_moments(LOG_PRIORS[bounded], y))
 
 
@@ -314,7 +317,7 @@ def test_the_posterior_of_an_unidentified_hyperparameter_is_its_prior() -> None:
         return vague()
 
     likelihood = likelihood_of(normal_model(parameters, KLD, y))
-    assert likelihood.groups[0].combinations.shape == (3, 2)
+    assert likelihood.combinations.shape == (3, 2)
     sample = sample_of(likelihood)
     place = likelihood.evaluator.hyperparameters.names.index("unused")
     draws = sample.draws[:, place]
@@ -332,7 +335,7 @@ def test_an_estimate_at_an_edge_is_moved_inside() -> None:
         prb.Simulator("y", lambda x: x, x, observed=1 + noise, metric=KLD)
     optimum = prb.minimize(model=model, progressbar=False)
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
-    assert likelihood.groups[0].combinations.shape[1] == 2
+    assert likelihood.combinations.shape[1] == 2
     draws = likelihood.evaluator.hyperparameters.constrained(sample_of(likelihood).draws)
     y = 1 + noise
     mu_grid = np.linspace(0.2, 1.8, 401)[:, None]

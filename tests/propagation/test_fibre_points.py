@@ -15,7 +15,8 @@ from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre_points import fibre_points
-from prbayes.propagation.specimen_points import Emulation, PointOptions, SpecimenPoints
+from prbayes.propagation.specimen_emulation import Emulation, PointOptions
+from prbayes.propagation.specimen_points import SpecimenPoints
 
 N = 8
 

@@ -10,7 +10,8 @@ import pytest
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference.refits import DesignErrors, SamplingDistribution
+from prbayes.inference.design_error import DesignErrors, design_error
+from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import aligned
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
@@ -21,9 +22,9 @@ from prbayes.optimize.design_refinement import (
     refine_at,
 )
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.exponential_families import PointDensity
 from prbayes.propagation.importance import SIZES, columns, mixture_of, spread_over
 from prbayes.propagation.points import MixtureSampler
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.budget import BudgetError
 from prbayes.response.compile import PLAIN
@@ -184,7 +185,7 @@ def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
         model = build(response, known=True)
         optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
         sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
-        errors[kind] = sampling.design_error()
+        errors[kind] = design_error(sampling)
     assert 0.01 < errors["kink"].emulators < np.inf
     assert errors["smooth"].emulators < 0.1 * errors["kink"].emulators
     assert 0.02 < errors["smooth"].points < 0.1
@@ -442,7 +443,7 @@ def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
     evaluator, bound = design_of(build())
     thetas = evaluator.hyperparameters.prior_thetas(2, 0)
     shares = np.array([0.125, 0.875])
-    sampler = MixtureSampler("y", bound.inputs, PointDensity(bound.inputs))
+    sampler = MixtureSampler("y", bound.inputs, PopulationDensity(bound.inputs))
     _, mixture = sampler.draw(evaluator.roots(thetas, 0), 1024, 3, shares)
     np.testing.assert_array_equal(mixture.counts, [128, 896])
 

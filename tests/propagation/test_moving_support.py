@@ -243,8 +243,8 @@ def test_a_support_that_moves_is_found_in_any_chunk_of_points(
         return (x < lower[:, None],)
 
     points = np.full(7, 2.0)
-    assert not edges._is_outside_for_some(outside, 1, [lower], points)
+    assert not edges._support_moves(outside, 1, [lower], points)
     points[place] = -1.0  # outside for all
-    assert not edges._is_outside_for_some(outside, 1, [lower], points)
+    assert not edges._support_moves(outside, 1, [lower], points)
     points[place] = 0.5
-    assert edges._is_outside_for_some(outside, 1, [lower], points)
+    assert edges._support_moves(outside, 1, [lower], points)

@@ -13,7 +13,7 @@ from prbayes.metrics.readings import Readings
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.response_share import ResponseShare, boundary_points, response_share
-from prbayes.propagation.specimen_points import Emulation, PointOptions
+from prbayes.propagation.specimen_emulation import Emulation, PointOptions
 
 LIMIT = 0.15
 OPTIONS = PointOptions()

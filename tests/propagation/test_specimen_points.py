@@ -15,18 +15,17 @@ from scipy.stats import multivariate_normal, norm
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.specimen_points import (
+from prbayes.propagation.normal_populations import normal_log_density
+from prbayes.propagation.specimen_emulation import (
     Emulation,
     PointOptions,
-    SpecimenPoints,
     _narrowing,
-    draw_points,
     emulate,
     first_runs,
-    normal_log_density,
     specimen_roots,
     surface_near,
 )
+from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
 
 Density = Callable[[Floats], Floats]
 
@@ -527,17 +526,16 @@ def test_two_specimens_are_enough() -> None:
 def test_a_run_with_a_huge_response_and_equal_runs_cost_no_digits() -> None:
     z = np.linspace(-1, 1, 41)[:, None]
     data = readings(np.linspace(-0.5, 0.5, 9)[:, None])
-    spread = data.spread()
     y = z + z**3
     y[-1] = 1e30
     # Twenty runs at one place, to the last digit but one.
     rng = np.random.default_rng(0)
     copies = 0.1 + 1e-16 * rng.standard_normal((20, 1))
     z, y = np.concatenate([z, copies]), np.concatenate([y, copies + copies**3])
-    surface, *_ = surface_near(z, y, data, spread, "y")
+    surface, *_ = surface_near(z, y, data, "y")
     near = np.linspace(-0.5, 0.5, 11)[:, None]
     np.testing.assert_allclose(surface.values(near), near + near**3, atol=0.02)
     # Of a straight response over a wide prior all runs keep their values.
     z = np.linspace(-1, 1, 41)[:, None]
-    surface, *_ = surface_near(z, 1e9 * z, data, spread, "y")
+    surface, *_ = surface_near(z, 1e9 * z, data, "y")
     np.testing.assert_allclose(surface.values(z), 1e9 * z, atol=1)

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.reports.tables import cells
+from prbayes.reports.numbers import cells
 
 
 def test_comparison(calibrated: Any, page: Any, row: Any) -> None:
@@ -84,8 +84,8 @@ def test_validity(calibrated: Any, page: Any, row: Any) -> None:
     rows = cells(tested.table).rows
     assert [r[0] for r in rows] == ["early", "late"]
     assert [r[1] for r in rows] == ["not rejected", "rejected"]
-    assert [p for p in tested.text if p.startswith("Held to be true: ")] == [
-        f"Held to be true: {test.null}."
+    assert [p for p in tested.text if p.startswith("Null hypothesis: ")] == [
+        f"Null hypothesis: {test.null}."
     ], "one null, said once"
 
 
@@ -103,7 +103,7 @@ def test_bootstrap_and_other_samplers(calibrated: Any, section: Any) -> None:
     model, optimum, _, _ = calibrated
     boot = prb.bootstrap(optimum, 60, random_seed=1)
     made = prb.Report("x", posterior={"bootstrap": boot}, pictures=False)
-    assert "not looked at, because that needs the model" in section(made, "Diagnostics").text[0]
+    assert "not diagnosed, because that needs the model" in section(made, "Diagnostics").text[0]
     assert cells(section(made, "Posterior").table).rows[0][0] == "mu"
     with_model = prb.Report(
         "x", model=model, posterior={"bootstrap": boot}, optimum=optimum, pictures=False
@@ -192,7 +192,7 @@ def test_a_page_of_them_is_told(later: xr.DataArray) -> None:
     fresh = np.random.default_rng(4).normal(2.0, 0.6, 60)
     report = prb.Report("x", validation={"hot": (fresh, later)}, pictures=False)
     (section,) = (s for s in report.sections if s.title == "Specimens of the test")
-    assert "The first 40 of 60 values are told." in " ".join(section.text)
+    assert "The first 40 of 60 values are shown." in " ".join(section.text)
     assert len(cells(section.table).rows) == 40
 
 

@@ -13,7 +13,7 @@ import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.model.random_variable import nodes
 from prbayes.reports.material import gather
-from prbayes.reports.tables import cells
+from prbayes.reports.numbers import cells
 
 
 def test_files_alone_tell_the_same(tmp_path: Path, calibrated: Any, section: Any) -> None:

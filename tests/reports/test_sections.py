@@ -12,9 +12,8 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.reports.material import gather
-from prbayes.reports.numbers import NOTHING
+from prbayes.reports.numbers import NOTHING, cells
 from prbayes.reports.sections import _other_optimum, data, metric
-from prbayes.reports.tables import cells
 from prbayes.response.outputs import Outputs
 
 
@@ -157,7 +156,7 @@ def test_of_a_curve_some_outputs_have_a_row(calibrated: Any) -> None:
     rows = cells(about.table).rows
     assert len(rows) == len(cells(correlations.table).rows) == 12
     assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
-    assert "y: 12 of 40 outputs are told." in about.text
+    assert "y: 12 of 40 outputs are shown." in about.text
     assert len(values.text) == 41  # of few specimens all outputs are listed
 
 
@@ -266,8 +265,8 @@ def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
         "the data could as well come from there."
     )
     assert text[2].endswith(
-        "at mu = 3.000, with discrepancy 0.2500: the data fit it less well; a posterior tells how "
-        "much it counts."
+        "at mu = 3.000, with discrepancy 0.2500: the data fit it less well; a posterior gives "
+        "its weight."
     )
     vector = ({"point": {"w": np.array([1.0, 2.0])}, "discrepancy": 0.25, "comparable": True},)
     of_it = {"w": np.array([3.0, 4.0])}

@@ -9,7 +9,7 @@ from four_metrics import METRICS, R256, same
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.inference.checks.prior_ends import PriorEnd, at_prior_ends
+from prbayes.inference.checks.prior_ends import PriorEnd, prior_ends
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 
@@ -44,7 +44,7 @@ def narrow(name: str) -> Any:
 def ends(found: pm.Model, theta: Any) -> list[PriorEnd]:
     evaluator = Evaluator.of(found)
     sampling = SamplingDistribution.of(evaluator, np.array(theta), np.ones(1))
-    return at_prior_ends(sampling)
+    return prior_ends(sampling)
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))

@@ -10,7 +10,7 @@ import pytest
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference.measured import Refits, drawn_in, principal_axes
+from prbayes.inference.refits import drawn_in, principal_axes, simplex_refits
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.reweighted import designs_restored
@@ -79,14 +79,14 @@ def sum_of(names: list[str]) -> Evaluator:
 
 def test_the_mean_of_a_sample_scatters_by_its_standard_error() -> None:
     evaluator = sum_of(["mu"])
-    local = Refits.at(evaluator, np.array([1.0]), np.ones(1)).local()
+    local = simplex_refits(evaluator, np.array([1.0]), np.ones(1)).local()
     # 200 data sets tell a standard deviation from their middle 89% to 6%.
     np.testing.assert_allclose(local.in_theta[0, 0] ** 0.5, 0.5 / N**0.5, rtol=3 * 0.06)
 
 
 def test_of_a_sum_of_two_means_only_the_sum_is_identified() -> None:
     evaluator = sum_of(["a", "b"])
-    local = Refits.at(evaluator, np.array([0.5, 0.5]), np.ones(1)).local()
+    local = simplex_refits(evaluator, np.array([0.5, 0.5]), np.ones(1)).local()
     assert local.identified.shape == (2, 1)
     unit = np.sqrt(np.full(2, 0.5))
     # In units of the priors' spreads, which are known from 256 draws to some per cent.
@@ -129,7 +129,7 @@ def test_a_kolmogorov_distance_knows_less_than_the_likelihood() -> None:
 
 def test_data_sets_are_drawn_at_the_optimum() -> None:
     evaluator = sum_of(["mu"])
-    refits = Refits.at(evaluator, np.array([2.0]), np.ones(1))
+    refits = simplex_refits(evaluator, np.array([2.0]), np.ones(1))
     minimisers = 2.0 + refits.shifts[:, 0] * evaluator.hyperparameters.prior_sd[0]
     assert abs(minimisers.mean() - 2.0) < 4 * 0.5 / (N * 200) ** 0.5
     # A minimiser is nowhere worse than theta, and the mean gain is that of one squared standard
@@ -140,15 +140,15 @@ def test_data_sets_are_drawn_at_the_optimum() -> None:
 def test_refits_are_remembered_and_forgotten_with_the_design() -> None:
     evaluator = sum_of(["mu"])
     at = np.array([1.0]), np.ones(1)
-    first = Refits.at(evaluator, *at)
+    first = simplex_refits(evaluator, *at)
     assert (
-        Refits.at(evaluator, at[0], 7 * at[1]) is first
+        simplex_refits(evaluator, at[0], 7 * at[1]) is first
     )  # a scale of one simulator changes nothing
     (bound,) = evaluator.reweighted.values()
     with designs_restored([bound]):
         bound.add(evaluator.roots(np.array([[1.0]]), 0))
-        assert Refits.at(evaluator, *at) is not first
-    assert Refits.at(evaluator, *at) is first
+        assert simplex_refits(evaluator, *at) is not first
+    assert simplex_refits(evaluator, *at) is first
 
 
 def test_principal_axes_of_a_normal_cloud_with_runaways() -> None:

@@ -10,7 +10,12 @@ import pytest
 
 import prbayes as prb
 from prbayes.inference.asymptotics import Local
-from prbayes.inference.checks.discrepancy_confounding import _alike, _canonical, _mixed, confounded
+from prbayes.inference.checks.identification import (
+    canonical_correlation,
+    confounding_findings,
+    correlated_estimates,
+    mixed_directions,
+)
 
 
 def local(identified: Any, variances: Any, size: int) -> Local:
@@ -23,7 +28,7 @@ def local(identified: Any, variances: Any, size: int) -> Local:
 
 def test_the_canonical_correlation_of_two_numbers_is_their_correlation() -> None:
     covariance = np.array([[4.0, -1.8], [-1.8, 1.0]])
-    found, _, _ = _canonical(covariance, np.array([0]), np.array([1]))
+    found, _, _ = canonical_correlation(covariance, np.array([0]), np.array([1]))
     assert found == pytest.approx(0.9)
 
 
@@ -32,7 +37,7 @@ def test_it_is_the_largest_over_all_combinations() -> None:
     root = rng.normal(size=(5, 5))
     covariance = root @ root.T
     own, others = np.array([0, 3]), np.array([1, 2, 4])
-    found, of_own, of_others = _canonical(covariance, own, others)
+    found, of_own, of_others = canonical_correlation(covariance, own, others)
     both = rng.normal(size=(20_000, 5))
     a, b = both[:, own], both[:, others]
     top = np.einsum("ki,ij,kj->k", a, covariance[np.ix_(own, others)], b)
@@ -52,23 +57,23 @@ OWN, OTHERS = np.array([1]), np.array([0, 2])
 
 def test_what_is_not_identified_of_both_is_named() -> None:
     sum_only = local([[1, 0], [1, 0], [0, np.sqrt(2)]] / np.sqrt(2), [0.01, 0.01], 3)
-    assert _mixed(sum_only, OWN, OTHERS, NAMES) in {
+    assert mixed_directions(sum_only, OWN, OTHERS, NAMES) in {
         "mu - lift is not identified",
         "lift - mu is not identified",
     }
 
 
-def test_what_is_not_identified_of_one_alone_is_not_mixed() -> None:
+def test_what_is_not_identified_of_one_alone_is_notmixed_directions() -> None:
     for missing in range(3):
         axes = np.delete(np.eye(3), missing, axis=1)
-        assert _mixed(local(axes, [0.01, 0.01], 3), OWN, OTHERS, NAMES) == ""
-    assert _mixed(local(np.zeros((3, 0)), [], 3), OWN, OTHERS, NAMES) == ""
+        assert mixed_directions(local(axes, [0.01, 0.01], 3), OWN, OTHERS, NAMES) == ""
+    assert mixed_directions(local(np.zeros((3, 0)), [], 3), OWN, OTHERS, NAMES) == ""
 
 
 @pytest.mark.parametrize(("along", "told"), [(1e-5, True), (1e-2, False)])
 def test_estimates_that_are_alike_are_named(along: float, told: bool) -> None:
     axes = np.array([[1, 1, 0], [1, -1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
-    found = _alike(local(axes, [along, 0.02, 0.01], 3), OWN, OTHERS, NAMES)
+    found = correlated_estimates(local(axes, [along, 0.02, 0.01], 3), OWN, OTHERS, NAMES)
     assert bool(found) is told
     if told:
         assert found == "estimates of lift and mu have a correlation of 0.999 in size"
@@ -127,4 +132,4 @@ def test_a_model_without_an_inadequacy_has_nothing_to_tell() -> None:
         )  # fmt: skip
     optimum = prb.minimize(model, progressbar=False)
     sampling = local(np.array([[1.0], [1.0]]) / np.sqrt(2), [0.1], 2)
-    assert confounded(optimum.evaluator, sampling) == []
+    assert confounding_findings(optimum.evaluator, sampling) == []

@@ -7,8 +7,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
-from prbayes.inference.disagreement import disagreement
-from prbayes.inference.goodness_of_fit import Refitted
+from prbayes.inference.goodness_of_fit import FittedSets, output_misfits
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 
@@ -41,7 +40,7 @@ def told(data: Any) -> str:
     """Return what is said of data against the population at zero."""
     evaluator = Evaluator.of(model_of(data))
     sampling = SamplingDistribution.of(evaluator, np.zeros(1), np.ones(1))
-    (finding,) = disagreement(Refitted.there(sampling, 200, 0))
+    (finding,) = output_misfits(FittedSets.at_theta(sampling, 200, 0))
     return finding.text
 
 

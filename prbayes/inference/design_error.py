@@ -1,0 +1,129 @@
+"""Error of an optimum by the finite design: by its points, and by its emulators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from prbayes._validate import Floats
+from prbayes.inference.batched_objective import BatchObjective
+from prbayes.inference.refits import (
+    SamplingDistribution,
+    descent_of,
+    is_stored,
+    minimise_sets,
+)
+from prbayes.inference.resampling import DataSets, observed_set
+from prbayes.numerics.batched_bfgs import Descent
+from prbayes.propagation.base import N_BLOCKS
+
+
+@dataclass(frozen=True)
+class DesignErrors:
+    """Distance between the optima of two independent designs, in standard errors."""
+
+    points: float  # by their points; NaN if not known
+    emulators: float  # by the error of emulators; NaN without emulators
+
+    @property
+    def whole(self) -> float:
+        """Both together; NaN if nothing is known."""
+        errors = [e for e in (self.points, self.emulators) if not np.isnan(e)]
+        return float(np.linalg.norm(errors)) if errors else np.nan
+
+
+def design_error(sampling: SamplingDistribution) -> DesignErrors:
+    """Return the distance to the optimum of another design along the worst axis."""
+    if not is_stored(sampling.evaluator):
+        return DesignErrors(np.nan, np.nan)
+    # Two designs differ by the root of two of one's error.
+    points = np.sqrt(2) * _error_of_points(sampling).max(initial=0.0)
+    emulators = np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0)
+    return DesignErrors(float(points), float(emulators))
+
+
+def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
+    """Return the error of the optimum by emulators, (r,); NaN without emulators.
+
+    From minima of emulators that lack a block of the runs, less the minimum of the whole by the
+    same descent, which may differ from the optimum for other reasons.
+    """
+    evaluator, scales = sampling.evaluator, sampling.scales
+    left_out = [
+        node.reweighted.design.without_each_block() if node.reweighted else []
+        for node in evaluator.nodes
+    ]
+    number = max(map(len, left_out))
+    if not number:
+        return np.full(sampling.stderr.size, np.nan)
+    observed = observed_set(evaluator)
+    whole = BatchObjective.of(evaluator, scales, observed)
+    descent = descent_of(sampling, whole, is_rough=True)
+    minimum = _minimum(sampling, whole, descent)
+    minimum = np.where(np.isfinite(minimum), minimum, 0.0)
+    shifts = []
+    for b in range(number):
+        stored = [values[b] if values else None for values in left_out]
+        objective = BatchObjective.of(evaluator, scales, observed, stored=stored)
+        shifts.append(_minimum(sampling, objective, descent) - minimum)
+    return np.asarray(np.sqrt(np.square(shifts).sum(axis=0)))
+
+
+def _error_of_points(sampling: SamplingDistribution) -> Floats:
+    """Return the error of the optimum by the design's points, (r,); NaN if not known.
+
+    The spread of the minima of blocks of the design, each a coarser design of the same kind, as if
+    they were independent, bounds the error of the whole. Points of large emulated samples fill
+    space better together. Points on a line, which cut it into parts of equal mass, are far better
+    than their parts: they count as exact.
+    """
+    evaluator = sampling.evaluator
+    blocks = [
+        np.zeros_like(node.bound.blocks) if node.bound.is_line else node.bound.blocks
+        for node in evaluator.nodes
+    ]
+    if not any(block.any() for block in blocks):
+        return np.full(sampling.stderr.size, np.nan)
+    observed = observed_set(evaluator)
+    bounds = [node.reweighted for node in evaluator.nodes]
+    if all(bound is not None and bound.design.is_emulated for bound in bounds):
+        # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
+        # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
+        rate = 0.5 + 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)
+        return np.asarray(_spread_of_parts(sampling, observed) / N_BLOCKS**rate)
+    # The observed responses against each block.
+    first = np.zeros(N_BLOCKS, dtype=int)
+    sets = DataSets(observed.values, [w[first] for w in observed.weights])
+    objective = BatchObjective.of(evaluator, sampling.scales, sets, blocks=blocks)
+    x, converged = minimise_sets(sampling, objective, descent_of(sampling, objective))
+    if converged.sum() < N_BLOCKS / 2:
+        return np.full(sampling.stderr.size, np.inf)
+    return np.asarray(x[converged].std(axis=0, ddof=1) / N_BLOCKS**0.5)
+
+
+def _spread_of_parts(sampling: SamplingDistribution, observed: DataSets) -> Floats:
+    """Return the spread of the minima of an eighth of the points each, (r,)."""
+    evaluator = sampling.evaluator
+    bounds = evaluator.reweighted
+    minima = []
+    descent = None
+    for b in range(N_BLOCKS):
+        parts = {
+            k: bound.copied(bound.design.rows(bound.blocks == b)) for k, bound in bounds.items()
+        }
+        nodes = tuple(replace(node, bound=parts[node.name]) for node in evaluator.nodes)
+        part = replace(evaluator, nodes=nodes, has_graph=False)
+        objective = BatchObjective.of(part, sampling.scales, observed)
+        descent = descent or descent_of(sampling, objective, is_rough=True)
+        minima.append(_minimum(sampling, objective, descent))
+    finite = np.array([x for x in minima if np.isfinite(x).all()])
+    if len(finite) < N_BLOCKS / 2:
+        return np.full(sampling.stderr.size, np.inf)
+    return np.asarray(finite.std(axis=0, ddof=1))
+
+
+def _minimum(sampling: SamplingDistribution, objective: BatchObjective, descent: Descent) -> Floats:
+    """Return the minimiser of one data set along the axes, (r,); infinite if not converged."""
+    x, converged = minimise_sets(sampling, objective, descent)
+    return x[0] if converged[0] else np.full(sampling.stderr.size, np.inf)

@@ -1,0 +1,547 @@
+"""Emulation of a response near the measured specimens: runs over the prior and at the roots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from prbayes._validate import AT_ONCE, Floats
+from prbayes.emulators.interpolant import Interpolant, fit_interpolant
+from prbayes.metrics.readings import Readings
+from prbayes.numerics.points import sobol
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.guards import missing_share, predicted_bias
+from prbayes.propagation.normal_populations import (
+    fit_normal,
+    normal_log_density,
+    normalised_weights,
+)
+from prbayes.propagation.roots import (
+    Roots,
+    find_roots,
+    gabriel_neighbours,
+    nearest_starts,
+    rows_by_specimen,
+)
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """Settings of the points, from the study of guards (docs/likelihood.md).
+
+    Attributes
+    ----------
+    starts : int
+        Fewest starts of the search for roots, by specimen; doubled while simulated specimens do not
+        get their inputs back.
+    gap : float
+        Largest misfit of a root above the specimen's best, in nats.
+    points : int
+        Points around each root; doubled until two independent halves agree.
+    most_points : int
+        Largest number of points of a specimen.
+    half_difference : float
+        Largest standard deviation, over plausible populations, of half the difference between the
+        log-likelihoods of the two halves.
+    fresh : int
+        Runs at roots that measure the emulator's bias; they stay in the emulator.
+    bias : float
+        Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
+        More runs are added where the emulator's error could cause as much.
+    floor : float
+        Smallest standard deviation of a comparison, as a share of the data's.
+    degrees : float
+        Degrees of freedom of the t distribution around a root.
+    """
+
+    starts: int = 12
+    gap: float = 20.0
+    points: int = 4
+    most_points: int = 4096
+    half_difference: float = 0.05
+    fresh: int = 16
+    bias: float = 0.15
+    floor: float = 1e-6
+    degrees: float = 5.0
+
+
+def first_runs(dimensions: int) -> int:
+    """Return the number of runs that an emulator of so many inputs starts from."""
+    return 64 if dimensions <= 2 else 128 if dimensions <= 4 else 480
+
+
+class Surface(Protocol):
+    """Outputs at coordinates between runs, with their Jacobian."""
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian, (k, d) -> (k, m), (k, m, d)."""
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class DifferencedResponse:
+    """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point."""
+
+    values: Callable[[Floats], Floats]  # coordinates (k, d) -> outputs (k, m)
+    step: float = 1e-5  # in units of the coordinates
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian."""
+        k, d = z.shape
+        axes = np.eye(d)
+        shifts = self.step * np.concatenate([np.zeros((1, d)), axes, -axes])
+        points = (z + shifts[:, None]).reshape(-1, d)
+        values = self.values(points).reshape(2 * d + 1, k, -1)
+        slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
+        return values[0], np.moveaxis(slopes, 0, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Emulation:
+    """Runs of the response, and the emulator through them.
+
+    Attributes
+    ----------
+    z : ndarray, shape (n, d)
+        Coordinates of the runs.
+    y : ndarray, shape (n, m)
+        Their outputs; NaN where there is no response.
+    box : ndarray, shape (2, d)
+        Bounds of the search for roots.
+    surface : Interpolant
+    error : ndarray, shape (m,)
+        Standard deviation of the emulator's error at the roots: twice the error at runs there
+        before they were part of it.
+    bias : float
+        Predicted bias of a mean or standard deviation of an input, in posterior standard
+        deviations.
+    range : ndarray, shape (2, d)
+        Of the roots at which runs were made.
+    """
+
+    z: Floats
+    y: Floats
+    box: Floats
+    surface: Surface
+    error: Floats
+    bias: float
+    range: Floats
+
+    @classmethod
+    def first(
+        cls,
+        run: Callable[[Floats], Floats],
+        z: Floats,
+        box: Floats,
+        readings: Readings,
+        options: PointOptions,
+        name: str,
+    ) -> Emulation:
+        """Return the emulation of runs at first points."""
+        y = run(z)
+        surface, left_out, is_near = surface_near(z, y, readings, name)
+        rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
+        error = np.maximum(2 * rms, options.floor * readings.spread())
+        infinite = np.full(z.shape[1], np.inf)
+        return cls(z, y, box, surface, error, np.inf, np.stack([infinite, -infinite]))
+
+    @classmethod
+    def of_function(
+        cls,
+        run: Callable[[Floats], Floats],
+        box: Floats,
+        search_box: Floats,
+        readings: Readings,
+        options: PointOptions,
+    ) -> Emulation:
+        """Return the response itself in place of an emulator, with runs as starts of a search."""
+        d = box.shape[1]
+        z = box[0] + (box[1] - box[0]) * sobol(first_runs(d), d, 0)
+        error = options.floor * readings.spread()
+        infinite = np.full(d, np.inf)
+        whole = np.stack([-infinite, infinite])
+        return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
+
+    def covers(self, z: Floats) -> bool:
+        """Return whether points lie in the range of the roots at which runs were made."""
+        with np.errstate(invalid="ignore"):
+            margin = np.nan_to_num(0.1 * np.maximum(self.range[1] - self.range[0], 0.0))
+        low, high = self.range
+        is_covered = (z >= low - margin) & (z <= high + margin)
+        return bool(is_covered.all())
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian, NaN where the nearest run has no response."""
+        values, jacobian = self.surface(z)
+        failed = self.fails(z)
+        if failed.any():
+            values[failed], jacobian[failed] = np.nan, np.nan
+        return values, jacobian
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+        values = self.surface.values(z)
+        values[self.fails(z)] = np.nan
+        return values
+
+    def fails(self, z: Floats) -> NDArray[np.bool_]:
+        """Return where the nearest run has no finite response."""
+        return self._of_nearest(~np.isfinite(self.y).all(axis=1), z)
+
+    def is_missing(self, z: Floats) -> NDArray[np.bool_]:
+        """Return where the nearest run has no response: NaN, while +inf is a failed specimen."""
+        return self._of_nearest(np.isnan(self.y).any(axis=1), z)
+
+    def _of_nearest(self, of_runs: NDArray[np.bool_], z: Floats) -> NDArray[np.bool_]:
+        """Return a property of the nearest run of each point."""
+        result = np.zeros(len(z), dtype=bool)
+        width = self.box[1] - self.box[0]
+        if len(z) and of_runs.any() and not _are_distant(of_runs, self.z / width, z / width):
+            _, nearest = self._tree.query(z / width)
+            result = of_runs[nearest]
+        return result
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.z / (self.box[1] - self.box[0]))
+
+
+def _are_distant(mask: NDArray[np.bool_], runs: Floats, points: Floats) -> bool:
+    """Return whether each of some runs is farther from all points than another run.
+
+    |x - f|^2 - |x - g|^2 is linear in x: it is least at a corner of the points' range.
+    """
+    # By columns: along the first axis of many rows it takes five times as long.
+    low = np.array([column.min() for column in points.T])
+    high = np.array([column.max() for column in points.T])
+    middle, reach = (low + high) / 2, (high - low) / 2
+    inner, outer = runs[mask, None] - middle, runs[~mask] - middle
+    # Runs near the middle are most likely nearer.
+    outer = outer[np.argsort((outer**2).sum(axis=1))[: len(low) * 8]]
+    margin = (inner**2).sum(axis=2) - (outer**2).sum(axis=1)
+    margin = margin - 2 * np.abs(inner - outer) @ reach
+    return bool((margin.max(axis=1, initial=-np.inf) > 0).all())
+
+
+def emulate(
+    run: Callable[[Floats], Floats],
+    readings: Readings,
+    box: Floats,
+    search_box: Floats,
+    options: PointOptions,
+    *,
+    n: int | None = None,
+    known: Emulation | None = None,
+    seed: int = 0,
+    name: str = "response",
+) -> tuple[Emulation, Roots]:
+    """Fit the emulator: runs over a box, then batches at the roots until the bias is small.
+
+    Parameters
+    ----------
+    run : callable
+        Coordinates (n, d) -> outputs (n, m); NaN where there is no response.
+    readings : Readings
+    box, search_box : ndarray, shape (2, d)
+        Of the first runs, and of the search for roots.
+    options : PointOptions
+    n : int, optional
+        First runs.
+    known : Emulation, optional
+        Of the same response for other data: runs are added where the roots leave its range.
+    seed : int
+    name : str
+        For messages.
+
+    Raises
+    ------
+    DesignError
+        If the response cannot be emulated well enough.
+    """
+    d = box.shape[1]
+    n = first_runs(d) if n is None else n
+    if known is None:
+        first = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
+        emulation = Emulation.first(run, first, search_box, readings, options, name)
+    else:
+        emulation = known
+    rng = np.random.default_rng([seed, 1])
+    for batch in range(6):
+        roots = specimen_roots(emulation, readings, options)
+        if batch < 2 and len(roots.z):
+            # Twice at most: a reading that no inputs reproduce is reported.
+            emulation = replace(emulation, box=_widened(emulation.box, roots))
+            roots = specimen_roots(emulation, readings, options)
+        enough = (batch >= 2 or known is not None) and emulation.covers(roots.z)
+        if enough and emulation.bias <= options.bias:
+            # Zero for the response itself, which no run improves.
+            narrowing = 0.0 if emulation.bias == 0 else _narrowing(emulation, readings, roots)
+            if narrowing <= options.bias:
+                break
+        count = max(n // 2, options.fresh)
+        fresh = spread_out(roots.z, emulation.box, count, options.fresh, rng)
+        emulation = extended(emulation, run, fresh, readings, options, name)
+    else:
+        roots = specimen_roots(emulation, readings, options)
+    roots = _all_roots(emulation, readings, options, roots, seed)
+    require_accurate(emulation, readings, options, name)
+    return emulation, roots
+
+
+def require_accurate(
+    emulation: Emulation, readings: Readings, options: PointOptions, name: str
+) -> None:
+    """Raise if the emulator's error is as large as the data's scatter, or shifts populations."""
+    rough = (
+        "the response is not smooth enough for prb.LogLikelihood(): use "
+        "metric=prb.ProbabilityResidual(), or more first runs with propagation=prb.Reweighted(n)"
+    )
+    scatter = readings.robust_spread()
+    if (emulation.error > scatter).any():
+        raise DesignError(
+            f"{name}: got an emulator with errors of {emulation.error} at the specimens, expected "
+            f"less than the data's standard deviations {scatter}; {rough}"
+        )
+    if emulation.bias > options.bias:
+        raise DesignError(
+            f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
+            f"input by {emulation.bias:.2g} posterior standard deviations after "
+            f"{len(emulation.z)} runs, expected at most {options.bias}; {rough}"
+        )
+
+
+def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
+    """Return by how much the error of the emulator could narrow the population of an input.
+
+    In posterior standard deviations of its standard deviation sigma. The comparison allows an error
+    covariance C of a root; the part of it that the runs have overestimated is missing in sigma^2:
+
+        sqrt(2 N) / 2 max_j mean_i sum_r w_ir C_jj / (C_jj + sigma_j^2)
+
+    with weights w_ir of the roots under a normal population that is fitted to them.
+    """
+    sd = np.where(readings.is_measured, readings.comparison_sd(emulation.error), 1.0)
+    factor = (sd / emulation.error)[roots.specimen][:, :, None]
+    table, log_mass, covariance = _laplace(roots, emulation.box)
+    _, _, of_error = _laplace(replace(roots, jacobian=roots.jacobian * factor), emulation.box)
+    mean, root = fit_normal(roots.z[table], log_mass)
+    w = normalised_weights(normal_log_density(roots.z[table], mean, root) + log_mass)
+    whole, part = (np.einsum("rdd->rd", matrix)[table] for matrix in (covariance, of_error))
+    share = np.einsum("nr,nrd->nd", w, part / (whole + (root**2).sum(axis=1)))
+    return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
+
+
+def _laplace(roots: Roots, box: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Return the roots of each specimen that has one, their log masses, and covariances.
+
+    Shapes (N, most), with rows filled up by -1, (N, most) and (R, d, d).
+    """
+    precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
+    precision = precision + np.diag(4.0 / (box[1] - box[0]) ** 2)
+    _, specimen = np.unique(roots.specimen, return_inverse=True)
+    table = rows_by_specimen(specimen)
+    log_mass = -np.linalg.slogdet(precision)[1] / 2 - roots.misfit
+    masses = np.where(table >= 0, log_mass[table], -np.inf)
+    return table, masses, np.linalg.inv(precision)
+
+
+def extended(
+    emulation: Emulation,
+    run: Callable[[Floats], Floats],
+    fresh: Floats,
+    readings: Readings,
+    options: PointOptions,
+    name: str,
+    sampled: int | None = None,
+) -> Emulation:
+    """Return the emulation with runs at fresh points, whose misfit gives its error and bias.
+
+    The misfit is that of the emulator before at the first points. With `sampled` it is the left-out
+    error of the new emulator at so many first points, which are a sample of the specimens' inputs.
+    """
+    values, jacobian = emulation.surface(fresh)
+    outputs = run(fresh)
+    z = np.concatenate([emulation.z, fresh])
+    y = np.concatenate([emulation.y, outputs])
+    surface, left_out, _ = surface_near(z, y, readings, name)
+    misfit = outputs - values if sampled is None else left_out[len(emulation.z) :]
+    good = np.isfinite(misfit).all(axis=1)
+    error, bias = emulation.error, np.inf
+    count = options.fresh if sampled is None else sampled
+    rows = np.flatnonzero(good[:count])
+    if len(rows) >= 4:
+        # At the roots alone: points around them may lie far out, where nothing was measured.
+        error = 2 * np.sqrt((misfit[rows] ** 2).mean(axis=0))
+        error = np.maximum(error, options.floor * readings.spread())
+        unit = typical_sd(readings.comparison_sd(error))
+        scaled = misfit[rows] / unit, jacobian[rows] / unit[:, None]
+        bias = float(np.abs(predicted_bias(*scaled, fresh[rows], len(readings))).max())
+        # m readings identify m of d directions; the posterior is wider than the formula assumes.
+        readings_per_specimen = (readings.is_measured | readings.is_censored).sum(axis=1).mean()
+        bias *= np.sqrt(min(1.0, readings_per_specimen / fresh.shape[1]))
+    reach = np.concatenate([emulation.range, fresh])
+    extremes = np.stack([reach.min(axis=0), reach.max(axis=0)])
+    return Emulation(z, y, emulation.box, surface, error, bias, extremes)
+
+
+def typical_sd(sd: Floats) -> Floats:
+    """Return the median of finite values by output, (N, m) -> (m,)."""
+    return np.array([np.median(column[np.isfinite(column)]) for column in sd.T])
+
+
+def surface_near(
+    z: Floats, y: Floats, readings: Readings, name: str
+) -> tuple[Interpolant, Floats, NDArray[np.bool_]]:
+    """Return the interpolant, left-out errors, (n, m), and which runs are near the data, (n,).
+
+    Of runs that are equal to nine digits one is taken: copies add nothing but rounding errors.
+    Left-out errors are NaN where there is no response.
+    """
+    good = np.isfinite(y).all(axis=1)
+    if good.sum() < 8:
+        raise DesignError(
+            f"{name}: got {int(good.sum())} runs with a response of {len(y)}, expected at least 8; "
+            "check the response, or give the hyperparameters priors where it exists"
+        )
+    spread = readings.spread()
+    rows = np.flatnonzero(good)
+    _, first, copies = np.unique(
+        np.round(z[rows], 9), axis=0, return_index=True, return_inverse=True
+    )
+    zg = z[rows[first]]
+    yg = _limited(y[rows[first]], readings, spread)
+    # Outputs within the range of the readings or half of it away.
+    low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
+    margin = np.maximum((high - low) / 2, spread)
+    inside = ((yg >= low - margin) & (yg <= high + margin)).all(axis=1)
+    if inside.sum() < len(yg) // 4:
+        distance = (((yg - np.nanmean(readings.values, axis=0)) / spread) ** 2).sum(axis=1)
+        inside = np.zeros(len(yg), dtype=bool)
+        inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
+    surface = fit_interpolant(zg, yg, inside)
+    left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
+    left_out[rows], is_near[rows] = surface.left_out[copies.ravel()], inside[copies.ravel()]
+    return surface, left_out, is_near
+
+
+def _limited(y: Floats, readings: Readings, spread: Floats) -> Floats:
+    """Return outputs (n, m) within a distance of the data, beyond which they are not resolved.
+
+    A response that is steep outside the data would take the digits that outputs near them need.
+    The distance is 10^4 standard deviations of the data, and at least ten times that of 90 % of
+    the runs: outputs over a wide prior keep their values.
+    """
+    center = np.nanmean(readings.values, axis=0)
+    distance = np.abs(y - center)
+    largest = np.maximum(1e4 * spread, 10 * np.quantile(distance, 0.9, axis=0))
+    return np.clip(y, center - largest, center + largest)
+
+
+def _widened(box: Floats, roots: Roots) -> Floats:
+    """Return the box with more room where roots or their population reach beyond its sides.
+
+    A quarter where the search for a root ends at the side with a misfit of 50 nats. And room for a
+    normal population that is fitted to the roots: all specimens of a data set are within the box,
+    with the probability 1 - 1 / 4097 of `Coordinates.bounds`.
+    """
+    poor = roots.z[roots.misfit > 50.0]
+    width = box[1] - box[0]
+    at_low = poor <= box[0] + 1e-6 * width
+    at_high = poor >= box[1] - 1e-6 * width
+    ends = np.stack([at_low, at_high])
+    wider = box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1)
+    table, log_mass, _ = _laplace(roots, box)
+    mean, root = fit_normal(roots.z[table], log_mass)
+    sd = np.sqrt((root**2).sum(axis=1))
+    reach = -ndtri(1 / 4097 / len(table)) * sd
+    low = np.minimum(wider[0], mean - reach)
+    high = np.maximum(wider[1], mean + reach)
+    return np.stack([low, high])
+
+
+def _all_roots(
+    emulation: Emulation, readings: Readings, options: PointOptions, roots: Roots, seed: int
+) -> Roots:
+    """Double the starts until simulated specimens get their own inputs back."""
+    values = readings.values[np.isfinite(readings.values).all(axis=1)]
+    if len(values) < 2 or readings.values.shape[1] < emulation.z.shape[1]:
+        return roots
+
+    def find(y: Floats) -> list[Floats]:
+        error = np.broadcast_to(np.median(readings.error, axis=0), y.shape)
+        relative = np.broadcast_to(readings.is_relative[:1], y.shape)
+        measured = replace(Readings.exact(y), error=error, is_relative=relative)
+        simulated = specimen_roots(emulation, measured, options)
+        return [simulated.z[simulated.specimen == i] for i in range(len(y))]
+
+    good = np.isfinite(emulation.y).all(axis=1)
+    run_z = emulation.z[good]
+    box = np.stack([run_z.min(axis=0), run_z.max(axis=0)])
+    while options.starts < len(emulation.z):
+        share = missing_share(find, lambda z: emulation(z)[0], box, values, seed=seed)
+        if not share > 0:
+            break
+        options = replace(options, starts=2 * options.starts)
+        roots = specimen_roots(emulation, readings, options)
+    return roots
+
+
+def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:
+    """Return the roots of the specimens with at least as many measured outputs as inputs."""
+    good = np.isfinite(emulation.y).all(axis=1)
+    run_z, run_y = emulation.z[good], emulation.y[good]
+    measured = readings.is_measured
+    target = np.where(measured, readings.values, 0.0)
+    sd = readings.comparison_sd(emulation.error)
+    solvable = np.flatnonzero(measured.sum(axis=1) >= emulation.z.shape[1])
+    # Runs are not chosen by an output that a reading error dominates.
+    error = readings.error_sd(target)
+    unit = np.hypot(readings.spread(), 10 * np.median(error, axis=0))
+    unit = np.where(measured, unit, np.inf)
+    neighbours = gabriel_neighbours(run_z)
+    parts = []
+    # Specimens in blocks: memory stays constant.
+    block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
+    for first in range(0, len(solvable), block):
+        rows = solvable[first : first + block]
+        starts = nearest_starts(run_z, run_y, target[rows], unit[rows], options.starts, neighbours)
+        scale = np.where(measured[rows], sd[rows], 1e150)
+        box = emulation.box
+        roots = find_roots(emulation, target[rows], scale, starts, box, gap=options.gap)
+        parts.append((roots, rows))
+    names = ("z", "misfit", "residual", "jacobian")
+    joined = [np.concatenate([getattr(r, name) for r, _ in parts]) for name in names]
+    specimen = np.concatenate([rows[r.specimen] for r, rows in parts])
+    return Roots(specimen, *joined)
+
+
+def spread_out(
+    z: Floats, box: Floats, count: int, sampled: int, rng: np.random.Generator
+) -> Floats:
+    """Return points for new runs, (count, d): a sample of the given ones, then others spread out.
+
+    The spread ones are selected one by one, each farthest from all others, among the given points
+    and points around them.
+    """
+    scale = np.maximum(z.std(axis=0), 1e-9 * (box[1] - box[0]))
+    sample = z[rng.permutation(len(z))[: min(sampled, len(z))]]
+    around = z[rng.integers(0, len(z), 8 * count)]
+    jittered = around + 0.4 * scale * rng.standard_normal(around.shape)
+    candidates = np.clip(np.concatenate([z, jittered]), box[0], box[1]) / scale
+    points = list(sample / scale)
+    distance = np.min([((candidates - p) ** 2).sum(axis=1) for p in points], axis=0)
+    while len(points) < count:
+        best = int(np.argmax(distance))
+        points.append(candidates[best])
+        distance = np.minimum(distance, ((candidates - candidates[best]) ** 2).sum(axis=1))
+    return np.asarray(np.array(points) * scale)
