@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -237,19 +238,9 @@ def number(
     return int(value) if whole else float(value)
 
 
-def finite_number(value: object, name: str) -> float:
-    """Return ``value`` as a float, or raise if it is not a finite number."""
-    return number(value, name)
-
-
-def positive_number(value: object, name: str) -> float:
-    """Return ``value`` as a float, or raise if it is not a positive finite number."""
-    return number(value, name, low=0, closed=False)
-
-
-def share(value: object, name: str) -> float:
-    """Return ``value`` as a float, or raise if it is not between 0 and 1, ends excluded."""
-    return number(value, name, low=0, high=1, closed=False)
+finite_number = number
+positive_number = partial(number, low=0, closed=False)
+share = partial(number, low=0, high=1, closed=False)
 
 
 def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:

@@ -509,8 +509,8 @@ INNER = {
         "pymc.pytensorf.join_nonshared_inputs",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.replace.vectorize_graph",
-        "pytensor.graph.traversal.ancestors",
     },
+    "model.evaluator": {"pytensor.graph.traversal.ancestors"},
     "model.fingerprint": {"pymc.printing.str_for_dist"},
     "model.measurement": {"pytensor.tensor.variable.TensorVariable"},
     "model.random_variable": {

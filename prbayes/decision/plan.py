@@ -17,7 +17,7 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
-from prbayes.model.elements import split_elements, told_elements
+from prbayes.model.elements import split_elements, table_elements
 from prbayes.model.labels import labelled
 from prbayes.model.locking import locked
 from prbayes.numerics.derivatives import cross, slopes
@@ -246,7 +246,7 @@ class _Forecast:
         variables = evaluator.hyperparameters.constrained(thetas)
         values = labelled(evaluator, variables, {"draw": len(thetas)}).data_vars
         elements = split_elements(values)
-        sd = {name: float(elements[name].std()) for name in told_elements(values)}
+        sd = {name: float(elements[name].std()) for name in table_elements(values)}
         if self.quantity is not None:
             sd["quantity"] = self._quantity_sd(thetas)
         return sd

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -156,7 +157,8 @@ class GaussianProcess(Surface):
             reduced[row] = 0.0
             coefficients.append(reduced)
             centers.append(center)
-        return _Mean(kernel, scaled, lengths, np.array(centers), np.stack(coefficients, axis=1))
+        columns = np.stack(coefficients, axis=1)
+        return partial(_mean, kernel, scaled, lengths, np.array(centers), columns)
 
     def slope(self, x: Floats, y: Floats, along: Floats) -> float:
         """Return the likeliest slope with these lengths, that of generalised least squares."""
@@ -180,27 +182,25 @@ def mean_through(kernel: Kernel, lengths: Floats, nugget: float, x: Floats, y: F
     correlation, _ = kernel(_squares(scaled, scaled))
     center = float(y.mean())
     coefficients = cho_solve((_root(correlation, nugget), True), y - center)
-    return _Mean(kernel, scaled, lengths, center, coefficients)
+    return partial(_mean, kernel, scaled, lengths, center, coefficients)
 
 
-@dataclass(frozen=True, eq=False)
-class _Mean:
-    """The mean of a process, or of B; a class, so that it can be pickled."""
-
-    kernel: Kernel
-    scaled: Floats
-    lengths: Floats
-    center: float | Floats  # or (B,)
-    coefficients: Floats  # (n,) or (n, B)
-
-    def __call__(self, at: Floats) -> Floats:
-        deviations = np.empty((len(at), *self.coefficients.shape[1:]))
-        step = 1024  # so many points stay in the cache
-        for start in range(0, len(at), step):
-            rows = slice(start, start + step)
-            correlation, _ = self.kernel(_squares(at[rows] / self.lengths, self.scaled))
-            deviations[rows] = correlation @ self.coefficients
-        return np.asarray(self.center + deviations)
+def _mean(
+    kernel: Kernel,
+    scaled: Floats,
+    lengths: Floats,
+    center: float | Floats,
+    coefficients: Floats,
+    at: Floats,
+) -> Floats:
+    """Return the mean of a process at points, (k,), or of B with coefficients (n, B), (k, B)."""
+    deviations = np.empty((len(at), *coefficients.shape[1:]))
+    step = 1024  # so many points stay in the cache
+    for start in range(0, len(at), step):
+        rows = slice(start, start + step)
+        correlation, _ = kernel(_squares(at[rows] / lengths, scaled))
+        deviations[rows] = correlation @ coefficients
+    return np.asarray(center + deviations)
 
 
 @dataclass(frozen=True, eq=False)

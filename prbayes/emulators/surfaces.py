@@ -6,6 +6,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from itertools import product
 from math import comb
 from typing import Any
@@ -181,7 +182,16 @@ class Polynomial(Surface):
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the polynomial of least squares."""
         coefficients = np.linalg.lstsq(self.basis(x), y, rcond=None)[0]
-        return _LeastSquares(self, coefficients)
+        return partial(self._values, coefficients)
+
+    def _values(self, coefficients: Floats, at: Floats) -> Floats:
+        """Return the polynomial with given coefficients at points."""
+        values = np.empty(len(at))
+        step = 4096  # the terms of so many points stay in the cache
+        for start in range(0, len(at), step):
+            rows = slice(start, start + step)
+            values[rows] = self.basis(at[rows]) @ coefficients
+        return values
 
     def basis(self, x: Floats) -> Floats:
         """Return products of Legendre polynomials at points of the unit cube, shape (n, terms)."""
@@ -198,22 +208,6 @@ class Polynomial(Surface):
         return terms.T
 
 
-@dataclass(frozen=True, eq=False)
-class _LeastSquares:
-    """A polynomial with its coefficients; a class, so that it can be pickled."""
-
-    polynomial: Polynomial
-    coefficients: Floats
-
-    def __call__(self, at: Floats) -> Floats:
-        values = np.empty(len(at))
-        step = 4096  # the terms of so many points stay in the cache
-        for start in range(0, len(at), step):
-            rows = slice(start, start + step)
-            values[rows] = self.polynomial.basis(at[rows]) @ self.coefficients
-        return values
-
-
 def least_squares(x: Floats, y: Floats, along: Floats) -> float:
     """Return the slope of responses along another one, beside a plane."""
     columns = np.column_stack([np.ones(len(x)), x, along])
@@ -223,39 +217,21 @@ def least_squares(x: Floats, y: Floats, along: Floats) -> float:
 def fitted(model: Any, x: Floats, y: Floats) -> Predict:
     """Return a surface, or a copy of a regressor, fitted to responses of unit spread.
 
-    Parameters
-    ----------
-    model : Surface or regressor
-        A regressor has ``fit(X, y)`` and ``predict(X)``.
-    x : ndarray, shape (n, d)
-        In the unit cube, or in units of their spread.
-    y : ndarray, shape (n,)
-        In units of the response.
-
-    Returns
-    -------
-    callable
-        From points, shape (k, d), to responses, shape (k,).
+    From points (n, d), in the unit cube or in units of their spread, and responses (n,) in any
+    unit, to a function from points (k, d) to responses (k,).
     """
     center = y.mean()
     spread = y.std() or 1.0  # one for a constant response
     z = (y - center) / spread
     if isinstance(model, Surface):
-        return _InUnits(model.through(x, z), center, spread)
+        return partial(_in_units, model.through(x, z), center, spread)
     regressor = copy.deepcopy(model)
     regressor.fit(x, z)
-    return _InUnits(regressor.predict, center, spread)
+    return partial(_in_units, regressor.predict, center, spread)
 
 
-@dataclass(frozen=True, eq=False)
-class _InUnits:
-    """A surface through responses of unit spread, in the response's own units."""
-
-    predict: Predict
-    center: float
-    spread: float
-
-    def __call__(self, at: Floats) -> Floats:
-        values = np.asarray(self.predict(at), dtype=np.float64)
-        # Some regressors give a column.
-        return np.asarray(self.center + self.spread * values.reshape(len(at)))
+def _in_units(surface: Predict, center: float, spread: float, at: Floats) -> Floats:
+    """Return a surface through responses of unit spread, in units of the response."""
+    values = np.asarray(surface(at), dtype=np.float64)
+    # Some regressors return a column.
+    return np.asarray(center + spread * values.reshape(len(at)))

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from os import PathLike
 from typing import Any, cast
 
@@ -472,7 +473,7 @@ class _FittedSurface:
         trees = cKDTree(unit), cKDTree(unit[usable])
         x, y = unit[usable], responses[usable]
         if y.ndim > 1:
-            surfaces = _OutputSurfaces(tuple(fitted(model, x, output) for output in y.T))
+            surfaces = partial(_outputs, [fitted(model, x, output) for output in y.T])
             return cls(domain, surfaces, None, None, *trees)
         surface = fitted(model, x, y)
         if coarse is None:
@@ -559,14 +560,9 @@ def _spread(values: Floats) -> Any:
     return float(sd) if sd.ndim == 0 else sd
 
 
-@dataclass(frozen=True, eq=False)
-class _OutputSurfaces:
-    """Surfaces of several outputs; a class, so that it can be pickled."""
-
-    surfaces: tuple[Predict, ...]
-
-    def __call__(self, at: Floats) -> Floats:
-        return np.stack([predict(at) for predict in self.surfaces], axis=-1)
+def _outputs(surfaces: Sequence[Predict], at: Floats) -> Floats:
+    """Return the values of the surfaces of several outputs, (k, m)."""
+    return np.stack([surface(at) for surface in surfaces], axis=-1)
 
 
 def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:

@@ -247,13 +247,7 @@ class Information:
         return float(np.mean(distances))
 
     def gradients(self, observed: Floats, weights: Floats) -> Floats:
-        """Return the gradients of the discrepancy at theta for data sets, shape (n_sets, d).
-
-        Parameters
-        ----------
-        observed : ndarray, shape (n,)
-        weights : ndarray, shape (n_sets, n)
-        """
+        """Return gradients at theta, (n_sets, d), for data sets of values (n,)."""
         across = self._along_stencil(observed, weights[:, None], slice(self.stencil.n_cross))
         return slopes(across.T, self.stencil.step)
 
@@ -281,14 +275,9 @@ class Information:
     def areas(
         self, observed: Floats, weights: Floats, subset: NDArray[np.bool_] | None = None
     ) -> list[LinearArea]:
-        """Return a linear model around theta of each area that the metric is a sum of.
+        """Return a linear model of each area that the metric is a sum of, for data sets.
 
-        Parameters
-        ----------
-        observed : ndarray, shape (n,) or (n, m)
-        weights : ndarray, shape (n_sets, n)
-        subset : ndarray of bool, optional
-            The points of the population that count; all by default.
+        ``subset`` are the points of the population that count; all by default.
         """
         areas = []
         for part in self.node.target.parts:
@@ -316,8 +305,8 @@ def _importance_sample(
         far = _squared_distances(target, values, weights) ** 2
         mass = weights * (1 + far / max(float(weights @ far), _TINY))
         mass = mass / mass.sum()
-    chosen_rows = order[reached(mass[order], (np.arange(n) + 0.5) / n)]
-    return values[chosen_rows], weights[chosen_rows] / mass[chosen_rows]
+    rows = order[reached(mass[order], (np.arange(n) + 0.5) / n)]
+    return values[rows], weights[rows] / mass[rows]
 
 
 def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> Floats:
@@ -416,20 +405,8 @@ def first_order_shifts(
     """Return shifts of the minimiser over data sets, to first order, along a basis.
 
     The features are taken as linear in theta. Smooth discrepancies then contribute their gradient
-    and Hessian; areas, integrals of an absolute value, are minimised by iterated reweighting.
-
-    Parameters
-    ----------
-    information : list of Information
-        By simulator.
-    scales : ndarray, shape (k,)
-    basis : ndarray, shape (d, r)
-        Directions in units of the prior's spread.
-    sets : DataSets
-
-    Returns
-    -------
-    ndarray, shape (n_sets, r)
+    and Hessian; areas, integrals of an absolute value, are minimised by iterated reweighting. The
+    basis, (d, r), has directions in units of the prior's spread; the shifts are (n_sets, r).
     """
     directions = basis * information[0].prior_sd[:, None]
     r = basis.shape[1]
@@ -458,17 +435,17 @@ def _reweighted_solution(
 ) -> Floats:
     """Return the minimisers with each |gap| as a parabola through its value at ``shifts``."""
     n_sets, r = shifts.shape
-    left = np.broadcast_to(curvature, (n_sets, r, r)).copy()
-    right = force.copy()
+    matrix = np.broadcast_to(curvature, (n_sets, r, r)).copy()
+    vector = force.copy()
     for area in areas:
         gaps = area.gaps + shifts @ area.slopes
         # Below a gap of 1e-4 an absolute value counts as a parabola.
         weight = area.lengths / np.sqrt(gaps**2 + 1e-8)
-        left += np.einsum("bm,im,jm->bij", weight, area.slopes, area.slopes, optimize=True)
-        right -= np.einsum("bm,im->bi", weight * area.gaps, area.slopes, optimize=True)
+        matrix += np.einsum("bm,im,jm->bij", weight, area.slopes, area.slopes, optimize=True)
+        vector -= np.einsum("bm,im->bi", weight * area.gaps, area.slopes, optimize=True)
     # A ridge relative to each direction's own size: priors may differ in width by far.
-    ridge = 1e-10 * np.diagonal(left, axis1=1, axis2=2)[:, :, None]
-    solution = np.linalg.solve(left + ridge * np.eye(r), right[..., None])
+    ridge = 1e-10 * np.diagonal(matrix, axis1=1, axis2=2)[:, :, None]
+    solution = np.linalg.solve(matrix + ridge * np.eye(r), vector[..., None])
     return np.asarray(solution[..., 0])
 
 

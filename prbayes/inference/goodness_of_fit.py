@@ -80,15 +80,7 @@ class FittedSets:
 def worst_p_value(observed: Floats, drawn: Floats, *, two_sided: bool = False) -> float:
     """Return how often the largest of q drawn statistics is at least the largest observed one.
 
-    Each statistic is standardised by its own distribution. Rows with an unknown number are left
-    out.
-
-    Parameters
-    ----------
-    observed : ndarray, shape (q,)
-    drawn : ndarray, shape (S, q)
-    two_sided : bool
-        Whether small numbers are extreme as well.
+    Each statistic is standardised by its own distribution. Rows with NaN are left out.
     """
     rows = drawn[np.isfinite(drawn).all(axis=1)]
     if not np.isfinite(observed).all() or len(rows) < 2:
@@ -102,12 +94,7 @@ def worst_p_value(observed: Floats, drawn: Floats, *, two_sided: bool = False) -
 def log_distances(expected: Floats, weights: Floats) -> Floats:
     """Return logarithms of the Cramer-von Mises and Anderson-Darling distances, (S, 2).
 
-    Parameters
-    ----------
-    expected : ndarray, shape (S, n)
-        Distribution functions at the values in order.
-    weights : ndarray, shape (S, n)
-        Of the values.
+    Of distribution functions at the values in order, and the weights of these, (S, n) both.
     """
     weights = weights / weights.sum(axis=1, keepdims=True)
     below = np.cumsum(weights, axis=1) - weights / 2
@@ -115,8 +102,8 @@ def log_distances(expected: Floats, weights: Floats) -> Floats:
     # A mass of at least 1e-4 beyond the extremes bounds the weight of single observations there.
     inside = np.clip(expected, 1e-4, 1 - 1e-4)
     in_the_tails = squares / (inside * (1 - inside))
-    both = np.stack([squares.sum(axis=1), in_the_tails.sum(axis=1)], axis=1)
-    return np.asarray(np.log(np.maximum(both, 1e-300)))
+    distances = np.stack([squares.sum(axis=1), in_the_tails.sum(axis=1)], axis=1)
+    return np.asarray(np.log(np.maximum(distances, 1e-300)))
 
 
 def _middles(values: Floats, weights: Floats, points: Floats) -> Floats:

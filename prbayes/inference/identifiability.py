@@ -9,14 +9,9 @@ from prbayes._validate import Floats
 
 
 def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]:
-    """Name unidentified directions, such as 'mu[0] - 0.8 mu[1]', alone where they can be.
+    """Name unidentified directions, orthonormal columns (d, q), such as 'mu[0] - 0.8 mu[1]'.
 
-    Parameters
-    ----------
-    unidentified : ndarray, shape (d, q)
-        Orthonormal columns.
-    names : list of str
-        Of the d elements.
+    They are rotated so that elements are alone if possible.
     """
     labels = []
     space = unidentified
@@ -72,12 +67,8 @@ def identified_by_curvature(
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return eigenvalues and eigenvectors of the Hessian, and which of them the data identify.
 
-    Parameters
-    ----------
-    hessian, noise : ndarray, shape (d, d)
-        H and J of the sandwich, in units of the prior's spread.
-    weakest : float
-        Upper bound of the standard error of an identified direction, in prior standard deviations.
+    H and J of the sandwich, (d, d), are in units of the prior's spread; ``weakest`` is an upper
+    bound of the standard error of an identified direction.
     """
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     noise_along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)

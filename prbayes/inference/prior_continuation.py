@@ -1,8 +1,7 @@
-"""Populations beyond the ends of bounded priors, so that minimisers do not pile up there.
+"""Continuation of populations beyond the ends of bounded priors.
 
-A uniform prior ends, and the unconstrained parameter of PyMC with it. The population often goes on:
-the mean of an input may be less than its prior allows. Minimisers of synthetic data sets are then
-sought beyond the end. Only the posterior knows the prior.
+The population of an input often exists beyond the end of a uniform prior, and minimisers of
+synthetic data sets lie there as well. Only the posterior contains the prior.
 """
 
 from __future__ import annotations
@@ -22,31 +21,28 @@ from prbayes.model.parameters import THETAS, Hyperparameters
 
 @dataclass(frozen=True, eq=False)
 class Continuation:
-    """Coordinates of theta in which bounded elements go on beyond an end of their prior.
+    """Coordinates of theta in which bounded elements continue beyond an end of their prior.
 
     An element in the interval (a, b) has the value v = a + (b - a) / (1 + exp(-theta)). Its
-    coordinate is v if populations go on beyond both ends, log(v - a) if only beyond b, -log(b - v)
-    if only beyond a. Elements that do not go on have the coordinate theta.
+    coordinate is v if populations exist beyond both ends, log(v - a) if only beyond b, -log(b - v)
+    if only beyond a, and theta if beyond none.
 
     Attributes
     ----------
     lower, upper : ndarray, shape (d,)
         Ends a and b; NaN of elements without them.
     below, above : ndarray of bool, shape (d,)
-        Whether populations go on there.
-    margin : float
-        Part of the interval at its ends in which the parameters of a population are continued.
+        Whether populations exist there.
     """
 
     lower: Floats
     upper: Floats
     below: NDArray[np.bool_]
     above: NDArray[np.bool_]
-    margin: float = 1e-3
 
     @property
     def is_continued(self) -> NDArray[np.bool_]:
-        """Which elements go on beyond an end, (d,)."""
+        """Which elements continue beyond an end, (d,)."""
         return self.below | self.above
 
     def coordinates(self, thetas: Floats) -> Floats:
@@ -69,9 +65,8 @@ class Continuation:
         result = np.where(self.above & ~self.below, above, result)
         return np.asarray(np.where(self.below & ~self.above, below, result))
 
-    def within(self, coordinates: Floats, margin: float | None = None) -> Floats:
+    def within(self, coordinates: Floats, margin: float = 1e-3) -> Floats:
         """Return thetas of coordinates, moved within the ends, (S, d)."""
-        margin = self.margin if margin is None else margin
         return self._thetas(self._shares(coordinates, margin), coordinates)
 
     def _shares(self, coordinates: Floats, margin: float) -> Floats:
@@ -87,17 +82,17 @@ class Continuation:
 
     def roots(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
         """Return the roots of the k-th simulator, continued linearly in values beyond the ends."""
-        shares = self._shares(coordinates, self.margin)
+        margin = 1e-3  # part of the interval whose slope continues the roots
+        shares = self._shares(coordinates, margin)
         base = evaluator.roots(self._thetas(shares, coordinates), k)
         roots = list(base)
-        width = self.upper - self.lower
-        beyond = (self.values(coordinates) - self.lower) / width - shares
+        beyond = (self.values(coordinates) - self.lower) / (self.upper - self.lower) - shares
         for i in np.flatnonzero(self.is_continued):
             passed = np.abs(beyond[:, i]) > 1e-12
             if not passed.any():
                 continue
             inside = shares.copy()
-            steps = -self.margin * np.sign(beyond[:, i])
+            steps = -margin * np.sign(beyond[:, i])
             inside[:, i] += steps
             moved = evaluator.roots(self._thetas(inside, coordinates), k)
             factors = np.where(passed, beyond[:, i] / np.where(passed, steps, 1.0), 0.0)
@@ -150,7 +145,7 @@ class ContinuedEvaluator(Evaluator):
 
 
 def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
-    """Return the coordinates of a model, with ends at which populations of thetas, (S, d), go on.
+    """Return coordinates with the ends beyond which populations of thetas, (S, d), exist.
 
     An element is bounded if its value is the logistic function of theta between fixed ends.
     """

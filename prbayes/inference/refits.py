@@ -121,15 +121,9 @@ def refit(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the minimiser of each data set, (n_sets, r) in coordinates, and which converged.
 
-    Parameters
-    ----------
-    sampling : SamplingDistribution
-    sets : DataSets
-    start : ndarray, shape (n_sets, r), optional
-        The optimum by default. With designs the minimisation is exact from there on, and computes
-        no response; without it is of first order.
-    is_rough : bool
-        Whether a few hundredths of a standard error suffice, in half of the time.
+    With stored responses by an exact minimisation from ``start``, the optimum by default, without a
+    new response; otherwise to first order. ``is_rough``: a few hundredths of a standard error
+    suffice, in half of the time.
     """
     if not is_stored(sampling.evaluator):
         shifts = first_order_shifts(sampling.information, sampling.scales, sampling.axes, sets)
@@ -171,13 +165,8 @@ def refit_prepared(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the minimiser of the metric prepared for each data set, and which converged.
 
-    Parameters
-    ----------
-    sampling : SamplingDistribution
-    sets : DataSets
-    minimisers : ndarray, shape (n_sets, r)
-        Those of the metric prepared for the observed data (`refit`). They remain where the metric
-        cannot be prepared, as for specimens that are all alike.
+    The minimisers of the metric prepared for the observed data (`refit`) remain if the metric
+    cannot be prepared, as for specimens that are all alike.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
     result = minimisers.copy()
@@ -377,15 +366,15 @@ def _cached_refits(
     d = center.size
     start = np.zeros((SETS, d))
     along_prior = _Along(objective, center, prior_sd, np.eye(d), np.ones(d))
-    before = along_prior(start[:, None], np.arange(SETS))[:, 0]
+    at_theta = along_prior(start[:, None], np.arange(SETS))[:, 0]
     # In spreads of the prior: an ordinary step.
     shifts, _, _ = descend_by_simplex(along_prior, start, sizes=[0.5])
     # The second simplices start along the principal axes of the first minimisers.
     axes, sd = principal_axes(shifts)
     along = _Along(objective, center, prior_sd, axes, sd)
-    x, after, _ = descend_by_simplex(along, shifts @ axes / sd, sizes=[1.0])
-    is_finite = np.isfinite(before)
-    gain = float((before[is_finite] - after[is_finite]).mean())
+    x, at_minimum, _ = descend_by_simplex(along, shifts @ axes / sd, sizes=[1.0])
+    is_finite = np.isfinite(at_theta)
+    gain = float((at_theta[is_finite] - at_minimum[is_finite]).mean())
     return SimplexRefits(objective, center, prior_sd, along.shifts(x), gain)
 
 

@@ -156,13 +156,7 @@ def stored_populations(evaluator: Evaluator, thetas: Floats) -> list[_Population
 def points_along(
     evaluator: Evaluator, thetas: Floats, rng: np.random.Generator
 ) -> list[NDArray[np.intp]]:
-    """Draw the specimens of one data set at each theta: points by simulator, (n, specimens).
-
-    Raises
-    ------
-    ValueError
-        As `simulated_sets`.
-    """
+    """Draw the specimens of one data set at each theta: points by simulator, (n, specimens)."""
     nodes = evaluator.nodes
     size = (len(thetas), specimens(nodes)[1])
     populations = stored_populations(evaluator, thetas)
@@ -192,17 +186,7 @@ def simulated_points(
     *,
     more: int = 0,
 ) -> list[NDArray[np.intp]]:
-    """Draw the specimens of data sets: points of populations, (n_sets, specimens + more) each.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    populations : list of (ndarray, ndarray)
-        By simulator: responses and weights, shapes (1, n).
-    n_sets, seed : int
-    more : int
-        Number of specimens besides those observed.
-    """
+    """Draw the specimens of data sets: points of populations, (n_sets, specimens + more) each."""
     nodes = evaluator.nodes
     rng = np.random.default_rng([seed, 1])
     size = (n_sets, specimens(nodes)[1] + more)
@@ -282,11 +266,6 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
     """Draw one data set from the populations at theta by calling the response.
 
     Specimens that cannot be observed are replaced, as in `simulated_sets`.
-
-    Raises
-    ------
-    ValueError
-        If hardly any response can be observed.
     """
     nodes = evaluator.nodes
     numbers, total = specimens(nodes)

@@ -210,14 +210,9 @@ class LiftedMetric(Metric):
         ----------
         observed : array_like, shape (N, m)
             Measured responses, a row for each specimen. NaN, or a mask, is an output that was not
-            measured, +inf a specimen that failed. Shape (N,) is left to the metric of one output.
+            measured, +inf a specimen that failed. The metric of one output takes shape (N,).
         weights : array_like, shape (N,), optional
             Weights of the specimens; equal by default.
-
-        Returns
-        -------
-        Discrepancy
-            ``discrepancy(simulated, weights=None)``, shapes (..., n, m), (..., n) -> (...).
 
         Raises
         ------

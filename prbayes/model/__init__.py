@@ -1,1 +1,1 @@
-"""What stands in a PyMC model, and the evaluator that all routes ask about it."""
+"""Simulators in a PyMC model, and the evaluator of a model."""

@@ -12,26 +12,27 @@ from prbayes.model.evaluator import Evaluator
 
 
 @dataclass(frozen=True)
-class Level:
+class Requirement:
     """How well a design has to support populations."""
 
-    ess: float  # weight effective sample size at the median, as a share of what the design asks for
+    ess: float  # median weight effective sample size, as a share of the design's required one
     lowest_ess: float  # the same at the 5% quantile
     # Bounds of the mean raw weight, which is one if the design covers the population.
     mass: tuple[float, float]
     tails: bool  # whether 5% and 95% quantiles of the mean raw weight are bounded, or the median
 
 
-# Of the optimiser and the samplers, whose designs grow until it holds. A mean weight of 0.8 to 1.25
-# is a fifth of the population's mass either way. Half the effective sample size moves an optimum by
-# .05 standard errors; twice is more than 1024 points give with two inputs (docs/constants.md).
-ENOUGH = Level(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
+# Of the optimiser and the samplers, whose designs grow until they meet it. A mean weight of 0.8 to
+# 1.25 is a fifth of the population's mass either way. Half the effective sample size moves an
+# optimum by .05 standard errors; twice is more than 1024 points give with two inputs
+# (docs/constants.md).
+ENOUGH = Requirement(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
 # Of predictions, whose designs do not grow. Laxer: draws at the edge of a posterior are less well
 # supported than its centre, and resampling needs no derivative.
-TOLERABLE = Level(ess=0.5, lowest_ess=0.0, mass=(0.7, 1.4), tails=False)
+TOLERABLE = Requirement(ess=0.5, lowest_ess=0.0, mass=(0.7, 1.4), tails=False)
 # Of plots: a curve may be worse than an estimate. A curve of fewer than ten responses, a fifth of
 # the smallest requirement, would show the design.
-VISIBLE = Level(ess=0.2, lowest_ess=0.2, mass=(0.5, 2.0), tails=False)
+VISIBLE = Requirement(ess=0.2, lowest_ess=0.2, mass=(0.5, 2.0), tails=False)
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Shortcoming:
     max_lost: float
     required_ess: float
     n_points: int
-    level: Level
+    requirement: Requirement
 
     def __bool__(self) -> bool:
         """Whether the design falls short of a requirement."""
@@ -62,15 +63,15 @@ class Shortcoming:
         complaints = []
         if self.ess is not None:
             low, middle = self.ess
-            least = self.level.lowest_ess * self.required_ess
-            need = self.level.ess * self.required_ess
+            least = self.requirement.lowest_ess * self.required_ess
+            need = self.requirement.ess * self.required_ess
             complaints.append(
                 f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) "
                 f"of {self.n_points} points, expected {least:.0f} and {need:.0f}"
             )
         if self.mass is not None:
             low, high = self.mass
-            least, most = self.level.mass
+            least, most = self.requirement.mass
             complaints.append(
                 f"mean raw weight from {low:.2f} to {high:.2f}, expected within {least} to {most}"
             )
@@ -89,15 +90,15 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]
 
 
 def supports_each(
-    support: dict[str, Floats], required_ess: float, max_lost: float, level: Level
+    support: dict[str, Floats], required_ess: float, max_lost: float, requirement: Requirement
 ) -> NDArray[np.bool_]:
     """Return which populations a design supports, shape (P,); parameters as in `shortcoming`."""
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
-    least, most = level.mass
+    least, most = requirement.mass
     covered = (mass >= least) & (mass <= most)
     # A sum of zero weights may be rounded.
     lost_little = lost <= max(max_lost, 1e-12)
-    return np.asarray((ess >= level.ess * required_ess) & covered & lost_little)
+    return np.asarray((ess >= requirement.ess * required_ess) & covered & lost_little)
 
 
 def shortcoming(
@@ -105,7 +106,7 @@ def shortcoming(
     required_ess: float,
     max_lost: float,
     n_points: int,
-    level: Level,
+    requirement: Requirement,
 ) -> Shortcoming:
     """Return how a design of n points falls short of its required effective sample size.
 
@@ -114,12 +115,14 @@ def shortcoming(
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
     # Single populations far out may fall short.
     low, middle = np.quantile(ess, [0.05, 0.5])
-    at = [0.05, 0.95] if level.tails else [0.5, 0.5]
+    at = [0.05, 0.95] if requirement.tails else [0.5, 0.5]
     mass_low, mass_high = np.quantile(mass, at)
     most_lost = float(np.quantile(lost, 0.95))
-    least, most = level.mass
+    least, most = requirement.mass
     # A comparison with NaN is false: the design falls short.
-    has_ess = middle >= level.ess * required_ess and low >= level.lowest_ess * required_ess
+    has_ess = (
+        middle >= requirement.ess * required_ess and low >= requirement.lowest_ess * required_ess
+    )
     is_covered = mass_low >= least and mass_high <= most
     return Shortcoming(
         lost=most_lost if most_lost > max_lost else None,
@@ -128,5 +131,5 @@ def shortcoming(
         max_lost=max_lost,
         required_ess=required_ess,
         n_points=n_points,
-        level=level,
+        requirement=requirement,
     )

@@ -172,16 +172,6 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
     also has to exceed the density within half a standard deviation of it (binomial test); the
     larger of the two p-values counts. Limits that differ between specimens leave no pile. A test
     has the table of size and power by population and step.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N,)
-        Finite values.
-    step : float
-        Step of rounded values, 0 for exact ones.
-    draws : int
-        Bootstrap samples.
-    seed : int
     """
     n, high, low = len(y), y.max(), y.min()
     if not step:
@@ -229,13 +219,7 @@ def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0)
     With p <= .01 the size is 0 to .03. Power for 20 % copies of 20 specimens is .98 and more with
     two or three outputs, and .06 with one output, whose repeats look like chance.
 
-    Parameters
-    ----------
-    y : ndarray, shape (N, m)
-        NaN where an output was not measured.
-    steps : ndarray, shape (m,)
-        Step of each output, 0 for exact ones. Specimens do not agree in an exact output by chance.
-    draws, seed : int
+    Steps, (m,), are 0 for exact outputs, in which specimens do not agree by chance.
     """
     repeats = _count_repeats(y)
     if not repeats:
@@ -380,18 +364,10 @@ def refuse_scatter(
 ) -> None:
     """Raise if the last good run differs when it is computed again: noise, or a hidden state.
 
-    Parameters
-    ----------
-    name : str
-    outputs : ndarray, shape (n, m)
-        Of the first runs.
-    alone : callable
-        Row -> outputs of this run computed by itself, (m,).
-    rounding : float
-        Largest relative difference of two runs of one specimen.
-    one_system : float
-        Largest difference of a specimen by itself from the same in a batch, in standard deviations
-        of the runs: the tolerance of a solver that takes the batch as one system.
+    ``alone`` computes the outputs, (m,), of one row of the first runs, (n, m), by itself. Two runs
+    of a specimen may differ by rounding, and a run by itself from the same in a batch by a share of
+    the standard deviation of the runs: the tolerance of a solver that takes the batch as one
+    system.
     """
     finite = np.isfinite(outputs).all(axis=1)
     if finite.sum() < 2:
@@ -470,18 +446,8 @@ def refuse_undetermined(
     """Raise if readings leave a direction of the inputs open, although there are enough outputs.
 
     Along such a direction the outputs change over half the prior's range by less than a few errors
-    of the emulator.
-
-    Parameters
-    ----------
-    name : str
-    emulation : Emulation
-    roots : Roots
-    inputs : sequence of str
-        Names of the coordinates.
-    smallest : float
-        Change in errors of the emulator, at the median root. Responses without such a direction
-        have 97 and more, those with one less than .01.
+    of the emulator, at the median root. Responses without such a direction have 97 errors and more,
+    those with one less than .01.
     """
     if len(inputs) < 2 or not len(roots.z):
         return
@@ -496,19 +462,10 @@ def refuse_undetermined(
 def refuse_unused_inputs(
     name: str, z: Floats, outputs: Floats, inputs: Sequence[str], smallest: float = 1e-3
 ) -> None:
-    """Raise if the first runs show a direction of the inputs without influence.
+    """Raise if the first runs, (n, d) -> (n, m), show a direction of the inputs without influence.
 
-    Parameters
-    ----------
-    name : str
-    z : ndarray, shape (n, d)
-        Coordinates of the first runs.
-    outputs : ndarray, shape (n, m)
-    inputs : sequence of str
-        Names of the coordinates.
-    smallest : float
-        Influence relative to the direction with the largest, at the median run. Responses whose
-        inputs all matter have .05 and more, others 1e-4 and less.
+    The influence is relative to the direction with the largest, at the median run. Responses whose
+    inputs all matter have .05 and more, others 1e-4 and less.
     """
     is_finite = np.isfinite(outputs).all(axis=1)
     d, m = len(inputs), outputs.shape[1]
@@ -551,15 +508,7 @@ def misfit_findings(
 ) -> list[Finding]:
     """Report specimens whose readings no inputs reproduce.
 
-    Parameters
-    ----------
-    name : str
-    readings : Readings
-    roots : Roots
-    error : ndarray, shape (m,)
-        Standard deviation of the emulator's error.
-    largest : float
-        Misfit in nats that is still an error of the emulator: ten standard deviations.
+    The largest misfit in nats is still an error of the emulator: ten standard deviations, (m,).
     """
     best = np.full(len(readings), np.inf)
     np.minimum.at(best, roots.specimen, roots.misfit)

@@ -1,8 +1,8 @@
 """Emulated populations of simulators with the log-likelihood by specimen.
 
-Such a simulator stores no weighted responses. Its populations are new specimens whose responses an
-emulator gives. `EmulatedSimulator` has what `Node` has for that, so that predictions, decisions,
-plots and reports treat both alike.
+Such a simulator stores no weighted responses. Its populations are new specimens with emulated
+responses. `EmulatedSimulator` has the attributes of `Node` that predictions, decisions, plots and
+reports use.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class EmulatedSizes:
     Attributes
     ----------
     specimens : int
-        Of a population in plots and scores: the error of a quantile of them is far below the width
-        of a posterior band.
+        Specimens of a population in plots and scores: the error of a quantile is far below the
+        width of a posterior band.
     populations, of_each : int
-        Populations of the result, and specimens of each, that make the weighted sample of a
-        decision. Twice as many change probabilities by less than their reported error.
+        Populations of the result, and specimens of each, in the weighted sample of a decision.
+        Twice as many change probabilities by less than their reported error.
     blocks : int
         Parts of the sample whose differences give its error.
     """
@@ -60,161 +60,90 @@ _SIZES = EmulatedSizes()
 
 
 @dataclass(frozen=True, eq=False)
-class SomeOutputs:
-    """Some outputs of a surface."""
-
-    surface: Surface
-    columns: slice
-
-    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian."""
-        values, jacobian = self.surface(z)
-        return values[:, self.columns], jacobian[:, self.columns]
-
-    def values(self, z: Floats) -> Floats:
-        """Return the values alone."""
-        return self.surface.values(z)[:, self.columns]
-
-
-@dataclass(frozen=True, eq=False)
 class EmulatedResponse:
-    """A response between its runs, as a function of the inputs.
-
-    Attributes
-    ----------
-    coordinates : Coordinates
-    z : ndarray, shape (n, d)
-        Coordinates of the runs.
-    y : ndarray, shape (n, m)
-        Their outputs; +inf is a specimen that failed, NaN a run without response.
-    surface : Surface
-        Through the finite runs.
-    event : tuple
-        Shape of a specimen's outputs, () or (m,).
-    error : ndarray, shape (m,)
-        Root mean square error of runs that are left out, near the specimens.
-    """
+    """A response between its runs, as a function of the inputs."""
 
     coordinates: Coordinates
-    z: Floats
-    y: Floats
-    surface: Surface
-    event: tuple[int, ...]
-    error: Floats
-
-    @classmethod
-    def of_measurement(
-        cls, likelihood: SpecimenLikelihood, measurement: Measurement
-    ) -> EmulatedResponse:
-        """Return the emulator of a simulator's outputs; its first use computes the runs."""
-        emulation = prepared(likelihood).emulation
-        columns = output_columns(likelihood, measurement)
-        return cls(
-            likelihood.coordinates,
-            emulation.z,
-            emulation.y[:, columns],
-            SomeOutputs(emulation.surface, columns),
-            measurement.event,
-            emulation.error[columns],
-        )
-
-    @classmethod
-    def of_runs(cls, likelihood: SpecimenLikelihood, responses: Responses) -> EmulatedResponse:
-        """Compute another response at the points of a likelihood's runs, and interpolate it.
-
-        Raises
-        ------
-        DesignError
-            If fewer than eight runs have a finite response.
-        """
-        runs = likelihood.coordinates.inputs(prepared(likelihood).emulation.z)
-        points = values_of(runs, likelihood.inputs, responses.inputs)
-        values = responses(points, [])
-        coordinates = Coordinates.of_prior(responses.inputs)
-        z = coordinates.of(points, 1)
-        y = values.reshape(len(z), -1)
-        good = np.isfinite(y).all(axis=1)
-        if good.sum() < 8:
-            raise DesignError(
-                f"{responses.name}: got {int(good.sum())} finite responses at {len(z)} points of "
-                f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
-                "prb.predict, which computes responses at new specimens"
-            )
-        near = _near_specimens(likelihood)
-        distinct = np.unique(z[good], axis=0, return_index=True)[1]
-        rows = np.flatnonzero(good)[distinct]
-        surface = fit_interpolant(z[rows], y[rows], near[rows] if near[rows].any() else None)
-        left_out = surface.left_out[near[rows]] if near[rows].any() else surface.left_out
-        error = np.sqrt((left_out**2).mean(axis=0))
-        return cls(
-            coordinates=coordinates,
-            z=z,
-            y=y,
-            surface=surface,
-            event=values.shape[1:],
-            error=error,
-        )
+    z: Floats  # (n, d): coordinates of the runs
+    y: Floats  # (n, m): their outputs; +inf is a failed specimen, NaN a run without response
+    surface: Surface  # through the finite runs
+    columns: slice  # the outputs of the surface that are those of the response
+    event: tuple[int, ...]  # shape of a specimen's outputs, () or (m,)
+    error: Floats  # (m,): root mean square error of left-out runs, near the specimens
 
     def __call__(self, inputs: Sequence[Floats]) -> Floats:
-        """Return responses of specimens, (n, *event) by input -> (n, *event); no run is made.
+        """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
 
         Beyond the runs' range an input has the response at the end of the range. Where the nearest
         run has no finite response, the response is that of the run.
         """
         z = self.coordinates.of(inputs, 1)
         z = np.clip(z, self.z.min(axis=0), self.z.max(axis=0))
-        values = self.surface.values(z)
-        good = np.isfinite(self.y).all(axis=1)
-        if not good.all():
-            nearest = _nearest(self.z, z)
-            values = np.where(good[nearest, None], values, self.y[nearest])
+        values = self.surface.values(z)[:, self.columns]
+        is_finite = np.isfinite(self.y).all(axis=1)
+        if not is_finite.all():
+            from scipy.spatial import cKDTree
+
+            width = np.maximum(np.ptp(self.z, axis=0), 1e-300)
+            _, nearest = cKDTree(self.z / width).query(z / width)
+            values = np.where(is_finite[nearest, None], values, self.y[nearest])
         return values.reshape(len(z), *self.event)
 
 
-def values_of(values: Sequence[Floats], inputs: Inputs, wanted: Inputs) -> list[Floats]:
-    """Return the values of some inputs, from those of all inputs of a response."""
+def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> EmulatedResponse:
+    """Compute another response at the points of a likelihood's runs, and interpolate it.
+
+    Raises a DesignError if fewer than eight runs have a finite response.
+    """
+    runs = likelihood.coordinates.inputs(prepared(likelihood).emulation.z)
+    points = values_of(runs, likelihood.inputs, responses.inputs)
+    values = responses(points, [])
+    coordinates = Coordinates.of_prior(responses.inputs)
+    z = coordinates.of(points, 1)
+    y = values.reshape(len(z), -1)
+    is_finite = np.isfinite(y).all(axis=1)
+    if is_finite.sum() < 8:
+        raise DesignError(
+            f"{responses.name}: got {int(is_finite.sum())} finite responses at {len(z)} points of "
+            f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
+            "prb.predict, which computes responses at new specimens"
+        )
+    is_near = _near_specimens(likelihood)
+    distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
+    rows = np.flatnonzero(is_finite)[distinct]
+    has_near = is_near[rows].any()
+    surface = fit_interpolant(z[rows], y[rows], is_near[rows] if has_near else None)
+    left_out = surface.left_out[is_near[rows]] if has_near else surface.left_out
+    error = np.sqrt((left_out**2).mean(axis=0))
+    return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
+
+
+def _near_specimens(likelihood: SpecimenLikelihood) -> NDArray[np.bool_]:
+    """Return which runs are within the range of the specimens' roots, (n,); all if few are."""
+    preparation = prepared(likelihood)
+    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
+    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
+    z = preparation.emulation.z
+    is_near = ((z >= low) & (z <= high)).all(axis=1)
+    return is_near if is_near.sum() >= 16 else np.ones(len(z), dtype=bool)
+
+
+def values_of(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
+    """Return the values of a subset of the inputs, from those of all inputs of a response."""
     places = [
         next(place for place, dist in enumerate(inputs.aleatory) if dist is x)
-        for x in wanted.aleatory
+        for x in subset.aleatory
     ]
     return [values[place] for place in places]
 
 
-def _near_specimens(likelihood: SpecimenLikelihood) -> NDArray[np.bool_]:
-    """Return which runs are within the range of the specimens' roots, (n,)."""
-    specimens = prepared(likelihood).points
-    roots = specimens.z[np.isfinite(specimens.log_a)]
-    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
-    run_z = prepared(likelihood).emulation.z
-    near = ((run_z >= low) & (run_z <= high)).all(axis=1)
-    return near if near.sum() >= 16 else np.ones(len(run_z), dtype=bool)
-
-
-def _nearest(runs: Floats, z: Floats) -> NDArray[np.intp]:
-    """Return the nearest run of each point, (k,)."""
-    from scipy.spatial import cKDTree
-
-    width = np.maximum(np.ptp(runs, axis=0), 1e-300)
-    _, nearest = cKDTree(runs / width).query(z / width)
-    return np.asarray(nearest)
-
-
 @dataclass(frozen=True, eq=False)
 class EmulatedSimulator:
-    """The specimens of a simulator, or of one of its groups, whose responses are emulated.
-
-    Attributes
-    ----------
-    likelihood : SpecimenLikelihood
-    measurement : Measurement
-        What the simulator was given.
-    place : int or None
-        Index of the group; None without groups.
-    """
+    """The specimens of a simulator, or of one of its groups, whose responses are emulated."""
 
     likelihood: SpecimenLikelihood
     measurement: Measurement
-    place: int | None = None
+    place: int | None = None  # index of the group; None without groups
 
     is_emulated: ClassVar[Literal[True]] = True
     # As of a Node: no response is weighted.
@@ -223,13 +152,8 @@ class EmulatedSimulator:
 
     @property
     def has_specimens(self) -> bool:
-        """Whether specimens of all populations are there without a run."""
+        """Whether a population has specimens without a run."""
         return not self.likelihood.calls_response
-
-    @property
-    def runs_per_theta(self) -> int:
-        """Runs that a population costs; none by an emulator."""
-        return 0 if self.has_specimens else _SIZES.specimens
 
     @property
     def name(self) -> str:
@@ -272,6 +196,11 @@ class EmulatedSimulator:
         return None if labels is None else labels[self.rows]
 
     @property
+    def n_specimens(self) -> float:
+        """Effective number of specimens."""
+        return float(1 / (self.weights**2).sum())
+
+    @property
     def metric(self) -> Metric:
         """The log-likelihood by specimen."""
         return self.measurement.metric
@@ -291,19 +220,20 @@ class EmulatedSimulator:
         """The outputs of a run."""
         return self.measurement.outputs
 
-    @property
-    def n_specimens(self) -> float:
-        """Effective number of specimens."""
-        return float(1 / (self.weights**2).sum())
-
-    @property
-    def n_runs(self) -> int:
-        """Runs of the emulator."""
-        return len(prepared(self.likelihood).emulation.z)
-
     @cached_property
     def _emulated(self) -> EmulatedResponse:
-        return EmulatedResponse.of_measurement(self.likelihood, self.measurement)
+        """The emulator of the simulator's outputs; its first use computes the runs."""
+        emulation = prepared(self.likelihood).emulation
+        columns = output_columns(self.likelihood, self.measurement)
+        return EmulatedResponse(
+            self.likelihood.coordinates,
+            emulation.z,
+            emulation.y[:, columns],
+            emulation.surface,
+            columns,
+            self.measurement.event,
+            emulation.error[columns],
+        )
 
     def emulator(self, responses: Responses) -> EmulatedResponse:
         """Return a response of the same inputs as a function of them.
@@ -313,26 +243,26 @@ class EmulatedSimulator:
         """
         if responses.same_as(self.responses):
             return self._emulated
-        return EmulatedResponse.of_runs(self.likelihood, responses)
+        return _emulate_at_runs(self.likelihood, responses)
 
     def populations(self, roots: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return emulated responses and weights of populations, (k, n) or (k, n, m) and (k, n).
 
         The quasi-random numbers are the same for all calls.
         """
+        size, n = len(roots[0]), _SIZES.specimens
         rng = np.random.default_rng(0)
-        specimens, _ = new_specimens(self.name, self.inputs, list(roots), _SIZES.specimens, rng)
-        count = len(roots[0])
-        flat = [x.reshape(count * _SIZES.specimens, *x.shape[2:]) for x in specimens]
-        values = self._emulated(flat).reshape(count, _SIZES.specimens, *self.measurement.event)
-        return values, np.full((count, _SIZES.specimens), 1 / _SIZES.specimens)
+        specimens, _ = new_specimens(self.name, self.inputs, list(roots), n, rng)
+        flat = [x.reshape(size * n, *x.shape[2:]) for x in specimens]
+        values = self._emulated(flat).reshape(size, n, *self.measurement.event)
+        return values, np.full((size, n), 1 / n)
 
 
 type PopulationSimulator = Node | EmulatedSimulator
 
 
 def emulated_simulators(model: pm.Model) -> list[EmulatedSimulator]:
-    """Return the simulators with a likelihood by specimen, one by one for groups with specimens."""
+    """Return the simulators with a likelihood by specimen, by group where they have groups."""
     result = []
     likelihoods = specimen_likelihoods(model)
     for rv, measurement in measurements_of(model).items():
@@ -354,40 +284,30 @@ class EmulatedSample:
 
     Specimens are drawn from a mixture of populations. A population of the mixture's range is the
     specimens with importance weights.
-
-    Attributes
-    ----------
-    simulator : EmulatedSimulator
-    points : list of ndarray, shapes (n, *event)
-    log_mixture : ndarray, shape (n,)
-        Log-density of the specimens in the mixture.
-    blocks : ndarray of int, shape (n,)
-        Eight parts, each of which represents the mixture.
     """
 
     simulator: EmulatedSimulator
-    points: list[Floats]
-    log_mixture: Floats
-    blocks: NDArray[np.intp]
+    points: list[Floats]  # (n, *event) by input
+    log_mixture: Floats  # (n,): log-density of the specimens in the mixture
+    blocks: NDArray[np.intp]  # (n,): eight parts, each of which represents the mixture
 
-    has_runs: ClassVar[Literal[False]] = False  # as points, which a design has
+    has_runs: ClassVar[Literal[False]] = False  # a design has runs as points
 
     @classmethod
     def of(cls, simulator: EmulatedSimulator, roots: Sequence[Floats]) -> EmulatedSample:
         """Draw specimens from populations at roots, shapes (k, *shape)."""
-        count = len(roots[0])
-        chosen = np.unique(np.linspace(0, count - 1, _SIZES.populations).round().astype(int))
-        roots = [root[chosen] for root in roots]
-        of_each = (
-            -(-_SIZES.populations * _SIZES.of_each // len(chosen) // _SIZES.blocks) * _SIZES.blocks
-        )
+        places = np.linspace(0, len(roots[0]) - 1, _SIZES.populations)
+        rows = np.unique(places.round().astype(int))
+        roots = [root[rows] for root in roots]
+        of_each = -(-_SIZES.populations * _SIZES.of_each // len(rows) // _SIZES.blocks)
+        of_each *= _SIZES.blocks
         specimens, _ = new_specimens(
             simulator.name, simulator.inputs, list(roots), of_each, np.random.default_rng(0)
         )
         flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
         log_p = _log_density(simulator.inputs, roots, flat)
-        log_mixture = logsumexp(log_p, axis=0) - np.log(len(chosen))
-        blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(chosen))
+        log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
+        blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
         return cls(simulator, flat, log_mixture, blocks)
 
     @property

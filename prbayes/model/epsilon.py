@@ -1,4 +1,4 @@
-"""`Epsilon` by simulator, as `calibrate_epsilon` returns it, and `set_epsilon`."""
+"""Epsilons of simulators: the scales of their discrepancies under `pymc.sample`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,7 @@ _log = logging.getLogger("prbayes")
 
 
 class Epsilon(dict[str, float]):
-    """Epsilon by the names of simulators, which knows the problem that it was calibrated for.
-
-    Attributes
-    ----------
-    identity : Identity or None
-    """
+    """Epsilon by the names of simulators, with the identity of the problem, None if unknown."""
 
     def __init__(self, values: Mapping[str, float], identity: Identity | None) -> None:
         super().__init__(values)
@@ -34,13 +29,10 @@ class Epsilon(dict[str, float]):
 def checked_epsilon(
     epsilon: Mapping[str, float], simulators: Sequence[AnySimulator], model: pm.Model, caller: str
 ) -> dict[str, float]:
-    """Return positive numbers by the names of simulators, or raise.
+    """Return positive numbers by the names of simulators.
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If a name is unknown, a value is not a positive number, or they were calibrated for another
-        problem.
+    Raise KeyError, TypeError or ValueError if a name is unknown, a value is not a positive number,
+    or they were calibrated for another problem.
     """
     if not isinstance(epsilon, Mapping):
         raise TypeError(
@@ -53,19 +45,11 @@ def checked_epsilon(
         raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {sorted(names)}")
     if isinstance(epsilon, Epsilon):
         require_same(epsilon.identity, identity_of(Evaluator.of(model)), caller)
-    found = {}
-    for name, value in epsilon.items():
-        found[name] = positive_number(value, f"{name}: epsilon")
-    return found
+    return {name: positive_number(value, f"{name}: epsilon") for name, value in epsilon.items()}
 
 
 def refuse_without_epsilon(model: pm.Model, caller: str, advice: str) -> None:
-    """Raise if all simulators of a model have a log-likelihood by specimen, which has no epsilon.
-
-    Raises
-    ------
-    ValueError
-    """
+    """Raise if all simulators of a model have a log-likelihood by specimen, without an epsilon."""
     if specimen_likelihoods(model) and not simulators(model):
         raise ValueError(
             f"{caller}: got a model whose simulators use prb.LogLikelihood(), which has no epsilon "
@@ -92,8 +76,8 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
 
     Notes
     -----
-    A clone of a model (``pymc.do``, ``pymc.observe``, a copy) has epsilons of its own from the
-    first time that this package is given it; what was compiled before follows the original.
+    A clone of a model (``pymc.do``, ``pymc.observe``, a copy) has its own epsilons from its first
+    use by this package; functions that were compiled before follow the original.
 
     Examples
     --------
@@ -104,9 +88,9 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     >>> prb.set_epsilon(model, {"y": 0.1})
     """
     refuse_without_epsilon(model, "set_epsilon", "sample it with prb.sample_smc or pm.sample")
-    known = list(required_simulators(model).values())
-    values = checked_epsilon(epsilon, known, model, "set_epsilon")
-    for simulator in known:
+    by_metric = list(required_simulators(model).values())
+    values = checked_epsilon(epsilon, by_metric, model, "set_epsilon")
+    for simulator in by_metric:
         if simulator.name in values:
             simulator.epsilon.set_value(np.asarray(values[simulator.name]))
     _log.info(

@@ -11,12 +11,13 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, roots_of
+from prbayes.model.parameters import Hyperparameters, roots_of, variable_names
 from prbayes.model.random_variable import (
     Node,
     SimulatorRV,
@@ -59,36 +60,17 @@ class Evaluation:
 
 @dataclass(frozen=True, eq=False)
 class Evaluator:
-    """The simulators, likelihoods and hyperparameters of a model, compiled for batches of thetas.
-
-    Attributes
-    ----------
-    model : pymc.Model
-    hyperparameters : Hyperparameters
-        Names, transforms and prior of theta.
-    nodes : tuple of Node
-        The simulators with a metric of distributions.
-    likelihoods : tuple of SpecimenLikelihood
-        The log-likelihoods by specimen, one for simulators with common specimens.
-    measurements : tuple of Measurement
-        The simulators with a log-likelihood by specimen.
-    emulated : tuple of EmulatedSimulator
-        The populations of these, by group.
-    has_graph : bool
-        Whether the nodes have the data and designs of the model, so that its graph is the
-        objective.
-    functions : dict
-        Compiled functions, which evaluators of other data share.
-    """
+    """Simulators, likelihoods and hyperparameters of a model, compiled for batches of thetas."""
 
     model: pm.Model
-    hyperparameters: Hyperparameters
-    nodes: tuple[Node, ...]
-    likelihoods: tuple[SpecimenLikelihood, ...]
-    measurements: tuple[Measurement, ...]
-    emulated: tuple[EmulatedSimulator, ...]
+    hyperparameters: Hyperparameters  # names, transforms and prior of theta
+    nodes: tuple[Node, ...]  # simulators with a metric of distributions
+    likelihoods: tuple[SpecimenLikelihood, ...]  # one for simulators with common specimens
+    measurements: tuple[Measurement, ...]  # simulators with a log-likelihood by specimen
+    emulated: tuple[EmulatedSimulator, ...]  # the populations of these, by group
+    # Whether the nodes have the data and designs of the model, whose graph is the objective then.
     has_graph: bool = True
-    functions: dict[Any, Any] = field(default_factory=dict, repr=False)
+    functions: dict[Any, Any] = field(default_factory=dict, repr=False)  # compiled and shared
 
     @classmethod
     def of(cls, model: pm.Model) -> Evaluator:
@@ -216,13 +198,8 @@ class Evaluator:
 
         (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, gradient].
 
-        The prior's density is that of the user's own units, as in `pymc.find_MAP`: without
-        Jacobian.
-
-        Raises
-        ------
-        NotImplementedError, TypeError
-            If the objective has no gradient.
+        The prior's density is in the user's own units, as in `pymc.find_MAP`: without Jacobian.
+        Raise NotImplementedError or TypeError if the objective has no gradient.
         """
         if not self.has_graph:
             if prior or gradient:
@@ -254,18 +231,10 @@ class Evaluator:
         metric: Metric | None = None,
         weights: dict[str, Floats] | None = None,
     ) -> Evaluator:
-        """Return an evaluator of the same model with other observed responses.
+        """Return an evaluator of the same model with other observed responses, by simulator.
 
         Metrics choose bandwidths and cells again; designs and epsilons are the same objects.
-
-        Parameters
-        ----------
-        data : dict
-            Observed responses by the names of simulators.
-        metric : Metric, optional
-            Of all simulators; by default each has its own.
-        weights : dict, optional
-            Weights of the responses; by default those of the model for as many responses.
+        Weights are by default those of the model for as many responses.
         """
         targets = []
         for node in self.nodes:
@@ -387,8 +356,18 @@ def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
 
     Such as the spread between groups, or the mean of a group that was not measured.
     """
+    model = evaluator.model
+    free = set(model.free_RVs)
     params = [p for group in _simulator_params(evaluator) for p in group]
-    return evaluator.hyperparameters.only_through_others(params)
+    direct = {v for v in ancestors(params, blockers=free) if v in free}
+    joined = free & set(ancestors(list(direct)))
+    # A variable comes after those that it depends on.
+    for rv in model.free_RVs:
+        if joined.intersection(ancestors([rv])):
+            joined.add(rv)
+    indirect = {str(rv.name) for rv in joined - direct}
+    sizes = [int(np.prod(s, dtype=int)) for s in evaluator.hyperparameters.shapes.values()]
+    return np.repeat([name in indirect for name in variable_names(model)], sizes)
 
 
 def likelihood_of(evaluator: Evaluator, measurement: Measurement) -> SpecimenLikelihood:
@@ -441,8 +420,8 @@ def is_current(evaluator: Evaluator) -> bool:
     model = evaluator.model
     likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
     now: list[object] = [*nodes(model).values(), *likelihoods]
-    before: list[object] = [*evaluator.nodes, *evaluator.likelihoods]
-    return len(now) == len(before) and all(a is b for a, b in zip(now, before, strict=True))
+    previous: list[object] = [*evaluator.nodes, *evaluator.likelihoods]
+    return len(now) == len(previous) and all(a is b for a, b in zip(now, previous, strict=True))
 
 
 def _sum_over_runs(evaluator: Evaluator, counts: list[int]) -> int:

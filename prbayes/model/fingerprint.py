@@ -1,10 +1,7 @@
-"""`Identity`: what a result belongs to.
+"""The fingerprint of a problem: what a result was computed from, and how two problems differ.
 
-One record of a problem, and one function that compares two of them.
-
-A result carries the identity of the problem that it was made from: an optimum, a posterior, a
-checkpoint on disk. Where it meets a model again, `require_same` refuses what is not the same
-problem. How much has to be the same depends on the question, see `Level`.
+A result carries the fingerprint of its problem: an optimum, a posterior, a checkpoint on disk.
+Where it meets a model again, `require_same` refuses another problem.
 """
 
 from __future__ import annotations
@@ -30,6 +27,7 @@ from prbayes.model.description import (
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement
+from prbayes.model.parameters import fixed_points, plain_names
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_variable import measurements_of, specimen_likelihoods
 from prbayes.response.compile import interpreted
@@ -37,33 +35,19 @@ from prbayes.response.inputs import Inputs
 
 
 class Level(IntEnum):
-    """How much of two problems has to be the same.
+    """How much of two problems has to be the same; each level includes those before it."""
 
-    Each level asks for what those before it ask for.
-
-    POPULATIONS
-        Hyperparameters, data, inputs and responses, so that a population of one is a population of
-        the other. Responses at the same points are compared; `require_same_responses` goes on
-        where the points are others.
-    PRIORS
-        And priors and other likelihood terms.
-    OPTIMUM
-        And metrics and propagations, and whether the prior was part of it: what is minimised. A
-        design that has grown since is the same problem.
-    POSTERIOR
-        And epsilon.
-    RUN
-        And the design: all that a sampler's draws depend on, but for its own settings.
-    """
-
+    # Hyperparameters, data, inputs and responses: populations agree. Responses at the same points
+    # are compared; `require_same_responses` continues where the points differ.
     POPULATIONS = 1
-    PRIORS = 2
+    PRIORS = 2  # and priors and other likelihood terms
+    # And metrics and propagations, and whether the prior was minimised. A design that has grown
+    # since is the same problem.
     OPTIMUM = 3
-    POSTERIOR = 4
-    RUN = 5
+    POSTERIOR = 4  # and epsilons
+    RUN = 5  # and designs: all that draws depend on, except the sampler's settings
 
 
-# What to do about a difference.
 _REMEDIES = {
     Level.POPULATIONS: "pass the model that the result was made from, or make the result anew",
     Level.PRIORS: "pass the model that the result was made from, or make the result anew",
@@ -75,116 +59,65 @@ _REMEDIES = {
 
 @dataclass(frozen=True)
 class SimulatorIdentity:
-    """What identifies one simulator.
-
-    Attributes
-    ----------
-    name : str
-    data, weights, specimens : str
-        Digests of the observed values, their weights and the specimens' labels, in the order of the
-        values.
-    inputs : str
-        The response's arguments, as PyMC prints them.
-    metric, propagation : str
-        Their representations.
-    n_points, batches : int
-        The number of runs of the design, and how often points of it were drawn.
-    epsilon : float
-        NaN while it is not set.
-    responses : tuple of float
-        The first responses that are known anyway.
-    discrepancies : tuple of float
-        At the fixed thetas; empty where that would cost responses.
-    points : tuple of tuple of float
-        The aleatory inputs of the first two of the responses, one after the other; empty where the
-        response has others.
-    """
+    """What identifies one simulator; digests are of values in a fixed order."""
 
     name: str
-    data: str
-    weights: str
-    specimens: str
-    inputs: str
+    data: str  # digest of the observed values
+    weights: str  # digest of their weights
+    specimens: str  # digest of the specimens' labels
+    inputs: str  # the response's arguments, as PyMC prints them
     metric: str
     propagation: str
-    n_points: int
-    batches: int
-    epsilon: float
-    responses: tuple[float, ...]
-    discrepancies: tuple[float, ...] = ()
+    n_points: int  # runs of the design
+    batches: int  # how often points of the design were drawn
+    epsilon: float  # NaN while unset
+    responses: tuple[float, ...]  # the first ones
+    discrepancies: tuple[float, ...] = ()  # at fixed thetas; empty where they would cost responses
+    # Aleatory inputs of the first two responses; empty where the response has epistemic ones.
     points: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What identifies a problem.
+    """What identifies a problem."""
 
-    Attributes
-    ----------
-    shapes : dict
-        Shapes of the value variables by name, such as 'sigma_log__'.
-    priors : dict
-        Distributions of the free variables by name, as PyMC prints them.
-    terms : tuple of str
-        Other observed variables with their distributions, and names of potentials.
-    simulators : tuple of SimulatorIdentity
-    prior_minimised : bool or None
-        Whether minus the log prior was part of the objective; None for what was not minimised.
-    thetas : tuple of tuple of float
-        Fixed points of the prior, elements in the order of the alphabet; empty if no numbers were
-        asked for.
-    log_prior, log_other : tuple of float
-        Logarithms of the prior density, and of other likelihood terms, at these points.
-    """
-
-    shapes: dict[str, tuple[int, ...]]
-    priors: dict[str, str]
-    terms: tuple[str, ...]
+    shapes: dict[str, tuple[int, ...]]  # of value variables by name, such as 'sigma_log__'
+    priors: dict[str, str]  # distributions of free variables, as PyMC prints them
+    terms: tuple[str, ...]  # other observed variables, and names of potentials
     simulators: tuple[SimulatorIdentity, ...]
-    prior_minimised: bool | None = None
+    prior_minimised: bool | None = None  # None for what was not minimised
+    # Fixed points of the prior, elements in the order of the alphabet; empty without numbers.
     thetas: tuple[tuple[float, ...], ...] = ()
-    log_prior: tuple[float, ...] = ()
-    log_other: tuple[float, ...] = ()
+    log_prior: tuple[float, ...] = ()  # at these points
+    log_other: tuple[float, ...] = ()  # log-likelihood of other terms at these points
 
 
 def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) -> Identity:
-    """Return the identity of an evaluator's problem, with numbers.
-
-    No response is computed for them.
-    """
-    # A change that leaves the values at all of them as they are is none that matters. A power of
-    # two, as Sobol points are balanced then.
-    thetas = evaluator.hyperparameters.fixed_points(4)
-    by_name = np.argsort(evaluator.hyperparameters.plain_names)
+    """Return the identity of an evaluator's problem, with numbers; computes no response."""
+    names = evaluator.hyperparameters
+    thetas = fixed_points(names, 4)  # a power of two: Sobol points are balanced then
     simulators = []
     for k, node in enumerate(evaluator.nodes):
-        free = node.bound.stored
-        discrepancies = evaluator.discrepancies(thetas, k) if free else np.empty(0)
-        simulators.append(_simulator(node, discrepancies))
-    simulators += map(_specimen_simulator, evaluator.measurements)
+        values = evaluator.discrepancies(thetas, k) if node.bound.stored else np.empty(0)
+        simulators.append(_node_identity(node, values))
+    simulators += map(_measurement_identity, evaluator.measurements)
     return _identity(
         evaluator.model,
         simulators,
-        shapes=evaluator.hyperparameters.shapes,
+        shapes=names.shapes,
         prior_minimised=prior_minimised,
-        thetas=tuple(map(_numbers, thetas[:, by_name])),
-        log_prior=_numbers(evaluator.hyperparameters.log_prior(thetas)),
-        log_other=_numbers(evaluator.log_other(thetas)),
+        thetas=_tuples(thetas[:, np.argsort(plain_names(names))]),
+        log_prior=_tuples(names.log_prior(thetas)),
+        log_other=_tuples(evaluator.log_other(thetas)),
     )
 
 
 def identity_of_model(model: pm.Model) -> Identity:
-    """Return the identity of a model without what has to be compiled.
-
-    Densities and discrepancies.
-    """
-    found = nodes(model).values()
-    simulators = [_simulator(node, np.empty(0)) for node in found]
-    simulators += map(_specimen_simulator, measurements_of(model).values())
-    shapes = {}
-    for rv in model.free_RVs:
-        value = model.rvs_to_values[rv]
-        shapes[str(value.name)] = value.type.shape
+    """Return the identity of a model without densities and discrepancies, which are compiled."""
+    simulators = [_node_identity(node, np.empty(0)) for node in nodes(model).values()]
+    simulators += map(_measurement_identity, measurements_of(model).values())
+    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+    shapes = {str(value.name): value.type.shape for value in values}
     if any(None in shape for shape in shapes.values()):
         with interpreted():
             point = model.initial_point(random_seed=0)
@@ -192,52 +125,50 @@ def identity_of_model(model: pm.Model) -> Identity:
     return _identity(model, simulators, shapes=shapes)
 
 
-def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **others: Any) -> Identity:
-    known = known_variables(model)
-    priors = {str(rv.name): as_pymc_writes(rv, known) for rv in model.free_RVs}
+def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **fields: Any) -> Identity:
+    variables = known_variables(model)
     simulated = {*nodes(model), *specimen_likelihoods(model)}
     observed = [rv for rv in model.observed_RVs if rv not in simulated]
-    terms = [f"{rv.name} ~ {as_pymc_writes(rv, known)}" for rv in observed]
+    terms = [f"{rv.name} ~ {as_pymc_writes(rv, variables)}" for rv in observed]
     terms += [str(potential.name) for potential in model.potentials]
-    # Clones may order variables in other ways.
-    ordered = sorted(simulators, key=lambda simulator: simulator.name)
-    return Identity(priors=priors, terms=tuple(sorted(terms)), simulators=tuple(ordered), **others)
+    return Identity(
+        priors={str(rv.name): as_pymc_writes(rv, variables) for rv in model.free_RVs},
+        terms=tuple(sorted(terms)),
+        # Clones may order variables in other ways.
+        simulators=tuple(sorted(simulators, key=lambda simulator: simulator.name)),
+        **fields,
+    )
 
 
-def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
-    observed = node.target.observed
-    weights = node.target.weights
+def _node_identity(node: Node, discrepancies: Floats) -> SimulatorIdentity:
+    observed, weights, bound = node.observed, node.weights, node.bound
     order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
-    labels = []
-    if node.specimens is not None:
-        labels = node.specimens[order].tolist()
-    # Stored responses are appended to, so that the first stay the first.
+    labels = [] if node.specimens is None else node.specimens[order].tolist()
     return SimulatorIdentity(
         name=node.name,
         data=_digest(observed[order].tobytes()),
         weights=_digest(weights[order].tobytes()),
         specimens=_digest(repr(labels).encode()),
-        inputs=_inputs(node.bound.inputs),
+        inputs=_inputs(bound.inputs),
         metric=without_addresses(node.metric),
         propagation=without_addresses(node.propagation),
-        n_points=node.bound.n_runs,
+        n_points=bound.n_runs,
         batches=1 if node.reweighted is None else node.reweighted.design.n_drawn,
         epsilon=node.epsilon_value,
-        responses=_numbers(node.bound.first_responses[:8].ravel()),
-        discrepancies=_numbers(discrepancies),
+        # Stored responses are appended to, so that the first stay the first.
+        responses=_tuples(bound.first_responses[:8].ravel()),
+        discrepancies=_tuples(discrepancies),
         points=_points(node),
     )
 
 
-def _specimen_simulator(measurement: Measurement) -> SimulatorIdentity:
-    """Return the identity of a simulator with a likelihood by specimen."""
-    observed = measurement.observed
+def _measurement_identity(measurement: Measurement) -> SimulatorIdentity:
     labels = [] if measurement.specimens is None else measurement.specimens.tolist()
     weights = b"" if measurement.weights is None else measurement.weights.tobytes()
     groups = b"" if measurement.groups is None else measurement.groups.tobytes()
     return SimulatorIdentity(
         name=measurement.name,
-        data=_digest(observed.tobytes() + groups),
+        data=_digest(measurement.observed.tobytes() + groups),
         weights=_digest(weights),
         specimens=_digest(repr(labels).encode()),
         inputs=_inputs(measurement.inputs),
@@ -250,32 +181,30 @@ def _specimen_simulator(measurement: Measurement) -> SimulatorIdentity:
     )
 
 
-# Responses by which another one is known: one alone may agree by chance, as at zero.
-_POINTS = 2
-
-
 def _points(node: Node) -> tuple[tuple[float, ...], ...]:
-    """Return the aleatory inputs of the first known responses, a row for each."""
-    # A propagation of a user's own may know none.
-    if node.bound.inputs.epistemic or not len(node.bound.first_points):
+    """Return the aleatory inputs of the first two responses, a row for each.
+
+    One response alone may agree with another by chance, as at zero.
+    """
+    # A user's own propagation may store no points.
+    if node.inputs.epistemic or not len(node.bound.first_points):
         return ()
-    columns = [x[:_POINTS].reshape(min(_POINTS, len(x)), -1) for x in node.bound.first_points]
-    return tuple(map(_numbers, np.concatenate(columns, axis=1)))
+    columns = [x[:2].reshape(min(2, len(x)), -1) for x in node.bound.first_points]
+    points: tuple[tuple[float, ...], ...] = _tuples(np.concatenate(columns, axis=1))
+    return points
 
 
 def _inputs(inputs: Inputs) -> str:
-    """Return the arguments of a response, the same for all clones of a model."""
-    roots = set(inputs.roots)
+    """Return the arguments of a response as text, the same for all clones of a model."""
     texts = []
     for argument in inputs.arguments:
         if isinstance(argument, int):
-            texts.append(str_for_dist(inputs.aleatory[argument], named_vars=roots))
+            texts.append(str_for_dist(inputs.aleatory[argument], named_vars=set(inputs.roots)))
         elif argument in inputs.epistemic:
             texts.append(str(argument.name or "an expression"))
         else:
             values = np.asarray(argument, dtype=np.float64)
-            content = values.tobytes()
-            texts.append(f"{values}" if values.ndim == 0 else _digest(content))
+            texts.append(f"{values}" if values.ndim == 0 else _digest(values.tobytes()))
     return ", ".join(texts)
 
 
@@ -283,11 +212,14 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
-def _numbers(values: Floats) -> tuple[float, ...]:
-    return tuple(map(float, values))
+def _tuples(values: Any) -> Any:
+    """Return nested sequences and arrays of numbers or texts as tuples."""
+    if isinstance(values, np.ndarray):
+        values = values.astype(np.float64).tolist()
+    return tuple(map(_tuples, values)) if isinstance(values, list | tuple) else values
 
 
-# Text, for files.
+# In files.
 
 
 def as_text(identity: Identity) -> str:
@@ -296,41 +228,26 @@ def as_text(identity: Identity) -> str:
 
 
 def from_text(text: str) -> Identity:
-    """Return an identity from JSON.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If it is none.
-    """
-    found = json.loads(text)
-    simulators = []
-    for fields in found.pop("simulators"):
-        for key in ("responses", "discrepancies"):
-            fields[key] = tuple(fields[key])
-        fields["points"] = tuple(tuple(point) for point in fields.get("points", ()))
-        simulators.append(SimulatorIdentity(**fields))
-    shapes = found.pop("shapes")
-    shapes = {name: tuple(shape) for name, shape in shapes.items()}
-    thetas = tuple(tuple(theta) for theta in found.pop("thetas"))
-    for key in ("terms", "log_prior", "log_other"):
-        found[key] = tuple(found[key])
-    return Identity(shapes=shapes, simulators=tuple(simulators), thetas=thetas, **found)
+    """Return an identity from JSON; raise KeyError, TypeError or ValueError if it is none."""
+    stored = json.loads(text)
+    simulators = tuple(
+        SimulatorIdentity(**{key: _tuples(value) for key, value in fields.items()})
+        for fields in stored.pop("simulators")
+    )
+    shapes = {name: tuple(shape) for name, shape in stored.pop("shapes").items()}
+    for key in ("terms", "thetas", "log_prior", "log_other"):
+        stored[key] = _tuples(stored[key])
+    return Identity(shapes=shapes, simulators=simulators, **stored)
 
 
 def as_attributes(identity: Identity | None) -> dict[str, str]:
     """Return an identity as an attribute of a file; none where it is unknown or too long."""
-    if identity is None:
-        return {}
-    text = as_text(identity)
-    return {"identity": text} if fits_attribute(text) else {}
+    text = "" if identity is None else as_text(identity)
+    return {"identity": text} if text and fits_attribute(text) else {}
 
 
 def from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
-    """Return the identity that a file has, or None.
-
-    That of a result of other tools is not known.
-    """
+    """Return the identity that a file has; None for results of other tools."""
     try:
         return from_text(attributes["identity"])
     except (AttributeError, KeyError, TypeError, ValueError):
@@ -343,64 +260,37 @@ def from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
 def require_same(
     got: Identity | None, expected: Identity | None, caller: str, level: Level = Level.OPTIMUM
 ) -> None:
-    """Raise unless a result is one of the problem at hand, as far as is known.
-
-    Parameters
-    ----------
-    got : Identity or None
-        Of the result; nothing is asked of one that is not known.
-    expected : Identity or None
-        Of the problem.
-    caller : str
-        For the message.
-    level : Level
-        How much has to be the same.
-
-    Raises
-    ------
-    ValueError
-        With all that differs.
-    """
+    """Raise a ValueError with all that differs, up to a level; unknown identities pass."""
     if got is None or expected is None:
         return
-    found = differences(got, expected, level)
-    if found:
+    texts = differences(got, expected, level)
+    if texts:
         raise ValueError(
-            f"{caller}: got a result of another problem: {'; '.join(found)}; {_REMEDIES[level]}"
+            f"{caller}: got a result of another problem: {'; '.join(texts)}; {_REMEDIES[level]}"
         )
 
 
 def require_same_responses(got: Identity | None, model: pm.Model, caller: str) -> None:
-    """Raise unless the responses of a model are those of a result, also at points of its own.
+    """Raise a ValueError unless a model has a result's responses, also at the result's points.
 
-    `differences` compares those that are known at the same points, which are drawn through the
-    priors. With other priors, or another propagation, two responses of each simulator are computed.
-
-    Raises
-    ------
-    ValueError
-        If one has another value.
+    `differences` compares responses at the same points, which are drawn through the priors. With
+    other priors, or another propagation, two responses of each simulator are computed.
     """
-    known = {} if got is None else {each.name: each for each in got.simulators}
+    stored = {} if got is None else {simulator.name: simulator for simulator in got.simulators}
     for node in nodes(model).values():
-        before = known.get(node.name)
-        if before is None or not before.points or before.points == _points(node):
+        saved = stored.get(node.name)
+        if saved is None or not saved.points or saved.points == _points(node):
             continue
-        values = _at_points(node, np.array(before.points)).ravel()
-        if not _close(values, before.responses[: values.size]):
+        shapes = node.inputs.event_shapes
+        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+        columns = np.split(np.array(saved.points), ends[:-1], axis=1)
+        aleatory = [x.reshape(-1, *shape) for x, shape in zip(columns, shapes, strict=True)]
+        values = node.responses(aleatory, []).ravel()
+        if not _close(values, saved.responses[: values.size]):
             raise ValueError(
                 f"{caller}: got a result of another problem: the response of {node.name} has other "
                 f"values at the same points; {_REMEDIES[Level.POPULATIONS]}"
             )
-
-
-def _at_points(node: Node, points: Floats) -> Floats:
-    """Return a simulator's responses at points, rows of its aleatory inputs."""
-    shapes = node.bound.inputs.event_shapes
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-    columns = np.split(points, ends[:-1], axis=1)
-    aleatory = [x.reshape(-1, *shape) for x, shape in zip(columns, shapes, strict=True)]
-    return node.bound.responses(aleatory, [])
 
 
 def require_together(
@@ -412,23 +302,11 @@ def require_together(
 ) -> Identity | None:
     """Return the identity of a model, or else of the first result that has one.
 
-    Parameters
-    ----------
-    identities : mapping
-        Of results, by their labels.
-    caller : str
-        For the message.
-    model : pymc.Model, optional
-        Nothing is asked of one without a simulator.
-    level : Level
-
-    Raises
-    ------
-    ValueError
-        If one of the results is of another problem.
+    Raise a ValueError if one of the results, by label, is of another problem. A model without a
+    simulator is not compared.
     """
-    known = [identity for identity in identities.values() if identity is not None]
-    expected = known[0] if known else None
+    with_identity = [i for i in identities.values() if i is not None]
+    expected = with_identity[0] if with_identity else None
     if model is not None and (nodes(model) or specimen_likelihoods(model)):
         expected = identity_of_model(model)
     for label, identity in identities.items():
@@ -437,127 +315,114 @@ def require_together(
 
 
 def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
-    """Return in what two problems differ, as far as a level asks for it, in words.
-
-    Numbers up to rounding.
-    """
+    """Return the differences of two problems, up to a level, as texts; numbers up to rounding."""
     if got.shapes != expected.shapes:
-        return [_told("hyperparameters", _shown(got.shapes), _shown(expected.shapes))]
-    names = [[s.name for s in one.simulators] for one in (got, expected)]
+        texts = [_shapes_text(identity.shapes) for identity in (got, expected)]
+        return [_unlike("hyperparameters", *texts)]
+    names = [[simulator.name for simulator in i.simulators] for i in (got, expected)]
     if names[0] != names[1]:
-        return [_told("simulators", *names)]
-    found: list[str] = []
+        return [_unlike("simulators", *names)]
     pairs = list(zip(got.simulators, expected.simulators, strict=True))
     priors = _prior_differences(got, expected)
+    result: list[str] = []
     for a, b in pairs:
-        # Design points are drawn through the priors: with others, other responses are known.
+        # Design points are drawn through the priors: other priors give other responses.
         comparable = not priors and a.propagation == b.propagation
-        found += _population_differences(a, b, comparable=comparable)
+        result += _population_differences(a, b, comparable=comparable)
     if level >= Level.PRIORS:
-        found += priors
+        result += priors
     if level >= Level.OPTIMUM:
-        found += _minimised_differences(got.prior_minimised, expected.prior_minimised)
+        result += _minimised_differences(got.prior_minimised, expected.prior_minimised)
         for a, b in pairs:
-            found += _discrepancy_differences(a, b)
-    if level >= Level.POSTERIOR:
-        for a, b in pairs:
-            if not _close([a.epsilon], [b.epsilon]):
-                found.append(_told(f"epsilon of {a.name}", a.epsilon, b.epsilon))
-    if level >= Level.RUN:
-        for a, b in pairs:
-            if not _same_design(a, b):
-                found.append(_told(f"number of responses of {a.name}", a.n_points, b.n_points))
-    return found
+            result += _discrepancy_differences(a, b)
+    for a, b in pairs if level >= Level.POSTERIOR else ():
+        if not _close([a.epsilon], [b.epsilon]):
+            result.append(_unlike(f"epsilon of {a.name}", a.epsilon, b.epsilon))
+    for a, b in pairs if level >= Level.RUN else ():
+        if not _same_design(a, b):
+            result.append(_unlike(f"number of responses of {a.name}", a.n_points, b.n_points))
+    return result
 
 
 def _same_design(a: SimulatorIdentity, b: SimulatorIdentity) -> bool:
-    return a.n_points == b.n_points and a.batches == b.batches
+    return (a.n_points, a.batches) == (b.n_points, b.batches)
 
 
 def _population_differences(
     a: SimulatorIdentity, b: SimulatorIdentity, *, comparable: bool
 ) -> list[str]:
-    found = [
-        f"other {what} of {a.name}"
-        for what, one, other in (
-            ("observed values", a.data, b.data),
-            ("weights of observed values", a.weights, b.weights),
-            ("labels of specimens", a.specimens, b.specimens),
-        )
-        if one != other
+    data = {
+        "data": "observed values",
+        "weights": "weights of observed values",
+        "specimens": "labels of specimens",
+    }
+    result = [
+        f"other {text} of {a.name}"
+        for field, text in data.items()
+        if getattr(a, field) != getattr(b, field)
     ]
-    if _without_names(a.inputs) != _without_names(b.inputs):
-        found.append(_told(f"inputs of {a.name}", a.inputs, b.inputs))
+    # Names of inputs do not matter to a population.
+    inputs = [re.sub(r"(^|, )[^,()~]+ ~ ", r"\1", simulator.inputs) for simulator in (a, b)]
+    if inputs[0] != inputs[1]:
+        result.append(_unlike(f"inputs of {a.name}", a.inputs, b.inputs))
     elif comparable and not _close(a.responses, b.responses):
-        found.append(f"the response of {a.name} has other values at the same points")
-    return found
-
-
-def _without_names(inputs: str) -> str:
-    """Return inputs as they are distributed: what they are called makes no other population."""
-    return re.sub(r"(^|, )[^,()~]+ ~ ", r"\1", inputs)
+        result.append(f"the response of {a.name} has other values at the same points")
+    return result
 
 
 def _prior_differences(got: Identity, expected: Identity) -> list[str]:
-    found = [
-        _told(f"prior of {name}", got.priors[name], expected.priors[name])
-        for name in got.priors
-        if got.priors[name] != expected.priors.get(name)
+    result = [
+        _unlike(f"prior of {name}", prior, expected.priors[name])
+        for name, prior in got.priors.items()
+        if prior != expected.priors.get(name)
     ]
     if got.terms != expected.terms:
-        found.append(_told("other likelihood terms", got.terms or "none", expected.terms or "none"))
-    if found or not got.thetas or not expected.thetas:
-        return found
-    same_prior = _close(got.thetas, expected.thetas) and _close(got.log_prior, expected.log_prior)
-    if not same_prior:
-        found.append("the priors have other densities")
-    elif not _close(got.log_other, expected.log_other):
-        found.append("other likelihood terms, or potentials, have other values")
-    return found
+        terms = got.terms or "none", expected.terms or "none"
+        result.append(_unlike("other likelihood terms", *terms))
+    if result or not got.thetas or not expected.thetas:
+        return result
+    if not (_close(got.thetas, expected.thetas) and _close(got.log_prior, expected.log_prior)):
+        return ["the priors have other densities"]
+    if not _close(got.log_other, expected.log_other):
+        return ["other likelihood terms, or potentials, have other values"]
+    return []
 
 
 def _minimised_differences(got: bool | None, expected: bool | None) -> list[str]:
     if None in (got, expected) or got == expected:
         return []
-    with_prior = "an optimum of discrepancy and prior together (prior=True)"
-    without = "one of the discrepancy alone"
-    told = (with_prior, without) if got else (without, with_prior)
-    return [f"got {told[0]}, expected {told[1]}"]
+    texts = {
+        True: "an optimum of discrepancy and prior together (prior=True)",
+        False: "one of the discrepancy alone",
+    }
+    return [f"got {texts[bool(got)]}, expected {texts[bool(expected)]}"]
 
 
 def _discrepancy_differences(a: SimulatorIdentity, b: SimulatorIdentity) -> list[str]:
-    found = []
-    for what in ("metric", "propagation"):
-        one = getattr(a, what)
-        other = getattr(b, what)
-        if one != other:
-            found.append(_told(f"{what} of {a.name}", one, other))
-    known = bool(a.discrepancies and b.discrepancies)
-    if found or not known or not _same_design(a, b):
-        return found
-    if not _close(a.discrepancies, b.discrepancies):
-        found.append(f"the discrepancy of {a.name} has other values at the same hyperparameters")
-    return found
+    result = [
+        _unlike(f"{field} of {a.name}", getattr(a, field), getattr(b, field))
+        for field in ("metric", "propagation")
+        if getattr(a, field) != getattr(b, field)
+    ]
+    comparable = a.discrepancies and b.discrepancies and _same_design(a, b)
+    if not result and comparable and not _close(a.discrepancies, b.discrepancies):
+        result.append(f"the discrepancy of {a.name} has other values at the same hyperparameters")
+    return result
 
 
-def _told(what: str, got: object, expected: object) -> str:
+def _unlike(what: str, got: object, expected: object) -> str:
     return f"{what}: got {got}, expected {expected}"
 
 
-def _shown(shapes: Mapping[str, tuple[int, ...]]) -> str:
-    texts = []
-    for name, shape in shapes.items():
-        texts.append(f"{name} {shape}" if shape else name)
-    return ", ".join(texts)
+def _shapes_text(shapes: Mapping[str, tuple[int, ...]]) -> str:
+    return ", ".join(f"{name} {shape}" if shape else name for name, shape in shapes.items())
 
 
 def _close(got: Any, expected: Any) -> bool:
     """Return whether numbers are the same up to rounding, relative to the largest of them."""
-    a = np.asarray(got, dtype=np.float64)
-    b = np.asarray(expected, dtype=np.float64)
-    if a.shape != b.shape:
-        return False
-    finite = a[np.isfinite(a)]
-    size = np.abs(finite).max(initial=0.0)
-    # As much as another machine, or another version of NumPy, may make.
-    return bool(np.allclose(a, b, rtol=0.0, atol=1e-6 * size, equal_nan=True))
+    a, b = np.asarray(got, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    size = np.abs(a[np.isfinite(a)]).max(initial=0.0)
+    # As much as another machine, or another version of NumPy, may change.
+    return a.shape == b.shape and bool(
+        np.allclose(a, b, rtol=0.0, atol=1e-6 * size, equal_nan=True)
+    )

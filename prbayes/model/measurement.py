@@ -32,37 +32,19 @@ from prbayes.response.response import Responses
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """The arguments of one simulator with a log-likelihood by specimen.
-
-    Attributes
-    ----------
-    name : str
-    metric : LogLikelihood
-    observed : ndarray, shape (N,) or (N, m)
-    weights : ndarray, shape (N,), or None
-        Factors of the specimens' log-likelihoods, which sum to N.
-    specimens : ndarray, shape (N,), or None
-        Labels.
-    inputs : Inputs
-    responses : Responses
-    propagation : Propagation
-    outputs : Outputs
-    groups : ndarray of int, shape (N,), or None
-        Index of each specimen's group.
-    extras : dict
-        Model variables of the measurement: ``error`` and ``gross_errors``.
-    """
+    """The arguments of one simulator with a log-likelihood by specimen."""
 
     name: str
     metric: LogLikelihood
-    observed: Floats
-    weights: Floats | None
-    specimens: NDArray[Any] | None
+    observed: Floats  # (N,) or (N, m)
+    weights: Floats | None  # (N,): factors of the specimens' log-likelihoods, which sum to N
+    specimens: NDArray[Any] | None  # (N,): labels
     inputs: Inputs
     responses: Responses
     propagation: Propagation
     outputs: Outputs
-    groups: NDArray[np.intp] | None = None
+    groups: NDArray[np.intp] | None = None  # (N,): index of each specimen's group
+    # Model variables of the measurement: ``error`` and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 
     @property
@@ -123,39 +105,19 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False)
 class StackedReadings:
-    """Readings of S specimens in M outputs, those of all simulators.
+    """Readings of S specimens in M outputs, those of all simulators."""
 
-    Attributes
-    ----------
-    readings : Readings
-        Repeated readings of an output by their weighted mean, with its error.
-    scale : ndarray, shape (S, M)
-        Standard deviation of the error of these readings, in units of an unknown error.
-    repeats : Repeats or None
-        None if no output of a specimen was read repeatedly.
-    numbers : tuple of ndarray of int, shapes (N,)
-        Specimen of each row, by simulator.
-    groups : ndarray of int, shape (S,), or None
-    log_gross : ndarray, shape (S,)
-        Log-density of a specimen with a gross error: uniform over twice the range of each output.
-    """
-
-    readings: Readings
-    scale: Floats
-    repeats: Repeats | None
-    numbers: tuple[NDArray[np.intp], ...]
-    groups: NDArray[np.intp] | None
+    readings: Readings  # repeated readings of an output by their weighted mean, with its error
+    scale: Floats  # (S, M): standard deviation of their error, in units of an unknown error
+    repeats: Repeats | None  # None if no output of a specimen was read repeatedly
+    numbers: tuple[NDArray[np.intp], ...]  # (N,) by simulator: specimen of each row
+    groups: NDArray[np.intp] | None  # (S,)
+    # (S,): log-density of a gross error, uniform over twice the range of each output.
     log_gross: Floats
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement]) -> StackedReadings:
-        """Stack the readings of simulators.
-
-        Raises
-        ------
-        ValueError
-            If readings of one specimen contradict each other, or cannot be combined.
-        """
+        """Stack the readings of simulators; raise if those of a specimen cannot be combined."""
         numbers, size = _specimen_numbers(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
         readings, scales, repeats = zip(*parts, strict=True)
@@ -245,24 +207,13 @@ def _specimen_groups(
 
 @dataclass(frozen=True, eq=False)
 class SpecimenLikelihood:
-    """Data and settings of a log-likelihood of specimens, measured by one simulator or several.
+    """Data and settings of a log-likelihood of specimens, measured by one simulator or several."""
 
-    Attributes
-    ----------
-    measurements : tuple of Measurement
-        Of simulators with the same inputs, in the order of the model.
-    model : weak reference to a pymc.Model
-    known : Emulation or None
-        Of the same responses, for other data.
-    options : PointOptions
-    cache : dict
-        Values that are computed at their first use, such as the points of the specimens.
-    """
-
-    measurements: tuple[Measurement, ...]
-    model: Any = None
-    known: Emulation | None = None
+    measurements: tuple[Measurement, ...]  # of simulators with the same inputs
+    model: Any = None  # weak reference to a pymc.Model
+    shared_emulation: Emulation | None = None  # of the same responses, for other data
     options: PointOptions = field(default_factory=PointOptions)
+    # Values that are computed at their first use, such as the points of the specimens.
     cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -366,8 +317,8 @@ class SpecimenLikelihood:
         if all(a is b for a, b in zip(changed, self.measurements, strict=True)):
             return self
         preparation = self.cache.get("preparation")
-        known = self.known if preparation is None else preparation.emulation
-        return replace(self, measurements=changed, known=known)
+        emulation = self.shared_emulation if preparation is None else preparation.emulation
+        return replace(self, measurements=changed, shared_emulation=emulation)
 
 
 def specimen_numbers(likelihood: SpecimenLikelihood, measurement: Measurement) -> NDArray[np.intp]:

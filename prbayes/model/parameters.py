@@ -6,17 +6,15 @@ Theta is the vector of the model's value variables, unconstrained through PyMC's
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
-from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import Floats, called, real_array, refuse_single_precision
 from prbayes.model.elements import coordinates, element_names
@@ -44,7 +42,6 @@ class Hyperparameters:
 
     model: pm.Model
     point: dict[str, Any]
-    _prior_draws: dict[tuple[int, int], Floats] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, model: pm.Model) -> Hyperparameters:
@@ -86,46 +83,12 @@ class Hyperparameters:
     @property
     def names(self) -> list[str]:
         """Names of the elements of theta, such as 'sigma_log__', 'mu[1]' or 'mu[Adler]'."""
-        return self._element_names(list(self.shapes))
+        return _element_names(self, list(self.shapes))
 
     @property
     def readable_names(self) -> list[str]:
         """The same with the names of the untransformed variables, such as 'sigma'."""
-        return self._element_names(self._variable_names)
-
-    @property
-    def plain_names(self) -> list[str]:
-        """Names with indices in place of coordinates."""
-        return [name for v, shape in self.shapes.items() for name in element_names(v, shape)]
-
-    @property
-    def _variable_names(self) -> list[str]:
-        """Names of the variables, in the order of theta."""
-        return [str(self.model.values_to_rvs[v].name) for v in self.model.value_vars]
-
-    def _element_names(self, names: list[str]) -> list[str]:
-        """Return the names of all elements, from those of the variables."""
-        elements: list[str] = []
-        shapes = self.shapes.values()
-        for name, variable, shape in zip(names, self._variable_names, shapes, strict=True):
-            elements += element_names(name, shape, coordinates(self.model, variable))
-        return elements
-
-    def only_through_others(self, graphs: Sequence[Any]) -> NDArray[np.bool_]:
-        """Return which elements of theta are linked to graphs, but by other variables only, (d,).
-
-        Parents of the variables that the graphs are of, and descendants of these.
-        """
-        free = set(self.model.free_RVs)
-        direct = {v for v in ancestors(graphs, blockers=free) if v in free}
-        joined = free & set(ancestors(list(direct)))
-        # A variable comes after those that it depends on.
-        for rv in self.model.free_RVs:
-            if joined.intersection(ancestors([rv])):
-                joined.add(rv)
-        indirect = {str(rv.name) for rv in joined - direct}
-        sizes = [int(np.prod(shape, dtype=int)) for shape in self.shapes.values()]
-        return np.repeat([name in indirect for name in self._variable_names], sizes)
+        return _element_names(self, variable_names(self.model))
 
     # Functions of theta.
 
@@ -174,20 +137,6 @@ class Hyperparameters:
         """Return the log prior density with the Jacobian of the transforms, shape (P,)."""
         values = self._log_prior(np.ascontiguousarray(thetas))
         return np.array(np.broadcast_to(sum(values), len(thetas)))
-
-    def log_posterior(self, thetas: Floats, log_likelihood: Callable[[Floats], Floats]) -> Floats:
-        """Return the log prior density plus a log-likelihood, (P, d) -> (P,).
-
-        The log-likelihood is evaluated where the prior is positive. The result is -inf where it is
-        NaN.
-        """
-        thetas = np.ascontiguousarray(thetas)
-        result = self.log_prior(thetas)
-        is_possible = np.isfinite(result)
-        if is_possible.any():
-            result[is_possible] += log_likelihood(thetas[is_possible])
-        result[~np.isfinite(result)] = -np.inf
-        return result
 
     def in_support(self, thetas: Floats) -> Any:
         """Return which thetas have a finite log prior, shape (P,)."""
@@ -268,14 +217,14 @@ class Hyperparameters:
     # The prior.
 
     @cached_property
-    def _sampler(self) -> PriorSampler:
-        return PriorSampler(self.model.free_RVs)
+    def _draw_prior(self) -> Callable[[int, int], Floats]:
+        """The function (size, seed) -> draws of thetas, which are computed once."""
+        sampler = PriorSampler(self.model.free_RVs)
+        return cache(lambda size, seed: self.thetas_of(sampler(size, seed)))
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        if (size, seed) not in self._prior_draws:
-            self._prior_draws[size, seed] = self.thetas_of(self._sampler(size, seed))
-        return self._prior_draws[size, seed].copy()
+        return self._draw_prior(size, seed).copy()
 
     @cached_property
     def prior_sd(self) -> Floats:
@@ -290,7 +239,7 @@ class Hyperparameters:
         return np.where((spread > 0) & np.isfinite(spread), spread, 1.0)
 
     @cached_property
-    def _points(self) -> PriorPoints | None:
+    def quantiles(self) -> PriorPoints | None:
         """The inverse distribution functions of the prior; None if a variable has none."""
         try:
             return PriorPoints(self.model.free_RVs)
@@ -302,26 +251,67 @@ class Hyperparameters:
 
         Sobol points through the inverse distribution functions, or draws where there are none.
         """
-        if self._points is None:
+        if self.quantiles is None:
             return self.prior_thetas(size, seed)
-        return self._thetas_at(self._points, sobol(size, self._points.size, seed))
+        return _thetas_at(self, self.quantiles, sobol(size, self.quantiles.size, seed))
 
-    def _thetas_at(self, points: PriorPoints, cube: Floats) -> Floats:
-        """Return thetas at points of the unit cube, shape (P, size)."""
-        thetas = self.thetas_of(points(cube))
-        return np.where(np.isfinite(thetas), thetas, self.initial)
 
-    def fixed_points(self, size: int) -> Floats:
-        """Return thetas, shape (size, d), that do not depend on the order of the variables.
+def variable_names(model: pm.Model) -> list[str]:
+    """Return the names of the free variables, in the order of theta."""
+    return [str(model.values_to_rvs[v].name) for v in model.value_vars]
 
-        Clones of a model may order variables in other ways.
-        """
-        if self._points is None:
-            offsets = sobol(size, self.size, seed=0) - 0.5
-            return self.initial + _columns_by_name(offsets, self.plain_names)
-        names = [n for rv in self.model.free_RVs for n in element_names(rv.name, event_shape(rv))]
-        cube = sobol(size, self._points.size, seed=0)
-        return self._thetas_at(self._points, _columns_by_name(cube, names))
+
+def _element_names(hyperparameters: Hyperparameters, names: list[str]) -> list[str]:
+    """Return the names of the elements of theta, from those of the variables."""
+    model = hyperparameters.model
+    elements: list[str] = []
+    shapes = hyperparameters.shapes.values()
+    for name, variable, shape in zip(names, variable_names(model), shapes, strict=True):
+        elements += element_names(name, shape, coordinates(model, variable))
+    return elements
+
+
+def plain_names(hyperparameters: Hyperparameters) -> list[str]:
+    """Return the names of the elements of theta with indices in place of coordinates."""
+    shapes = hyperparameters.shapes.items()
+    return [name for variable, shape in shapes for name in element_names(variable, shape)]
+
+
+def log_posterior(
+    hyperparameters: Hyperparameters, thetas: Floats, log_likelihood: Callable[[Floats], Floats]
+) -> Floats:
+    """Return the log prior density plus a log-likelihood, (P, d) -> (P,).
+
+    The log-likelihood is evaluated where the prior is positive. The result is -inf where it is NaN.
+    """
+    thetas = np.ascontiguousarray(thetas)
+    result = hyperparameters.log_prior(thetas)
+    is_possible = np.isfinite(result)
+    if is_possible.any():
+        result[is_possible] += log_likelihood(thetas[is_possible])
+    result[~np.isfinite(result)] = -np.inf
+    return result
+
+
+def _thetas_at(hyperparameters: Hyperparameters, quantiles: PriorPoints, cube: Floats) -> Floats:
+    """Return thetas at points of the unit cube, shape (P, size)."""
+    thetas = hyperparameters.thetas_of(quantiles(cube))
+    return np.where(np.isfinite(thetas), thetas, hyperparameters.initial)
+
+
+def fixed_points(hyperparameters: Hyperparameters, size: int) -> Floats:
+    """Return thetas, shape (size, d), that do not depend on the order of the variables.
+
+    Clones of a model may order variables in other ways.
+    """
+    quantiles = hyperparameters.quantiles
+    if quantiles is None:
+        offsets = sobol(size, hyperparameters.size, seed=0) - 0.5
+        return hyperparameters.initial + _columns_by_name(offsets, plain_names(hyperparameters))
+    free = hyperparameters.model.free_RVs
+    names = [name for rv in free for name in element_names(rv.name, event_shape(rv))]
+    cube = sobol(size, quantiles.size, seed=0)
+    return _thetas_at(hyperparameters, quantiles, _columns_by_name(cube, names))
 
 
 def _columns_by_name(columns: Floats, names: Sequence[str]) -> Floats:

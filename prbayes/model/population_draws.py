@@ -15,7 +15,7 @@ from scipy.special import chdtri, ndtri
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.model.measurement import SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, roots_of
+from prbayes.model.parameters import Hyperparameters, log_posterior, roots_of
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.numerics.points import sobol
 from prbayes.propagation.population_density import WeightedPoints
@@ -109,16 +109,8 @@ class Populations:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
 
         Weights are tempered until their effective sample size is ten times the number of
-        hyperparameters, so that a few draws do not decide the next proposal.
-
-        Parameters
-        ----------
-        z, log_a : ndarray, shapes (N, K, d) and (N, K)
-        smoothing : ndarray, shape (d, d), optional
-            As in `log_likelihoods`.
-        share : ResponseShare, optional
-            Points of the share of a population that has a response.
-        seed : int
+        hyperparameters, so that a few draws do not decide the next proposal. Points and smoothing
+        are those of `log_likelihoods`; the share is that of a population with a response.
         """
         names = self.hyperparameters
         d = names.size
@@ -128,7 +120,7 @@ class Populations:
             return total if share is None else total - self.log_share(thetas, share)
 
         thetas = names.prior_points(2048, seed)
-        log_weights = names.log_posterior(thetas, log_likelihood) - names.log_prior(thetas)
+        log_weights = log_posterior(names, thetas, log_likelihood) - names.log_prior(thetas)
         weights, _ = _tempered(log_weights, 10 * d)
         for attempt in range(12):
             mean = weights @ thetas
@@ -140,7 +132,7 @@ class Populations:
             standard = ndtri(u[:, :d]) * radius[:, None]
             thetas = mean + standard @ root.T
             log_proposal = -(5 + d) / 2 * np.log1p((standard**2).sum(axis=1) / 5)
-            log_density = names.log_posterior(thetas, log_likelihood)
+            log_density = log_posterior(names, thetas, log_likelihood)
             weights, temper = _tempered(log_density - log_proposal, 10 * d)
             if temper == 1.0 and attempt >= 2 and 1 / (weights**2).sum() > 200:
                 break

@@ -68,8 +68,6 @@ class abc_distance(Op):  # noqa: N801 (reads as a function in a model)
             self._prepared = (np.array(observed), self.metric.against(observed))
         _, target = self._prepared
         value = -np.inf
-        lacking = np.isnan(simulated) | np.isneginf(simulated)
-        if not lacking.any():
-            discrepancy = target(simulated)
-            value = log_kernel(discrepancy, epsilon)
+        if not (np.isnan(simulated) | np.isneginf(simulated)).any():
+            value = log_kernel(target(simulated), epsilon)
         outputs[0][0] = np.asarray(value, dtype=np.float64)

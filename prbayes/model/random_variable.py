@@ -133,21 +133,21 @@ class Node:
         TypeError, ValueError
             If the metric does not take them, or weights or labels go with as many as before.
         """
-        before = self.target
+        target = self.target
         data = np.asarray(data)
-        if np.array_equal(data, before.observed.astype(data.dtype), equal_nan=True):
+        if np.array_equal(data, target.observed.astype(data.dtype), equal_nan=True):
             return self
         values = np.asarray(data, dtype=np.float64)
-        if values.shape[1:] != before.event or values.ndim != before.observed.ndim:
+        if values.shape[1:] != target.event or values.ndim != target.observed.ndim:
             raise ValueError(
                 f"{self.name}: observed: got shape {values.shape}, expected "
-                f"{('N', *before.event)}, as when the simulator was made"
+                f"{('N', *target.event)}, as when the simulator was made"
             )
-        weights: Floats | None = before.weights
-        n = len(before.weights)
+        weights: Floats | None = target.weights
+        n = len(target.weights)
         if len(values) != n:
             # Weights and labels belong to the values before.
-            if self.specimens is not None or np.ptp(before.weights) > 0:
+            if self.specimens is not None or np.ptp(target.weights) > 0:
                 raise ValueError(
                     f"{self.name}: observed: got {len(values)} specimens, expected "
                     f"{n}, as many as there are specimens= or weights=; build the "
@@ -428,11 +428,11 @@ class SimulatorRV(RandomVariable):
         """Draw responses of specimens; their shape is the last of the arguments."""
         if self.simulator.same_inputs and not self._warned:
             self._warned = True
-            others = ", ".join(self.simulator.same_inputs)
+            names = ", ".join(self.simulator.same_inputs)
             report(
                 Finding(
                     "independent-draws",
-                    f"{self.simulator.name} has inputs that {others} has too, the same "
+                    f"{self.simulator.name} has inputs that {names} has too, the same "
                     "specimens; PyMC's predictive sampling draws each variable by itself, and so "
                     "as independent of the others: use prb.predict for responses of the same "
                     "specimens.",

@@ -377,7 +377,7 @@ def _refuse_by_specimen(
     name: str, inputs: Inputs, epsilon: float | None, propagation: Propagation | None
 ) -> None:
     """Raise where the log-likelihood by specimen does not apply, and name the metric that does."""
-    other = "use metric=prb.ProbabilityResidual()"
+    remedy = "use metric=prb.ProbabilityResidual()"
     if epsilon is not None:
         raise ValueError(
             f"{name}: epsilon: got {epsilon!r}, expected none: prb.LogLikelihood() is a likelihood "
@@ -386,7 +386,7 @@ def _refuse_by_specimen(
     if isinstance(propagation, Propagation) and propagation.is_random:
         raise TypeError(
             f"{name}: propagation: got {called(propagation)}, expected stored responses of a "
-            f"deterministic response for prb.LogLikelihood(); {other}, or leave propagation= out"
+            f"deterministic response for prb.LogLikelihood(); {remedy}, or leave propagation= out"
         )
     if inputs.epistemic:
         names = ", ".join(str(e.name or e) for e in inputs.epistemic)
@@ -399,7 +399,7 @@ def _refuse_by_specimen(
     if discrete:
         raise TypeError(
             f"{name}: got {discrete[0].owner.op}, which is discrete, expected continuous inputs "
-            f"for prb.LogLikelihood(); {other}"
+            f"for prb.LogLikelihood(); {remedy}"
         )
     refuse_nested(name, inputs)
     refuse_without_density(name, inputs)
@@ -553,14 +553,14 @@ def _warn_shared_specimens(simulator: AnySimulator, earlier: list[AnySimulator])
     if simulator.specimens is None:
         return
     labels = set(simulator.specimens.tolist())
-    for other in earlier:
-        if other.specimens is None or labels.isdisjoint(other.specimens.tolist()):
+    for second in earlier:
+        if second.specimens is None or labels.isdisjoint(second.specimens.tolist()):
             continue
-        if has_default_epsilon(simulator) or has_default_epsilon(other):
+        if has_default_epsilon(simulator) or has_default_epsilon(second):
             report(
                 Finding(
                     "shared-specimens",
-                    f"{other.name} and {simulator.name} share specimens, and each epsilon "
+                    f"{second.name} and {simulator.name} share specimens, and each epsilon "
                     "counts them: under pm.sample they count twice, and the posterior comes "
                     "out too narrow; call "
                     "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) "

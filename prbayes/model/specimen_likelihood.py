@@ -208,25 +208,13 @@ def draw_readings(
     n: int,
     measurement: Measurement | None = None,
 ) -> Floats:
-    """Draw the emulated readings of n specimens of each population.
+    """Draw the emulated readings of n specimens of each population, (P, n), (P, n, m) or (P, n, M).
 
-    Parameters
-    ----------
-    likelihood : SpecimenLikelihood
-    rng : Generator
-    params : mapping
-        Values by the likelihood's variables, shapes (P, *shape), without the group of a specimen:
-        specimens are of the groups of the observed ones.
-    n : int
-    measurement : Measurement, optional
-        The simulator; by default the outputs of all, with repeated readings as their mean.
-
-    Returns
-    -------
-    ndarray, shape (P, n), (P, n, m) or (P, n, M)
-        With the error of the readings, and gross errors where the metric has them. As many as
-        the simulator's rows are of its specimens, so that repeated readings have common inputs.
-        NaN in a population of which next to nothing has a response.
+    Values are by the likelihood's variables, shapes (P, *shape), without the group of a specimen:
+    specimens are of the groups of the observed ones. Readings are those of one simulator, or the
+    outputs of all, with repeated readings as their mean. They have errors, and gross errors where
+    the metric has them. As many as the simulator's rows are of its specimens, so that repeated
+    readings have common inputs. NaN in a population of which next to nothing has a response.
     """
     roots = [params[root] for root in likelihood.inputs.roots if not is_group(root)]
     groups = likelihood.stacked.groups if measurement is None else measurement.groups

@@ -41,31 +41,18 @@ _log = logging.getLogger("prbayes")
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """Emulator and importance points of measured specimens.
-
-    Attributes
-    ----------
-    emulation : Emulation
-    points : SpecimenPoints
-    findings : tuple of Finding
-        Warnings about the data and the runs, before the fit.
-    share : ResponseShare or None
-        Points from which the share of a population with a response follows, if it matters.
-    """
+    """Emulator and importance points of measured specimens."""
 
     emulation: Emulation
     points: SpecimenPoints
-    findings: tuple[Finding, ...]
-    share: ResponseShare | None
+    findings: tuple[Finding, ...]  # about the data and the runs, before the fit
+    share: ResponseShare | None  # of a population with a response, if it matters
 
 
 def prepared(likelihood: SpecimenLikelihood) -> Preparation:
     """Return the emulator and the points of a likelihood; the first call computes the runs.
 
-    Raises
-    ------
-    DesignError, ResponseError
-        If the runs are not sufficient, or the response does not allow the likelihood.
+    Raise DesignError or ResponseError if the response does not allow the likelihood.
     """
     preparation: Preparation = likelihood.cached("preparation", lambda: _prepare(likelihood))
     return preparation
@@ -91,7 +78,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     runs = Runs(likelihood)
     options = likelihood.options
     try:
-        emulation, points, findings = _emulate(runs, populations, likelihood.known)
+        emulation, points, findings = _emulate(runs, populations, likelihood.shared_emulation)
         refined, share = response_share(
             runs,
             emulation,
@@ -143,13 +130,13 @@ class Runs:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
         likelihood = self.likelihood
         responses = [m.responses for m in likelihood.measurements]
-        before = sum(response.computed for response in responses)
+        n_computed = sum(response.computed for response in responses)
         inputs = likelihood.coordinates.inputs(z)
         parts = [response(inputs, []).reshape(len(z), -1) for response in responses]
         values = np.concatenate(parts, axis=1)
         values = np.where(np.isneginf(values), np.nan, values)
-        if likelihood.known is None and self.first is None:
-            if sum(response.computed for response in responses) > before:
+        if likelihood.shared_emulation is None and self.first is None:
+            if sum(response.computed for response in responses) > n_computed:
 
                 def alone(row: int) -> Floats:
                     inputs = likelihood.coordinates.inputs(z[row : row + 1])
@@ -177,7 +164,7 @@ def _is_partial(likelihood: SpecimenLikelihood) -> bool:
 
 
 def _emulate(
-    runs: Runs, populations: Populations, known: Emulation | None
+    runs: Runs, populations: Populations, emulation: Emulation | None
 ) -> tuple[Emulation, SpecimenPoints, Sequence[Finding]]:
     """Return the emulator, the points and findings of both."""
     likelihood = runs.likelihood
@@ -203,8 +190,10 @@ def _emulate(
         return emulation, points, _data_findings(likelihood, several_roots=True)
     box = np.stack([-np.ones(d), np.ones(d)])
     if likelihood.calls_response:
-        known = Emulation.of_function(runs, box, bounds, readings, options)
-    emulation, roots = emulate(runs, readings, box, bounds, options, n=n, known=known, name=name)
+        emulation = Emulation.of_function(runs, box, bounds, readings, options)
+    emulation, roots = emulate(
+        runs, readings, box, bounds, options, n=n, known=emulation, name=name
+    )
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
     points = draw_points(

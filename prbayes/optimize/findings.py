@@ -11,7 +11,7 @@ from prbayes.inference.checks.identification import confounding_findings, uniden
 from prbayes.inference.checks.prior_ends import prior_end_findings, prior_ends
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.metrics.multivariate import components_missed
-from prbayes.model.elements import read_variables, split_elements, told_elements
+from prbayes.model.elements import readable_variables, split_elements, table_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import labelled
 from prbayes.optimize.design_refinement import AGREE
@@ -69,10 +69,10 @@ def _second_mode(evaluator: Evaluator, rival: Rival) -> Finding:
     hyperparameters = evaluator.hyperparameters
     # Beside a second point, so that constants can be recognised.
     points = hyperparameters.constrained(np.stack([rival.theta, hyperparameters.initial]))
-    names = read_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
+    names = readable_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
     values = labelled(evaluator, {name: points[name] for name in names}, {"point": 2}).data_vars
     elements = split_elements(values)
-    place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in told_elements(values))
+    place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in table_elements(values))
     return Finding(
         "second-mode",
         f"The data could as well come from {place}: another optimum, or mirror "

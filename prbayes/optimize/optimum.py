@@ -18,7 +18,7 @@ from prbayes.inference.refits import SamplingDistribution, sampling_of_functions
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
-from prbayes.model.elements import read_variables, single_elements, told_of
+from prbayes.model.elements import optimum_elements, readable_variables, single_elements
 from prbayes.model.evaluator import (
     Evaluator,
     has_other_terms,
@@ -271,14 +271,14 @@ def _rows(optimum: Optimum) -> list[list[str]]:
     stderr = labelled(optimum.evaluator, optimum.stderr, {}).data_vars
     names = [str(name) for name in point]
     rows = []
-    for name in read_variables(names, names):
+    for name in readable_variables(names, names):
         value, error = point[name], stderr[name]
         has_rows = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
         if not has_rows or value.size > 20:
             rows.append([name, short(value), short(error)])
             continue
         values, errors = single_elements({name: value}), single_elements({name: error})
-        for element in told_of({name: value}, {name: error}):
+        for element in optimum_elements({name: value}, {name: error}):
             rows.append([element, short(values[element]), short(errors[element])])
     return rows
 

@@ -8,7 +8,12 @@ from typing import Any
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.model.elements import single_elements, split_elements, told_of, variable_of
+from prbayes.model.elements import (
+    optimum_elements,
+    single_elements,
+    split_elements,
+    variable_of,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import labelled
 from prbayes.optimize.optimum import Optimum
@@ -60,7 +65,7 @@ def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
 def free_names(optimum: Optimum) -> list[str]:
     """Return the names of these elements, without constants such as zeros of a factor."""
     point = {str(rv.name): optimum.point[str(rv.name)] for rv in optimum.model.free_RVs}
-    return told_of(labelled(optimum.evaluator, point, {}).data_vars, optimum.stderr)
+    return optimum_elements(labelled(optimum.evaluator, point, {}).data_vars, optimum.stderr)
 
 
 @dataclass(frozen=True, eq=False)

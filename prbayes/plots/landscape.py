@@ -106,7 +106,7 @@ def plot_landscape(
             "its message"
         )
     fixed = [named(name, labels) for name in hyperparameters if name not in names]
-    title = f"{', '.join(fixed)} held at the optimum" if fixed else ""
+    title = f"{', '.join(fixed)} fixed at the optimum" if fixed else ""
     objective = objective_label(optimum)
     canvas = Canvas(["landscape"], size=(6.4, 5.4), pc_kwargs=pc_kwargs)
     panel = canvas.panel("landscape")

@@ -14,11 +14,11 @@ from scipy.stats import norm
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, share
 from prbayes.model.elements import (
-    read_elements,
+    readable_elements,
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
+    table_elements,
     variable_of,
 )
 from prbayes.model.evaluator import Evaluator
@@ -139,7 +139,7 @@ def _check_results(posterior: Any, optimum: Any, model: pm.Model | None) -> None
 def _select(names: list[str], var_names: Sequence[str] | None) -> list[str]:
     """Return the hyperparameters of the picture; by default those that a reader wants."""
     if var_names is None:
-        return list(read_elements(names))
+        return list(readable_elements(names))
     selection = [var_names] if isinstance(var_names, str) else list(var_names)
     unknown = set(selection) - {*names, *map(variable_of, names)}
     if unknown or not selection:
@@ -164,7 +164,7 @@ def _read_hyperparameters(
     """Return the elements that posterior, optimum and model share."""
     stacked = stacked_draws(posterior["posterior"])
     draws = split_elements(stacked)
-    shared = {name for name in told_elements(stacked) if np.ptp(draws[name]) > 0}
+    shared = {name for name in table_elements(stacked) if np.ptp(draws[name]) > 0}
     best, errors = {}, {}
     if optimum is not None:
         best = single_elements(labelled(optimum.evaluator, optimum.point, {}).data_vars)

@@ -1,4 +1,4 @@
-"""Measured responses that a calibration has not seen, beside their prediction."""
+"""Measured responses of new specimens beside their prediction."""
 
 from __future__ import annotations
 

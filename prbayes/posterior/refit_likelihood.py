@@ -39,7 +39,7 @@ from prbayes.inference.resampling import (
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.coverage import TOLERABLE, supports_each
 from prbayes.model.evaluator import Evaluator, coarse_where_sufficient
-from prbayes.model.parameters import THETAS
+from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.optimum import Optimum, optima_of
@@ -278,7 +278,7 @@ def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
 
-    density = partial(evaluator.hyperparameters.log_posterior, log_likelihood=log_likelihood)
+    density = partial(log_posterior, evaluator.hyperparameters, log_likelihood=log_likelihood)
     modes = laplace(density, likelihood.starts, likelihood.scale)
     sample = importance_sample(density, modes, number, options.seed)
     thetas = likelihood.continuation.coordinates(sample.draws)

@@ -10,6 +10,7 @@ from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import log_posterior
 from prbayes.optimize.optimum import Optimum, optima_of
 from prbayes.posterior.estimate_likelihood import estimate_likelihood, score_obstacle
 from prbayes.posterior.importance import LogDensity
@@ -27,7 +28,7 @@ class Target:
 
     def log_posterior(self, thetas: Floats) -> Floats:
         """Return the unnormalised log-density, (S, d) -> (S,); -inf where it is not known."""
-        return self.evaluator.hyperparameters.log_posterior(thetas, self.log_likelihood)
+        return log_posterior(self.evaluator.hyperparameters, thetas, self.log_likelihood)
 
 
 def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:

@@ -48,7 +48,7 @@ class ReferencePopulation:
         covariance = (centred.T * weights) @ centred
         sd = np.sqrt(np.diagonal(covariance))
         if np.all(sd > 0):
-            # Scaled, so that units of the inputs do not decide what counts as singular.
+            # Scaled: units of the inputs do not decide whether the matrix is singular.
             correlation = covariance / np.outer(sd, sd)
             if np.linalg.eigvalsh(correlation)[0] > 1e-10:
                 return cls(mean, sd[:, None] * np.linalg.cholesky(correlation))
@@ -183,16 +183,6 @@ class Charts:
 
     and u has a t distribution as proposal. The proposal of a specimen is the mixture of its charts.
     Arrays of some charts have the shape (n, ...) in place of (N, C, ...).
-
-    Attributes
-    ----------
-    centre : ndarray, shape (N, C, d)
-    free, solved : ndarray, shapes (N, C, d, d - m) and (N, C, d, m)
-        Orthonormal columns; at first null space and row space of the Jacobian at the centre.
-    location, scale : ndarray, shapes (N, C, d - m) and (N, C, d - m, d - m)
-        Of the t distribution; `scale` is a lower Cholesky factor.
-    share : ndarray, shape (N, C)
-        Mixing weight, zero where there is no chart.
     """
 
     # Degrees of freedom of the t distributions; 5 and 20 gave the same effective sample sizes.
@@ -200,12 +190,13 @@ class Charts:
     # Inflation of the covariance against that of weighted points; 1.1 and 1.5 gave the same.
     inflation: ClassVar[float] = 1.3
 
-    centre: Floats
-    free: Floats
-    solved: Floats
-    location: Floats
-    scale: Floats
-    share: Floats
+    centre: Floats  # (N, C, d)
+    # Orthonormal columns, at first the null space and the row space of the Jacobian at the centre.
+    free: Floats  # (N, C, d, d - m)
+    solved: Floats  # (N, C, d, m)
+    location: Floats  # (N, C, d - m): of the t distribution
+    scale: Floats  # (N, C, d - m, d - m): lower Cholesky factor of its scale matrix
+    share: Floats  # (N, C): mixing weight, zero where there is no chart
 
     @classmethod
     def empty(cls, n: int, charts: int, d: int, m: int) -> Charts:

@@ -15,25 +15,16 @@ from prbayes.response.inputs import Inputs
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """A smooth map between the aleatory inputs and a vector z with the prior range [-1, 1].
+    """A smooth map between the aleatory inputs and a vector z with the prior range [-1, 1]."""
 
-    Attributes
-    ----------
-    shapes : tuple
-        Event shape of each aleatory input.
-    is_log : ndarray of bool, shape (d,)
-        Which elements are logarithms: positive inputs whose prior spans more than a factor of ten.
-    center, half_width : ndarray, shape (d,)
-        Of the prior range: all but 1 % of the specimens of the prior predictive population.
-    bounds : ndarray, shape (2, d)
-        Smallest and largest z in data sets of the prior, one for each of 4096 populations. A new
-        data set of the prior exceeds an end with a probability of 1 in 4097.
-    """
-
-    shapes: tuple[tuple[int, ...], ...]
+    shapes: tuple[tuple[int, ...], ...]  # event shape of each aleatory input
+    # (d,): logarithms are positive inputs whose prior spans more than a factor of ten.
     is_log: NDArray[np.bool_]
-    center: Floats
-    half_width: Floats
+    # Of the prior range, which has 99 % of the specimens of the prior predictive population.
+    center: Floats  # (d,)
+    half_width: Floats  # (d,)
+    # (2, d): smallest and largest z in data sets of the prior, one for each of 4096 populations. A
+    # new data set of the prior exceeds an end with a probability of 1 in 4097.
     bounds: Floats
 
     @classmethod

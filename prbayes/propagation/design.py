@@ -38,45 +38,25 @@ class Design:
     """Stored runs, and the points that represent populations by their weights.
 
     A design that grows is a new record.
-
-    Attributes
-    ----------
-    runs : Sample
-    mixture : Mixture
-        Of the runs: their proposal density.
-    batch_sizes : tuple of int
-        Number of runs of each batch, in the order of the runs.
-    groups : tuple
-        Populations that the points are to support: the prior's, and those of interest last. Roots,
-        shapes (k, *shape), of each group.
-    sample : Sample
-        The points that have weights: the runs, or emulated points with or without the runs.
-    coarse : ndarray, shape (n, m), optional
-        A coarse response at the runs.
-    emulated : EmulatedPoints, optional
-        The first points of the sample, if their responses are emulated.
-    emulator : DesignEmulator, optional
-    n_emulated_samples : int
-        Number of times that emulated points were drawn.
-    emulated_size : int
-        Number of points of the next emulated sample.
-    moving : tuple of int
-        Positions of the inputs whose support moves with the hyperparameters.
-    on_line : bool
-        Whether a specimen is one continuous number, and the points a quadrature rule.
     """
 
     runs: Sample
-    mixture: Mixture
-    batch_sizes: tuple[int, ...]
+    mixture: Mixture  # of the runs: their proposal density
+    batch_sizes: tuple[int, ...]  # number of runs of each batch, in the order of the runs
+    # Roots, shapes (k, *shape), of populations that the points support: the prior's, and those of
+    # interest last.
     groups: tuple[tuple[Floats, ...], ...]
+    # The points that have weights: the runs, or emulated points with or without the runs.
     sample: Sample
-    coarse: Floats | None = None
+    coarse: Floats | None = None  # (n, m): a coarse response at the runs
+    # The first points of the sample, if their responses are emulated.
     emulated: EmulatedPoints | None = None
     emulator: DesignEmulator | None = None
-    n_emulated_samples: int = 0
-    emulated_size: int = SIZES.first
+    n_emulated_samples: int = 0  # number of times that emulated points were drawn
+    emulated_size: int = SIZES.first  # number of points of the next emulated sample
+    # Positions of the inputs whose support moves with the hyperparameters.
     moving: tuple[int, ...] = ()
+    # Whether a specimen is one continuous number, and the points a quadrature rule.
     on_line: bool = False
 
     @property
@@ -147,7 +127,7 @@ class Design:
             return text
         following, outputs = self.emulator.n_following, len(self.emulator.surfaces)
         if not following:
-            return f"{text} It does not follow the coarse response, which tells nothing more."
+            return f"{text} It does not follow the coarse response, which adds no information."
         share = f" in {following} of {outputs} outputs" if following < outputs else ""
         return f"{text} It follows the coarse response{share}."
 
@@ -274,8 +254,8 @@ def _responses_at(points: Sequence[Floats], responses: Responses, design: Design
     if values is not None:
         responses.count_reused(len(values))
         return values
-    known = None if design is None else KnownPoints(design.runs.points, design.runs.values)
-    values = deduplicated_responses(responses, points, known)
+    runs = None if design is None else KnownPoints(design.runs.points, design.runs.values)
+    values = deduplicated_responses(responses, points, runs)
     responses.runs.stored.append((list(points), values))
     return values
 
@@ -323,8 +303,8 @@ class WeightFunction:
 
 def is_line(inputs: Inputs) -> bool:
     """Return whether a specimen is one continuous number."""
-    x, *others = inputs.aleatory
-    return not others and x.type.ndim == 0 and x.dtype.startswith("float")
+    x = inputs.aleatory[0]
+    return len(inputs.aleatory) == 1 and x.type.ndim == 0 and x.dtype.startswith("float")
 
 
 def common_rows(first: Sequence[Floats], second: Sequence[Floats]) -> int:

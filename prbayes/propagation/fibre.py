@@ -67,16 +67,10 @@ class FibrePoints:
     """K importance points on the fibre of each of N specimens.
 
     log L_i(theta) = logsumexp_k(log p(x_ik | theta) + log_a_ik).
-
-    Attributes
-    ----------
-    x : ndarray, shape (N, K, d)
-        Inputs; the mean of the reference population for points of weight zero.
-    log_a : ndarray, shape (N, K)
-        Logarithms of the importance numbers, minus log K; -inf for points of weight zero.
     """
 
-    x: Floats
+    x: Floats  # (N, K, d): inputs; the mean of the reference population for points of weight zero
+    # (N, K): logarithms of the importance numbers, minus log K; -inf for points of weight zero
     log_a: Floats
 
     def without_errors(self, outputs: int) -> FibrePoints:
@@ -92,20 +86,11 @@ class FibrePoints:
 
 @dataclass(frozen=True, eq=False)
 class FibreProposal:
-    """Proposal distribution on the fibres of N specimens: a mixture over charts for each.
+    """Proposal distribution on the fibres of N specimens: a mixture over charts for each."""
 
-    Attributes
-    ----------
-    fibres : Fibres
-        Response, reference population and measured outputs.
-    charts : Charts
-    numbers : ndarray of int, shape (N,)
-        Numbers of the specimens, from which their random numbers follow.
-    """
-
-    fibres: Fibres
+    fibres: Fibres  # response, reference population and measured outputs
     charts: Charts
-    numbers: Indices
+    numbers: Indices  # (N,): numbers of the specimens, from which their random numbers follow
 
     def draw(self, points: int, seed: int, after: int = 0) -> FibrePoints:
         """Draw points on all fibres.
@@ -257,7 +242,7 @@ def _draw(
         t = normal / np.sqrt(chi_square / Charts.degrees)
     scaled = charts.scale[specimen, slot] @ t[..., None]
     u = charts.location[specimen, slot] + scaled[..., 0]
-    # Specimens without charts have arrays of zeros, so that all their solves fail.
+    # Specimens without charts have arrays of zeros: all their solves fail.
     z, jacobian, converged = charts.points(fibres, specimen, slot, u)
 
     rows = np.flatnonzero(converged)
@@ -334,7 +319,7 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
 def _shifted_sobol(points: int, dimensions: int, key: tuple[int, int], numbers: Indices) -> Floats:
     """Return Sobol points with a digital shift of the specimen, (n, points, dimensions).
 
-    Errors of specimens are independent, so that they average out in the log-likelihood.
+    Errors of specimens are independent: they average out in the log-likelihood.
     """
     bits = 30  # of SciPy's points, which are multiples of 2^-30
     net = (sobol(points, dimensions, key[1]) * 2**bits).astype(np.int64)

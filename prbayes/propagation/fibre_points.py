@@ -1,7 +1,7 @@
 """Points of specimens with fewer measured outputs than inputs: emulation and points on fibres.
 
-The inputs of such a specimen are not determined by its readings, so that its points have to cover
-every plausible population. The reference population in which they are drawn is the prior
+The readings of such a specimen do not determine its inputs: its points have to cover every
+plausible population. The reference population in which they are drawn is the prior
 predictive one at first, then that of draws of the posterior, twice. Posteriors of smoothed
 populations come before these where points lie farther apart than populations are wide.
 """
@@ -219,11 +219,11 @@ class FibreProposals:
         m = readings.values.shape[1]
         sd = readings.comparison_sd(emulation.error)
         has_error = readings.is_measured & ((readings.error > 0) | (readings.step > 0))
-        both = np.concatenate([readings.is_measured, has_error], axis=1)
-        patterns, which = np.unique(both, axis=0, return_inverse=True)
+        flags = np.concatenate([readings.is_measured, has_error], axis=1)
+        patterns, number = np.unique(flags, axis=0, return_inverse=True)
         proposals = []
         for k, pattern in enumerate(patterns):
-            rows = np.flatnonzero(which.ravel() == k)
+            rows = np.flatnonzero(number.ravel() == k)
             columns = np.flatnonzero(pattern[:m])
             if not len(columns):
                 proposals.append(_Pattern(rows, columns))

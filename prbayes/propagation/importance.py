@@ -30,8 +30,8 @@ from prbayes.response.response import Responses
 class EmulatedSizes:
     """Sizes of emulated samples, whose points cost no run.
 
-    The mixture that a sample is drawn from has few populations beside the prior, so that each fills
-    its space evenly.
+    The mixture that a sample is drawn from has few populations beside the prior: each fills its
+    space evenly.
     """
 
     first: int = 8192  # points
@@ -79,33 +79,17 @@ class EmulatedPoints:
 
 @dataclass(frozen=True, eq=False)
 class DesignEmulator:
-    """An emulator of one response, fitted to the runs of a design.
-
-    Attributes
-    ----------
-    runs : Runs
-    surfaces : tuple
-        By output.
-    left_out : ndarray, shape (n, m)
-        Predictions of runs that were left out.
-    weights : ndarray, shape (T, n)
-        Of the runs in the populations that matter.
-    run_share : float
-        Mixing weight of the runs among the points of a population.
-    error : float
-        Root mean square error of the worst output at runs that were left out, in units of its
-        spread in the populations that matter.
-    event : tuple of int
-        Shape of one response: () or (m,).
-    """
+    """An emulator of one response, fitted to the runs of a design."""
 
     runs: Runs
-    surfaces: tuple[Any, ...]
-    left_out: Floats
-    weights: Floats
-    run_share: float
+    surfaces: tuple[Any, ...]  # by output
+    left_out: Floats  # (n, m): predictions of runs that were left out
+    weights: Floats  # (T, n): of the runs in the populations that matter
+    run_share: float  # mixing weight of the runs among the points of a population
+    # Root mean square error of the worst output at runs that were left out, in units of its spread
+    # in the populations that matter.
     error: float
-    event: tuple[int, ...]
+    event: tuple[int, ...]  # shape of one response: () or (m,)
 
     def for_populations(self, weights: Floats) -> DesignEmulator | None:
         """Return the same surfaces for other populations; None where runs alone are as good."""
@@ -258,13 +242,13 @@ def mixture_of(groups: Sequence[Sequence[Floats]], size: int) -> tuple[list[Floa
 
     The first group is the prior; groups have one array of roots, (k, *shape), by root.
     """
-    prior, *others = groups
-    if not others:
+    prior, *posteriors = groups
+    if not posteriors:
         count = 384  # more cost time and change nothing
         return spread_over(prior, count), np.full(count, 1 / count)
     near = SIZES.near * size // SIZES.first
-    parts = [spread_over(prior, SIZES.from_prior), *(spread_over(g, near) for g in others)]
-    each = (1 - SIZES.prior_share) / (near * len(others))
-    shares = np.full(SIZES.from_prior + near * len(others), each)
+    parts = [spread_over(prior, SIZES.from_prior), *(spread_over(g, near) for g in posteriors)]
+    share = (1 - SIZES.prior_share) / (near * len(posteriors))
+    shares = np.full(SIZES.from_prior + near * len(posteriors), share)
     shares[: SIZES.from_prior] = SIZES.prior_share / SIZES.from_prior
     return [np.concatenate(same) for same in zip(*parts, strict=True)], shares

@@ -47,7 +47,7 @@ class MixtureSampler:
         """Return n points of populations with ``shares``, (k,), equal by default.
 
         Scrambled Sobol points go through the inverse distribution functions where they exist. One
-        of their axes selects the population, so that populations are stratified.
+        of their axes selects the population: populations are stratified.
         """
         points, mixture = self._drawn(components, n, seed, shares)
         return self._off_the_edges(points, mixture), mixture

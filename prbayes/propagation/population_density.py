@@ -101,25 +101,15 @@ def _standardised(values: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class ExponentialForm:
-    """Log-densities at n fixed points as a matrix product.
+    """Log-densities at n fixed points as a matrix product."""
 
-    Attributes
-    ----------
-    statistics : ndarray, shape (q + 1, n)
-        Sufficient statistics of all inputs, the last of which is the constant; zero outside of the
-        support.
-    is_inside : ndarray of bool, shape (n,)
-        Points of the support.
-    anchors : tuple of ndarray, shapes (q + 1, *event)
-        Points at which the log-density determines the natural parameters.
-    inverse : ndarray, shape (q + 1, q + 1)
-        Inverse of the statistics at the anchors.
-    """
-
+    # (q + 1, n): sufficient statistics of all inputs, the last of which is the constant; zero
+    # outside of the support
     statistics: Floats
-    is_inside: NDArray[np.bool_]
+    is_inside: NDArray[np.bool_]  # (n,): points of the support
+    # (q + 1, *event): points at which the log-density determines the natural parameters
     anchors: tuple[Floats, ...]
-    inverse: Floats
+    inverse: Floats  # (q + 1, q + 1): inverse of the statistics at the anchors
 
     @classmethod
     def of(
@@ -177,19 +167,11 @@ def _is_rounded(at_anchors: Floats) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class WeightedPoints:
-    """Points of N specimens, with the matrix form of log-densities there.
+    """Points of N specimens, with the matrix form of log-densities there."""
 
-    Attributes
-    ----------
-    x : sequence of ndarray, shapes (N, K, *event)
-        By aleatory input.
-    log_a : ndarray, shape (N, K)
-    form : ExponentialForm, optional
-        At the points in the order of (K, N): reductions are then sums of long rows.
-    """
-
-    x: Sequence[Floats]
-    log_a: Floats
+    x: Sequence[Floats]  # (N, K, *event): by aleatory input
+    log_a: Floats  # (N, K)
+    # at the points in the order of (K, N): reductions are then sums of long rows
     form: ExponentialForm | None
 
     @classmethod

@@ -138,7 +138,7 @@ class ResimulatedBound(Bound):
         self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]
     ) -> bool:
         """Return whether the response of PyTensor variables is a graph with the same numbers."""
-        if not self.responses.plain:
+        if not self.responses.is_batched:
             return False
         values = [*aleatory, *epistemic]
         symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in values]

@@ -86,7 +86,7 @@ class Reweighted(Propagation):
         at runs that were left out, mixed with the weighted runs as far as these errors require;
         not with one input, discrete ones, or an n above 2000, where runs alone are as good. Or a
         surface of ``prb.surrogate``, or any regressor with ``fit(X, y)`` and ``predict(X)``. With
-        None the runs stand alone.
+        None the runs are used alone.
     coarse : callable, optional
         A cheap response of the same inputs and outputs that approximates the expensive one, such as
         that of a coarser mesh. The emulator then models the difference of the two, for each output
@@ -499,9 +499,9 @@ class ReweightedBound(Bound):
         if emulator is None or share > most + design.emulator.run_share:
             raise PoorEmulatorError(
                 f"{self.name}: the design is of {self.n_runs} runs, between which its own response "
-                "is emulated; another response of the same specimens is not told by the runs: got "
-                f"an emulator that would leave {share:.0%} of a population to them, expected at "
-                f"most {most:.0%} more than of its own; calibrate with "
+                "is emulated; another response of the same specimens is not predicted by the runs: "
+                f"got an emulator that would leave {share:.0%} of a population to them, expected "
+                f"at most {most:.0%} more than of its own; calibrate with "
                 "prb.Reweighted(n, emulator=None), or let one response return both outputs"
             )
         return emulator

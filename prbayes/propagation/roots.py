@@ -1,8 +1,8 @@
 """All roots of f(x) = y: the inputs with which a response reproduces each measured specimen.
 
 Levenberg-Marquardt runs for all specimens and starts at once. A root is kept if its misfit is at
-most `gap` nats above the specimen's best, so that a mirror root is kept as long as the error of the
-comparison cannot tell it from the true one.
+most `gap` nats above the specimen's best: a mirror root that the error of the comparison does not
+exclude is kept.
 """
 
 from __future__ import annotations
@@ -22,26 +22,14 @@ Response = Callable[[Floats], tuple[Floats, Floats]]
 
 @dataclass(frozen=True, eq=False)
 class Roots:
-    """Roots of all specimens, one row each.
+    """Roots of all specimens, one row each."""
 
-    Attributes
-    ----------
-    specimen : ndarray of int, shape (R,)
-        Row of the specimen; sorted.
-    z : ndarray, shape (R, d)
-    misfit : ndarray, shape (R,)
-        Half the squared standardised residual, in nats.
-    residual : ndarray, shape (R, m)
-        Measured minus simulated outputs, in units of the comparison's standard deviation.
-    jacobian : ndarray, shape (R, m, d)
-        Of the outputs in the same units.
-    """
-
-    specimen: NDArray[np.intp]
-    z: Floats
-    misfit: Floats
+    specimen: NDArray[np.intp]  # (R,): row of the specimen; sorted
+    z: Floats  # (R, d)
+    misfit: Floats  # (R,): half the squared standardised residual, in nats
+    # (R, m): measured minus simulated outputs, in units of the comparison's standard deviation
     residual: Floats
-    jacobian: Floats
+    jacobian: Floats  # (R, m, d): of the outputs in the same units
 
 
 def find_roots(

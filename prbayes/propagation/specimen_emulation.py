@@ -33,42 +33,23 @@ from prbayes.propagation.roots import (
 
 @dataclass(frozen=True)
 class PointOptions:
-    """Settings of the points, from the study of guards (docs/likelihood.md).
+    """Settings of the points, from the study of guards (docs/likelihood.md)."""
 
-    Attributes
-    ----------
-    starts : int
-        Fewest starts of the search for roots, by specimen; doubled while simulated specimens do not
-        get their inputs back.
-    gap : float
-        Largest misfit of a root above the specimen's best, in nats.
-    points : int
-        Points around each root; doubled until two independent halves agree.
-    most_points : int
-        Largest number of points of a specimen.
-    half_difference : float
-        Largest standard deviation, over plausible populations, of half the difference between the
-        log-likelihoods of the two halves.
-    fresh : int
-        Runs at roots that measure the emulator's bias; they stay in the emulator.
-    bias : float
-        Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
-        More runs are added where the emulator's error could cause as much.
-    floor : float
-        Smallest standard deviation of a comparison, as a share of the data's.
-    degrees : float
-        Degrees of freedom of the t distribution around a root.
-    """
-
+    # Fewest starts of the search for roots, by specimen; doubled while simulated specimens do not
+    # get their inputs back.
     starts: int = 12
-    gap: float = 20.0
-    points: int = 4
-    most_points: int = 4096
+    gap: float = 20.0  # largest misfit of a root above the specimen's best, in nats
+    points: int = 4  # points around each root; doubled until two independent halves agree
+    most_points: int = 4096  # largest number of points of a specimen
+    # Largest standard deviation, over plausible populations, of half the difference between the
+    # log-likelihoods of the two halves.
     half_difference: float = 0.05
-    fresh: int = 16
+    fresh: int = 16  # runs at roots that measure the emulator's bias; they stay in the emulator
+    # Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
+    # More runs are added where the emulator's error could cause as much.
     bias: float = 0.15
-    floor: float = 1e-6
-    degrees: float = 5.0
+    floor: float = 1e-6  # smallest standard deviation of a comparison, as a share of the data's
+    degrees: float = 5.0  # degrees of freedom of the t distribution around a root
 
 
 def first_runs(dimensions: int) -> int:
@@ -106,34 +87,18 @@ class DifferencedResponse:
 
 @dataclass(frozen=True, eq=False)
 class Emulation:
-    """Runs of the response, and the emulator through them.
+    """Runs of the response, and the emulator through them."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (n, d)
-        Coordinates of the runs.
-    y : ndarray, shape (n, m)
-        Their outputs; NaN where there is no response.
-    box : ndarray, shape (2, d)
-        Bounds of the search for roots.
-    surface : Interpolant
-    error : ndarray, shape (m,)
-        Standard deviation of the emulator's error at the roots: twice the error at runs there
-        before they were part of it.
-    bias : float
-        Predicted bias of a mean or standard deviation of an input, in posterior standard
-        deviations.
-    range : ndarray, shape (2, d)
-        Of the roots at which runs were made.
-    """
-
-    z: Floats
-    y: Floats
-    box: Floats
+    z: Floats  # (n, d): coordinates of the runs
+    y: Floats  # (n, m): their outputs; NaN where there is no response
+    box: Floats  # (2, d): bounds of the search for roots
     surface: Surface
+    # (m,): standard deviation of the emulator's error at the roots: twice the error at runs there
+    # before they were part of it.
     error: Floats
+    # Predicted bias of a mean or standard deviation of an input, in posterior standard deviations.
     bias: float
-    range: Floats
+    range: Floats  # (2, d): of the roots at which runs were made
 
     @classmethod
     def first(

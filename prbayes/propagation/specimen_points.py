@@ -44,30 +44,18 @@ from prbayes.propagation.specimen_emulation import PointOptions
 
 @dataclass(frozen=True, eq=False)
 class SpecimenPoints:
-    """Points of N specimens.
+    """Points of N specimens."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (N, K, d)
-    outputs : ndarray, shape (N, K, m)
-        The emulator's outputs at the points.
-    log_a : ndarray, shape (N, K)
-        The log-likelihood of a specimen under a density p of z is
-        ``logsumexp(log p(z) + log_a, axis=1)``; -inf for points that fill up the array.
-    log_proposal : ndarray, shape (N, K)
-        Log of the number of points times the proposal density: ``log_a`` without the density of
-        the readings, for an error that is not known in advance.
-    n_roots : ndarray of int, shape (N,)
-    difference : float
-        The half difference of the log-likelihoods.
-    """
-
-    z: Floats
-    outputs: Floats
+    z: Floats  # (N, K, d)
+    outputs: Floats  # (N, K, m): the emulator's outputs at the points
+    # (N, K): the log-likelihood of a specimen under a density p of z is ``logsumexp(log p(z) +
+    # log_a, axis=1)``; -inf for points that fill up the array
     log_a: Floats
+    # (N, K): log of the number of points times the proposal density: ``log_a`` without the density
+    # of the readings, for an error that is not known in advance
     log_proposal: Floats
-    n_roots: NDArray[np.intp]
-    difference: float = np.nan
+    n_roots: NDArray[np.intp]  # (N,)
+    difference: float = np.nan  # the half difference of the log-likelihoods
 
     def with_rows(self, rows: NDArray[np.intp], points: SpecimenPoints) -> SpecimenPoints:
         """Return the points with those of a sample for some specimens, which have fewer roots."""

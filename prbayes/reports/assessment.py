@@ -243,7 +243,7 @@ def specimens(m: Material) -> list[Section]:
         return []
     about = (
         "u is the share of the predicted responses below the measured one: a specimen with a u "
-        "near 0 or 1 is at the edge of what was predicted."
+        "near 0 or 1 is at the edge of the prediction."
     )
     if len(rows) > 40:
         about += f" The first 40 of {len(rows)} values are shown."

@@ -99,7 +99,7 @@ def _population(m: Material) -> Request:
 
 def _responses(m: Material) -> Request:
     if m.model is not None and _computes_responses(m.model):
-        return NotDrawn("it would compute responses anew; call prb.plot_responses for it")
+        return NotDrawn("it would recompute responses; call prb.plot_responses for it")
     return _population(m)
 
 

@@ -102,7 +102,7 @@ class Section(_Content):
         if picture is not None:
             if not alt.strip():
                 raise ValueError(
-                    f"Section {title!r}: alt: got nothing, expected a sentence on what is seen"
+                    f"Section {title!r}: alt: got nothing, expected a sentence on the picture"
                 )
             picture = image(picture)
         paragraphs = tuple(paragraph for paragraph in paragraphs if paragraph.strip())

@@ -13,12 +13,12 @@ import xarray as xr
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats
 from prbayes.model.elements import (
-    read_elements,
+    optimum_elements,
+    readable_elements,
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
-    told_of,
+    table_elements,
 )
 from prbayes.model.labels import labelled
 from prbayes.optimize.optimum import compared_in
@@ -299,7 +299,9 @@ def optima(m: Material) -> list[Section]:
     """Return a section for each optimum."""
     sections = []
     for label, tree in m.optima.items():
-        names = read_elements(told_of(tree["optimum"].data_vars, tree["stderr"].data_vars))
+        names = readable_elements(
+            optimum_elements(tree["optimum"].data_vars, tree["stderr"].data_vars)
+        )
         text = [_how_it_ended(tree["optimum"].attrs)]
         if label in m.live_optima:
             evaluator = m.live_optima[label].evaluator
@@ -366,13 +368,13 @@ def posteriors(m: Material) -> list[Section]:
         by = f" by {posterior.attrs['sampler']}" if "sampler" in posterior.attrs else ""
         text = [
             f"{chains} of {posterior.sizes['draw']} draws{by}. "
-            f"Intervals hold {INTERVAL:.0%} of the draws, with equal tails."
+            f"Intervals contain {INTERVAL:.0%} of the draws, with equal tails."
         ]
         if not m.is_by_specimen:
             text += _width(tree)
         draws = stacked_draws(posterior)
         values = split_elements(draws)
-        names = read_elements(told_elements(draws))
+        names = readable_elements(table_elements(draws))
         title = _titled("Posterior", label, m.posteriors)
         table = rows_table(_posterior_rows(tree, list(values), names))
         sections.append(Section(title, text, table))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes.model.elements import (
-    read_variables,
+    optimum_elements,
+    readable_variables,
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
-    told_of,
+    table_elements,
     variable_of,
 )
 from prbayes.plots._labels import metric_label, named
@@ -72,15 +72,12 @@ def _whole_verdict(m: Material) -> str:
     if not m.results:
         return ""
     if m.rejected:
-        return "Verdict: the calibrated model is rejected by data that it has not seen."
+        return "Verdict: the calibrated model is rejected by new data."
     if _has_problems(m):
         return "Verdict: not to be used before the problems under Diagnostics are removed."
     if not m.tests:
-        return "Verdict: calibrated, and not tested on data that it has not seen."
-    return (
-        "Verdict: calibrated, and not rejected by data that it has not seen, which does not prove "
-        "it right."
-    )
+        return "Verdict: calibrated, and not tested on new data."
+    return "Verdict: calibrated, and not rejected by new data, which does not prove it right."
 
 
 def _has_problems(m: Material) -> bool:
@@ -95,7 +92,7 @@ def verdict(label: str, test: ValidityTest, m: Material) -> str:
     directions = len(in_directions(test))
     values = counted(test.u_values.size, "value")
     if directions:
-        values = f"several outputs, seen in {counted(directions, 'direction')}"
+        values = f"several outputs in {counted(directions, 'direction')}"
     conditions = test.of_conditions
     # A single condition may only have the name of a function.
     is_named = len(conditions) > 1 or conditions[0] in {*m.validation, *m.labels}
@@ -176,15 +173,17 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
         draws = split_elements(stacked)
         estimates = {
             name: (float(draws[name].mean()), float(draws[name].std(ddof=1)))
-            for name in told_elements(stacked)
+            for name in table_elements(stacked)
         }
     else:
         optimum = m.optima[label]["optimum"].data_vars
         stderr = m.optima[label]["stderr"].data_vars
         points = single_elements(optimum)
         errors = single_elements(stderr)
-        estimates = {name: (points[name], errors[name]) for name in told_of(optimum, stderr)}
-    variables = read_variables(m.hyperparameters, {variable_of(name) for name in estimates})
+        estimates = {
+            name: (points[name], errors[name]) for name in optimum_elements(optimum, stderr)
+        }
+    variables = readable_variables(m.hyperparameters, {variable_of(name) for name in estimates})
     return {name: pair for name, pair in estimates.items() if variable_of(name) in variables}
 
 

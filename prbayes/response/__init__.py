@@ -1,4 +1,4 @@
-"""The user's response: its inputs, how it is called, when it fails, where it is kept."""
+"""The user's response: inputs, calls, failures and storage."""
 
 from prbayes.response.budget import BudgetError, Cost
 from prbayes.response.discrepancy import Additive, Multiplicative

@@ -58,11 +58,6 @@ class CallSettings:
     timeout: float | None = None  # seconds for one response
     outputs: Outputs | None = SINGLE_OUTPUT  # None takes them from the first run
 
-    @property
-    def accepts_stored_failures(self) -> bool:
-        """Whether points that are stored as failed are not computed again."""
-        return self.on_failure.final.goes_on and not self.retry_failed
-
 
 @dataclass
 class Tally:
@@ -210,7 +205,7 @@ def _stored(settings: CallSettings, keys: Floats) -> tuple[Floats, Rows, dict[in
     if settings.outputs is not None:
         values = values.reshape(len(keys), *settings.outputs.event)
     failed = settings.store.failed(keys)
-    if not settings.accepts_stored_failures:
+    if settings.retry_failed or not settings.on_failure.final.goes_on:
         is_stored[list(failed)] = False
         failed = {}
     return values, np.flatnonzero(~is_stored), failed

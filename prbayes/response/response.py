@@ -132,9 +132,9 @@ class Runs:
 class Responses:
     """The user's response: a function of inputs, and how it is called.
 
-    A function of whole batches without other settings is called once for each batch (``plain``).
-    Every other one goes through `respond`: on an executor, in chunks, with a store (a folder) and a
-    failure policy. ``outputs`` of None are those of the first run.
+    A function of whole batches without other settings is called once for each batch. Every other
+    one goes through `respond`: on an executor, in chunks, with a store (a folder) and a failure
+    policy. ``outputs`` of None are those of the first run.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Responses:
         self.outputs = outputs
         self.function = function
         self.inputs = inputs
-        self.plain = (
+        self.is_batched = (
             executor is None
             and store is None
             and policy == Abort()
@@ -177,11 +177,11 @@ class Responses:
         )
         self.count = 0  # runs that were needed, whether computed here or found in the store
         # Whether the response has different values at the same point; None while it is not known.
-        self.scatters: bool | None = None
+        self.is_random: bool | None = None
         # Called with the number of runs of a call, and the seconds of one: NaN before a batch.
         self.on_start: Callable[[int, float], None] | None = None
         self.runs = Runs()
-        self._checks_batches = self.plain
+        self._checks_batches = self.is_batched
         self._n_reused = 0
         self._settings = CallSettings(
             name, function, executor, opened, policy, retry_failed, timeout, outputs
@@ -204,7 +204,7 @@ class Responses:
     @property
     def computed(self) -> int:
         """Responses computed here: without those found in a store, with those tried again."""
-        return self.count - self._n_reused if self.plain else self._tally.computed
+        return self.count - self._n_reused if self.is_batched else self._tally.computed
 
     @property
     def failures(self) -> int:
@@ -260,14 +260,14 @@ class Responses:
         if responses is not None:
             self.count_reused(responses.size)
             return responses
-        responses = self._as_batch(values) if self.plain else self._as_points(values)
+        responses = self._as_batch(values) if self.is_batched else self._as_points(values)
         self.runs.record(values, responses)
         return responses
 
     def alone(self, aleatory: Sequence[Floats]) -> Floats:
         """Compute one specimen by itself, (1, *event) by input; no run, and not in the store."""
         values = [np.asarray(v, dtype=np.float64) for v in aleatory]
-        if self.plain:
+        if self.is_batched:
             return self._called(values, (1,), is_run=False)
         _, points = self._points(values)
         return respond(replace(self._settings, store=None), points, self._tally.copied())
@@ -429,12 +429,12 @@ def deduplicated_responses(
     _, first, which = np.unique(keys, return_index=True, return_inverse=True)
     earliest = first[which]
     is_new = earliest[m:] == np.arange(m, m + n)
-    if is_new.all() or responses.scatters:
+    if is_new.all() or responses.is_random:
         return responses(points, [])
 
     new, repeated = np.flatnonzero(is_new), np.flatnonzero(~is_new)
     again = repeated[:0]
-    if responses.scatters is not False:
+    if responses.is_random is not False:
         # Different points; a response that is zero or one by chance passes four once in 16 times.
         _, place = np.unique(earliest[m:][repeated], return_index=True)
         again = repeated[np.sort(place)[:4]]
@@ -447,8 +447,8 @@ def deduplicated_responses(
     values[m + new] = computed[: new.size]
     second = computed[new.size :]
     if again.size:
-        responses.scatters = not _equal_up_to_rounding(values[earliest[m + again]], second)
-    if responses.scatters:
+        responses.is_random = not _equal_up_to_rounding(values[earliest[m + again]], second)
+    if responses.is_random:
         values[m + again] = second
         if rest.size:
             values[m + rest] = responses([x[rest] for x in points], [])

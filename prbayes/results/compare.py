@@ -26,12 +26,12 @@ from prbayes.model.coverage import shortcomings
 from prbayes.model.elements import (
     coordinates,
     element_names,
-    read_elements,
+    optimum_elements,
+    readable_elements,
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
-    told_of,
+    table_elements,
     variable_of,
     with_coordinates,
 )
@@ -132,7 +132,7 @@ def compare(
     columns = {label: _column(label, result, naming) for label, result in results.items()}
     shared = _shared_elements(list(columns.values()), model)
     in_table = set.intersection(*(column.in_table for column in columns.values()))
-    names = read_elements(name for name in shared if name in in_table)
+    names = readable_elements(name for name in shared if name in in_table)
     if not names:
         raise ValueError(
             f"compare: got results {list(results)} that share no hyperparameter, "
@@ -231,7 +231,7 @@ def _column(label: str, result: Any, naming: pm.Model | None) -> _Column:
             lower, upper = np.quantile(x, tails)
             estimates[element] = _Estimate(float(x.mean()), float(x.std(ddof=1)), lower, upper)
         cost = _cost(result["posterior"].attrs)
-        return _Column(estimates, set(told_elements(draws)), *cost)
+        return _Column(estimates, set(table_elements(draws)), *cost)
     if "optimum" in groups:
         optimum, stderr = result["optimum"], result["stderr"].data_vars
         return _optimum_column(optimum.data_vars, stderr, _cost(optimum.attrs))
@@ -251,7 +251,7 @@ def _optimum_column(
     for element, value in single_elements(point).items():
         sd = errors[element]
         estimates[element] = _Estimate(value, sd, value - z * sd, value + z * sd)
-    return _Column(estimates, set(told_of(point, stderr)), *cost)
+    return _Column(estimates, set(optimum_elements(point, stderr)), *cost)
 
 
 def _cost(attrs: Mapping[Any, Any]) -> tuple[float, float]:

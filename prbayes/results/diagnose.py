@@ -30,7 +30,7 @@ from prbayes.model.elements import (
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
+    table_elements,
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
@@ -398,7 +398,7 @@ def _diagnose_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
     findings = [*_stored_findings(posterior.attrs), *modes]
     # Chains in different modes have a large R-hat; ArviZ gives NaN for shorter chains.
     if not modes and posterior.sizes["draw"] >= 4:
-        findings += [*_chains_disagree(variables), *_few_independent_draws(variables)]
+        findings += _convergence(variables)
     findings += [
         *_repeated_draws(variables),
         *_particles_stuck(result),
@@ -448,45 +448,38 @@ def _kernel_width(attrs: Mapping[Any, Any]) -> tuple[Finding, ...]:
     )
 
 
-def _chains_disagree(posterior: xr.Dataset) -> list[Finding]:
-    chains = posterior.sizes["chain"]
-    if chains == 1:
-        return []
-    # Recommended by Vehtari et al. (2021).
-    limit = max(1.01, 1 + _NOISE / (chains * posterior.sizes["draw"]))
-    rhats = _by_element("rhat", posterior)
-    high = {name: rhat for name, rhat in rhats.items() if rhat > limit}
-    if not high:
-        return []
-    return [
-        Finding(
-            "chains-disagree",
-            f"R-hat is {_listed(high, '.2f')}, expected at most {limit:.2f}: the chains disagree, "
-            "look at az.plot_rank(idata). "
-            "Pass more draws, or with prb.sample_smc a threshold of 0.8; "
-            "if the chains sit in separate modes, state a prior that excludes one.",
-            "validity.md#diagnostics-of-the-sampler",
+def _convergence(posterior: xr.Dataset) -> list[Finding]:
+    """Report large R-hat and small effective sample sizes (Vehtari et al. 2021)."""
+    chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    findings = []
+    limit = max(1.01, 1 + _NOISE / (chains * draws))
+    rhats = _by_element("rhat", posterior) if chains > 1 else {}
+    listed = ", ".join(f"{rhat:.2f} for {name}" for name, rhat in rhats.items() if rhat > limit)
+    if listed:
+        findings.append(
+            Finding(
+                "chains-disagree",
+                f"R-hat is {listed}, expected at most {limit:.2f}: the chains disagree, look at "
+                "az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; "
+                "if the chains sit in separate modes, state a prior that excludes one.",
+                "validity.md#diagnostics-of-the-sampler",
+            )
         )
-    ]
-
-
-def _few_independent_draws(posterior: xr.Dataset) -> list[Finding]:
-    total = posterior.sizes["chain"] * posterior.sizes["draw"]
-    # Recommended by Vehtari et al. (2021), for R-hat and ESS themselves to be reliable; of few
-    # draws no more than a quarter need be independent.
+    total = chains * draws
+    # For R-hat and ESS themselves to be reliable; of few draws a quarter.
     needed = min(400, 0.25 * total)
     sizes = _by_element("ess", posterior)
-    low = {name: size for name, size in sizes.items() if size < needed}
-    if not low:
-        return []
-    return [
-        Finding(
-            "few-independent-draws",
-            f"The effective sample size is {_listed(low, '.0f')} of {total} draws: "
-            "too few for means and intervals. Pass more draws.",
-            "validity.md#diagnostics-of-the-sampler",
+    listed = ", ".join(f"{size:.0f} for {name}" for name, size in sizes.items() if size < needed)
+    if listed:
+        findings.append(
+            Finding(
+                "few-independent-draws",
+                f"The effective sample size is {listed} of {total} draws: "
+                "too few for means and intervals. Pass more draws.",
+                "validity.md#diagnostics-of-the-sampler",
+            )
         )
-    ]
+    return findings
 
 
 def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
@@ -495,11 +488,7 @@ def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
     with np.errstate(all="ignore"):  # a variable that never moves
         values = getattr(stats, statistic)(posterior)
     elements = single_elements(values.data_vars)
-    return {name: elements[name] for name in told_elements(stacked_draws(posterior))}
-
-
-def _listed(values: Mapping[str, float], form: str) -> str:
-    return ", ".join(f"{value:{form}} for {name}" for name, value in values.items())
+    return {name: elements[name] for name in table_elements(stacked_draws(posterior))}
 
 
 def _repeated_draws(draws: xr.Dataset) -> list[Finding]:

@@ -50,27 +50,15 @@ from prbayes.response.inputs import Inputs, aleatory_names
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """Sizes and thresholds of the checks.
+    """Sizes and thresholds of the checks (likelihood_guards, sections 2.4 and 2.11)."""
 
-    Attributes
-    ----------
-    replicates : int
-        Of the tests: 199 suffice (likelihood_guards, section 2.4).
-    prior_draws, specimens : int
-        Draws of the prior, and specimens of each from which its information is computed.
-    separation : float
-        Within-chain standard deviations between the means of two chains that are in different
-        modes. Chains of one mode with ten independent draws each differ by one.
-    pull : float
-        Pull of the prior, in standard errors, above which a conflict matters (likelihood_guards,
-        section 2.11).
-    """
-
-    replicates: int = 199
-    prior_draws: int = 500
-    specimens: int = 256
+    replicates: int = 199  # of the population test
+    prior_draws: int = 500  # of the conflict of prior and data
+    specimens: int = 256  # of each draw, from which its information is computed
+    # Within-chain standard deviations between the means of chains in different modes. Chains of one
+    # mode with ten independent draws each differ by one.
     separation: float = 2.0
-    pull: float = 0.5
+    pull: float = 0.5  # of the prior, in standard errors, above which a conflict matters
 
 
 _OPTIONS = CheckOptions()
@@ -78,20 +66,11 @@ _OPTIONS = CheckOptions()
 
 @dataclass(frozen=True)
 class Checked:
-    """Reports of checks.
-
-    Attributes
-    ----------
-    findings : tuple of Finding
-    remarks : tuple of Finding
-        Tests without a finding, with their power.
-    untested : tuple of str
-        Tests that were not run, and why.
-    """
+    """Reports of checks."""
 
     findings: tuple[Finding, ...] = ()
-    remarks: tuple[Finding, ...] = ()
-    untested: tuple[str, ...] = ()
+    remarks: tuple[Finding, ...] = ()  # tests without a finding, with their power
+    untested: tuple[str, ...] = ()  # tests that were not run, and why
 
     def __add__(self, other: Checked) -> Checked:
         """Return both."""
@@ -285,16 +264,7 @@ def scored_specimens(
 
 
 def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None) -> Checked:
-    """Return the reports of the checks of draws.
-
-    Parameters
-    ----------
-    evaluator : Evaluator or None
-        None without the model.
-    result : DataTree
-    thetas : ndarray, shape (chains, draws, d), or None
-        Draws in unconstrained space.
-    """
+    """Return the reports of the checks of draws; without a model, evaluator and thetas are None."""
     checked = Checked(findings=influence(result))
     if evaluator is None or thetas is None:
         return checked + Checked(
@@ -313,13 +283,7 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
 
 
 def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
-    """Report chains whose means are farther apart than the chains are wide.
-
-    Parameters
-    ----------
-    thetas : ndarray, shape (chains, draws, d)
-    names : sequence of str
-    """
+    """Report chains whose means are farther apart than the chains are wide."""
     if len(thetas) < 2 or thetas.shape[1] < 4:
         return ()
     within = np.sqrt(thetas.var(axis=1).mean(axis=0))

@@ -174,7 +174,7 @@ def predict(
     points, coords = populations_of(result, model, n_draws, "prb.predict")
     inputs_read = read_inputs(label, inputs, model)
     simulators = population_simulators(model)
-    before = sum(simulator.responses.count for simulator in simulators)
+    n_stored = sum(s.responses.count for s in simulators)
     responses = Responses(
         label,
         response,
@@ -188,34 +188,39 @@ def predict(
     simulator = serving(simulators, responses) if stored else None
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, np.random.default_rng(seed))
-    allowed = [each.max_lost for each in simulators] if max_lost is None else [max_lost]
+    allowed = [s.max_lost for s in simulators] if max_lost is None else [max_lost]
     missing = _count_missing(label, drawn.values, max(allowed, default=MAX_LOST))
     _report_rough_emulator(label, drawn)
-    groups = inputs_read.groups
+    n_computed = responses.count - n_stored + sum(s.responses.count for s in simulators)
+    attrs = {
+        "source": drawn.source,
+        "responses": n_computed,
+        **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
+        "nan": missing,
+        "specimens_id": _digest(*drawn.specimens),
+        "random_seed": str(seed),
+        "findings": as_json(findings_of(response)),
+        **_calibration_attributes(result, model),
+        **as_attributes(identity_in(result) or identity_of_model(model)),
+        **versions(),
+    }
+    return _labelled(drawn.values, responses, coords, n_samples).rename(label).assign_attrs(attrs)
+
+
+def _labelled(
+    values: Floats, responses: Responses, coords: dict[str, NDArray[Any]], n_samples: int
+) -> xr.DataArray:
+    """Return predicted responses with dimensions and coordinates."""
+    groups = responses.inputs.groups
     group_coords = {} if groups is None else {groups.dim: list(groups.labels)}
-    event = drawn.values.shape[2 + len(group_coords) :]
+    leading, event = values.shape[1 : 1 + len(group_coords)], values.shape[2 + len(group_coords) :]
     outputs = responses.outputs or Outputs(tuple(range(event[0] if event else 0)))
     output_coords = {outputs.dim: list(outputs.labels)} if event else {}
-    leading = drawn.values.shape[1 : 1 + len(group_coords)]
     sizes = (len(coords["chain"]), len(coords["draw"]), *leading)
-    n_computed = responses.count - before + sum(each.responses.count for each in simulators)
     return xr.DataArray(
-        drawn.values.reshape(*sizes, n_samples, *event),
+        values.reshape(*sizes, n_samples, *event),
         dims=("chain", "draw", *group_coords, "sample", *output_coords),
         coords={**coords, **group_coords, "sample": np.arange(n_samples), **output_coords},
-        name=label,
-        attrs={
-            "source": drawn.source,
-            "responses": n_computed,
-            **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
-            "nan": missing,
-            "specimens_id": _digest(*drawn.specimens),
-            "random_seed": str(seed),
-            "findings": as_json(findings_of(response)),
-            **_calibration_attributes(result, model),
-            **as_attributes(identity_in(result) or identity_of_model(model)),
-            **versions(),
-        },
     )
 
 
@@ -236,27 +241,7 @@ def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
 def populations_of(
     result: Any, model: pm.Model, draws: int, caller: str
 ) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
-    """Return the populations of a result: values of the free variables, and chain and draw.
-
-    Parameters
-    ----------
-    result : Optimum or xarray.DataTree
-    model : pymc.Model
-    draws : int
-        Largest number of populations; draws are thinned evenly.
-    caller : str
-        For messages.
-
-    Returns
-    -------
-    points : dict of ndarray, shapes (k, *shape)
-    coords : dict of ndarray
-
-    Raises
-    ------
-    TypeError, KeyError
-        If the result is neither, or lacks a free variable.
-    """
+    """Return the free variables, (k, *shape), at evenly thinned draws, and their coordinates."""
     names = [str(rv.name) for rv in model.free_RVs]
     if isinstance(result, Optimum):
         _require_variables(result.point, names, caller)

@@ -9,7 +9,7 @@ from prbayes.model.coverage import (
     ENOUGH,
     TOLERABLE,
     VISIBLE,
-    Level,
+    Requirement,
     Shortcoming,
     shortcoming,
     supports_each,
@@ -21,7 +21,7 @@ def support(ess: Any = 100.0, mass: Any = 1.0, lost: Any = 0.0) -> dict[str, Any
     return dict(zip(("weight_ess", "mean_weight", "lost_mass"), values, strict=True))
 
 
-def found(level: Level = ENOUGH, **keywords: Any) -> Shortcoming:
+def found(level: Requirement = ENOUGH, **keywords: Any) -> Shortcoming:
     return shortcoming(support(**keywords), 80.0, 0.05, 256, level)
 
 
@@ -45,7 +45,7 @@ def test_a_design_that_supports_all_falls_short_in_nothing() -> None:
         ({"lost": 0.04}, ENOUGH, None),
     ],
 )
-def test_levels(keywords: dict[str, float], level: Level, which: str | None) -> None:
+def test_levels(keywords: dict[str, float], level: Requirement, which: str | None) -> None:
     short = found(level, **keywords)
     assert bool(short) == (which is not None)
     for name in ("ess", "mass", "lost"):

@@ -8,13 +8,13 @@ from prbayes.model.elements import (
     element_name,
     element_names,
     finite_draws,
-    read_elements,
-    read_variables,
+    optimum_elements,
+    readable_elements,
+    readable_variables,
     single_elements,
     split_elements,
     stacked_draws,
-    told_elements,
-    told_of,
+    table_elements,
 )
 
 
@@ -74,28 +74,28 @@ def correlations(size: int) -> np.ndarray:
 
 def test_of_a_correlation_each_pair_is_told_once_and_no_diagonal() -> None:
     values = {"mu": np.zeros((50, 2)), "r": correlations(50)}
-    assert told_elements(values) == ["mu[0]", "mu[1]", "r[0,1]", "r[0,2]", "r[1,2]"]
+    assert table_elements(values) == ["mu[0]", "mu[1]", "r[0,1]", "r[0,2]", "r[1,2]"]
 
 
 def test_of_a_cholesky_factor_no_zeros_are_told() -> None:
     factors = np.linalg.cholesky(correlations(50))
     told = ["l[1,0]", "l[1,1]", "l[2,0]", "l[2,1]", "l[2,2]"]
-    assert told_elements({"l": factors}) == told
+    assert table_elements({"l": factors}) == told
 
 
 def test_matrices_of_other_kinds_are_told_as_they_are() -> None:
     draws = np.random.default_rng(0).normal(size=(50, 2, 2))
-    assert len(told_elements({"any": draws})) == 4
-    assert len(told_elements({"oblong": draws.reshape(25, 2, 4)})) == 8
+    assert len(table_elements({"any": draws})) == 4
+    assert len(table_elements({"oblong": draws.reshape(25, 2, 4)})) == 8
     stuck = np.broadcast_to([[1.0, 0.5], [0.5, 1.0]], (50, 2, 2))
-    assert len(told_elements({"stuck": stuck})) == 4  # chains that never moved are to be seen
+    assert len(table_elements({"stuck": stuck})) == 4  # chains that never moved are to be seen
 
 
 @pytest.mark.parametrize("error", [0.1, np.inf, np.nan])
 def test_of_an_optimum_the_standard_errors_tell_what_is_constant(error: float) -> None:
     point = {"r": np.array([[1.0, 0.5], [0.5, 1.0]]), "mu": 2.0}
     stderr = {"r": np.array([[0.0, error], [error, 0.0]]), "mu": 0.0}
-    assert told_of(point, stderr) == ["r[0,1]", "mu"]
+    assert optimum_elements(point, stderr) == ["r[0,1]", "mu"]
 
 
 def test_elements_are_called_by_their_coordinates() -> None:
@@ -117,25 +117,25 @@ def test_draws_and_points_carry_their_coordinates() -> None:
     mu = xr.DataArray(np.arange(12.0).reshape(2, 2, 3), coords, ["supplier", "draw", "chain"])
     stacked = stacked_draws(xr.Dataset({"mu": mu}))
     np.testing.assert_array_equal(split_elements(stacked)["mu[Busch]"], mu.values[1].T.ravel())
-    assert told_elements(stacked) == ["mu[Adler]", "mu[Busch]"]
+    assert table_elements(stacked) == ["mu[Adler]", "mu[Busch]"]
     point = xr.Dataset({"mu": ("supplier", [1.0, 2.0])}, coords).data_vars
     assert single_elements(point) == {"mu[Adler]": 1.0, "mu[Busch]": 2.0}
-    assert told_of(point, {"mu": [0.1, 0.2]}) == ["mu[Adler]", "mu[Busch]"]
+    assert optimum_elements(point, {"mu": [0.1, 0.2]}) == ["mu[Adler]", "mu[Busch]"]
     assert type(finite_draws(xr.Dataset({"mu": mu}), ["mu"])["mu"]) is np.ndarray
 
 
 def test_for_a_packed_factor_its_standard_deviations_and_correlations_are_read() -> None:
-    assert read_variables(["mu", "chol"], {"mu", "chol", "chol_stds", "chol_corr"}) == [
+    assert readable_variables(["mu", "chol"], {"mu", "chol", "chol_stds", "chol_corr"}) == [
         "mu",
         "chol_stds",
         "chol_corr",
     ]
-    assert read_variables(["mu", "chol"], {"mu", "chol", "chol_corr"}) == ["mu", "chol"]
+    assert readable_variables(["mu", "chol"], {"mu", "chol", "chol_corr"}) == ["mu", "chol"]
     every = ["chol", "mu", "chol_corr", "chol_stds"]
-    assert read_variables(every, every) == ["chol_stds", "chol_corr", "mu"]
+    assert readable_variables(every, every) == ["chol_stds", "chol_corr", "mu"]
 
 
 def test_of_elements_those_of_a_packed_factor_are_not_read() -> None:
     names = ["mu[0]", "chol[0]", "chol[1]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
-    assert read_elements(names) == ["mu[0]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
-    assert read_elements(["chol[0]", "chol_stds[0]"]) == ["chol[0]", "chol_stds[0]"]
+    assert readable_elements(names) == ["mu[0]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
+    assert readable_elements(["chol[0]", "chol_stds[0]"]) == ["chol[0]", "chol_stds[0]"]

@@ -638,5 +638,5 @@ def test_a_propagation_that_knows_no_responses_has_an_identity_too(
 ) -> None:
     model = base()
     bound = next(iter(nodes(model).values())).bound
-    monkeypatch.setattr(type(bound), "known_points", ())
+    monkeypatch.setattr(bound, "first_points", ())
     assert not identity_of_model(model).simulators[0].points

@@ -53,7 +53,7 @@ def test_a_curve_over_one_hyperparameter(
     x, y = read.xy(pc, "landscape", "landscape")
     thetas = np.column_stack([np.full(x.size, optimum.theta[0]), np.log(x)])
     np.testing.assert_allclose(y, optimum.evaluator(thetas).discrepancies[:, 0])
-    assert pc.viz["plot"]["landscape"].item().get_title() == "mu held at the optimum"
+    assert pc.viz["plot"]["landscape"].item().get_title() == "mu fixed at the optimum"
     np.testing.assert_allclose(read.xy(pc, "optimum", "landscape")[0], optimum.point["sigma"])
     assert "asked" not in pc.viz
 

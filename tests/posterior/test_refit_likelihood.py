@@ -15,6 +15,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.prior_continuation import ContinuedEvaluator, continuation_of
+from prbayes.model.parameters import log_posterior
 from prbayes.posterior.importance import importance_sample, laplace
 from prbayes.posterior.refit_likelihood import (
     RefitLikelihood,
@@ -61,7 +62,7 @@ def posterior(likelihood: RefitLikelihood) -> dict[str, Floats]:
     evaluator = likelihood.evaluator
 
     def density(thetas: Floats) -> Floats:
-        return evaluator.hyperparameters.log_posterior(thetas, likelihood.log_likelihood)
+        return log_posterior(evaluator.hyperparameters, thetas, likelihood.log_likelihood)
 
     modes = laplace(density, likelihood.starts, likelihood.scale)
     sample = importance_sample(density, modes, DRAWS, seed=0)

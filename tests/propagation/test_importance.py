@@ -233,7 +233,7 @@ def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() ->
     other = optimum.evaluator.nodes[0].bound.responses.copied()
     other.function = rough
     with pytest.raises(
-        PoorEmulatorError, match="another response of the same specimens is not told"
+        PoorEmulatorError, match="another response of the same specimens is not predicted"
     ):
         bound.values_of(other)
     inputs = optimum.evaluator.nodes[0].bound.inputs.aleatory
@@ -260,7 +260,7 @@ def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
     null = prb.validation.JointNull(optimum, responses=(rough, *inputs), replicates=99)
     before = optimum.evaluator(optimum.theta[None]).discrepancies
     with pytest.raises(
-        DesignError, match=r"JointNull: y: .* not told .* runs alone do not support"
+        DesignError, match=r"JointNull: y: .* not predicted .* runs alone do not support"
     ):
         prb.area_test(np.linspace(-1, 1, 20), fresh, null=null)
     np.testing.assert_array_equal(optimum.evaluator(optimum.theta[None]).discrepancies, before)
@@ -372,7 +372,9 @@ def test_another_response_that_no_surface_follows_is_refused() -> None:
     evaluator, bound = design_of(build(n=256))
     other = evaluator.nodes[0].bound.responses.copied()
     other.function = jumping
-    with pytest.raises(DesignError, match="another response of the same specimens is not told"):
+    with pytest.raises(
+        DesignError, match="another response of the same specimens is not predicted"
+    ):
         bound.values_of(other)
 
 

@@ -139,7 +139,7 @@ def test_a_report_computes_no_response(monkeypatch: pytest.MonkeyPatch, section:
     assert "Graph" not in [s.title for s in made.sections]
     text = section(made, "Measured and calibrated responses").text
     assert text == (
-        "This picture could not be made: it would compute responses anew; "
+        "This picture could not be made: it would recompute responses; "
         "call prb.plot_responses for it",
     )
 

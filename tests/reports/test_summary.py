@@ -122,7 +122,7 @@ def test_a_verdict_on_several_outputs_counts_directions() -> None:
     test = prb.area_test(rng.normal(size=(12, 2)), predicted, null=null)
     text = verdict("a", test, material(validity=test))
     assert text.startswith(
-        "On the responses of 12 specimens (several outputs, seen in 4 directions), the"
+        "On the responses of 12 specimens (several outputs in 4 directions), the"
     )
     assert "(mean area 0." in text
     made = prb.Report("x", validity=test, pictures=False)

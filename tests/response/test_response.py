@@ -63,7 +63,7 @@ def test_every_way_of_calling_gives_the_same_in_the_shape_of_the_batch(
         "tolerant": {"function": by_rows, "on_failure": Replace()},
     }
     responses = Responses("y", inputs=inputs(*ALL), **settings[way])
-    assert responses.plain == (way == "plain")
+    assert responses.is_batched == (way == "plain")
     np.testing.assert_array_equal(responses([PAIRS, XS], [SLOPES]), EXPECTED)
     assert (responses.count, responses.computed, responses.failures) == (12, 12, 0)
     np.testing.assert_array_equal(responses([PAIRS[:1], XS[0]], [SLOPES[0, 0]]), EXPECTED[:1])
@@ -93,7 +93,7 @@ def test_failures_are_counted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found, [-9.0, -1.0, -9.0])
     assert responses.failures == 2
     plain = Responses("y", steep, inputs(X), on_failure=Abort())
-    assert plain.plain
+    assert plain.is_batched
     np.testing.assert_array_equal(plain([np.array([1.0, -1.0])], []), [np.nan, -1.0])
     assert plain.failures == 0
 
@@ -375,7 +375,7 @@ def test_failed_points_fail_again() -> None:
     responses = responses_of(lambda x: np.where(x > 1, np.nan, x))
     found = deduplicated_responses(responses, [np.array([0, 2, 2, 1, 0])], None)
     np.testing.assert_array_equal(found, [0, np.nan, np.nan, 1, 0])
-    assert responses.scatters is False
+    assert responses.is_random is False
 
 
 @pytest.mark.exact

@@ -18,18 +18,8 @@ def failing_region_findings(
 
     Where the response is NaN no specimen can be measured: the likelihood is that of the population
     truncated to the other inputs (`prbayes.propagation.response_share`). Where it is +inf specimens
-    fail: as none is among the data, a population moves away from there. The finding
-    ``failing-region`` has the share of both.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    theta : ndarray, shape (d,)
-        In unconstrained space.
-    specimens : int
-        Number of simulated specimens.
-    lost : float
-        Expected number of specimens in the region that is reported.
+    fail: as none is among the data, a population moves away from there. Regions with an expected
+    number of ``lost`` specimens are reported, with the share of both.
     """
     findings = []
     rng = np.random.default_rng(23)

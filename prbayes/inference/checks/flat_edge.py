@@ -60,18 +60,8 @@ def elements_at_edge(
     then the last point on the way back with the same discrepancy counts. Standard errors are no
     sign: curvature and noise are both rounding errors at an edge. The way back to the middle of the
     prior changes the discrepancy, unlike that of a hyperparameter without effect. At the bound of a
-    prior the population itself is constant: that is a minimum under a constraint.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    theta : ndarray, shape (d,)
-    scales : ndarray, shape (k,)
-    size : float
-        Typical size of the objective.
-    tolerance : float
-        Of the minimiser: it stops where the objective changes by less in one spread of the prior.
-    seed : int
+    prior the population itself is constant: that is a minimum under a constraint. ``size`` is the
+    typical size of the objective. The minimiser stops at a relative change below ``tolerance``.
     """
     hyperparameters = evaluator.hyperparameters
     shift = theta - np.median(hyperparameters.prior_thetas(THETAS, seed), axis=0)

@@ -111,12 +111,12 @@ def canonical_correlation(
         for block in (rows, columns)
     )
     between = first @ covariance[np.ix_(rows, columns)] @ second.T
-    left, correlations, right = np.linalg.svd(between)
+    u, correlations, vt = np.linalg.svd(between)
     # Loadings are the covariances of theta with the best combinations.
     return (
         float(correlations[0]),
-        np.linalg.solve(first, left[:, 0]),
-        np.linalg.solve(second, right[0]),
+        np.linalg.solve(first, u[:, 0]),
+        np.linalg.solve(second, vt[0]),
     )
 
 

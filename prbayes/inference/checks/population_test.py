@@ -34,21 +34,11 @@ def normal_scores(u: Floats) -> Floats:
 
 
 def zhang_statistic(z: Floats, weights: Floats, draws: int = 8, seed: int = 0) -> Floats:
-    """Return the mean Z_A of drawn inputs, (d,). Large values reject.
+    """Return the mean Z_A of drawn inputs, (d,), of scores (N, K, d) and weights (N, K).
 
     A drawn input has the population's distribution, however many roots a specimen has. Posterior
     means do not: their power is half as large on a folded response. The mean over a few draws
-    removes most of the noise of drawing.
-
-    Parameters
-    ----------
-    z : ndarray, shape (N, K, d)
-        Normal scores of the points.
-    weights : ndarray, shape (N, K)
-        Posterior weights, with sum 1 for each specimen.
-    draws : int
-        Number of draws, if there are several points.
-    seed : int
+    removes most of the noise of drawing. Large values reject.
     """
     n, points, _ = z.shape
     cumulative = np.cumsum(weights, axis=1)
@@ -67,17 +57,6 @@ def mixture_ratio(z: Floats, weights: Floats, width: float = 0.5, steps: int = 1
     Large values reject. The mixture replaces the population of one input at a time. Its 25 centers
     are fixed between -3.5 and 3.5, its mixing weights follow from EM. The width of its normals
     bounds the likelihood: without it, exact data would put a point mass on each root.
-
-    Parameters
-    ----------
-    z : ndarray, shape (N, K, d)
-        Normal scores of the points.
-    weights : ndarray, shape (N, K)
-        Posterior weights, with sum 1 for each specimen.
-    width : float
-        Standard deviation of the normals.
-    steps : int
-        Steps of EM.
     """
     centers = np.linspace(-3.5, 3.5, 25)
     ratios = []
@@ -94,37 +73,19 @@ def mixture_ratio(z: Floats, weights: Floats, width: float = 0.5, steps: int = 1
 def population_statistics(z: Floats, weights: Floats, seed: int = 0) -> Floats:
     """Return Z_A of all inputs, then the mixture's ratio of all inputs, (2 d,).
 
-    Parameters
-    ----------
-    z : ndarray, shape (N, K, d)
-        Normal scores of the points, by input with a fitted population.
-    weights : ndarray, shape (N, K)
-        Posterior weights, with sum 1 for each specimen.
-    seed : int
-        Seed of the drawn inputs. Observed and bootstrap samples take the same seed.
+    Observed and bootstrap samples need the same seed of the drawn inputs.
     """
     return np.concatenate([zhang_statistic(z, weights, seed=seed), mixture_ratio(z, weights)])
 
 
 @dataclass(frozen=True)
 class PopulationTest:
-    """Result of the test of the family of the population.
-
-    Parameters
-    ----------
-    p_value : float
-    zhang : ndarray, shape (d,)
-        p-values of Z_A by input, not adjusted for the number of statistics.
-    mixture : ndarray, shape (d,)
-        p-values of the mixture's likelihood ratio by input.
-    n : int
-        Number of specimens.
-    """
+    """Result of the test of the family of the population."""
 
     p_value: float
-    zhang: Floats
-    mixture: Floats
-    n: int
+    zhang: Floats  # (d,): p-values of Z_A by input, not adjusted for the number of statistics
+    mixture: Floats  # (d,): p-values of the mixture's likelihood ratio by input
+    n: int  # specimens
 
 
 def population_test(
@@ -151,17 +112,8 @@ def population_test(
 
     .. [1] Warp-speed bootstrap (Giacomini, Politis and White 2013), 1000 data sets.
 
-    Parameters
-    ----------
-    z : ndarray, shape (N, K, d)
-        Normal scores of the points under the fitted population.
-    weights : ndarray, shape (N, K)
-        Posterior weights of the points, with sum 1 for each specimen.
-    null : sequence of ndarray, shape (2 d,)
-        `population_statistics` of bootstrap samples of the fitted population, each with N specimens
-        and refitted. 199 suffice.
-    seed : int
-        Seed of the drawn inputs, the same as for the bootstrap samples.
+    ``null`` has the `population_statistics` of bootstrap samples of the fitted population, each
+    with N specimens and refitted; 199 suffice.
     """
     observed = population_statistics(z, weights, seed)
     null = np.asarray(null)
@@ -173,16 +125,7 @@ def population_test(
 def power_text(n: int, inputs: int = 1, outputs: int = 1) -> str:
     """Return a sentence about the power of the test at p <= .05 with n specimens.
 
-    Means over the three problems of `population_test`, interpolated in log n between 20, 50 and 200
-    specimens.
-
-    Parameters
-    ----------
-    n : int
-    inputs : int
-        Number of uncertain inputs.
-    outputs : int
-        Number of measured outputs.
+    Means over the three problems of `population_test`, interpolated in log n.
     """
     if outputs < inputs:
         return (
@@ -210,14 +153,6 @@ def population_findings(
 
     The finding lists causes, because the best-fitting one is often wrong: skewness is taken for
     truncation in .69 of the data sets, gross errors for two modes in .84.
-
-    Parameters
-    ----------
-    test : PopulationTest
-    labels : sequence of str
-        Names of the d inputs.
-    threshold : float
-        Size of the test.
     """
     if test.p_value > threshold:
         return ()

@@ -18,21 +18,11 @@ from prbayes._validate import Floats
 
 @dataclass(frozen=True)
 class PriorConflict:
-    """Conflict of prior and data, by hyperparameter.
+    """Conflict of prior and data, by hyperparameter, (d,) each."""
 
-    Parameters
-    ----------
-    p_values : ndarray, shape (d,)
-        Two-sided p-values of the estimates in their prior predictive distributions.
-    adjusted : ndarray, shape (d,)
-        The p-values adjusted for the number of hyperparameters (Holm 1979).
-    pulls : ndarray, shape (d,)
-        Shifts of the posterior means from the estimates, in standard errors.
-    """
-
-    p_values: Floats
-    adjusted: Floats
-    pulls: Floats
+    p_values: Floats  # two-sided, of the estimates in their prior predictive distributions
+    adjusted: Floats  # for the number of hyperparameters (Holm 1979)
+    pulls: Floats  # shifts of the posterior means from the estimates, in standard errors
 
 
 def prior_conflict(
@@ -44,18 +34,9 @@ def prior_conflict(
     (linear problem, sharp prior, 1000 data sets, p-values not adjusted): a mean four prior standard
     deviations off .86, .98, 1.00; a logarithm of the standard deviation three prior standard
     deviations off .36 to .55, .70 to .76, .94 to .96. The Mahalanobis distance of all
-    hyperparameters together has .66, .91, 1.00 for the mean.
-
-    Parameters
-    ----------
-    estimate : ndarray, shape (d,)
-        Maximum-likelihood estimate.
-    standard_error : ndarray, shape (d,)
-        Standard errors of the estimate.
-    posterior_mean : ndarray, shape (d,)
-    predictive : ndarray, shape (S, d)
-        Estimates from synthetic data sets, one for each draw of the prior; 1000 suffice. Failed
-        estimates, which are not finite, are left out.
+    hyperparameters together has .66, .91, 1.00 for the mean. ``predictive``, (S, d), are estimates
+    from synthetic data sets at draws of the prior; 1000 suffice. Those that are not finite are left
+    out.
     """
     finite = np.isfinite(predictive)
     below = (finite & (predictive <= estimate)).sum(axis=0)
@@ -88,20 +69,8 @@ def conflict_findings(
     """Return a finding ``prior-conflict`` of each hyperparameter in conflict.
 
     With a wide prior a conflict is certain to be seen and costs nothing (pulls of .1 to .6 standard
-    errors). With a sharp one, four prior standard deviations off, the pull is 1.5 to 2.
-
-    Parameters
-    ----------
-    labels : sequence of str
-        Names of the d hyperparameters.
-    prior : ndarray, shape (S, d)
-        Draws of the prior.
-    estimate, standard_error, posterior_mean, predictive : ndarray
-        As for `prior_conflict`.
-    threshold : float
-        Largest adjusted p-value of a conflict.
-    pull : float
-        Smallest shift of the posterior mean, in standard errors, of a conflict that matters.
+    errors). With a sharp one, four prior standard deviations off, the pull is 1.5 to 2. ``prior``
+    are draws, (S, d); the arrays behind it are those of `prior_conflict`.
 
     Examples
     --------

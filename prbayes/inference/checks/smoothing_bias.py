@@ -21,17 +21,8 @@ def smoothing_bias(
 ) -> list[Finding]:
     """Report log-likelihoods whose smoothing moves the optimum by more than half a standard error.
 
-    By a Newton step to the optimum under kernels of half the width; of stored responses only.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    theta : ndarray, shape (d,)
-        The optimum.
-    scales : ndarray, shape (k,)
-        Divisors of the simulators' discrepancies.
-    local : Local, optional
-        The sampling distribution there; without it nothing is reported.
+    By a Newton step to the optimum under kernels of half the width; of stored responses only. It
+    needs the sampling distribution ``local``.
     """
     smoothed = [
         k
