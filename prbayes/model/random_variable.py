@@ -126,12 +126,8 @@ class Node:
     def observing(self, data: Any) -> Node:
         """Return the same simulator with other observed responses; it computes no response.
 
-        It is the same object where the values are the same.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the metric does not take them, or weights or labels go with as many as before.
+        It is the same object where the values are the same. Raise TypeError or ValueError if the
+        metric does not take them, or weights or labels go with as many as before.
         """
         target = self.target
         data = np.asarray(data)
@@ -193,13 +189,6 @@ class Specification:
         """The simulator, with its first responses: the first access computes them.
 
         After an error, or an interruption, the next access tries again.
-
-        Raises
-        ------
-        BudgetError, ResponseError, StoreError
-            If the first responses cannot be computed.
-        TypeError, ValueError
-            If the propagation does not take the inputs or their priors.
         """
         with lock(self):
             return self._node
@@ -308,10 +297,7 @@ def shared_epsilon(name: str, value: float) -> Any:
 
 
 def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
-    """Return the log-density of an observed node.
-
-    The only place where the sign of a discrepancy changes.
-    """
+    """Return the log-density of an observed node; the sign of a discrepancy changes only here."""
     return -discrepancy / epsilon
 
 
@@ -327,13 +313,6 @@ class SimulatorRV(RandomVariable):
     PyTensor's rewriters keep every operation that they have met. The simulator with all stored
     responses is therefore referenced by applications of the operation, which live as long as a
     model or a compiled function, and weakly by the operation itself.
-
-    Attributes
-    ----------
-    simulator : Specification or Node
-        A specification until `nodes` computes its first responses.
-    node : Node
-        The first access computes its first responses.
     """
 
     __props__ = ("name", "signature", "dtype", "inplace", "simulator")
@@ -356,7 +335,7 @@ class SimulatorRV(RandomVariable):
 
     @property
     def simulator(self) -> AnySimulator:
-        """The simulator, with its first responses once these are computed."""
+        """The simulator: a specification until `nodes` computes its first responses."""
         simulator = self._simulator()
         if simulator is None:
             raise RuntimeError(f"{self}: got an operation of a model that is gone")
@@ -364,7 +343,7 @@ class SimulatorRV(RandomVariable):
 
     @property
     def node(self) -> Node:
-        """The simulator with its first responses."""
+        """The simulator with its first responses, which the first access computes."""
         simulator = self.simulator
         return simulator if isinstance(simulator, Node) else simulator.node
 
@@ -625,11 +604,6 @@ def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
     """Return the simulators of a model as far as they are computed, by their observed variables.
 
     In a clone they are copies, which the first call makes.
-
-    Raises
-    ------
-    TypeError
-        If it is no model.
     """
     if not isinstance(model, pm.Model):
         raise TypeError(f"model: got {called(model)}, expected a pm.Model")
@@ -642,14 +616,8 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
 
     The first call computes their first responses. In a clone it makes copies, which compiled
     functions of the clone follow. Where `pymc.set_data` or `pymc.observe` changed the data, the
-    metric is prepared again, and the responses are the same.
-
-    Raises
-    ------
-    BudgetError, ResponseError, StoreError
-        If the first responses cannot be computed; the next call tries again.
-    TypeError, ValueError
-        If it is no model, or a metric does not take the data that it has now.
+    metric is prepared again, and the responses are the same. If the first responses cannot be
+    computed, the next call tries again.
     """
     computed = {}
     for rv, simulator in simulators(model).items():

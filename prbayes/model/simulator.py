@@ -57,7 +57,7 @@ from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
 
-def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
+def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     name: str,
     response: Callable[..., Any],
     *inputs: Any,
@@ -77,44 +77,44 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     name : str
         Name of the node.
     response : callable
-        ``response(*inputs)``, a NumPy-style function: one array per input, any leading batch shape,
-        a multivariate input with its event axis last; returns an array of the batch shape, in units
-        of the observed values, in which each specimen's is its own: one of them is computed by
-        itself as well, and what differs then is refused; for m outputs of each specimen an array
-        with them in a last axis, or a mapping of arrays with the keys of ``observed``. NaN is a
-        point at which it could not be computed, all outputs of it, +inf a specimen that failed. It
-        is a function of its inputs: where these repeat, as discrete ones do, a design computes it
-        once, unless four that are computed again differ. Scatter of its own is best an input, as
-        ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs and propagation,
-        and metrics of distributions, share its runs.
+        ``response(*inputs)``, a NumPy-style function. Each input is an array of any leading batch
+        shape; a multivariate input has its event axis last. The function returns an array of the
+        batch shape, in units of the observed values; for m outputs of a specimen an array with them
+        in a last axis, or a mapping of arrays with the keys of ``observed``. NaN is a point without
+        response, +inf a specimen that failed. The response of a specimen depends on the inputs of
+        that specimen alone: one of them is also computed by itself, and a difference is refused.
+        Where inputs repeat, as discrete ones do, a design computes the response once, unless four
+        of them differ when they are computed again. Model random scatter of the response as an
+        input, such as ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs
+        and propagation, and metrics of distributions, share runs.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
-        same population; that values were measured on the same specimens is said by ``specimens``.
+        same population; ``specimens`` marks values that were measured on the same specimens.
     metric : Metric, optional
-        How simulated and observed responses are compared. By default `LogLikelihood`, the
-        log-likelihood by specimen, for a deterministic response of continuous inputs: it needs a
-        hundred-odd runs, and no epsilon.
+        Comparison of simulated and observed responses. By default `LogLikelihood`, the
+        log-likelihood by specimen, for a deterministic response of continuous inputs: it needs
+        about a hundred runs, and no epsilon.
     observed : array_like, shape (N,) or (N, m), DataFrame, DataArray, mapping or pymc.Data
-        Measured responses, of at least two specimens. Several outputs of each, (N, m), go with a
-        metric that sees them together, such as `Joint`: an array, a DataFrame whose columns are
+        Measured responses, of at least two specimens. Several outputs of a specimen, (N, m), need a
+        metric that compares them together, such as `Joint`: an array, a DataFrame whose columns are
         outputs, a DataArray with specimens first, or a mapping of arrays. NaN is an output that was
-        not measured, +inf a specimen that had failed. After ``pymc.set_data`` or ``pymc.observe``
-        the metric is prepared against the new values, and no response is computed anew. With the
-        group of each specimen where inputs depend on `prbayes.response.group`.
+        not measured, +inf a specimen that failed. After ``pymc.set_data`` or ``pymc.observe`` the
+        metric is prepared against the new values, and no response is computed. Include the group of
+        each specimen where inputs depend on `prbayes.response.group`.
     epsilon : float, optional
-        Scale of the discrepancy. 1/N for metrics on the scale of a likelihood, N the effective
-        number of specimens; unset for the others, until `calibrate_epsilon` and `set_epsilon`, or
-        `sample_smc`, set it.
+        Scale of the discrepancy. By default 1/N for metrics on the scale of a likelihood, with the
+        effective number N of specimens; unset for other metrics, until `calibrate_epsilon` and
+        `set_epsilon`, or `sample_smc`, set it.
     weights : array_like, shape (N,), optional
         Weights of the observed responses.
     specimens : array_like, shape (N,), optional
         Labels of the specimens. Observations with the same label, also of several simulators,
         belong together: data sets are drawn specimen by specimen. With a metric of distributions
-        each simulator's default epsilon counts its specimens, so that those that several share
-        count several times under `pymc.sample`, until `calibrate_epsilon` corrects for it; a
-        warning says so. With `LogLikelihood` observations of a specimen share its inputs, and the
-        last simulator has the log-likelihoods of all specimens.
+        each simulator's default epsilon counts its specimens. Shared specimens then count several
+        times under `pymc.sample`, until `calibrate_epsilon` corrects for it; a warning reports it.
+        With `LogLikelihood` observations of a specimen share its inputs, and the last simulator has
+        the log-likelihoods of all specimens.
     dims : str or sequence of str, optional
         Names of the observed dimensions.
     propagation : Propagation, optional
@@ -125,16 +125,15 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     Returns
     -------
     TensorVariable, or a tuple of them
-        The observed variable, or that of each group, called ``y[Adler]`` and so on. PyMC's
-        predictive sampling draws N specimens for it: new ones under `Fresh`, else from the
-        population's points, by weight and with replacement, so that one may come twice; and
-        independent of those of other variables, of which a warning is logged where simulators share
-        inputs (`predict` draws the same specimens for them).
+        The observed variable, or that of each group, such as ``y[Adler]``. PyMC's predictive
+        sampling draws N specimens for it: new ones under `Fresh`, else points of the population, by
+        weight and with replacement. It draws each variable independently; a warning reports
+        simulators that share inputs, for which `predict` draws the same specimens.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is described here.
+        If an argument does not have the form above.
 
     Notes
     -----
@@ -142,7 +141,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     responses: `minimize`, `sample_smc`, `pymc.sample`, a plot or a prediction. An executor has to
     be open then. A response that raises, returns a wrong shape or type, or is NaN at all points is
     a `ResponseError` there, and the next use tries again. A line of the log ("prbayes", level INFO)
-    reports how many runs there are, and how long they take; `cost` reports it before.
+    reports the number of runs and their time; `cost` reports them before.
 
     References
     ----------

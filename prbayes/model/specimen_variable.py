@@ -225,11 +225,6 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
     """Return the likelihoods by specimen of a model, by their observed variables.
 
     Simulators with common specimens have the same one.
-
-    Raises
-    ------
-    TypeError
-        If it is no model.
     """
     if not isinstance(model, pm.Model):
         raise TypeError(f"model: got {called(model)}, expected a pm.Model")
