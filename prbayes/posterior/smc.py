@@ -169,7 +169,7 @@ def sample_smc(
     ------
     TypeError, ValueError
         If an argument is not as described, no prior draw has a finite density, or the optimum is
-        needed and at an edge or a jump (``at_edge`` and ``at_jump`` of `Optimum`).
+        needed and at an edge or a jump (``search.at_edge``, ``search.at_jump``).
     DesignError
         If a design does not support the posterior after refinement.
     StoreError
