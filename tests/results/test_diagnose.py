@@ -19,6 +19,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.model.evaluator import Evaluator
+from prbayes.optimize.convergence import Result
 from prbayes.posterior.smc import _refuse_lost
 from prbayes.propagation.base import DesignError, discrepancy_error
 from prbayes.results.diagnose import _NOISE
@@ -191,11 +192,12 @@ def test_a_stored_optimum_tells_what_the_optimum_does() -> None:
     assert prb.diagnose(optimum).ok
     assert prb.diagnose(optimum.to_datatree()).ok
     findings = (Finding("not-identified", "It is flat."), Finding("design-error", "So so."))
-    lost = replace(optimum, converged=False, message="stopped", findings=findings)
+    search = replace(optimum.search, result=Result.FAILED, details="It stopped.")
+    lost = replace(optimum, search=search, findings=findings)
     memory, stored = prb.diagnose(lost), prb.diagnose(lost.to_datatree())
     assert memory.messages == stored.messages
     assert memory.messages[:2] == ("It is flat.", "So so.")
-    said = "did not converge (stopped); try another start or method; see docs/choose.md"
+    said = "did not converge (The minimiser failed. It stopped.); try another start or method; see docs/choose.md"
     assert said in memory.messages[2]
     assert memory.support.sizes == {"simulator": 1, "sample": 1}
 
