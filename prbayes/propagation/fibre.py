@@ -95,13 +95,8 @@ class FibreProposal:
     def draw(self, points: int, seed: int, after: int = 0) -> FibrePoints:
         """Draw points on all fibres.
 
-        Parameters
-        ----------
-        points : int
-            K, for each specimen. A power of two fills the fibre most evenly.
-        seed : int
-        after : int
-            Points of the same seed that are left out, as they were drawn before.
+        K = ``points`` for each specimen: a power of two fills the fibre most evenly. The first
+        ``after`` points of the same seed are left out, as they were drawn before.
         """
         n, d = len(self.fibres.y), len(self.fibres.population.mean)
         x = np.empty((n, points, d))
@@ -133,26 +128,11 @@ def fit_fibres(
     outputs lacked up to .35 in log L. Numbers of a specimen depend on the other specimens only by
     rounding.
 
-    Parameters
-    ----------
-    response : Response
-        Called with many inputs (n, d); NaN where it has no value.
-    y : ndarray, shape (N, m)
-        Measured outputs, m < d.
-    population : ReferencePopulation
-        Population that the proposals are fitted to; it should cover the plausible populations.
-    starts : int
-        Searches for modes, for each specimen.
-    tries : int
-        Random points of the fibre that decide whether charts are missing.
-    most_charts : int
-        Of a specimen.
-    rounds : int
-        Of adaptation. With one round charts do not turn.
-    seed : int
-    numbers : ndarray of int, shape (N,), optional
-        Numbers of the specimens, by default 0 to N - 1. A specimen has the same points alone as in
-        a batch if its number is the same.
+    The response is called with many inputs (n, d), and is NaN where it has no value; y are the
+    measured outputs, (N, m) with m < d. The proposals are fitted to ``population``, which should
+    cover the plausible populations. Modes are searched from ``starts`` points, and ``tries`` random
+    points of the fibre show whether charts are missing. A specimen has the same points alone as in
+    a batch if its number is the same.
 
     Examples
     --------

@@ -68,24 +68,11 @@ def fibre_points(
 ) -> tuple[Emulation, SpecimenPoints]:
     """Emulate a response and draw points on the fibres of all specimens.
 
-    Parameters
-    ----------
-    run : callable
-        Coordinates (n, d) -> outputs (n, m); NaN where there is no response.
-    readings : Readings
-    bounds : ndarray, shape (2, d)
-        Of the prior predictive population; its middle 99 % lies within [-1, 1].
-    prior_specimens : ndarray, shape (n, d)
-        Specimens of the prior predictive population.
-    posterior : callable
-        Points (N, K, d), their numbers (N, K), and a covariance (d, d) by which populations are
-        smoothed, or None -> draws of the hyperparameters.
-    options : PointOptions
-    n : int, optional
-        First runs.
-    seed : int
-    name : str
-        For messages.
+    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. ``bounds``,
+    (2, d), and ``prior_specimens``, (n, d), are those of the prior predictive population, whose
+    middle 99 % lies within [-1, 1]. ``posterior`` maps points (N, K, d), their numbers (N, K), and
+    None or a covariance (d, d) by which populations are smoothed, to draws of the hyperparameters.
+    ``n`` is the number of first runs.
 
     Raises
     ------

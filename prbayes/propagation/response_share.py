@@ -91,25 +91,10 @@ def response_share(
     """Return the points of the share, and the emulation with runs at the failing region's boundary.
 
     None where the share changes the log-likelihood of no plausible population by more than the
-    error of the points of the specimens.
-
-    Parameters
-    ----------
-    run : callable
-        Coordinates (n, d) -> outputs (n, m); NaN where there is no response.
-    emulation : Emulation
-    prior_specimens : callable
-        Returns specimens of the prior predictive population, (n, d).
-    posterior : callable
-        Share -> draws of the hyperparameters.
-    options : PointOptions
-    count : int
-        Points of each half at first.
-    batches : int
-        Largest number of batches of runs at the boundary.
-    seed : int
-    name : str
-        For messages.
+    error of the points of the specimens. ``run`` maps coordinates (n, d) to outputs (n, m), NaN
+    where there is no response; ``posterior`` maps a share to draws of the hyperparameters. Each
+    half has ``count`` points at first, and there are at most ``batches`` batches of runs at the
+    boundary.
 
     Raises
     ------

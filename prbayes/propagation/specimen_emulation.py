@@ -212,21 +212,9 @@ def emulate(
 ) -> tuple[Emulation, Roots]:
     """Fit the emulator: runs over a box, then batches at the roots until the bias is small.
 
-    Parameters
-    ----------
-    run : callable
-        Coordinates (n, d) -> outputs (n, m); NaN where there is no response.
-    readings : Readings
-    box, search_box : ndarray, shape (2, d)
-        Of the first runs, and of the search for roots.
-    options : PointOptions
-    n : int, optional
-        First runs.
-    known : Emulation, optional
-        Of the same response for other data: runs are added where the roots leave its range.
-    seed : int
-    name : str
-        For messages.
+    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. The first n
+    runs are in ``box``, and roots are searched in ``search_box``, both (2, d). ``known`` is the
+    emulation of the same response for other data: runs are added where the roots leave its range.
 
     Raises
     ------

@@ -133,21 +133,10 @@ def draw_points(
 ) -> SpecimenPoints:
     """Draw points around all roots until two independent halves of them agree.
 
-    Parameters
-    ----------
-    emulation : callable
-    error : ndarray, shape (m,)
-        Standard deviation of its error.
-    readings : Readings
-        A specimen without a root, whose readings are censored, gets points of the population.
-    roots : Roots
-    box : ndarray, shape (2, d)
-    options : PointOptions
-    error_is_known : bool
-        Whether the error of the readings is the one given; else it is about so large. With a known
-        error the weights around the root of certain readings are scaled to its mass, which 256
-        points measure.
-    seed : int
+    ``error``, (m,), is the standard deviation of the emulation's error. A specimen without a root,
+    whose readings are censored, gets points of the population. If ``error_is_known``, the error of
+    the readings is the one given, and the weights around the root of certain readings are scaled to
+    its mass, which 256 points measure; otherwise the error is approximate.
 
     Raises
     ------
