@@ -70,12 +70,16 @@ def basins(evaluator: Any, name: str, metric: str, *, guided: bool) -> tuple[Any
     labels, counts = [], []
     for theta in thetas(name, STARTS):
         search = Search(
-            evaluator, np.array([sigma, 1.0]), Method("BFGS"), prior=False, tolerance=1e-5, most=500
+            evaluator,
+            np.array([sigma, 1.0]),
+            Method("BFGS"),
+            prior=False,
+            tolerance=1e-5,
+            max_evaluations=500,
         )
         start, trace = theta, Trace()
         if guided:
-            led = approach(search, theta, np.ones(1), 0)
-            start, trace = led.theta, led.trace
+            start, trace = approach(search, theta, np.ones(1), 0, trace)
         run = settle(search, minimise(search, start, np.ones(1), trace))
         at, spread = run.best[0], np.exp(run.best[1])
         close = 0.5 < spread / sigma < 2

@@ -25,7 +25,7 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS
 from prbayes.model.evaluator import Evaluator
-from prbayes.optimize.convergence import Search, approach, minimise, settle
+from prbayes.optimize.convergence import Search, Trace, approach, minimise, settle
 from prbayes.optimize.methods import Method
 
 SIZES = (20, 50, 1000, 100_000)
@@ -77,11 +77,13 @@ def fit(base: Evaluator, data: Any, metric: str) -> tuple[float, float, bool]:
         ev = base.observing({"y": data}, METRICS[metric])
     except ValueError:
         return np.nan, np.nan, False
-    search = Search(ev, np.array([1.0, 1.0]), Method(), prior=False, tolerance=1e-6, most=3000)
+    search = Search(
+        ev, np.array([1.0, 1.0]), Method(), prior=False, tolerance=1e-6, max_evaluations=3000
+    )
     start = ev.hyperparameters.unconstrained({"mu": float(np.median(data)) + 0.3, "sigma": 1.5})
-    led = approach(search, start, np.ones(1), 0)
-    run = settle(search, minimise(search, led.theta, np.ones(1), led.trace))
-    return float(run.best[0]), float(np.exp(run.best[1])), run.success
+    theta, trace = approach(search, start, np.ones(1), 0, Trace())
+    run = settle(search, minimise(search, theta, np.ones(1), trace))
+    return float(run.best[0]), float(np.exp(run.best[1])), run.result.converged
 
 
 def families(base: Evaluator, seeds: int) -> dict[str, Any]:

@@ -117,7 +117,7 @@ def evaluations() -> dict[str, Any]:
             model = smooth_model(SYSTEMS[name], configured, observed(name), prb.Resimulated(4096))
             optimum = prb.minimize(model, start=start)
             assert optimum.converged
-            out[name][metric] = optimum.n_evaluations
+            out[name][metric] = optimum.search.n_evaluations
         print(f"{name:12s} " + " ".join(f"{n:15d}" for n in out[name].values()), flush=True)
     return out
 
@@ -168,7 +168,7 @@ def against_plain(repeats: int) -> dict[str, Any]:
     print(
         f"\n{'linear, PR':42s} {'seconds':>9s} {'evaluations':>12s} {'error, standard errors':>23s}"
     )
-    print(f"{'prb.minimize, 4096 Sobol points':42s} {ours['seconds']:9.2f} {optimum.n_evaluations:12d} "
+    print(f"{'prb.minimize, 4096 Sobol points':42s} {ours['seconds']:9.2f} {optimum.search.n_evaluations:12d} "
           f"{ours['error']:23.4f}", flush=True)  # fmt: skip
     out: dict[str, Any] = {"prbayes": ours}
     for n in (1000, 10_000):

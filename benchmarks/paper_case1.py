@@ -64,7 +64,7 @@ def fits(
     ev.total = remembered(ev.total)
     out = {}
     for name, method in METHODS.items():
-        search = Search(ev, scale, method, prior=False, tolerance=1e-6, most=2000)
+        search = Search(ev, scale, method, prior=False, tolerance=1e-6, max_evaluations=2000)
         theta = ev.unconstrained({"mu": initial[0], "sigma": initial[1]})
         run = minimise(search, theta, np.ones(1), Trace())
         walked = len(run.trace.values)
@@ -74,7 +74,7 @@ def fits(
             float(point["mu"][0]),
             float(point["sigma"][0]),
             len(run.trace.values),
-            float(run.success),
+            float(run.result.converged),
         ]
         out[name].append(walked)
     return out

@@ -78,7 +78,7 @@ def packages(maximum: float, base: int) -> tuple[int, float, float]:
             "y", lambda x: x, x, metric=metric, observed=data, propagation=prb.Resimulated(4096)
         )
     optimum = prb.minimize(start={"mu": 12 * sd, "sigma": 1.5 * sd}, model=model)
-    return optimum.n_evaluations, optimum.point["mu"] / sd, optimum.point["sigma"] / sd
+    return optimum.search.n_evaluations, optimum.point["mu"] / sd, optimum.point["sigma"] / sd
 
 
 def main() -> None:

@@ -139,7 +139,9 @@ def main():
         store = arguments.store or temporary
         model, optimum, posterior = calibrate(plate, measured, threads, store)
     print(optimum.message)
-    print(f"{optimum.n_computed} runs of the calibration, {MEASURED} for the measured plates")
+    print(
+        f"{optimum.search.n_computed} runs of the calibration, {MEASURED} for the measured plates"
+    )
     print(f"{'':10} {'truth':>8} {'these plates':>13} {'optimum':>17} {'posterior':>17}")
     for (name, true), value in zip(
         TRUTH.items(),

@@ -82,7 +82,7 @@ def main():
             found = np.array([optimum.point["mu"], optimum.point["sigma"]])
             error = 100 * np.abs(found / truth - 1)
             row = f"{found[0]:8.4f} {error[0]:8.2f} {found[1]:8.4f} {error[1]:8.2f}"
-            row += f" {optimum.n_evaluations:12d}"
+            row += f" {optimum.search.n_evaluations:12d}"
             print(
                 f"{name:12s} {label:15s} {row}"
                 f"{'' if optimum.converged else '  ' + optimum.message}",

@@ -17,7 +17,7 @@ from prbayes._validate import Floats
 from prbayes.inference.refits import SamplingDistribution, refit, sampling_of_functions
 from prbayes.inference.resampling import DataSets
 from prbayes.model.evaluator import Evaluator
-from prbayes.optimize.solution import point_and_stderr
+from prbayes.optimize.optimum import point_and_stderr
 
 MEAN = np.array([1.0, 2.0])
 SDS = np.array([1.0, 0.7])

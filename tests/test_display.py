@@ -33,7 +33,7 @@ def test_an_optimum_is_a_table() -> None:
     optimum = prb.minimize(build())
     text = optimum._repr_html_()
     assert ">mu</th>" in text
-    assert f"{optimum.n_evaluations} evaluations" in text
+    assert f"{optimum.search.n_evaluations} evaluations" in text
     assert "standard error" in text
     assert "0.0% of specimens fail" not in repr(optimum)
 

@@ -18,7 +18,7 @@ import prbayes as prb
 from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.random_variable import nodes
-from prbayes.optimize.design_refinement import _add
+from prbayes.optimize.design_refinement import _add_runs
 from prbayes.plots.population import margins, select_margins
 from prbayes.response.compile import PLAIN
 
@@ -72,7 +72,7 @@ def test_all_groups_are_of_one_design() -> None:
     first, second = (node.bound for node in evaluator.nodes)
     assert first.same_points(second)
     # It grows for the populations of both at the same points.
-    _add(evaluator, evaluator.hyperparameters.prior_thetas(64, 1), {"y[Busch]"})
+    _add_runs(evaluator, evaluator.hyperparameters.prior_thetas(64, 1), {"y[Busch]"})
     assert calls == before + 512
     assert n_design_runs(evaluator) == evaluator.n_responses == 512
     assert first.same_points(second)

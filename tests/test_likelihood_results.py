@@ -434,8 +434,8 @@ def test_plots(problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree) -
     ]
     assert all(list(collection.viz.children) for collection in shown)
     # The path is that of the descent that found the optimum.
-    assert np.isfinite(optimum.trace["discrepancy"][-1])
-    np.testing.assert_allclose(optimum.trace["theta"][-1], optimum.theta, atol=1e-3)
+    assert np.isfinite(optimum.search.trace["discrepancy"][-1])
+    np.testing.assert_allclose(optimum.search.trace["theta"][-1], optimum.theta, atol=1e-3)
 
 
 @pytest.mark.long

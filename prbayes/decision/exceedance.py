@@ -176,40 +176,38 @@ def exceedance(
     errors = np.array([estimate.error for estimate in estimates])
     bounds = [int(means.argmin()), int(means.argmax())]
     _warn_of_large_error(response, means[bounds], errors[bounds], points)
-    attrs = {
-        "prob": prob,
-        "limit": limit,
-        "below": int(below),
-        "responses": sum(estimate.responses for estimate in estimates),
-        "source": estimates[0].source,
-        "random_seed": str(seed),
-        **populations.provenance(),
-    }
-    data: dict[str, Any]
-    if len(grid) == 1:
-        coords = {}
-        data = {
-            "probability": means[0],
-            "error": errors[0],
-            "by_draw": ("draw", by_draw[0]),
-        }
-    else:
-        coords = {"bound": ["lower", "upper"]}
-        data = {
+    table = xr.Dataset(
+        {
             "probability": ("bound", means[bounds]),
             "error": ("bound", errors[bounds]),
             "by_draw": (["bound", "draw"], by_draw[bounds]),
-        }
-        attrs["at"] = [interval_values(inputs, grid[bound]) for bound in bounds]
-    data |= {"lower": low.min(), "upper": high.max()}
+            "lower": low.min(),
+            "upper": high.max(),
+        },
+        coords={"bound": ["lower", "upper"]},
+        attrs={
+            "prob": prob,
+            "limit": limit,
+            "below": int(below),
+            "responses": sum(estimate.responses for estimate in estimates),
+            "source": estimates[0].source,
+            "random_seed": str(seed),
+            **populations.provenance(),
+        },
+    )
+    if len(grid) == 1:
+        table = table.isel(bound=0, drop=True)
+    else:
+        table.attrs["at"] = [interval_values(inputs, grid[bound]) for bound in bounds]
     if requirement is not None:
-        verdict = "not decided"
-        if data["upper"] <= requirement:
-            verdict = "met"
-        elif data["lower"] > requirement:
-            verdict = "not met"
-        attrs |= {"requirement": requirement, "verdict": verdict}
-    return xr.Dataset(data, coords=coords, attrs=attrs)
+        table.attrs |= {"requirement": requirement, "verdict": _verdict(table, requirement)}
+    return table
+
+
+def _verdict(table: xr.Dataset, requirement: float) -> str:
+    if table["upper"] <= requirement:
+        return "met"
+    return "not met" if table["lower"] > requirement else "not decided"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,107 +1,208 @@
-"""Refinement of the designs of `Reweighted`: more points where the populations that matter live."""
+"""Refinement of the designs of `Reweighted`: points where the populations in question are."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Information, Local
-from prbayes.inference.design_error import DesignErrors
+from prbayes.inference.checks.identification import unidentified_findings
+from prbayes.inference.design_error import DesignErrors, design_error
 from prbayes.inference.identifiability import oriented
+from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.requirements import sampling_obstacle
 from prbayes.inference.resampling import families, siblings
 from prbayes.model.coverage import Shortcoming, shortcomings
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.parameters import THETAS
-from prbayes.optimize.convergence import apart_from_data, areas
+from prbayes.optimize.convergence import (
+    OVERLAP_ENOUGH,
+    Fit,
+    Search,
+    apart_from_data,
+    approach,
+    areas,
+    best_or_nearest,
+)
+from prbayes.optimize.objective import Ridge
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 
 _log = logging.getLogger("prbayes")
-# Batches added before a design is refused: by judgement; half or twice changes no answer
-# (docs/constants.md).
+# Batches after which a design is refused; half or twice changes no answer (docs/constants.md).
 MAX_ROUNDS = 8
-# Standard errors within which the optima of two independent designs are to be: a tenth adds half a
-# per cent to the width of an interval.
+# Share of it for points and for emulators: together they then have it all.
+_SHARE = np.sqrt(0.5)
+# Largest difference between optima of independent designs, in standard errors: a tenth adds half a
+# percent to the width of an interval.
 AGREE = 0.1
-# The power of its size with which the error of a design of several inputs falls, about; it only
-# says how many points are added at a time (benchmarks/dimensions.py).
-_RATE = 0.65
-# Share of that which points and emulators may have each: together they then have it all.
-_OF_EACH = np.sqrt(0.5)
-# Most by which a design grows at a time: the estimate of its error is itself uncertain.
-_GROWTH = 2.0
-# Step of a pilot, in standard deviations of the thetas kept: small against their spread, so that
-# the next ones are within reach of the design. Half or twice leads to another design, and moves an
-# optimum within that design's own error (docs/constants.md).
-_PILOT_STEP = 0.4
-# Error of an emulator, in the response's spread, from which on runs are added on the way: what is
-# minimised is then another response. By judgement, as it only leads the way.
-_UNTOLD = 0.25
-# Data sets that tell a noise floor which only says when a pilot stops, or when optima are compared.
+# Error of an emulator, in the response's spread, that makes it another response.
+_POOR_EMULATOR = 0.25
+# Data sets for noise floors that only end a pilot or compare optima.
 FEW_SETS = 50
 
 
+@dataclass(frozen=True, eq=False)
+class Restart:
+    """Where to minimise again on designs that have grown."""
+
+    theta: Floats  # (d,)
+    cloud: Floats | None
+    ridge: Ridge | None
+    alternative: Floats | None = None  # (d,): an earlier minimum, which may be better
+
+
+def refine_designs(
+    search: Search, fit: Fit, round_: int, seed: int, advance: Callable[[int, str], None]
+) -> tuple[Fit, Restart | None]:
+    """Add points where designs are too small for a fit; return it with the design's error.
+
+    The restart is None if nothing was added. Raises DesignError if designs still do not support
+    the fit after the last round.
+    """
+    evaluator = search.evaluator
+    if not evaluator.reweighted:
+        return fit, None
+    nearby = _neighbourhood(evaluator, fit, seed)
+    short = shortcomings(evaluator, nearby) or shortcomings(evaluator, fit.theta[None])
+    if short and round_ == MAX_ROUNDS:
+        # A minimiser follows what is not identified until no design supports it.
+        findings = [] if fit.local is None else unidentified_findings(evaluator, fit.local)
+        refuse(short, evaluator, findings)
+    if short:
+        return fit, _cover(search, fit, nearby, seed)
+    is_apart = apart_from_data(evaluator, fit.theta)
+    if round_ < MAX_ROUNDS and apart_from_data(evaluator, fit.theta, OVERLAP_ENOUGH):
+        # The design supports this point, but the fit is poor: continue along the area metric.
+        trace = fit.run.trace
+        theta, _ = approach(search, fit.theta, fit.scales, seed, trace, OVERLAP_ENOUGH)
+        if refine_at(evaluator, theta[None]):
+            alternative = None if is_apart else fit.theta
+            return fit, Restart(theta, fit.cloud, fit.ridge, alternative)
+    if is_apart or fit.sampling is None:
+        return fit, None
+    errors = design_error(fit.sampling)
+    fit = replace(fit, design_error=errors.whole)
+    if not errors.whole > AGREE:
+        return fit, None
+    left = runs_left(evaluator, errors)
+    note = f"error {errors.whole:.2f} standard errors, {AGREE} are wanted"
+    note += f", about {left} runs to go" if left else ", no more runs are needed"
+    previous = n_design_runs(evaluator)
+    if not grow(evaluator, nearby, errors):
+        return fit, None
+    advance(n_design_runs(evaluator) - previous, note)
+    return fit, Restart(_best_nearby(search, fit, nearby), fit.cloud, fit.ridge)
+
+
+def _neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
+    """Return thetas around a fit that designs have to support, (m, d)."""
+    hyperparameters = evaluator.hyperparameters
+    nearby = fit.cloud
+    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
+    if nearby is None or (is_emulated and fit.local is not None):
+        # Emulated samples follow the fit anywhere; runs are added around the pilot's thetas.
+        nearby = spread_around(fit.theta, fit.covariance, hyperparameters.prior_sd, seed=seed)
+    if fit.ridge is not None and fit.local is not None:
+        nearby = spread_along(fit.theta, fit.local, seed=seed)
+    return np.asarray(nearby[hyperparameters.in_support(nearby)])
+
+
+def _cover(search: Search, fit: Fit, nearby: Floats, seed: int) -> Restart:
+    """Add points to designs that do not support a fit: a pilot first, then where it led."""
+    evaluator, cloud = search.evaluator, fit.cloud
+    if cloud is None:
+        cloud = nearby = pilot(evaluator, fit.scales, seed=seed)
+    elif (ridge := _ridge(search, fit, cloud, seed)) is not None:
+        refine_at(evaluator, ridge.center[None] if fit.ridge is None else nearby)
+        return Restart(ridge.center, cloud, ridge)
+    elif not refine_at(evaluator, nearby):
+        refine_at(evaluator, fit.theta[None])
+    return Restart(_best_nearby(search, fit, nearby), cloud, fit.ridge)
+
+
+def _best_nearby(search: Search, fit: Fit, nearby: Floats) -> Floats:
+    """Return the best theta on the grown designs: the fit may be an artefact of the smaller one."""
+    return best_or_nearest(search, np.vstack([fit.theta, nearby]), fit.scales)
+
+
+def _ridge(search: Search, fit: Fit, cloud: Floats, seed: int) -> Ridge | None:
+    """Return a penalty on directions that are not identified, or None if there are none.
+
+    Along them a minimiser follows the error of the design, which grows with the distance. The
+    penalty is the sampling noise at one spread of the prior.
+    """
+    evaluator = search.evaluator
+    hyperparameters = evaluator.hyperparameters
+
+    def noise(theta: Floats) -> float:
+        return float((noise_floors(evaluator, theta, FEW_SETS) / fit.scales).sum())
+
+    if search.prior:
+        return None
+    center = fit.theta
+    if fit.ridge is None or shortcomings(evaluator, center[None]):
+        # Of thetas that fit as well as the best, the one closest to the prior's median.
+        values = evaluator.total(cloud, fit.scales)
+        candidates = cloud[values <= values.min() + noise(cloud[np.argmin(values)])]
+        median = np.median(hyperparameters.prior_thetas(THETAS, seed), axis=0)
+        distances = (((candidates - median) / hyperparameters.prior_sd) ** 2).sum(axis=1)
+        center = np.asarray(candidates[np.argmin(distances)])
+    sampling = sampling_distribution(evaluator, center, fit.scales)
+    if sampling is None or not sampling.local.unidentified.size:
+        return None
+    return Ridge(center, sampling.local.unidentified, noise(center))
+
+
+def sampling_distribution(
+    evaluator: Evaluator, theta: Floats, scales: Floats
+) -> SamplingDistribution | None:
+    """Return the sampling distribution of the minimiser, or None if the model has none."""
+    if sampling_obstacle(evaluator) is not None:
+        return None
+    return SamplingDistribution.of(evaluator, theta, scales)
+
+
 def refine_at(
-    evaluator: Evaluator, thetas: Floats, *, beside: Floats | None = None, again: bool = False
+    evaluator: Evaluator, thetas: Floats, *, beside: Floats | None = None
 ) -> dict[str, Shortcoming]:
-    """Add one batch to each design that falls short at thetas, (P, d); return what was short.
+    """Add a batch to each design that falls short at thetas, (P, d); return what was short.
 
-    A cloud is drawn anew for them, and for those that it is to support ``beside`` them; it is
-    larger where that was done before (``again``).
-
-    Raises
-    ------
-    DesignError
-        If too many points have no response, of which more points would have no more.
+    Emulated samples are redrawn for these thetas and those ``beside`` them. Raises DesignError if
+    too many points have no response.
     """
     short = shortcomings(evaluator, thetas)
-    for name, what in short.items():
-        if what.lost is not None:
+    for name, shortcoming in short.items():
+        if shortcoming.lost is not None:
             raise DesignError(
-                f"{name}: {what}; repair the response there, return +inf for specimens that fail, "
-                "narrow the priors, or raise max_lost"
+                f"{name}: {shortcoming}; repair the response there, return +inf for specimens "
+                "that fail, narrow the priors, or raise max_lost"
             )
-    thin = set(short)
-    every = thetas if beside is None else np.concatenate([thetas, beside])
-    drawn = _widened(evaluator, every, thin) if again else _reach(evaluator, every, thin)
-    while drawn and thin:
-        thin &= set(shortcomings(evaluator, thetas))
-        drawn = _widened(evaluator, every, thin, on_the_way=True)
-    # What no cloud reaches needs runs, and so does what no emulator tells.
-    _add(evaluator, every, thin | _untold(evaluator, set(short)))
-    return short
-
-
-def _untold(evaluator: Evaluator, names: set[str]) -> set[str]:
-    """Return the designs, of those named, whose emulators say little where the last points went."""
-    found = set()
-    for name in names:
+    names = set(short)
+    nearby = thetas if beside is None else np.concatenate([thetas, beside])
+    is_drawn = _redraw_samples(evaluator, nearby, names)
+    while is_drawn and names:
+        names &= set(shortcomings(evaluator, thetas))
+        is_drawn = _enlarge_samples(evaluator, nearby, names, same_surfaces=True)
+    # Runs, where samples do not suffice or the emulator is poor.
+    for name in short:
         emulator = evaluator.reweighted[name].design.emulator
-        if emulator is not None and emulator.error > _UNTOLD:
-            found.add(name)
-    return found
+        if emulator is not None and emulator.error > _POOR_EMULATOR:
+            names.add(name)
+    _add_runs(evaluator, nearby, names)
+    return short
 
 
 def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
     """Add points to all designs until their error is expected to be small enough.
 
-    Parameters
-    ----------
-    evaluator : Evaluator
-    thetas : ndarray, shape (P, d)
-        Where the populations live that matter.
-    errors : DesignErrors
-        Differences between the optima of independent designs.
-
-    Returns
-    -------
-    bool
-        Whether any were added.
+    Returns whether any were added; ``thetas``, (P, d), are where the populations in question are.
     """
     _log.info(
         "the optima of independent designs would differ by %.2f standard errors, more than the "
@@ -109,59 +210,60 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         errors.whole,
         AGREE,
     )
-    clouds = {name for name, bound in evaluator.reweighted.items() if bound.design.is_emulated}
-    if _needs_runs(evaluator, errors):
-        names = set(evaluator.reweighted)
-        # A cloud is then drawn anew for these populations; whether that is enough is seen next.
-        if _add(evaluator, thetas, names, min(_GROWTH, _factor(errors.whole))):
-            return True
-    # Points of clouds cost no run.
-    short = clouds and errors.points > _OF_EACH * AGREE
-    return bool(short) and _widened(evaluator, thetas, clouds)
+    names = set(evaluator.reweighted)
+    # At most twice as many runs at a time: the estimate of the error is itself uncertain.
+    if _needs_runs(evaluator, errors) and _add_runs(
+        evaluator, thetas, names, min(2.0, _growth_factor(errors.whole))
+    ):
+        return True
+    emulated = {name for name in names if evaluator.reweighted[name].design.is_emulated}
+    if not emulated or not errors.points > _SHARE * AGREE:
+        return False
+    return _enlarge_samples(evaluator, thetas, emulated)
 
 
 def runs_left(evaluator: Evaluator, errors: DesignErrors) -> int:
-    """Return how many more runs are expected until designs' error is small enough."""
+    """Return how many more runs are expected until the designs' error is small enough."""
     if not _needs_runs(evaluator, errors):
         return 0
-    more = _factor(errors.whole) - 1
-    left = 0.0
-    for bound in evaluator.reweighted.values():
-        left += min(more * bound.n_runs, max(0, bound.config.most - bound.n_runs))
-    return round(left)
+    more = _growth_factor(errors.whole) - 1
+    bounds = evaluator.reweighted.values()
+    return round(sum(min(more * b.n_runs, max(0, b.config.most - b.n_runs)) for b in bounds))
 
 
 def _needs_runs(evaluator: Evaluator, errors: DesignErrors) -> bool:
-    """Return whether more runs make designs' error smaller."""
-    emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
-    return not emulated or errors.emulators > _OF_EACH * AGREE
+    """Return whether more runs reduce the designs' error."""
+    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
+    return not is_emulated or errors.emulators > _SHARE * AGREE
 
 
-def _factor(error: float) -> float:
-    """Return by how much designs have to grow for an error to become small enough."""
-    return float((error / AGREE) ** (1 / _RATE))
+def _growth_factor(error: float) -> float:
+    """Return the factor by which designs have to grow for an error to become small enough.
+
+    The error of a design of several inputs falls with about the power .65 of its size
+    (benchmarks/dimensions.py).
+    """
+    return float((error / AGREE) ** (1 / 0.65))
 
 
-def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:
-    """Add one batch to the designs named, and to those of simulators that share their specimens.
+def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:
+    """Add a batch to the designs named, and to those of simulators that share their specimens.
 
     The batch has the design's first size, or brings the whole to ``factor`` times what it was.
     Returns whether ``max_points`` left room for any.
     """
     names = siblings(evaluator.nodes, names)
-    added: list[str] = []
+    added = []
     for k, node in enumerate(evaluator.nodes):
         bound = node.reweighted
         if bound is None or node.name not in names:
             continue
-        now = bound.n_runs
-        first = bound.batch_size
-        batches = max(1, round((factor - 1) * now / first))
-        room = bound.config.most - now
-        size = min(batches * first, room)
+        previous = bound.n_runs
+        batches = max(1, round((factor - 1) * previous / bound.batch_size))
+        size = min(batches * bound.batch_size, bound.config.most - previous)
         if size > 0:
             bound.add(_components(evaluator, thetas, k), size)
-            added.append(f"{node.name} from {now} to {bound.n_runs}")
+            added.append(f"{node.name} from {previous} to {bound.n_runs}")
     if added:
         _log.info("refined: %s runs", ", ".join(added))
     return bool(added)
@@ -169,200 +271,189 @@ def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 
 
 def _components(evaluator: Evaluator, thetas: Floats, k: int) -> list[Floats]:
     """Return the populations at thetas for which a design has points: those of all its groups."""
-    own = next((family for family in families(evaluator.nodes) if k in family), [k])
-    of_each = [evaluator.roots(thetas, member) for member in own]
-    return [np.concatenate(values) for values in zip(*of_each, strict=True)]
+    members = next((family for family in families(evaluator.nodes) if k in family), [k])
+    by_member = [evaluator.roots(thetas, member) for member in members]
+    return [np.concatenate(values) for values in zip(*by_member, strict=True)]
 
 
 def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
-    """Lead a design that is far too thin from the prior to where the discrepancy is small.
+    """Move an undersampled design from the prior to where the discrepancy is small.
 
-    Each step keeps the best quarter of the thetas and, where the design is thin there, adds points
-    from their populations before it looks closer: the kept thetas are never far from its reach.
-
-    Returns
-    -------
-    ndarray, shape (256, d)
-        Thetas whose discrepancies differ by no more than sampling noise.
+    Each step keeps the best quarter of the thetas and, where the design does not support them, adds
+    points from their populations before the next step. Returns thetas, (256, d), whose
+    discrepancies differ by no more than sampling noise.
     """
     rng = np.random.default_rng(seed)
     thetas = evaluator.hyperparameters.prior_thetas(4 * THETAS, seed)
     for _ in range(2 * MAX_ROUNDS):
         # Keep the best.
-        found = evaluator(thetas)
-        total = (found.discrepancies / scales).sum(axis=-1)
-        value = total - found.log_other
-        value = np.where(np.isfinite(found.log_prior), value, np.inf)
-        order = np.argsort(value)[:THETAS]
-        apart = apart_from_data(evaluator, thetas[order[0]])
-        if apart:
-            # The discrepancy is then the same everywhere, up to rounding.
+        evaluation = evaluator(thetas)
+        values = (evaluation.discrepancies / scales).sum(axis=-1) - evaluation.log_other
+        values = np.where(np.isfinite(evaluation.log_prior), values, np.inf)
+        order = np.argsort(values)[:THETAS]
+        is_apart = apart_from_data(evaluator, thetas[order[0]])
+        if is_apart:
+            # Discrepancies are equal, up to rounding.
             order = np.argsort(areas(evaluator, scales, thetas))[:THETAS]
         best = thetas[order]
-        # Let the designs reach them.
-        thin = _thin(evaluator, best)
-        _reach(evaluator, best, thin, on_the_way=True)
-        growing = {name for name in thin if _has_room(evaluator.reweighted[name])}
-        _add(evaluator, best, growing)
-        # Stop where sampling explains the differences that are left.
-        spread = value[order[-1]] - value[order[0]]
+        # Extend the designs to them.
+        names = _undersampled(evaluator, best)
+        _redraw_samples(evaluator, best, names, same_surfaces=True)
+        _add_runs(
+            evaluator, best, {name for name in names if _has_room(evaluator.reweighted[name])}
+        )
+        # Stop where sampling explains the remaining differences.
+        spread = values[order[-1]] - values[order[0]]
         noise = sum(noise_floors(evaluator, best[0], FEW_SETS) / scales)
-        if not (thin or apart) and spread < noise:
+        if not (names or is_apart) and spread < noise:
             break
-        # Step on, from each of them at random.
+        # Random steps, small against the spread, so that the design almost covers the next thetas.
         covariance = np.atleast_2d(np.cov(best, rowvar=False))
-        # A share of each variance is added, so that there is a root.
-        share = 1e-12 * np.diag(np.diag(covariance))
-        root = np.linalg.cholesky(covariance + share)
-        chosen = rng.integers(len(best), size=4 * THETAS)
-        parents = best[chosen]
+        jitter = 1e-12 * np.diag(np.diag(covariance))
+        root = np.linalg.cholesky(covariance + jitter)
+        parents = best[rng.integers(len(best), size=4 * THETAS)]
         z = rng.standard_normal(parents.shape)
-        thetas = parents + _PILOT_STEP * z @ root.T
+        thetas = parents + 0.4 * z @ root.T
     return best
 
 
-def _clouds(evaluator: Evaluator, names: set[str]) -> Iterator[tuple[int, ReweightedBound]]:
-    """Yield designs with a cloud, by position of their simulators, of those named.
-
-    And of those that share their specimens, whose points stay the same ones.
-    """
-    together = siblings(evaluator.nodes, names)
-    for k, node in enumerate(evaluator.nodes):
-        bound = node.reweighted
-        if bound is not None and bound.design.is_emulated and node.name in together:
-            yield k, bound
-
-
-def _reach(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool = False
-) -> bool:
-    """Let clouds reach the populations at thetas; return whether there are any."""
-    clouds = list(_clouds(evaluator, names))
-    for k, bound in clouds:
-        bound.reach(_components(evaluator, thetas, k), same_surfaces=on_the_way)
-    return bool(clouds)
-
-
-@contextmanager
-def reached(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
-    """Let clouds of a model that was never calibrated reach the populations at thetas, inside.
-
-    They know the prior alone, and are thin around what was found by another process.
-    """
-    bounds = evaluator.reweighted.items()
-    names = {name for name, bound in bounds if len(bound.design.groups) == 1}
-    with _reaching(evaluator, thetas, names, on_the_way=False):
-        yield
-
-
-@contextmanager
-def visited(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
-    """Let clouds reach the populations at thetas, inside, with the emulators that they have."""
-    with _reaching(evaluator, thetas, set(evaluator.reweighted), on_the_way=True):
-        yield
-
-
-@contextmanager
-def _reaching(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool
-) -> Iterator[None]:
-    """Let clouds of the designs named reach populations, and bring them back afterwards."""
-    with designs_restored([bound for _, bound in _clouds(evaluator, names)]):
-        _reach(evaluator, thetas, names, on_the_way=on_the_way)
-        yield
-
-
-def _widened(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool = False
-) -> bool:
-    """Draw larger clouds for the populations at thetas; return whether any could be."""
-    grown = False
-    for k, bound in _clouds(evaluator, names):
-        grown |= bound.widen(_components(evaluator, thetas, k), same_surfaces=on_the_way)
-    return grown
-
-
 def _has_room(bound: ReweightedBound) -> bool:
-    """Return whether runs are added to a design on the way: a cloud needs none."""
+    """Return whether a pilot adds runs to a design: emulated samples need none."""
     return not bound.design.is_emulated and len(bound.design.batch_sizes) <= MAX_ROUNDS
 
 
-def _thin(evaluator: Evaluator, thetas: Floats) -> set[str]:
-    """Return the designs that reach fewer than half of the populations at thetas."""
-    names = set()
-    for name, support in evaluator.support(thetas).items():
-        if np.median(support["weight_ess"]) < evaluator.reweighted[name].required_ess:
-            names.add(name)
-    return names
+def _undersampled(evaluator: Evaluator, thetas: Floats) -> set[str]:
+    """Return the designs that support fewer than half of the populations at thetas."""
+    return {
+        name
+        for name, support in evaluator.support(thetas).items()
+        if np.median(support["weight_ess"]) < evaluator.reweighted[name].required_ess
+    }
+
+
+# -- emulated samples ------------------------------------------------------------------------------
+
+
+def _emulated_designs(evaluator: Evaluator, names: set[str]) -> list[tuple[int, ReweightedBound]]:
+    """Return designs with emulated samples, by position of their simulators.
+
+    Those named, and those of simulators that share their specimens.
+    """
+    names = siblings(evaluator.nodes, names)
+    return [
+        (k, node.reweighted)
+        for k, node in enumerate(evaluator.nodes)
+        if node.reweighted is not None and node.reweighted.design.is_emulated and node.name in names
+    ]
+
+
+def _redraw_samples(
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool = False
+) -> bool:
+    """Redraw emulated samples for the populations at thetas; return whether there are any."""
+    bounds = _emulated_designs(evaluator, names)
+    for k, bound in bounds:
+        bound.reach(_components(evaluator, thetas, k), same_surfaces=same_surfaces)
+    return bool(bounds)
+
+
+def _enlarge_samples(
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool = False
+) -> bool:
+    """Draw larger samples for the populations at thetas; return whether any could be."""
+    is_larger = False
+    for k, bound in _emulated_designs(evaluator, names):
+        is_larger |= bound.widen(_components(evaluator, thetas, k), same_surfaces=same_surfaces)
+    return is_larger
+
+
+@contextmanager
+def temporary_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
+    """Redraw emulated samples for the populations at thetas within the context."""
+    with _temporary_samples(evaluator, thetas, set(evaluator.reweighted), same_surfaces=True):
+        yield
+
+
+@contextmanager
+def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
+    """Do the same in designs of a model that was never calibrated, which cover the prior alone."""
+    bounds = evaluator.reweighted.items()
+    names = {name for name, bound in bounds if len(bound.design.groups) == 1}
+    with _temporary_samples(evaluator, thetas, names, same_surfaces=False):
+        yield
+
+
+@contextmanager
+def _temporary_samples(
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool
+) -> Iterator[None]:
+    with designs_restored([bound for _, bound in _emulated_designs(evaluator, names)]):
+        _redraw_samples(evaluator, thetas, names, same_surfaces=same_surfaces)
+        yield
+
+
+# -- noise, refusals, neighbourhoods ---------------------------------------------------------------
 
 
 def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
     """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
-    floors = []
-    for k in range(len(evaluator.nodes)):
-        information = Information(evaluator, k, theta, n_sets=n_sets)
-        floors.append(information.noise_floor)
-    return np.array(floors)
+    nodes = range(len(evaluator.nodes))
+    return np.array([Information(evaluator, k, theta, n_sets=n_sets).noise_floor for k in nodes])
 
 
 def refuse(
     short: Mapping[str, Shortcoming], evaluator: Evaluator, findings: Iterable[Finding] = ()
 ) -> None:
-    """Raise for designs that still fall short, with what else is known of where they do."""
+    """Raise for designs that still fall short, with findings about the place."""
     if not short:
         return
-    what = "; ".join(
+    reasons = "; ".join(
         f"{name}: the design does not support the answer: {s}" for name, s in short.items()
     )
     bound = evaluator.reweighted[next(iter(short))]
-    known = "".join(f". {finding}" for finding in findings)
     raise DesignError(
-        f"{what}; narrow the priors, pass a larger prb.Reweighted(n) (now {bound.n_runs} runs "
+        f"{reasons}; narrow the priors, pass a larger prb.Reweighted(n) (now {bound.n_runs} runs "
         f"in all, of at most {bound.config.most}), or use prb.Resimulated(n), which has no design"
-        f"{known}"
+        + "".join(f". {finding}" for finding in findings)
     )
 
 
 def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
-    """Raise where too much of a population, of shares by simulator, has no response.
-
-    Of designs, refinement says it.
-    """
+    """Raise if too much of a population, by simulator without a design, has no response."""
     for node in evaluator.nodes:
         share = lost.get(node.name, 0.0)
-        most = node.bound.max_lost
-        if node.reweighted is None and share > most:
+        limit = node.bound.max_lost
+        if node.reweighted is None and share > limit:
             raise DesignError(
                 f"{node.name}: lost mass: got {share:.1%} of the population without a response "
-                f"(NaN) at the answer, expected at most max_lost = {most:.1%}: it would rest on "
+                f"(NaN) at the answer, expected at most max_lost = {limit:.1%}: it would rest on "
                 "the specimens that have one; repair the response, return +inf for specimens that "
                 "fail, or pass a larger max_lost to the propagation"
             )
 
 
 def spread_around(center: Floats, covariance: Floats, prior_sd: Floats, *, seed: int = 0) -> Floats:
-    """Return thetas around an optimum, from a normal with its covariance, no wider than the prior.
+    """Return normal thetas around an optimum with its covariance, (256, d).
 
-    Along elements of which nothing is known they are as wide as the prior.
+    They are no wider than the prior, and as wide along elements whose variance is not known.
     """
-    unit = np.outer(prior_sd, prior_sd)
-    relative = np.where(np.isfinite(covariance), covariance / unit, 0.0)
-    known = np.isfinite(np.diag(covariance))
-    variances = np.where(known, np.diag(relative), 1.0)
-    np.fill_diagonal(relative, variances)
+    relative = np.where(np.isfinite(covariance), covariance / np.outer(prior_sd, prior_sd), 0.0)
+    is_known = np.isfinite(np.diag(covariance))
+    np.fill_diagonal(relative, np.where(is_known, np.diag(relative), 1.0))
     values, vectors = np.linalg.eigh(relative)
-    sd = np.sqrt(np.clip(values, 0, 1))
-    rng = np.random.default_rng(seed)
-    z = rng.standard_normal((THETAS, center.size))
-    steps = (z * sd) @ oriented(vectors).T
-    return np.asarray(center + steps * prior_sd)
+    return np.asarray(center + _normal_steps(values, vectors, seed) * prior_sd)
 
 
 def spread_along(center: Floats, local: Local, *, seed: int = 0) -> Floats:
     """Return thetas around an optimum along the directions that the data identify, (256, d)."""
     values, vectors = np.linalg.eigh(local.covariance)
-    sd = np.sqrt(np.clip(values, 0, 1))
-    rng = np.random.default_rng(seed)
-    z = rng.standard_normal((THETAS, sd.size))
-    steps = (z * sd) @ oriented(local.identified @ vectors).T
-    return np.asarray(center + steps * local.prior_sd)
+    return np.asarray(
+        center + _normal_steps(values, local.identified @ vectors, seed) * local.prior_sd
+    )
+
+
+def _normal_steps(variances: Floats, axes: Floats, seed: int) -> Floats:
+    """Return normal vectors with at most unit variances along axes, (256, d)."""
+    sd = np.sqrt(np.clip(variances, 0, 1))
+    z = np.random.default_rng(seed).standard_normal((THETAS, sd.size))
+    return np.asarray((z * sd) @ oriented(axes).T)

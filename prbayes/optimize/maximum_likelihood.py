@@ -21,51 +21,42 @@ from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_preparation import prepared
-from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.optimum import Optimum, plain
+from prbayes.optimize.convergence import Result
+from prbayes.optimize.optimum import (
+    Optimum,
+    SearchRecord,
+    n_computed,
+    point_and_stderr,
+    point_at,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class LocalOptimum:
-    """A local minimum of minus the log-likelihood, or of minus the log-posterior.
+    """A local minimum of minus the log-likelihood, or of minus the log-posterior."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (d,)
-        In unconstrained space.
-    value : float
-    covariance : ndarray, shape (d, d)
-        Inverse Hessian; infinite along directions without curvature, NaN at the edge of a support.
-    converged : bool
-    steps : slice
-        Its evaluations of the objective, without those of the Hessian.
-    """
-
-    theta: Floats
+    theta: Floats  # (d,)
     value: float
+    # (d, d): inverse Hessian; infinite along directions without curvature, NaN at the edge of a
+    # support.
     covariance: Floats
     converged: bool
-    steps: slice = slice(0)
+    steps: slice = slice(0)  # of the objective's trace, without those of the Hessian
 
 
-def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
-    """Return the maximum of the likelihood, times the prior where that is asked for.
+def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
+    """Return the maximum of the likelihood, or of the posterior density with ``settings.prior``.
 
-    Parameters
-    ----------
-    evaluator : Evaluator
-        Of a model without a metric of distributions.
-    options : Minimisation
-        ``start``, ``prior``, ``tolerance``, ``max_evaluations``, ``starts`` and ``random_seed``.
+    The model has no metric of distributions; ``settings`` is a `Minimisation`.
     """
     clock = time.perf_counter()
-    before = evaluator.n_responses
-    objective = _Objective(evaluator, options.prior)
-    starts, screened = _starts(evaluator, options)
+    n_previous = evaluator.n_responses
+    objective = _Objective(evaluator, settings.prior)
+    starts, n_screened = _starts(evaluator, settings)
     optima = []
     for start in starts:
-        optima.append(_descend(objective, start, options))
-        if objective.count > options.max_evaluations:
+        optima.append(_descend(objective, start, settings))
+        if objective.count > settings.max_evaluations:
             break
     # Points of specimens have a Monte Carlo error, with which a ridge has ripples.
     errors = [
@@ -73,14 +64,14 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
     ]
     modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
     best = modes[0]
-    point, stderr = _in_units(evaluator, best.theta, best.covariance)
+    point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
     ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
+    weights = _posterior_weights(evaluator, modes, with_prior=settings.prior)
     findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
-    weights = _posterior_weights(evaluator, modes, with_prior=options.prior)
     findings += report(*_findings(evaluator, modes, weights, ends))
     rivals = tuple(
         {
-            "point": _in_units(evaluator, mode.theta, mode.covariance)[0],
+            "point": point_at(evaluator, mode.theta),
             "discrepancy": mode.value,
             "theta": mode.theta,
             "comparable": mode.value - best.value < 6.0,
@@ -88,31 +79,33 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         }
         for mode, weight in zip(modes[1:], weights[1:], strict=True)
     )
-    values = specimen_log_likelihoods(evaluator, best.theta[None])
-    identified = np.isfinite(best.covariance).all()
-    message = "Converged: " if best.converged else "Not converged: "
-    message += f"{len(modes)} local optimum(s) from {len(starts)} starts."
+    log_likelihoods = specimen_log_likelihoods(evaluator, best.theta[None])
+    # The covariance is NaN at the edge of a support.
+    is_converged = best.converged and not np.isnan(best.covariance).any()
     return Optimum(
         point=point,
-        discrepancy=best.value,
-        discrepancies={name: -float(v.sum()) for name, v in values.items()},
-        scales=dict.fromkeys(values, 1.0),
-        n_evaluations=objective.count,
-        n_screened=screened,
-        n_responses=evaluator.n_responses - before,
-        converged=best.converged and bool(identified or np.isinf(best.covariance).any()),
-        message=message,
         stderr=stderr,
-        covariance=best.covariance,
         theta=best.theta,
+        covariance=best.covariance,
         names=evaluator.hyperparameters.names,
         evaluator=evaluator,
-        trace=objective.trace(best.steps),
-        seconds=time.perf_counter() - clock,
+        discrepancy=best.value,
+        discrepancies={name: -float(v.sum()) for name, v in log_likelihoods.items()},
+        scales=dict.fromkeys(log_likelihoods, 1.0),
+        n_responses=evaluator.n_responses - n_previous,
+        prior=settings.prior,
+        identity=identity_of(evaluator, prior_minimised=settings.prior),
+        search=SearchRecord(
+            result=Result.CONVERGED if is_converged else Result.FAILED,
+            details=f"{len(modes)} local optimum(s) from {len(starts)} starts.",
+            n_evaluations=objective.count,
+            n_screened=n_screened,
+            n_computed=n_computed(evaluator),
+            seconds=time.perf_counter() - clock,
+            trace=objective.trace(best.steps),
+        ),
         rivals=rivals,
         findings=tuple(findings),
-        prior=options.prior,
-        identity=identity_of(evaluator, prior_minimised=options.prior),
     )
 
 
@@ -131,14 +124,8 @@ def mode_weights(
 ) -> Floats:
     """Return the share of each mode in the posterior's mass, by Laplace's approximation.
 
-    Parameters
-    ----------
-    modes : list of LocalOptimum
-    log_prior : ndarray, shape (M,), optional
-        Log-density of the prior at each mode, in unconstrained space; none by default, as where
-        the optima are those of the posterior.
-    prior_sd : ndarray, shape (d,), optional
-        Spread of the prior, which bounds the mass along directions that the data do not identify.
+    ``log_prior``, (M,), is added to optima of the likelihood. ``prior_sd``, (d,), bounds the mass
+    along directions that the data do not identify.
     """
     logs = np.array([-mode.value for mode in modes])
     if log_prior is not None:
@@ -147,33 +134,36 @@ def mode_weights(
         covariance = mode.covariance
         if np.isnan(covariance).any():
             continue
-        open_directions = np.isinf(np.diag(covariance))
+        is_unidentified = np.isinf(np.diag(covariance))
         covariance = np.where(np.isinf(covariance), 0.0, covariance)
         if prior_sd is not None:
-            covariance = covariance + 1e6 * np.diag(open_directions * prior_sd**2)
+            covariance = covariance + 1e6 * np.diag(is_unidentified * prior_sd**2)
             precision = np.linalg.inv(covariance) + np.diag(prior_sd**-2.0)
             logs[k] -= np.linalg.slogdet(precision)[1] / 2
-        elif not open_directions.any():
+        elif not is_unidentified.any():
             sign, log_det = np.linalg.slogdet(covariance)
             logs[k] += log_det / 2 if sign > 0 else 0.0
-    shares = np.exp(logs - logs.max())
-    return np.asarray(shares / shares.sum())
+    weights = np.exp(logs - logs.max())
+    return np.asarray(weights / weights.sum())
 
 
 class _Objective:
-    """Minus the log-likelihood in standardised parameters, with a trace of its evaluations."""
+    """Minus the log-likelihood or log-posterior, with a trace of its evaluations."""
 
     def __init__(self, evaluator: Evaluator, prior: bool) -> None:
         self.function = evaluator.objective(prior=prior, gradient=True)
         self.unit = evaluator.hyperparameters.prior_sd
-        self.count = 0
         self.thetas: list[Floats] = []
         self.values: list[float] = []
 
+    @property
+    def count(self) -> int:
+        """Number of evaluations."""
+        return len(self.values)
+
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
-        """Return value and gradient in unconstrained space; +inf outside the support."""
+        """Return value and gradient at theta; +inf outside the support."""
         value, gradient = self.function(theta, np.empty(0))
-        self.count += 1
         value = float(value) if np.isfinite(value) else np.inf
         self.thetas.append(theta.copy())
         self.values.append(value)
@@ -188,115 +178,112 @@ class _Objective:
         }
 
 
-def _starts(
-    evaluator: Evaluator, options: Any, screened: int = 1024, descents: int = 8
-) -> tuple[list[Floats], int]:
-    """Return the given start, or the most likely points of the prior, and the number screened."""
-    if options.start is not None:
-        return [evaluator.hyperparameters.unconstrained(options.start)], 0
-    thetas = evaluator.hyperparameters.prior_points(screened, options.random_seed)
+def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
+    """Return the user's start, or likely points of the prior, and the number screened."""
+    hyperparameters = evaluator.hyperparameters
+    if settings.start is not None:
+        return [hyperparameters.unconstrained(settings.start)], 0
+    n_screened = 1024
+    thetas = hyperparameters.prior_points(n_screened, settings.random_seed)
     values = evaluator.total(thetas, np.empty(0))
     order = np.argsort(values, kind="stable")
-    count = descents if options.starts is None else max(1, options.starts)
     order = order[np.isfinite(values[order])]
     if not order.size:
-        return [evaluator.hyperparameters.initial], screened
-    # The best one, and of the better quarter those farthest from all chosen before.
-    candidates = thetas[order[: max(count, order.size // 4)]] / evaluator.hyperparameters.prior_sd
-    chosen = [0]
+        return [hyperparameters.initial], n_screened
+    # The best one, and of the better quarter always the one farthest from all selected ones.
+    n_starts = 8 if settings.starts is None else max(1, settings.starts)
+    candidates = thetas[order[: max(n_starts, order.size // 4)]] / hyperparameters.prior_sd
+    selected = [0]
     distance = ((candidates - candidates[0]) ** 2).sum(axis=1)
-    while len(chosen) < min(count, len(candidates)):
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1))
-    return list(candidates[chosen] * evaluator.hyperparameters.prior_sd), screened
+    while len(selected) < min(n_starts, len(candidates)):
+        selected.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, ((candidates - candidates[selected[-1]]) ** 2).sum(axis=1))
+    return list(candidates[selected] * hyperparameters.prior_sd), n_screened
 
 
-def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum:
-    """Return the local minimum that BFGS finds, with its inverse Hessian."""
+def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimum:
+    """Return the local minimum that BFGS reaches, with its inverse Hessian."""
     from scipy.optimize import minimize
 
-    unit = objective.unit
-    first = objective.count
+    unit, first = objective.unit, objective.count
 
     def standardised(u: Floats) -> tuple[float, Floats]:
         value, gradient = objective(u * unit)
         return value, gradient * unit
 
-    left = max(10, options.max_evaluations - objective.count)
+    remaining = max(10, settings.max_evaluations - objective.count)
     result = minimize(
         standardised,
         start / unit,
         jac=True,
         method="BFGS",
-        options={"gtol": options.tolerance * 100, "maxiter": left},
+        options={"gtol": settings.tolerance * 100, "maxiter": remaining},
     )
     theta = np.asarray(result.x) * unit
     value, _ = objective(theta)
     if not result.success and np.isfinite(value):
-        # A support whose end moves has its optimum at a jump: without gradients from there.
+        # The optimum of a moving support is at a jump: continue without gradients.
         simplex = minimize(
             lambda u: objective(u * unit)[0],
             theta / unit,
             method="Nelder-Mead",
-            options={"maxfev": min(left, 200 * theta.size), "xatol": 1e-8, "fatol": 1e-8},
+            options={"maxfev": min(remaining, 200 * theta.size), "xatol": 1e-8, "fatol": 1e-8},
         )
         if simplex.fun < value - 1e-6:
             theta = np.asarray(simplex.x) * unit
             value, _ = objective(theta)
     steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
-    return LocalOptimum(
-        theta=theta,
-        value=value,
-        covariance=covariance,
-        converged=bool(slope < 0.05),
-        steps=steps,
-    )
+    return LocalOptimum(theta, value, covariance, bool(slope < 0.05), steps)
 
 
 def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, float]:
     """Return the inverse Hessian, and the gradient in standard errors.
 
-    By central differences of the gradient, with steps of a hundredth of a standard error. Infinite
-    along directions without curvature; NaN where the log-likelihood jumps.
+    Infinite along directions without curvature; NaN where the log-likelihood jumps.
     """
-    d = theta.size
-    unknown = np.full((d, d), np.nan)
-    step = 1e-3 * objective.unit
-    hessian = unknown
-    for _ in range(3):
-        rows = []
-        for j in range(d):
-            shift = np.eye(d)[j] * step
-            (ahead, up), (behind, down) = objective(theta + shift), objective(theta - shift)
-            if not (np.isfinite(ahead) and np.isfinite(behind)):
-                return unknown, np.inf
-            rows.append((up - down) / (2 * step[j]))
-        hessian = (np.array(rows) + np.array(rows).T) / 2
-        curvature = np.maximum(np.diag(hessian), 1e-4 / objective.unit**2)
-        new = 0.01 / np.sqrt(curvature)
-        if np.all((new / step < 10) & (step / new < 10)):
-            break
-        step = new
-    # In units of the prior.
-    unit = objective.unit
+    unit, unknown = objective.unit, np.full((theta.size, theta.size), np.nan)
+    hessian = _hessian(objective, theta)
+    if hessian is None:
+        return unknown, np.inf
     values, vectors = np.linalg.eigh(hessian * np.outer(unit, unit))
     if values.min() < -1e-3 * max(values.max(), 1.0):
         return unknown, np.inf
-    # Less curvature than the prior's would have is none that data identify.
+    # A curvature below a twenty-fifth of the prior's identifies nothing.
     is_flat = values < 1.0 / 25
     inverse = np.where(is_flat, 0.0, 1 / np.where(is_flat, 1.0, values))
     covariance = (vectors * inverse) @ vectors.T
-    # Along directions without curvature in units of the prior: a slope there is no optimum.
+    # In units of the prior along flat directions: with a slope there it is no optimum.
     _, gradient = objective(theta)
     along = vectors.T @ (gradient * unit)
     slope = float(np.sqrt((along**2 * np.where(is_flat, 1.0, inverse)).sum()))
     covariance = covariance * np.outer(unit, unit)
-    touched = (np.abs(vectors[:, is_flat]) > 1e-3).any(axis=1)
-    covariance[touched, :] = np.where(touched, np.inf, covariance[touched, :])
-    covariance[:, touched] = np.where(touched[:, None], np.inf, covariance[:, touched])
-    covariance[touched, touched] = np.inf
+    is_touched = (np.abs(vectors[:, is_flat]) > 1e-3).any(axis=1)
+    covariance[np.ix_(is_touched, is_touched)] = np.inf
     return covariance, slope
+
+
+def _hessian(objective: _Objective, theta: Floats) -> Floats | None:
+    """Return central differences of the gradient, or None where the objective is not finite.
+
+    The steps are a hundredth of a standard error.
+    """
+    step = 1e-3 * objective.unit
+    hessian = None
+    for _ in range(3):
+        rows = []
+        for j, shift in enumerate(np.diag(step)):
+            (ahead, up), (behind, down) = objective(theta + shift), objective(theta - shift)
+            if not (np.isfinite(ahead) and np.isfinite(behind)):
+                return None
+            rows.append((up - down) / (2 * step[j]))
+        hessian = (np.array(rows) + np.array(rows).T) / 2
+        curvature = np.maximum(np.diag(hessian), 1e-4 / objective.unit**2)
+        better_step = 0.01 / np.sqrt(curvature)
+        if np.all((better_step / step < 10) & (step / better_step < 10)):
+            break
+        step = better_step
+    return hessian
 
 
 def _distinct(
@@ -313,8 +300,8 @@ def _distinct(
     for optimum in ordered[1:]:
         if optimum.value > ordered[0].value + 30 or not optimum.converged:
             continue
-        away = [np.abs((optimum.theta - mode.theta) / objective.unit).max() for mode in modes]
-        if min(away) > 0.01 and not any(
+        distances = [np.abs((optimum.theta - mode.theta) / objective.unit).max() for mode in modes]
+        if min(distances) > 0.01 and not any(
             share_mode(objective, objective.unit, mode, optimum, error) for mode in modes
         ):
             modes.append(optimum)
@@ -326,29 +313,19 @@ def share_mode(
     unit: Floats,
     first: LocalOptimum,
     second: LocalOptimum,
-    largest: float,
+    barrier: float,
 ) -> bool:
-    """Return whether two optima are of one mode: no barrier lies between them.
+    """Return whether two optima are of one mode: no barrier in nats lies between them.
 
-    The barrier is that of the profile along the straight line between the optima: the smallest
-    value across the line, in units of the prior. So a ridge, straight or curved, is one mode.
-
-    Parameters
-    ----------
-    objective : callable
-        Theta (d,) -> value and gradient.
-    unit : ndarray, shape (d,)
-        Unit of each parameter.
-    first, second : LocalOptimum
-    largest : float
-        Height above the higher optimum, in nats, from which on it is a barrier.
+    The profile along the straight line between the optima has the smallest value across the line,
+    in units of the prior. So a ridge, straight or curved, is one mode.
     """
     from scipy.linalg import null_space
     from scipy.optimize import minimize
 
     start, step = first.theta / unit, (second.theta - first.theta) / unit
     across = null_space(step[None])
-    height = max(first.value, second.value) + largest
+    height = max(first.value, second.value) + barrier
 
     def profile(u: Floats, at: Floats) -> tuple[float, Floats]:
         value, gradient = objective((at + across @ u) * unit)
@@ -365,42 +342,23 @@ def share_mode(
     return True
 
 
-def _in_units(
-    evaluator: Evaluator, theta: Floats, covariance: Floats
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return variables in the user's units, and their standard errors by the delta method."""
-    step = 1e-4 * evaluator.hyperparameters.prior_sd
-    values = evaluator.hyperparameters.constrained(cross(theta, step))
-    point = {name: plain(v[0]) for name, v in values.items()}
-    stderr = {}
-    for name, v in values.items():
-        gradient = slopes(v, step)
-        infinite = np.isinf(covariance)
-        finite = np.where(infinite, 0.0, covariance)
-        variance = np.einsum("...i,ij,...j->...", gradient, finite, gradient)
-        touched = (np.abs(gradient) * np.isinf(np.diag(covariance))).sum(axis=-1) > 0
-        stderr[name] = plain(np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0))))
-    return point, stderr
-
-
 def _prior_ends(
     evaluator: Evaluator, optimum: LocalOptimum, objective: Callable[[Floats], float]
 ) -> list[PriorEnd]:
     """Return the hyperparameters that the data push to a finite end of their prior.
 
     In unconstrained space the end is at infinity, and nothing changes on the way there. Back at the
-    middle of the prior the log-likelihood is lower by more than three nats, whatever the others do.
+    median of the prior the log-likelihood is lower by more than three nats, whatever the others do.
     """
     from scipy.optimize import minimize
 
-    theta, unit = optimum.theta, evaluator.hyperparameters.prior_sd
+    hyperparameters = evaluator.hyperparameters
+    theta, unit = optimum.theta, hyperparameters.prior_sd
     flat = np.flatnonzero(np.isinf(np.diag(optimum.covariance)))
+    if not flat.size:
+        return []
+    prior = hyperparameters.prior_thetas(THETAS, 0)
     ends = []
-    prior = (
-        evaluator.hyperparameters.prior_thetas(THETAS, 0)
-        if flat.size
-        else np.empty((0, theta.size))
-    )
     for i in flat.tolist():
         below = float((prior[:, i] <= theta[i]).mean())
         if 0.05 <= below <= 0.95:
@@ -414,13 +372,13 @@ def _prior_ends(
         def along(u: Floats, start: Floats = start, i: int = i) -> float:
             return objective(start + np.insert(u, i, 0.0) * unit)
 
-        nothing = np.zeros(theta.size - 1)
-        back = along(nothing)
-        if theta.size > 1 and np.isfinite(back):
+        origin = np.zeros(theta.size - 1)
+        lowest = along(origin)
+        if theta.size > 1 and np.isfinite(lowest):
             options = {"maxfev": 100 * theta.size, "xatol": 1e-2, "fatol": 1e-2}
-            back = minimize(along, nothing, method="Nelder-Mead", options=options).fun
-        if back > optimum.value + 3.0:
-            ends.append(PriorEnd(evaluator.hyperparameters.readable_names[i], value, bound))
+            lowest = minimize(along, origin, method="Nelder-Mead", options=options).fun
+        if lowest > optimum.value + 3.0:
+            ends.append(PriorEnd(hyperparameters.readable_names[i], value, bound))
     return ends
 
 
@@ -441,13 +399,9 @@ def _findings(
                 "likelihood.md#moving-supports",
             )
         )
-    flat = [
-        name
-        for name, v in zip(
-            evaluator.hyperparameters.readable_names, np.diag(best.covariance), strict=True
-        )
-        if np.isinf(v) and name not in {end.name for end in ends}
-    ]
+    names = np.array(evaluator.hyperparameters.readable_names)
+    unidentified = names[np.isinf(np.diag(best.covariance))].tolist()
+    flat = [name for name in unidentified if name not in {end.name for end in ends}]
     if flat:
         findings.append(
             Finding(
@@ -460,7 +414,7 @@ def _findings(
     for mode, weight in zip(modes[1:], weights[1:], strict=True):
         if weight < 0.01:
             continue
-        point = _in_units(evaluator, mode.theta, mode.covariance)[0]
+        point = point_at(evaluator, mode.theta)
         free = [str(rv.name) for rv in evaluator.model.free_RVs]
         where = ", ".join(
             f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free

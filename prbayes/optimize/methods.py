@@ -1,4 +1,4 @@
-"""`Method`: which minimiser of scipy runs, and with which options."""
+"""Minimisers of scipy, and their options for a standardised problem."""
 
 from __future__ import annotations
 
@@ -10,32 +10,29 @@ from typing import Any
 
 import numpy as np
 
-# Names of scipy's minimisers that need no Hessian.
+# Scipy's minimisers that need no Hessian.
 _GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
 _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
-# First step of methods without gradient, in spreads of the prior: larger than the standard errors
-# of most problems, and within the prior. Half or twice changes no answer (docs/constants.md).
-_FIRST_STEP = 0.2
 
 
 @dataclass(frozen=True)
 class Method:
-    """A minimiser of `scipy.optimize.minimize`, with options of its own.
+    """A minimiser of `scipy.optimize.minimize` with its options.
 
     Parameters
     ----------
     method : str or callable
-        Scipy's name of a method that needs no Hessian, or a function as `scipy.optimize.minimize`
-        takes it: ``method(fun, x0, args, jac=..., callback=..., **options) -> OptimizeResult``. It
-        works on standardised parameters, that start at zero; ``jac`` is None under `Fresh`.
+        Scipy's name of a method that needs no Hessian, or a function that
+        `scipy.optimize.minimize` accepts: ``method(fun, x0, args, jac=..., callback=...,
+        **options) -> OptimizeResult``.
     options : mapping
-        For scipy's ``options=``, in units of the standardised problem; they replace those that
-        `minimize` would set.
+        For scipy's ``options=``, in units of the standardised problem; they replace those of
+        `settings`.
 
     Raises
     ------
     ValueError, TypeError
-        If there is no such method, or the options are no mapping.
+        If there is no such method or option.
 
     References
     ----------
@@ -52,11 +49,11 @@ class Method:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        known = (*_WITH_GRADIENT, *_GRADIENT_FREE)
+        names = (*_WITH_GRADIENT, *_GRADIENT_FREE)
         if isinstance(self.method, str):
-            if self.method.lower() not in {name.lower() for name in known}:
+            if self.method.lower() not in {name.lower() for name in names}:
                 raise ValueError(
-                    f"method: got {self.method!r}, expected one of {', '.join(known)}, or a "
+                    f"method: got {self.method!r}, expected one of {', '.join(names)}, or a "
                     "function that scipy.optimize.minimize takes as its method"
                 )
         elif not callable(self.method) or isinstance(self.method, type):
@@ -68,65 +65,61 @@ class Method:
             raise TypeError(
                 f"options: got {type(self.options).__name__}, expected a mapping of names to values"
             )
-        self._refuse_unknown_options()
+        if isinstance(self.method, str) and self.options:
+            self._refuse_unknown_options(self.method)
 
-    def _refuse_unknown_options(self) -> None:
-        """Raise if scipy's method does not know an option, which it would only warn of."""
-        if not isinstance(self.method, str) or not self.options:
-            return
+    def _refuse_unknown_options(self, method: str) -> None:
+        """Raise for options that scipy's method does not have, of which it only warns."""
         if not all(isinstance(name, str) for name in self.options):
             raise TypeError(f"options: got {list(self.options)} as names, expected texts")
         from scipy import optimize  # takes longer to import than the whole package
 
-        # It knows its options only when it runs: here on a parabola, from its minimum.
-        trial = {name: value for name, value in self.options.items() if name != "disp"}
-        with warnings.catch_warnings(record=True) as caught:
+        # Scipy checks names when it runs: here from the minimum of a parabola. Bad values raise
+        # later, on the problem itself.
+        options = {name: value for name, value in self.options.items() if name != "disp"}
+        with warnings.catch_warnings(record=True) as caught, suppress(Exception):
             warnings.simplefilter("always")
-            # What is wrong with the value of an option, the user's problem tells.
-            with suppress(Exception):
-                optimize.minimize(
-                    lambda x: (x @ x, 2 * x),
-                    np.zeros(2),
-                    method=self.method,
-                    jac=True,
-                    options=trial,
-                )
-        for found in caught:
-            if issubclass(found.category, optimize.OptimizeWarning):
+            optimize.minimize(
+                lambda x: (x @ x, 2 * x), np.zeros(2), method=method, jac=True, options=options
+            )
+        for warning in caught:
+            if issubclass(warning.category, optimize.OptimizeWarning):
                 raise ValueError(
-                    f"options: got {dict(self.options)}, expected options of scipy's "
-                    f"{self.method}; scipy says: {found.message}"
+                    f"options: got {dict(self.options)}, expected options of scipy's {method}; "
+                    f"scipy says: {warning.message}"
                 )
 
     @classmethod
     def of(
         cls, method: str | Callable[..., Any] | None, options: Mapping[str, Any] | None
     ) -> Method:
-        """Return what a user meant by ``method=`` and ``options=``."""
+        """Return the method of the arguments of `minimize`."""
         return cls("BFGS" if method is None else method, {} if options is None else options)
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """The name in messages."""
         if isinstance(self.method, str):
             return self.method
         return str(getattr(self.method, "__name__", repr(self.method)))
 
     @property
     def gradient(self) -> bool:
-        """Whether the method is given gradients."""
-        if not isinstance(self.method, str):
-            return True
-        return self.method.lower() not in {n.lower() for n in _GRADIENT_FREE}
+        """Whether the method uses gradients."""
+        gradient_free = {name.lower() for name in _GRADIENT_FREE}
+        return not isinstance(self.method, str) or self.method.lower() not in gradient_free
 
     def settings(self, tolerance: float, size: int) -> dict[str, Any]:
-        """Return scipy's options for a standardised problem.
+        """Return scipy's options for a standardised problem of ``size`` parameters.
 
-        The budget of evaluations alone limits iterations.
+        The objective limits evaluations, so iterations are unlimited.
         """
         most = 10**9  # never reached
-        simplex = np.vstack([np.zeros(size), _FIRST_STEP * np.eye(size)])
-        known: dict[str, dict[str, Any]] = {
+        # First step of methods without gradient, in spreads of the prior: larger than most standard
+        # errors, and within the prior.
+        step = 0.2
+        simplex = np.vstack([np.zeros(size), step * np.eye(size)])
+        defaults: dict[str, dict[str, Any]] = {
             "bfgs": {"gtol": tolerance, "maxiter": most},
             "cg": {"gtol": tolerance, "maxiter": most},
             "l-bfgs-b": {"gtol": tolerance, "ftol": tolerance**2, "maxfun": most, "maxiter": most},
@@ -142,13 +135,13 @@ class Method:
                 "maxiter": most,
             },
             "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most, "maxiter": most},
-            "cobyla": {"tol": tolerance, "rhobeg": _FIRST_STEP, "maxiter": most},
+            "cobyla": {"tol": tolerance, "rhobeg": step, "maxiter": most},
             "cobyqa": {
                 "final_tr_radius": tolerance,
-                "initial_tr_radius": _FIRST_STEP,
+                "initial_tr_radius": step,
                 "maxfev": most,
                 "maxiter": most,
             },
         }
         name = self.method.lower() if isinstance(self.method, str) else ""
-        return {**known.get(name, {}), **self.options}
+        return {**defaults.get(name, {}), **self.options}

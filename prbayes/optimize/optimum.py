@@ -1,8 +1,8 @@
-"""`Optimum`: what `minimize` returns."""
+"""`Optimum`, the result of `minimize`, and its storage."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,20 @@ import xarray as xr
 from prbayes._display import view
 from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
-from prbayes.inference.checks.flat_edge import breakdown_findings
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.asymptotics import Local
+from prbayes.inference.checks.flat_edge import breakdown_findings, no_information
+from prbayes.inference.refits import SamplingDistribution, sampling_of_functions
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import optimum_elements, readable_variables, single_elements
-from prbayes.model.evaluator import Evaluator, likelihood_of, specimen_log_likelihoods
+from prbayes.model.evaluator import (
+    Evaluator,
+    has_other_terms,
+    likelihood_of,
+    missing_mass,
+    specimen_log_likelihoods,
+)
 from prbayes.model.fingerprint import (
     Identity,
     Level,
@@ -30,14 +37,59 @@ from prbayes.model.fingerprint import (
 )
 from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
 from prbayes.model.locking import locked
+from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_preparation import prepared
+from prbayes.numerics.derivatives import cross, slopes
+from prbayes.optimize.convergence import Fit, Result, Search, apart_from_data
 
-# What is less is written as 0.0%.
-TOLD_SHARE = 5e-4
-# Elements of a variable that make as many lines.
-_ONE_BY_ONE = 20
-# How specimens whose response is NaN are told of.
+# A smaller share is displayed as 0.0%.
+SMALLEST_SHARE = 5e-4
 NO_RESPONSE = "have no response (NaN) and are left out"
+
+
+@dataclass(frozen=True, eq=False)
+class SearchRecord:
+    """How a minimisation went, and what it cost.
+
+    Attributes
+    ----------
+    result : Result
+        How it ended, with a message.
+    details : str
+        Sentences with the numbers behind the result.
+    n_evaluations : int
+        Evaluations of the objective by the optimiser. One with an exact gradient counts as one; of
+        a gradient by differences each evaluation counts.
+    n_screened : int
+        Points of the prior that were tried as starting points, in one batch.
+    n_computed : int
+        Responses computed for the model up to the end, without those found in a store.
+    seconds : float
+    trace : dict
+        ``theta`` (n, d), ``discrepancy`` (n,) and ``evaluations`` (n,) of each point that the
+        optimiser evaluated: unconstrained hyperparameters, the objective, and the evaluations up to
+        the point.
+    stopped : str
+        The budget that ended the minimisation; empty if none. What would have cost responses is
+        then NaN or left out.
+    at_edge : tuple of str
+        Elements that moved far out, where the discrepancy no longer depends on them: their best
+        value is at the edge of the support, and standard errors are not known.
+    at_jump : tuple of str
+        Simulators whose discrepancy jumps at the optimum, as points lose their response there;
+        standard errors are not known.
+    """
+
+    result: Result
+    details: str = ""
+    n_evaluations: int = 0
+    n_screened: int = 0
+    n_computed: int = 0
+    seconds: float = 0.0
+    trace: dict[str, Floats] = field(default_factory=dict)
+    stopped: str = ""
+    at_edge: tuple[str, ...] = ()
+    at_jump: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,144 +99,83 @@ class Optimum:
     Attributes
     ----------
     point : dict
-        Hyperparameters and deterministics by name, in the user's own units.
+        Hyperparameters and deterministics by name, in the user's units.
+    stderr : dict
+        Standard errors by name, in the user's units: the sampling standard deviation of the
+        estimator; infinite along directions that the data do not identify; NaN where not known, as
+        at the edge of a support.
+    theta : ndarray, shape (d,)
+        The optimum in unconstrained space.
+    covariance : ndarray, shape (d, d)
+        Sampling covariance in unconstrained space.
+    names : list of str
+        Names of the elements of theta.
+    evaluator : Evaluator
     discrepancy : float
         The minimised sum of d_k / s_k; with one simulator, its discrepancy.
     discrepancies : dict
         Discrepancy by simulator.
     scales : dict
         The s_k by simulator.
-    n_evaluations : int
-        Evaluations of the objective by the optimiser; one with an exact gradient counts as one,
-        each of those that make a gradient by differences counts too.
-    n_screened : int
-        Points of the prior that were tried as starting points, in one batch.
-    n_responses : int
-        Scalar responses that this optimum took, the design's included, and those found in a store;
-        `n_computed` has how many were computed.
-    converged : bool
-    message : str
-        What the optimiser said.
-    stderr : dict
-        Standard errors by name, in the user's own units: the estimator's sampling standard
-        deviation; infinite along directions that the data do not identify; NaN where nothing is
-        known, as at the edge of a support.
-    covariance : ndarray, shape (d, d)
-        Sampling covariance in unconstrained space.
-    theta : ndarray, shape (d,)
-        The optimum in unconstrained space.
-    names : list of str
-        Names of the elements of theta.
     support : dict
-        By simulator: ``lost_mass``, the share of the population at the optimum that has no
-        response (NaN), and ``failed_mass``, that of specimens that failed (+inf) in the rest; with
+        By simulator: ``lost_mass``, the share of the population at the optimum without response
+        (NaN), and ``failed_mass``, the share of failed specimens (+inf) in the rest; with
         `Reweighted` also ``weight_ess`` and ``mean_weight``.
-    trace : dict
-        ``theta`` (n, d), ``discrepancy`` (n,) and ``evaluations`` (n,) of each point that the
-        optimiser asked for: unconstrained hyperparameters, the objective there, and how many
-        evaluations there were until then.
-    seconds : float
+    n_responses : int
+        Scalar responses that this optimum took, including the design's and those found in a store.
     design_error : float
-        How far the optimum of an independent design of the same size would be, in standard errors,
-        along the worst direction; NaN where it is not known (`Resimulated`) or is negligible (one
-        input).
+        Distance to the optimum of an independent design of the same size, in standard errors along
+        the worst direction; NaN where it is not known (`Resimulated`) or negligible (one input).
     rivals : tuple of dict
         Other optima, such as mirror solutions: ``point``, ``discrepancy`` (the sum of d_k / s_k),
         ``theta``, and ``comparable``, whether the data could as well come from there.
     findings : tuple of Finding
         What is not identified, and what else to know of the answer; also logged.
-    at_edge : tuple of str
-        Elements that went far out, where no change of them changes the discrepancy: their best
-        value is at the edge of the support, the optimiser has not converged, and nothing is known
-        of standard errors.
-    at_jump : tuple of str
-        Simulators whose discrepancy jumps at the optimum, since points lose their response there:
-        nothing is known of standard errors.
     prior : bool
         Whether minus the log prior was part of the objective.
-    stopped : str
-        Which budget ended it before it was finished; empty if none. It has not converged then, and
-        what would have cost responses is NaN or left out.
     identity : Identity or None
-        Of the problem that was solved, by which it is known again.
+        Fingerprint of the problem.
+    search : SearchRecord
+        How the minimisation went, and what it cost.
     """
 
     point: dict[str, Any]
+    stderr: dict[str, Any]
+    theta: Floats
+    covariance: Floats
+    names: list[str]
+    evaluator: Evaluator
     discrepancy: float
     discrepancies: dict[str, float]
     scales: dict[str, float]
-    n_evaluations: int
-    n_screened: int
     n_responses: int
-    converged: bool
-    message: str
-    stderr: dict[str, Any]
-    covariance: Floats
-    theta: Floats
-    names: list[str]
-    evaluator: Evaluator
+    prior: bool
+    identity: Identity | None
+    search: SearchRecord
     support: dict[str, dict[str, float]] = field(default_factory=dict)
-    trace: dict[str, Floats] = field(default_factory=dict)
-    seconds: float = 0.0
     design_error: float = np.nan
     rivals: tuple[dict[str, Any], ...] = ()
     findings: tuple[Finding, ...] = ()
-    at_edge: tuple[str, ...] = ()
-    at_jump: tuple[str, ...] = ()
-    prior: bool = False
-    stopped: str = ""
-    identity: Identity | None = None
 
     def __repr__(self) -> str:
-        """Show the answer, what it cost, and what is to be said of it."""
-        found = [f"{name} = {value} ± {error}" for name, value, error in self._told()]
-        return "\n  ".join([self._heading(), *found, *self._shares(), *map(str, self.findings)])
+        """Show the estimates, their cost, and the findings."""
+        rows = [f"{name} = {value} ± {error}" for name, value, error in _rows(self)]
+        return "\n  ".join([_heading(self), *rows, *_sentences(self)])
 
     def _repr_html_(self) -> str:
         """Show the same in a notebook, as a table."""
-        rows = [list(told) for told in self._told()]
         header = ["", "estimate", "standard error"]
-        sentences = [*self._shares(), *map(str, self.findings)]
-        return view(self._heading(), header=header, rows=rows, sentences=sentences)
+        return view(_heading(self), header=header, rows=_rows(self), sentences=_sentences(self))
 
-    def _told(self) -> list[tuple[str, str, str]]:
-        """Return name, estimate and standard error in words.
+    @property
+    def converged(self) -> bool:
+        """Whether the minimum is found."""
+        return self.search.result.converged
 
-        Elements with labels, and those of matrices, one by one.
-        """
-        point = labelled(self.evaluator, self.point, {}).data_vars
-        stderr = labelled(self.evaluator, self.stderr, {}).data_vars
-        rows = []
-        names = [str(name) for name in point]
-        for name in readable_variables(names, names):
-            value, error = point[name], stderr[name]
-            alone = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
-            if not alone or value.size > _ONE_BY_ONE:
-                rows.append((name, _short(value), _short(error)))
-                continue
-            values, errors = single_elements({name: value}), single_elements({name: error})
-            for element in optimum_elements({name: value}, {name: error}):
-                rows.append((element, _short(values[element]), _short(errors[element])))
-        return rows
-
-    def _heading(self) -> str:
-        """Say how good it is, and what it cost."""
-        state = "converged" if self.converged else "NOT converged"
-        what = "Optimum with the prior" if self.prior else "Optimum"
-        label = "discrepancy" if self.evaluator.nodes else "minus log-likelihood"
-        value = f"{label} {self.discrepancy:.4g}"
-        head = f"{what}: {value} after"
-        return f"{head} {self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
-
-    def _shares(self) -> list[str]:
-        """Say which share of the specimens fails, or has no response, where some do."""
-        said = []
-        for name, each in self.support.items():
-            for key, what in (("failed_mass", "fail"), ("lost_mass", NO_RESPONSE)):
-                share = each.get(key, 0.0)
-                if share >= TOLD_SHARE:
-                    said.append(f"{name}: {share:.1%} of specimens {what}")
-        return said
+    @property
+    def message(self) -> str:
+        """How the minimisation ended."""
+        return f"{self.search.result.value} {self.search.details}".strip()
 
     @property
     def model(self) -> pm.Model:
@@ -199,16 +190,6 @@ class Optimum:
         there: PyMC's default jitter can move a chain into another mode.
         """
         return {str(rv.name): self.point[str(rv.name)] for rv in self.model.free_RVs}
-
-    @property
-    def n_computed(self) -> int:
-        """Responses computed for the model so far.
-
-        Without those found in a store, with those computed again.
-        """
-        evaluator = self.evaluator
-        by_metric = sum(node.bound.responses.computed for node in evaluator.nodes)
-        return by_metric + sum(m.responses.computed for m in evaluator.measurements)
 
     @property
     def failures(self) -> xr.Dataset:
@@ -232,10 +213,10 @@ class Optimum:
         Raises
         ------
         ValueError
-            If nothing is known around the optimum: it is at the edge of a support, or at a jump; or
-            if the prior was part of it, or the model has changed since.
+            If the optimum is at the edge of a support or at a jump, if the prior was part of the
+            objective, or if the model has changed since.
         TypeError
-            If a metric declares nothing of its minimum, or a discrepancy is random.
+            If a metric does not declare its behaviour at the minimum, or a discrepancy is random.
         """
         require_sampling(self, "sampling")
         obstacle = sampling_obstacle(self.evaluator)
@@ -248,26 +229,198 @@ class Optimum:
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree.
 
-        Groups ``optimum``, ``stderr``, ``trace`` and ``calibration``.
+        Groups ``optimum``, ``stderr``, ``trace``, ``calibration`` and ``observed_data``, and
+        ``failures`` if there are any.
         """
-        return optimum_tree(self)
+        groups = {
+            "optimum": labelled(self.evaluator, self.point, {}).assign_attrs(_attributes(self)),
+            "stderr": labelled(self.evaluator, self.stderr, {}),
+            "trace": _trace_dataset(self),
+            "calibration": _calibration_dataset(self),
+            "observed_data": observed_dataset(self.evaluator),
+        }
+        failures = self.failures
+        if failures.sizes["failure"]:
+            groups["failures"] = failures
+        return xr.DataTree.from_dict(groups)
 
 
-def _short(value: Any) -> str:
-    return np.array2string(
-        np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format}
+def _heading(optimum: Optimum) -> str:
+    """Return the discrepancy and its cost in words."""
+    kind = "Optimum with the prior" if optimum.prior else "Optimum"
+    label = "discrepancy" if optimum.evaluator.nodes else "minus log-likelihood"
+    state = "converged" if optimum.converged else "NOT converged"
+    return (
+        f"{kind}: {label} {optimum.discrepancy:.4g} after {optimum.search.n_evaluations} "
+        f"evaluations, {optimum.n_responses} responses, {state}"
     )
 
 
-def require_sampling(optimum: Optimum, caller: str) -> Optimum:
-    """Return the optimum, or raise where nothing is known of the discrepancy around it.
+def _rows(optimum: Optimum) -> list[list[str]]:
+    """Return name, estimate and standard error in words.
 
-    Raises
-    ------
-    ValueError
-        If it is at the edge of a support, or at a jump.
+    Elements with labels, and those of matrices, have rows of their own, up to twenty of a variable.
     """
-    findings = breakdown_findings(optimum.at_edge, optimum.at_jump)
+
+    def short(value: Any) -> str:
+        return np.array2string(
+            np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format}
+        )
+
+    point = labelled(optimum.evaluator, optimum.point, {}).data_vars
+    stderr = labelled(optimum.evaluator, optimum.stderr, {}).data_vars
+    names = [str(name) for name in point]
+    rows = []
+    for name in readable_variables(names, names):
+        value, error = point[name], stderr[name]
+        has_rows = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
+        if not has_rows or value.size > 20:
+            rows.append([name, short(value), short(error)])
+            continue
+        values, errors = single_elements({name: value}), single_elements({name: error})
+        for element in optimum_elements({name: value}, {name: error}):
+            rows.append([element, short(values[element]), short(errors[element])])
+    return rows
+
+
+def _sentences(optimum: Optimum) -> list[str]:
+    """Return the shares of specimens that fail or have no response, and the findings."""
+    sentences = []
+    for name, support in optimum.support.items():
+        for key, verb in (("failed_mass", "fail"), ("lost_mass", NO_RESPONSE)):
+            share = support.get(key, 0.0)
+            if share >= SMALLEST_SHARE:
+                sentences.append(f"{name}: {share:.1%} of specimens {verb}")
+    return [*sentences, *map(str, optimum.findings)]
+
+
+# -- from the end of a minimisation ----------------------------------------------------------------
+
+
+def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) -> Optimum:
+    """Return the optimum of a fit, without findings, rivals and design error.
+
+    ``n_previous`` responses were computed for something else. None is computed if a budget has
+    stopped the search.
+    """
+    evaluator, theta, scales = search.evaluator, fit.theta, fit.scales
+    functions = None if fit.sampling is None else sampling_of_functions(fit.sampling)
+    point, stderr = point_and_stderr(evaluator, theta, fit.covariance, functions)
+    is_affordable = not (record.stopped and evaluator.responses_per_theta)
+    record = replace(record, result=_final_result(search, fit, record, is_affordable=is_affordable))
+    if is_affordable:
+        values = evaluator(theta[None]).discrepancies[0]
+    elif len(scales) > 1 or search.prior or has_other_terms(evaluator):
+        values = np.full(len(scales), np.nan)
+    else:
+        values = fit.run.lowest * scales
+    n_responses = evaluator.n_responses - n_previous  # without those of the support
+    support = {
+        name: {key: float(value[0]) for key, value in numbers.items()}
+        for name, numbers in evaluator.support(theta[None]).items()
+    }
+    for k, node in enumerate(evaluator.nodes):
+        if node.reweighted is None and is_affordable:
+            support[node.name] = missing_mass(evaluator, theta, k)
+    names = [node.name for node in evaluator.nodes]
+    return Optimum(
+        point=point,
+        stderr=stderr,
+        theta=theta,
+        covariance=fit.covariance,
+        names=evaluator.hyperparameters.names,
+        evaluator=evaluator,
+        discrepancy=float((values / scales).sum()),
+        discrepancies=dict(zip(names, map(float, values), strict=True)),
+        scales=dict(zip(names, map(float, scales), strict=True)),
+        n_responses=n_responses,
+        prior=search.prior,
+        identity=identity_of(evaluator, prior_minimised=search.prior),
+        search=record,
+        support=support,
+    )
+
+
+def _final_result(search: Search, fit: Fit, record: SearchRecord, *, is_affordable: bool) -> Result:
+    """Return how a minimisation ended: the result of its last run, unless it is no minimum."""
+    evaluator = search.evaluator
+    # A variance of rounding errors is suspect as well; the discrepancy decides.
+    variance = np.diag(fit.covariance) / evaluator.hyperparameters.prior_sd**2
+    is_suspect = bool((np.isinf(variance) | (variance < 1e-16)).all())
+    is_flat = is_suspect and no_information(evaluator, fit.theta)
+    if record.stopped:
+        return Result.STOPPED
+    if record.at_edge:
+        return Result.AT_EDGE
+    if is_flat:
+        return Result.NO_INFORMATION
+    if is_affordable and not search.prior and apart_from_data(evaluator, fit.theta):
+        # Such a minimum is one of the mass beyond the grid, and no fit.
+        return Result.NO_OVERLAP
+    return fit.run.result
+
+
+def n_computed(evaluator: Evaluator) -> int:
+    """Return the number of responses computed for a model, without those found in a store."""
+    by_metric = sum(node.bound.responses.computed for node in evaluator.nodes)
+    return by_metric + sum(m.responses.computed for m in evaluator.measurements)
+
+
+def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:
+    """Return variables and deterministics at theta in the user's units."""
+    values = evaluator.hyperparameters.constrained(theta[None])
+    return {name: plain(value[0]) for name, value in values.items()}
+
+
+def point_and_stderr(
+    evaluator: Evaluator, theta: Floats, covariance: Floats, functions: Local | None = None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return variables and deterministics in the user's units, and their standard errors."""
+    hyperparameters = evaluator.hyperparameters
+    step = 1e-4 * hyperparameters.prior_sd  # any small step: transforms are smooth
+    values = hyperparameters.constrained(cross(theta, step))
+    prior = hyperparameters.constrained(hyperparameters.prior_thetas(THETAS, seed=0))
+    deterministics = {str(variable.name) for variable in evaluator.model.deterministics}
+    stderr = {}
+    for name, value in values.items():
+        gradients = slopes(value, step)
+        errors = _delta_method(gradients, covariance)
+        if functions is not None and name in deterministics:
+            # Functions of unidentified elements may be identified: if better than by their prior.
+            faint = np.sqrt(functions.variance(gradients))
+            upper, lower = np.quantile(prior[name], [0.84, 0.16], axis=0)
+            errors = np.where(np.isinf(errors) & (faint < (upper - lower) / 2), faint, errors)
+        # Constants up to rounding, such as the diagonal of a correlation matrix.
+        ranges = np.ptp(np.concatenate([value, prior[name]]), axis=0)
+        is_constant = ranges <= 1e-12 * np.abs(value[0])
+        stderr[name] = plain(np.where(is_constant, 0.0, errors))
+    return {name: plain(value[0]) for name, value in values.items()}, stderr
+
+
+def _delta_method(gradients: Floats, covariance: Floats) -> Floats:
+    """Return standard errors of functions with gradients (..., d); inf, or NaN at a bound."""
+    is_infinite = np.isinf(covariance)
+    finite = np.where(is_infinite, 0.0, covariance)
+    variance = np.einsum("...i,ij,...j->...", gradients, finite, gradients)
+    size = np.abs(gradients)
+    is_touched = np.einsum("...i,ij,...j->...", size, is_infinite.astype(float), size) > 0
+    # At a bound of the support nothing moves a function, and its error is not known.
+    is_at_bound = is_infinite.any() & (gradients == 0).all(axis=-1)
+    variance = np.where(is_touched, np.inf, np.maximum(variance, 0))
+    return np.asarray(np.sqrt(np.where(is_at_bound, np.nan, variance)))
+
+
+def plain(value: Any) -> Any:
+    """Return a float, or an array of several numbers."""
+    return float(value) if np.ndim(value) == 0 else np.asarray(value)
+
+
+# -- requirements ----------------------------------------------------------------------------------
+
+
+def require_sampling(optimum: Optimum, caller: str) -> Optimum:
+    """Return the optimum, or raise if it is at the edge of a support or at a jump."""
+    findings = breakdown_findings(optimum.search.at_edge, optimum.search.at_jump)
     if findings:
         reasons = " ".join(map(str, findings))
         raise ValueError(
@@ -277,8 +430,31 @@ def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     return optimum
 
 
+def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
+    """Return an optimum whose model can be calibrated to other data sets, or raise with advice."""
+    if not isinstance(optimum, Optimum):
+        got = type(optimum).__name__
+        raise TypeError(f"{caller}: got {got}, expected an Optimum; call prb.minimize() first")
+    obstacle = refit_obstacle(require_sampling(optimum, caller).evaluator)
+    if obstacle is not None:
+        raise ValueError(f"{caller}: {obstacle}{advice}")
+    return require_minimiser(optimum, caller)
+
+
+def require_minimiser(optimum: Optimum, caller: str) -> Optimum:
+    """Return an optimum without the prior, whose model has not changed since, or raise."""
+    expected = identity_of(optimum.evaluator, prior_minimised=False)
+    require_same(optimum.identity, expected, caller)
+    return optimum
+
+
+def require_of_model(result: Any, model: pm.Model, caller: str, level: Level) -> None:
+    """Raise with all differences if a result is of another problem than a model's."""
+    require_same(identity_in(result), identity_of_model(model), caller, level)
+
+
 def identity_in(result: Any) -> Identity | None:
-    """Return the identity that a result carries, an Optimum, a DataTree or a Dataset; or None."""
+    """Return the fingerprint in an Optimum, a DataTree or a Dataset; None without one."""
     if isinstance(result, Optimum):
         return result.identity
     if isinstance(result, xr.Dataset):
@@ -289,98 +465,40 @@ def identity_in(result: Any) -> Identity | None:
     return from_attributes(result[group].attrs) if group in result.children else None
 
 
-def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
-    """Return an optimum whose model can be calibrated to other data sets, or raise.
-
-    Raises
-    ------
-    TypeError
-        If it is no Optimum.
-    ValueError
-        If nothing is known around it, or the prior was part of it, or the model has changed since,
-        or cannot be calibrated anew; then with ``advice``.
-    """
-    if not isinstance(optimum, Optimum):
-        got = type(optimum).__name__
-        raise TypeError(f"{caller}: got {got}, expected an Optimum; call prb.minimize() first")
-    obstacle = refit_obstacle(require_sampling(optimum, caller).evaluator)
-    if obstacle is not None:
-        raise ValueError(f"{caller}: {obstacle}{advice}")
-    return require_minimiser(optimum, caller)
-
-
 def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
-    """Return the optimum and local optima that the data support as well, (M, d).
+    """Return the optimum and its comparable rivals, (M, d), in the evaluator's order of elements.
 
-    Their elements are in the evaluator's order, which may differ in a clone of the optimum's model.
+    The order may differ in a clone of the optimum's model.
     """
     order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
     rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
     return np.array([optimum.theta, *rivals])[:, order]
 
 
-def require_minimiser(optimum: Optimum, caller: str) -> Optimum:
-    """Return an optimum of the discrepancy alone, whose model is the one that was minimised.
-
-    Raises
-    ------
-    ValueError
-        If the prior was part of the objective, or the model has changed since.
-    """
-    expected = identity_of(optimum.evaluator, prior_minimised=False)
-    require_same(optimum.identity, expected, caller)
-    return optimum
+# -- storage ---------------------------------------------------------------------------------------
 
 
-def require_of_model(result: Any, model: pm.Model, caller: str, level: Level) -> None:
-    """Raise if a result is of another problem than a model's.
-
-    Raises
-    ------
-    ValueError
-        With all that differs.
-    """
-    require_same(identity_in(result), identity_of_model(model), caller, level)
-
-
-def plain(value: Any) -> Any:
-    """Return a float, or an array where there are several numbers."""
-    return float(value) if np.ndim(value) == 0 else np.asarray(value)
-
-
-def optimum_tree(optimum: Optimum) -> xr.DataTree:
-    """Return the DataTree of an optimum."""
-    evaluator = optimum.evaluator
-    attrs = {
+def _attributes(optimum: Optimum) -> dict[str, Any]:
+    search = optimum.search
+    return {
         "discrepancy": optimum.discrepancy,
         "converged": int(optimum.converged),
         "prior": int(optimum.prior),
         "message": optimum.message,
-        "stopped": optimum.stopped,
-        "n_evaluations": optimum.n_evaluations,
-        "n_screened": optimum.n_screened,
+        "stopped": search.stopped,
+        "n_evaluations": search.n_evaluations,
+        "n_screened": search.n_screened,
         "n_responses": optimum.n_responses,
-        "seconds": optimum.seconds,
+        "seconds": search.seconds,
         "findings": as_json(optimum.findings),
         **versions(),
         **as_attribute(optimum.model),
         **as_attributes(optimum.identity),
     }
-    groups = {
-        "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),
-        "stderr": labelled(evaluator, optimum.stderr, {}),
-        "trace": _trace_dataset(optimum),
-        "calibration": _calibration_dataset(optimum),
-        "observed_data": observed_dataset(evaluator),
-    }
-    failures = optimum.failures
-    if failures.sizes["failure"]:
-        groups["failures"] = failures
-    return xr.DataTree.from_dict(groups)
 
 
 def _trace_dataset(optimum: Optimum) -> xr.Dataset:
-    trace = optimum.trace
+    trace = optimum.search.trace
     variables = {
         "theta": (["evaluation", "element"], trace["theta"]),
         "discrepancy": ("evaluation", trace["discrepancy"]),
@@ -392,40 +510,35 @@ def _trace_dataset(optimum: Optimum) -> xr.Dataset:
 def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     evaluator = optimum.evaluator
     nodes, measurements = evaluator.nodes, evaluator.measurements
-    discrepancies = {name: -float(v.sum()) for name, v in _log_likelihoods(optimum).items()}
-    discrepancies |= optimum.discrepancies
     names = [node.name for node in nodes] + [m.name for m in measurements]
-    variables: dict[str, Any] = {
-        "discrepancy": ("simulator", [discrepancies[name] for name in names]),
-        "scale": ("simulator", [optimum.scales.get(name, 1.0) for name in names]),
+    likelihoods = specimen_log_likelihoods(evaluator, optimum.theta[None])
+    discrepancies = {name: -float(v.sum()) for name, v in likelihoods.items()}
+    discrepancies |= optimum.discrepancies
+    n_runs = [node.bound.n_runs for node in nodes]
+    n_runs += [len(prepared(likelihood_of(evaluator, m)).emulation.z) for m in measurements]
+    metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
+    compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
+    by_simulator: dict[str, list[Any]] = {
+        "discrepancy": [discrepancies[name] for name in names],
+        "scale": [optimum.scales.get(name, 1.0) for name in names],
+        "metric": [without_addresses(metric) for metric in metrics],
+        "compared": compared,
+        "is_likelihood": [0] * len(nodes) + [1] * len(measurements),
+        "n_runs": n_runs,
     }
     for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
-        values = [optimum.support.get(n, {}).get(key, np.nan) for n in names]
-        variables[key] = ("simulator", values)
+        by_simulator[key] = [optimum.support.get(name, {}).get(key, np.nan) for name in names]
+    variables: dict[str, Any] = {key: ("simulator", v) for key, v in by_simulator.items()}
     variables["theta"] = ("element", optimum.theta)
     variables["covariance"] = (["element", "other_element"], optimum.covariance)
-    metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
-    variables["metric"] = ("simulator", [without_addresses(metric) for metric in metrics])
-    compared = [components_summary(node.target) for node in nodes] + [""] * len(measurements)
-    variables["compared"] = ("simulator", compared)
-    is_likelihood = [0] * len(nodes) + [1] * len(measurements)
-    variables["is_likelihood"] = ("simulator", is_likelihood)
-    runs = [node.bound.n_runs for node in nodes]
-    runs += [len(prepared(likelihood_of(evaluator, m)).emulation.z) for m in measurements]
-    variables["n_runs"] = ("simulator", runs)
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.Dataset(variables, coords={"simulator": names, **elements})
 
 
-def _log_likelihoods(optimum: Optimum) -> dict[str, Floats]:
-    """Return the log-likelihoods of the specimens at the optimum, by simulator, (1, N)."""
-    return specimen_log_likelihoods(optimum.evaluator, optimum.theta[None])
-
-
 def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:
-    """Say by what the outputs of simulators are compared, where it is not by themselves."""
+    """Return how simulators compare their outputs, where not one by one."""
     if "compared" not in calibration:
         return ()
-    told = calibration["compared"].values.tolist()
-    pairs = zip(calibration["simulator"].values.tolist(), told, strict=True)
+    clauses = calibration["compared"].values.tolist()
+    pairs = zip(calibration["simulator"].values.tolist(), clauses, strict=True)
     return tuple(f"{name}: {clause}." for name, clause in pairs if clause)

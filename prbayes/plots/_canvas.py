@@ -92,14 +92,13 @@ class Canvas:
 
     def finish(self) -> Any:
         """Return the `PlotCollection`, with a legend, and the artists by visual and panel."""
-        visuals: dict[str, dict[str, Any]] = {}
+        by_visual: dict[str, dict[str, Any]] = {}
         for name, panel in self._panels.items():
             for visual, artist in panel.artists.items():
                 cell = np.empty((), dtype=object)
                 cell[()] = artist
-                visuals.setdefault(visual, {})[name] = cell
-        for visual, by_panel in visuals.items():
-            artists = {name: ((), cell) for name, cell in by_panel.items()}
+                by_visual.setdefault(visual, {})[name] = ((), cell)
+        for visual, artists in by_visual.items():
             self._collection.viz[visual] = xr.DataTree(xr.Dataset(artists))
         figure = self._collection.viz["figure"].item()
         draw_legend(figure, [panel.target for panel in self._panels.values()])
@@ -145,11 +144,14 @@ class Panel:
         legend: str = "",
     ) -> None:
         """Draw a line; without a width, that of Matplotlib's settings."""
-        look: dict[str, Any] = {"label": legend} if legend else {}
-        if width is not None:
-            look["width"] = width
+        look: dict[str, Any] = {} if width is None else {"width": width}
         self.artists[visual] = self.library.line(
-            np.asarray(x), np.asarray(y), self.target, color=color, linestyle=style, **look
+            *map(np.asarray, (x, y)),
+            self.target,
+            color=color,
+            linestyle=style,
+            label=legend,
+            **look,
         )
 
     def band(
@@ -163,9 +165,8 @@ class Panel:
         legend: str = "",
     ) -> None:
         """Shade the area between two curves, the lower one first."""
-        look = {"label": legend} if legend else {}
         self.artists[visual] = self.library.fill_between_y(
-            x, *sides, self.target, color=color, alpha=alpha, **look
+            x, *sides, self.target, color=color, alpha=alpha, label=legend
         )
 
     def points(
@@ -180,10 +181,9 @@ class Panel:
         legend: str = "",
     ) -> None:
         """Draw markers of an area, in square points."""
-        look = {"label": legend} if legend else {}
         places = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
         self.artists[visual] = self.library.scatter(
-            *places, self.target, color=color, marker=marker, size=size, **look
+            *places, self.target, color=color, marker=marker, size=size, label=legend
         )
 
     def heights(

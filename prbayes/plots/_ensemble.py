@@ -144,8 +144,8 @@ def read_before(
             f"before: got {type(before).__name__}, expected a dict with a value for each "
             "hyperparameter, None or False"
         )
-    if isinstance(result, Optimum) and not result.n_screened:
-        path = result.trace.get("theta")
+    if isinstance(result, Optimum) and not result.search.n_screened:
+        path = result.search.trace.get("theta")
         if path is not None and len(path):
             return path[:1], "optimiser's first point"
     return evaluator.hyperparameters.initial[None], "prior's initial point"

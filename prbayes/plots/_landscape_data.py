@@ -32,7 +32,7 @@ def check_optimum(optimum: Any, caller: str) -> None:
             f"{caller}: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() "
             "first"
         )
-    if not len(optimum.trace.get("theta", ())):
+    if not len(optimum.search.trace.get("theta", ())):
         raise ValueError(
             f"{caller}: got an optimum without a trace, expected one as prb.minimize returns it"
         )
@@ -129,7 +129,7 @@ class _Plane:
 def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: int) -> Landscape:
     """Evaluate the objective on a grid of ``points`` along each of one or two hyperparameters."""
     plane = _Plane.of(optimum, evaluator, names)
-    path = free_elements(evaluator, optimum.trace["theta"])
+    path = free_elements(evaluator, optimum.search.trace["theta"])
     local_optima = np.array([rival["theta"] for rival in optimum.rivals])
     rivals = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
     prior = free_elements(evaluator, evaluator.hyperparameters.prior_thetas(1000, 0))

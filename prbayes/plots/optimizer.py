@@ -78,12 +78,12 @@ def plot_optimizer(
     """
     refuse_look(labels, pc_kwargs)
     check_optimum(optimum, "plot_optimizer")
-    path = free_elements(optimum.evaluator, optimum.trace["theta"])
+    path = free_elements(optimum.evaluator, optimum.search.trace["theta"])
     final = free_elements(optimum.evaluator, optimum.theta[None])
     hyperparameters = free_names(optimum)
     refuse_labels(labels, hyperparameters, evaluator=optimum.evaluator)
     canvas = Canvas(["discrepancy", *hyperparameters], size=(4.6, 3.4), pc_kwargs=pc_kwargs)
-    evaluations = optimum.trace["evaluations"].astype(np.float64)
+    evaluations = optimum.search.trace["evaluations"].astype(np.float64)
     _draw_objective(canvas.panel("discrepancy"), optimum, evaluations)
     ends = evaluations[[0, -1]]
     for name in hyperparameters:
@@ -100,9 +100,9 @@ def _draw_objective(panel: Panel, optimum: Optimum, evaluations: Floats) -> None
     """Draw the objective of each point, and the lowest so far."""
     # Recomputed with the final design and scales, where that costs no response
     is_free = not optimum.evaluator.responses_per_theta
-    values = optimum.trace["discrepancy"]
+    values = optimum.search.trace["discrepancy"]
     if is_free:
-        values = objective(optimum, optimum.evaluator, optimum.trace["theta"])
+        values = objective(optimum, optimum.evaluator, optimum.search.trace["theta"])
     values = np.where(np.isfinite(values), values, np.nan)
     best = np.fmin.accumulate(values)
     ticks = None

@@ -67,7 +67,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         For simulators with `Fresh`, or with `Resimulated` and a metric of undeclared minimum: pass
         their epsilon.
     ValueError
-        If the optimum is at an edge or a jump (``at_edge`` and ``at_jump`` of `Optimum`), or
+        If the optimum is at an edge or a jump (``search.at_edge``, ``search.at_jump``), or
         nothing is identified; if the prior was part of it, its model has changed since, or no
         simulator has an epsilon.
 

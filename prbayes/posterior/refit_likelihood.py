@@ -213,8 +213,8 @@ def refit_likelihood(
     Responses are stored. Raises ValueError if the estimate is at an edge, stored responses do not
     support populations around it, or refits do not converge.
     """
-    if optimum.at_edge:
-        raise ValueError(_at_edge(", ".join(optimum.at_edge)))
+    if optimum.search.at_edge:
+        raise ValueError(_at_edge(", ".join(optimum.search.at_edge)))
     thetas = optima_of(optimum, evaluator)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     continuation = continuation_of(evaluator, thetas[:1])

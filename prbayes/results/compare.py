@@ -42,7 +42,7 @@ from prbayes.model.labels import labelled
 from prbayes.model.locking import locked
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_variable import specimen_likelihoods
-from prbayes.optimize.design_refinement import reached
+from prbayes.optimize.design_refinement import temporary_first_samples
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.response.inputs import event_shape
 
@@ -219,7 +219,7 @@ def _column(label: str, result: Any, naming: pm.Model | None) -> _Column:
             labelled(result.evaluator, values, {}).data_vars
             for values in (result.point, result.stderr)
         )
-        return _optimum_column(point, stderr, (float(result.n_responses), result.seconds))
+        return _optimum_column(point, stderr, (float(result.n_responses), result.search.seconds))
     groups = result.children if isinstance(result, xr.DataTree) else {}
     if "posterior" in groups:
         draws = stacked_draws(result["posterior"])
@@ -288,7 +288,7 @@ def _scores(
     thetas = _thetas(evaluator, names, estimates)
     if thetas is None:
         return {}
-    with nullcontext() if is_covered else reached(evaluator, thetas):
+    with nullcontext() if is_covered else temporary_first_samples(evaluator, thetas):
         lacking = [shortcomings(evaluator, theta[None]) for theta in thetas]
         several = len(evaluator.simulators) > 1
         scores = {}

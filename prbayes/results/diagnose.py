@@ -35,7 +35,13 @@ from prbayes.model.elements import (
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
-from prbayes.optimize.optimum import NO_RESPONSE, TOLD_SHARE, Optimum, compared_in, require_of_model
+from prbayes.optimize.optimum import (
+    NO_RESPONSE,
+    SMALLEST_SHARE,
+    Optimum,
+    compared_in,
+    require_of_model,
+)
 from prbayes.response.inputs import model_on_context
 from prbayes.results.likelihood_checks import Checked, check_draws, check_optimum, separate_modes
 
@@ -184,7 +190,7 @@ def _diagnose_optimum(optimum: Optimum) -> Diagnosis:
         checked = check_optimum(optimum)
         remarks = checked.remarks
     findings = [*optimum.findings, *small_simulators(evaluator), *misfit]
-    if not (optimum.converged or optimum.at_edge or optimum.stopped):
+    if not (optimum.converged or optimum.search.at_edge or optimum.search.stopped):
         findings.append(_not_converged(optimum.message))
     designs = _computed_coverage(evaluator, optimum.theta[None])
     lost, failed = (
@@ -206,7 +212,7 @@ def _check_family(optimum: Optimum) -> tuple[list[Finding], tuple[Finding, ...]]
     """Test whether the data can come from the best population, or return why it was not tested."""
     evaluator = optimum.evaluator
     obstacle = refit_obstacle(evaluator)
-    if not optimum.converged or optimum.at_edge or optimum.at_jump:
+    if not optimum.converged or optimum.search.at_edge or optimum.search.at_jump:
         return [], _not_tested("nothing is known of the sampling distribution of this optimum")
     if obstacle is not None:
         return [], _not_tested(obstacle)
@@ -306,7 +312,7 @@ def _failure_findings(
             share = lost.get(name, np.nan)
         elif np.isposinf(replacement):
             share = failed.get(name, np.nan)
-        if share < TOLD_SHARE:
+        if share < SMALLEST_SHARE:
             text += "the populations of the answer have next to no specimens there."
             harmless.append(Finding("harmless-failures", text))
             continue
@@ -332,7 +338,7 @@ def _specimens_left_out(lost: Mapping[str, float]) -> tuple[Finding, ...]:
             "distributed.md#when-a-response-fails",
         )
         for name, share in lost.items()
-        if share >= TOLD_SHARE
+        if share >= SMALLEST_SHARE
     )
 
 

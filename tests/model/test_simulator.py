@@ -504,7 +504,7 @@ def test_simulators_of_one_response_share_their_design_s_runs() -> None:
     prb.refine(model, thetas=narrow)
     assert first.bound.n_points == second.bound.n_points > 128
     assert sum(asked) == first.bound.n_points
-    assert prb.minimize(model, progressbar=False).n_computed == sum(asked)
+    assert prb.minimize(model, progressbar=False).search.n_computed == sum(asked)
 
 
 @pytest.mark.parametrize("propagation", [prb.Resimulated(128), prb.Fresh(128)])

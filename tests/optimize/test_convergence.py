@@ -15,7 +15,16 @@ import prbayes as prb
 from prbayes.metrics.density import overlap as density_overlap
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import differences
-from prbayes.optimize.convergence import Run, Search, Trace, _newton, approach, overlap, settle
+from prbayes.optimize.convergence import (
+    Result,
+    Run,
+    Search,
+    Trace,
+    _newton_step,
+    approach,
+    settle,
+    smallest_overlap,
+)
 from prbayes.optimize.methods import Method
 from prbayes.optimize.objective import Objective
 
@@ -41,9 +50,9 @@ def test_the_budget_means_the_same_for_all_methods(method: str, box: bool) -> No
     assert not found.converged
     assert "max_evaluations = 7" in found.message
     # A gradient by differences is five evaluations, and is not cut short.
-    assert 7 <= found.n_evaluations < 7 + 5
-    assert found.trace["evaluations"][-1] == found.n_evaluations
-    steps = np.diff(found.trace["evaluations"], prepend=0)
+    assert 7 <= found.search.n_evaluations < 7 + 5
+    assert found.search.trace["evaluations"][-1] == found.search.n_evaluations
+    steps = np.diff(found.search.trace["evaluations"], prepend=0)
     assert set(steps) == ({5} if box and method in {"BFGS", "L-BFGS-B"} else {1})
 
 
@@ -53,7 +62,7 @@ def test_units_do_not_matter(unit: float) -> None:
         normal_model(prb.Resimulated(256), unit=unit), start={"mu": 0.5 * unit, "sigma": 0.8 * unit}
     )
     assert found.converged
-    assert found.n_evaluations == best().n_evaluations <= 15
+    assert found.search.n_evaluations == best().search.n_evaluations <= 15
     np.testing.assert_allclose(pair(found) / unit, pair(best()), rtol=1e-6)
 
 
@@ -71,8 +80,8 @@ def test_the_tolerance_is_that_of_the_standardised_gradient() -> None:
             / 2
         )
         assert np.abs(gradient * scale).max() / size <= tolerance
-        assert found.n_evaluations >= last
-        last = found.n_evaluations
+        assert found.search.n_evaluations >= last
+        last = found.search.n_evaluations
 
 
 def test_exact_and_differenced_gradients_agree() -> None:
@@ -101,7 +110,7 @@ def test_the_area_metric_takes_few_evaluations(response: Any) -> None:
     assert found.converged
     assert "gained nothing in 4 evaluations. Gradients around it promise a gain" in found.message
     # Its line search ends at the kinks of a thousand points: 18 and 23 here, 87 by a simplex.
-    assert found.n_evaluations <= 40
+    assert found.search.n_evaluations <= 40
     simplex = prb.minimize(other, starts=0, method="Nelder-Mead")
     assert found.discrepancy < simplex.discrepancy * (1 + 1e-4)
 
@@ -115,62 +124,63 @@ def valley(t: Any) -> Any:
 
 
 def objective(function: Any, size: int = 2) -> Objective:
-    return Objective(function, np.zeros(size), np.ones(size), 1.0, gradient=True, most=100)
+    return Objective(
+        function, np.zeros(size), np.ones(size), 1.0, gradient=True, max_evaluations=100
+    )
 
 
 def test_gradients_a_step_apart_see_along_a_kink() -> None:
     # At a kink, where each step across goes up, and a line search ends.
     at = np.array([0.2, -0.2])
-    step, promised, _ = _newton(objective(valley), at, 0.01)
+    step, promised, _ = _newton_step(objective(valley), at, 0.01)
     np.testing.assert_allclose(step[0], -step[1], atol=1e-9)
     assert np.hypot(*step) == pytest.approx(0.1)  # as far as it may go beyond what it saw
     assert promised == np.inf
     at = np.array([0.99, -0.99])
-    step, promised, _ = _newton(objective(valley), at, 0.01)
+    step, promised, _ = _newton_step(objective(valley), at, 0.01)
     np.testing.assert_allclose(step, [0.01, -0.01], atol=1e-9)
     assert promised == pytest.approx(valley(at)[0] - valley(at + step)[0], rel=1e-6)
-    _, promised, _ = _newton(objective(valley), np.array([1.0, -1.0]), 0.01)
+    _, promised, _ = _newton_step(objective(valley), np.array([1.0, -1.0]), 0.01)
     assert abs(promised) < 1e-12
     # Where it is smooth the step is Newton's, and where it bends down it goes down.
     bends = np.array([[3.0, 1.0, 0.5], [1.0, 2.0, 0.0], [0.5, 0.0, 1.0]])
     smooth = objective(lambda t: (t @ bends @ t / 2, bends @ t, 1), size=3)
-    step, promised, _ = _newton(smooth, np.array([0.03, -0.05, 0.01]), 0.01)
+    step, promised, _ = _newton_step(smooth, np.array([0.03, -0.05, 0.01]), 0.01)
     np.testing.assert_allclose(step, [-0.03, 0.05, -0.01])
-    step, _, ways = _newton(objective(lambda t: (-t @ t / 2, -t, 1)), np.array([0.5, -0.5]), 0.01)
+    step, _, ways = _newton_step(
+        objective(lambda t: (-t @ t / 2, -t, 1)), np.array([0.5, -0.5]), 0.01
+    )
     np.testing.assert_allclose(step, [0.1, -0.1])
     assert (ways @ np.array([-0.5, 0.5]) <= 0).all()  # against the slope
     saddle = objective(lambda t: (t[0] ** 2 - t[1] ** 2, np.array([2.0, -2.0]) * t, 1))
-    step, promised, _ = _newton(saddle, np.zeros(2), 0.01)
+    step, promised, _ = _newton_step(saddle, np.zeros(2), 0.01)
     np.testing.assert_allclose(np.abs(step), [0.0, 0.1], atol=1e-12)
     assert promised == np.inf
     nowhere = objective(lambda t: (np.nan, np.zeros(2), 1))
-    assert _newton(nowhere, at, 0.01)[1] == np.inf
+    assert _newton_step(nowhere, at, 0.01)[1] == np.inf
 
 
 def settled(function: Any, at: list[float], most: int = 1000, count: int = 10) -> Run:
     """Settle a line search that gave up at a place of some function."""
 
     class Known(Search):
-        def _with_gradient(self, scales: Any) -> Any:
-            return function
-
-        def _without_gradient(self, scales: Any) -> Any:
-            return lambda theta: (function(theta)[0], None, 1)
+        def _function(self, scales: Any, *, gradient: bool) -> Any:
+            return function if gradient else lambda theta: (function(theta)[0], None, 1)
 
     search = Known(Evaluator.of(model()), np.ones(2), Method(), False, 1e-5, most)
     end = np.array(at)
     value = float(function(end)[0])
     trace = Trace((end,), (value,), (count,), count)
-    return settle(search, Run(end, False, "Gave up.", trace, np.zeros(2), np.ones(1), value, 1.0))
+    return settle(search, Run(end, Result.STALLED, "", trace, np.zeros(2), np.ones(1), value, 1.0))
 
 
 def test_a_line_search_at_a_kink_goes_on_along_it() -> None:
     run = settled(valley, [0.99, -0.99])
-    assert run.success
+    assert run.result.converged
     np.testing.assert_allclose(run.best, [1.0, -1.0], atol=1e-6)
     assert run.lowest == pytest.approx(1)
     assert run.trace.count == 10 + 2 * 5 + 2
-    assert run.message.startswith("Gave up. Gradients around it promise a gain of ")
+    assert run.details.startswith("Gradients around it promise a gain of ")
 
 
 def test_what_is_lower_than_gradients_promise_is_followed() -> None:
@@ -178,7 +188,7 @@ def test_what_is_lower_than_gradients_promise_is_followed() -> None:
         return 1.0 - 0.1 * np.sum(t > 0.002), np.zeros(2), 1
 
     run = settled(stairs, [0.0, 0.0])
-    assert run.success
+    assert run.result.converged
     assert run.lowest == pytest.approx(0.8)
     assert run.trace.count == 10 + 3 * 5 + 2
 
@@ -190,7 +200,7 @@ def test_a_small_minimum_on_a_slope_is_left() -> None:
 
     run = settled(lambda t: (*slope(t)[:2], 1), [0.0, 0.0], most=60)
     assert run.lowest < 1.95  # 1.998 in the dent
-    assert not run.success  # it goes on down, and the slope has no end
+    assert not run.result.converged  # it goes on down, and the slope has no end
 
 
 def test_gradients_whose_promise_is_not_kept_leave_the_word_to_a_simplex() -> None:
@@ -198,22 +208,23 @@ def test_gradients_whose_promise_is_not_kept_leave_the_word_to_a_simplex() -> No
         return 1 + t @ t, np.array([1.0, 1.0]) + 0 * t, 1
 
     run = settled(promising, [0.0, 0.0])
-    assert run.success
-    assert "A simplex from there gained 0.0e+00" in run.message
+    assert run.result.converged
+    assert "A simplex from there gained 0.0e+00" in run.details
     # Differences that take many evaluations are not asked for all rounds.
     run = settled(lambda t: (*promising(t)[:2], 60), [0.0, 0.0])
-    assert "A simplex from there" in run.message
+    assert "A simplex from there" in run.details
     assert run.trace.count < 10 + 5 * 60 + 120
 
 
 def test_a_budget_that_is_spent_is_not_convergence() -> None:
     run = settled(valley, [0.2, -0.2], most=13)
-    assert not run.success
-    assert run.message == "Gave up. max_evaluations = 13 was reached before convergence."
+    assert not run.result.converged
+    assert run.result is Result.MAX_EVALUATIONS
+    assert run.details == "max_evaluations = 13."
     assert run.trace.count == 13
     # Nor where it is spent on the last look around.
     run = settled(valley, [1.0, -1.0], most=16)
-    assert not run.success
+    assert not run.result.converged
 
 
 def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
@@ -268,15 +279,17 @@ def test_overlap_is_one_for_equal_and_zero_for_disjoint_densities() -> None:
 )
 def test_where_there_is_overlap_the_start_is_left_alone(propagation: Any) -> None:
     evaluator = Evaluator.of(normal_model(propagation))
-    search = Search(evaluator, np.ones(2), Method(), prior=False, tolerance=1e-6, most=100)
+    search = Search(
+        evaluator, np.ones(2), Method(), prior=False, tolerance=1e-6, max_evaluations=100
+    )
     theta = np.array([0.3, 0.0])
-    near = approach(search, theta, np.ones(1), 0)
-    assert near.theta is theta
-    assert near.trace.count == 0
-    far = approach(search, np.array([9.0, -1.0]), np.ones(1), 0)
-    values, weights = evaluator.populations(far.theta[None], 0)
-    assert overlap(evaluator, [values], [weights])[0] > 0.5
-    assert far.trace.count > 0
+    near, trace = approach(search, theta, np.ones(1), 0, Trace())
+    assert near is theta
+    assert trace.count == 0
+    far, trace = approach(search, np.array([9.0, -1.0]), np.ones(1), 0, Trace())
+    values, weights = evaluator.populations(far[None], 0)
+    assert smallest_overlap(evaluator, [values], [weights])[0] > 0.5
+    assert trace.count > 0
 
 
 # -- a million responses

@@ -5,6 +5,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes._finding import Finding
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.design_error import DesignErrors
 from prbayes.model.coverage import shortcomings
@@ -53,10 +54,10 @@ def test_a_refusal_tells_what_the_data_do_not() -> None:
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
     evaluator = Evaluator.of(model)
     short = shortcomings(evaluator, np.array([[30.0]]))
-    told = "The data tell less than the prior about mu"
-    with pytest.raises(DesignError, match=rf"y: .*; narrow the priors, .*\. There {told}"):
-        refuse(short, evaluator, [told])
-    refuse({}, evaluator, [told])
+    text = "The data tell less than the prior about mu."
+    with pytest.raises(DesignError, match=rf"y: .*; narrow the priors, .*\. {text}"):
+        refuse(short, evaluator, [Finding("not-identified", text)])
+    refuse({}, evaluator, [Finding("not-identified", text)])
 
 
 def test_the_runs_that_are_left_follow_from_the_error_and_the_room() -> None:

@@ -18,9 +18,17 @@ from prbayes.model.coverage import shortcomings
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.batched_bfgs import descend
 from prbayes.optimize.design_refinement import refine_at
-from prbayes.optimize.local_optima import Best, Rival, _joined, _separate, rivals, standing, visit
-from prbayes.optimize.minimize import _visited
-from prbayes.optimize.objective import Hold
+from prbayes.optimize.local_optima import (
+    Reference,
+    Rival,
+    are_connected,
+    has_barrier,
+    mirror_optimum,
+    polished_rivals,
+    rivals_from_prior,
+    verified_rivals,
+)
+from prbayes.optimize.objective import Ridge
 from prbayes.propagation.reweighted import designs_restored
 
 DATA = (np.random.default_rng(3).normal(2.0, 0.3, 40) - 1) ** 2
@@ -158,12 +166,12 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
     optimum = fit("pr")
     evaluator = Evaluator.of(optimum.model)
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
-    best = Best(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
-    assert rivals(best, starts=16, seed=0)
-    assert rivals(replace(best, noise=1e3), starts=16, seed=0) == []
+    best = Reference(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
+    assert rivals_from_prior(best, starts=16, seed=0)
+    assert rivals_from_prior(replace(best, noise=1e3), starts=16, seed=0) == []
     # Nor is there one where a search that is held cannot go.
-    hold = Hold(optimum.theta, np.eye(2), 1e3)
-    assert rivals(replace(best, hold=hold), starts=16, seed=0) == []
+    ridge = Ridge(optimum.theta, np.eye(2), 1e3)
+    assert rivals_from_prior(replace(best, ridge=ridge), starts=16, seed=0) == []
 
 
 # -- the posterior of two modes
@@ -275,12 +283,12 @@ def test_a_mirror_far_from_the_points_is_found_and_both_are_supported() -> None:
 
 
 @cache
-def around(starts: int) -> Best:
+def around(starts: int) -> Reference:
     """Return what is known of the optimum, to look for others."""
     optimum = followed(starts)
     evaluator = optimum.evaluator
     local = Local(evaluator.hyperparameters.prior_sd, np.eye(3), np.zeros((3, 0)), 1e-3 * np.eye(3))
-    return Best(evaluator, optimum.theta, np.ones(1), local, 0.05)
+    return Reference(evaluator, optimum.theta, np.ones(1), local, 0.05)
 
 
 @pytest.mark.parametrize(("mu", "sigma", "real"), [(None, 0.05, True), (-6.0, 0.3, False)])
@@ -293,7 +301,7 @@ def test_what_few_points_tell_is_looked_at_with_more(
     there = optimum.theta.copy()
     there[:2] = mirror + 0.05 if mu is None else mu, np.log(sigma)
     before = bound.design
-    found = visit(around(0), there)
+    found = mirror_optimum(around(0), there)
     assert bound.design is before  # and not a run more
     if not real:
         assert found is None
@@ -313,7 +321,7 @@ def test_clouds_that_reach_a_mirror_reach_the_best_optimum_as_well() -> None:
 
     bound = best.evaluator.reweighted["y"]
     with designs_restored([bound]):
-        (found,) = _visited(best, [far])
+        (found,) = verified_rivals(best, [far])
         beside = at_the_best()
     assert found.theta[0] == pytest.approx(there[0], abs=0.05)
     with designs_restored([bound]):
@@ -327,15 +335,15 @@ def test_what_is_worse_by_more_than_the_noise_is_no_mirror_image() -> None:
     optimum = followed(0)
     mirror = optimum.theta.copy()
     mirror[0] = 2 - mirror[0]
-    assert visit(best, mirror) is not None
+    assert mirror_optimum(best, mirror) is not None
     # A hold adds about a sixth there.
-    hold = Hold(optimum.theta, np.eye(3), 1.5)
-    assert visit(replace(best, hold=hold), mirror) is None
+    ridge = Ridge(optimum.theta, np.eye(3), 1.5)
+    assert mirror_optimum(replace(best, ridge=ridge), mirror) is None
 
 
 def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
-    assert visit(around(0), followed(0).theta + 0.02) is None
-    assert standing(around(0), followed(0).theta[None] + 0.02) == []
+    assert mirror_optimum(around(0), followed(0).theta + 0.02) is None
+    assert polished_rivals(around(0), followed(0).theta[None] + 0.02) == []
 
 
 @dataclass(frozen=True)
@@ -362,9 +370,9 @@ def test_a_bent_valley_has_no_two_optima(formula: Any, joined: bool) -> None:
     a, b = np.array([-1.0, 1.0]), np.array([1.0, 1.0])
     evaluator: Any = Landscape(formula)
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), 0.01 * np.eye(2))
-    best = Best(evaluator, a, np.ones(1), local, noise=0.1)
-    assert _separate(best, a, 0.0, b, 0.0)  # straight on
-    assert _joined(best, a, b, 5) is joined
+    best = Reference(evaluator, a, np.ones(1), local, noise=0.1)
+    assert has_barrier(best, a, 0.0, b, 0.0)  # straight on
+    assert are_connected(best, a, b, 5) is joined
 
 
 class Valley:
@@ -391,9 +399,7 @@ def test_where_a_descent_was_stopped_in_a_valley_is_no_optimum(
     evaluator: Any = Valley()
     covariance = 0.01 * np.linalg.inv([[802.0, -400.0], [-400.0, 200.0]])
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), covariance)
-    best = Best(evaluator, np.ones(2), np.ones(1), local, noise=0.01)
+    best = Reference(evaluator, np.ones(2), np.ones(1), local, noise=0.01)
     short = partial(descend, max_iterations=iterations)
     monkeypatch.setattr("prbayes.optimize.local_optima.descend", short)
-    found = best.descended(best.shifts(evaluator.hyperparameters.prior_points(16, 1)), np.eye(2))
-    assert found.converged.all() == (iterations == 40)
-    assert rivals(best, starts=16, seed=0) == []
+    assert rivals_from_prior(best, starts=16, seed=0) == []

@@ -258,16 +258,16 @@ def test_an_end_of_a_support_at_the_largest_specimen(codes: list[str]) -> None:
 def test_the_number_of_evaluations_is_limited(most: int) -> None:
     optimum = fit(normal_model(), max_evaluations=most)
     # A descent has ten evaluations at least, and the Hessian up to twelve of them.
-    assert optimum.n_evaluations <= most + 40
+    assert optimum.search.n_evaluations <= most + 40
     # The trace is that of the best descent.
-    assert len(optimum.trace["theta"]) <= optimum.n_evaluations
+    assert len(optimum.search.trace["theta"]) <= optimum.search.n_evaluations
 
 
 @pytest.mark.long
 def test_the_number_of_starts() -> None:
     model = normal_model()
     few, many = fit(model, starts=1), fit(model, starts=8)
-    assert few.n_evaluations < many.n_evaluations
+    assert few.search.n_evaluations < many.search.n_evaluations
     assert "from 1 starts" in few.message
     assert few.point == pytest.approx(many.point, abs=1e-4)
 

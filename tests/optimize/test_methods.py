@@ -52,7 +52,7 @@ def test_options_replace_defaults_and_are_not_changed() -> None:
         model(), start={"mu": 0.5, "sigma": 0.8}, method="Nelder-Mead", options=options
     )
     tight = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method="Nelder-Mead")
-    assert loose.n_evaluations < tight.n_evaluations / 3
+    assert loose.search.n_evaluations < tight.search.n_evaluations / 3
     assert options == {"xatol": 0.3, "fatol": 10.0}
 
 

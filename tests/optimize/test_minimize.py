@@ -22,8 +22,9 @@ from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
 from prbayes.optimize import minimize as minimization
-from prbayes.optimize.convergence import Approach, Run, Search, Trace
-from prbayes.optimize.objective import Hold
+from prbayes.optimize.convergence import Run, Search, Trace
+from prbayes.optimize.design_refinement import Restart
+from prbayes.optimize.objective import Ridge
 from prbayes.response.compile import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -429,7 +430,7 @@ def test_a_collapsed_population_is_known_by_the_objective(
     """Not by standard errors: curvature and its noise are rounding errors there, and their ratio is anything."""
     optimum = prb.minimize(collapsing(spread), **keywords)
     assert optimum.point["sigma"] < 3e-3
-    assert optimum.at_edge == ("sigma",)
+    assert optimum.search.at_edge == ("sigma",)
     assert not optimum.converged
 
 
@@ -440,7 +441,7 @@ def test_a_hyperparameter_without_effect_is_at_no_edge_however_far_out() -> None
         prb.Simulator("y", same, x, metric=METRICS["pr"], observed=OBSERVED, propagation=R256)
     optimum = prb.minimize(model, start={"mu": 1.0, "idle": 60.0}, starts=0)
     assert optimum.point["idle"] == pytest.approx(60.0)
-    assert optimum.at_edge == ()
+    assert optimum.search.at_edge == ()
     assert optimum.converged
 
 
@@ -449,7 +450,7 @@ def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() ->
     optimum = prb.minimize(model)
     assert optimum.point["sigma"] < 1e-3
     assert not optimum.converged
-    assert optimum.at_edge == ("sigma",)
+    assert optimum.search.at_edge == ("sigma",)
     assert np.isnan(errors(optimum)).all()
     assert "sigma ran to the edge of the support" in repr(optimum)
     assert optimum.message.endswith("sigma ran to the edge of the support.")
@@ -506,7 +507,7 @@ def test_bfgs_steps_over_the_jumps_of_points_that_lose_their_response(name: str,
 
 def test_at_a_jump_there_are_no_standard_errors() -> None:
     optimum = prb.minimize(lossy("kl", 1, 1024), start=START)
-    assert optimum.at_jump == ("y",)
+    assert optimum.search.at_jump == ("y",)
     assert np.isnan(errors(optimum)).all()
     assert "the discrepancy jumps" in repr(optimum)
     assert "points lose their response" in str(prb.diagnose(optimum))
@@ -537,7 +538,7 @@ def test_a_jump_that_hardly_matters_leaves_standard_errors_alone(name: str) -> N
         found.append(prb.minimize(model))
     cut, whole = found
     assert cut.converged
-    assert cut.at_jump == ()
+    assert cut.search.at_jump == ()
     np.testing.assert_allclose(
         errors(cut), errors(whole), rtol=0.25
     )  # a cut response does tell more about sigma
@@ -550,7 +551,7 @@ def test_an_optimum_far_outside_the_prior_is_not_taken_for_an_edge(name: str) ->
     model = normal_model(METRICS[name], prb.Resimulated(16384), observed=observed)
     optimum = prb.minimize(model, start={"mu": 1.0, "sigma": 0.002})
     assert optimum.converged
-    assert optimum.at_edge == ()
+    assert optimum.search.at_edge == ()
     np.testing.assert_allclose(
         optimum.point["sigma"], 0.002 * fitted(name).point["sigma"], rtol=0.1
     )
@@ -560,11 +561,11 @@ def test_an_optimum_far_outside_the_prior_is_not_taken_for_an_edge(name: str) ->
 def test_the_start_is_honoured() -> None:
     model = fitted("pr").model
     optimum = prb.minimize(model, start={"mu": 0.5, "sigma": 0.9})
-    np.testing.assert_allclose(optimum.trace["theta"][0], [0.5, np.log(0.9)], rtol=1e-12)
-    assert optimum.n_screened == 0
-    assert fitted("pr").n_screened == 257
-    first = Evaluator.of(model)(optimum.trace["theta"][:1]).discrepancies[0, 0]
-    np.testing.assert_allclose(optimum.trace["discrepancy"][0], first, rtol=1e-9)
+    np.testing.assert_allclose(optimum.search.trace["theta"][0], [0.5, np.log(0.9)], rtol=1e-12)
+    assert optimum.search.n_screened == 0
+    assert fitted("pr").search.n_screened == 257
+    first = Evaluator.of(model)(optimum.search.trace["theta"][:1]).discrepancies[0, 0]
+    np.testing.assert_allclose(optimum.search.trace["discrepancy"][0], first, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -625,14 +626,20 @@ def test_far_starts_converge(name: str, propagation: Any, start: tuple[float, fl
     best = from_the_data(name, propagation)
     assert "the area metric" not in best.message
     np.testing.assert_allclose(optimum.theta, best.theta, atol=1e-4)
-    assert optimum.n_evaluations == optimum.trace["evaluations"][-1] > len(optimum.trace["theta"])
+    assert (
+        optimum.search.n_evaluations
+        == optimum.search.trace["evaluations"][-1]
+        > len(optimum.search.trace["theta"])
+    )
     if (
         propagation is not R256
     ):  # the first point is the start itself, and not a draw of the prior that costs nothing
         np.testing.assert_allclose(
-            optimum.trace["theta"][0], [start[0], np.log(start[1])], rtol=1e-12
+            optimum.search.trace["theta"][0], [start[0], np.log(start[1])], rtol=1e-12
         )
-    np.testing.assert_allclose(optimum.trace["discrepancy"].min(), optimum.discrepancy, rtol=1e-9)
+    np.testing.assert_allclose(
+        optimum.search.trace["discrepancy"].min(), optimum.discrepancy, rtol=1e-9
+    )
 
 
 @cache
@@ -646,9 +653,7 @@ def far_model(name: str, propagation: Any) -> pm.Model:
 def test_without_the_area_metric_a_far_start_does_not_arrive(
     propagation: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        minimization, "approach", lambda search, theta, *_: Approach(theta, Trace())
-    )
+    monkeypatch.setattr(minimization, "approach", lambda search, theta, *_: (theta, Trace()))
     optimum = prb.minimize(
         far_model("pr", propagation), start={"mu": 30.0, "sigma": 0.1}, refine=False, starts=0
     )
@@ -747,9 +752,9 @@ def test_responses_under_reweighted_are_those_of_the_design() -> None:
     again = prb.minimize(model)  # the design is there already, and is part of this optimum as well
     assert again.n_responses == response.count == optimum.n_responses
     assert (
-        optimum.n_evaluations
-        == len(optimum.trace["discrepancy"])
-        == len(optimum.trace["theta"])
+        optimum.search.n_evaluations
+        == len(optimum.search.trace["discrepancy"])
+        == len(optimum.search.trace["theta"])
         > 3
     )
 
@@ -763,14 +768,18 @@ def test_a_black_box_response_under_resimulated() -> None:
     optimum = prb.minimize(model)  # BFGS on finite differences
     assert optimum.converged
     assert optimum.n_responses == response.count - probe
-    assert optimum.n_evaluations * 1024 < optimum.n_responses < (optimum.n_evaluations + 20) * 1024
+    assert (
+        optimum.search.n_evaluations * 1024
+        < optimum.n_responses
+        < (optimum.search.n_evaluations + 20) * 1024
+    )
     assert (np.abs(pair(optimum) - pair(fitted("pr"))) < 0.03 * errors(fitted("pr"))).all()
     symbolic = prb.minimize(normal_model(METRICS["pr"], prb.Resimulated(1024)))
     np.testing.assert_allclose(pair(optimum), pair(symbolic), atol=1e-5)
     # Responses inside a graph are counted all the same, and a gradient costs no more than a value.
-    assert symbolic.n_evaluations < optimum.n_evaluations / 2
-    extra = optimum.n_responses - 1024 * optimum.n_evaluations
-    assert symbolic.n_responses == 1024 * symbolic.n_evaluations + extra
+    assert symbolic.search.n_evaluations < optimum.search.n_evaluations / 2
+    extra = optimum.n_responses - 1024 * optimum.search.n_evaluations
+    assert symbolic.n_responses == 1024 * symbolic.search.n_evaluations + extra
 
 
 @pytest.mark.parametrize("method", ["BFGS", "Nelder-Mead", "Powell"])
@@ -779,8 +788,10 @@ def test_running_out_of_evaluations_is_a_value(method: str) -> None:
         optimum = prb.minimize(method=method, max_evaluations=2)
     assert not optimum.converged
     assert "max_evaluations = 2" in optimum.message
-    assert optimum.n_evaluations == len(optimum.trace["discrepancy"]) == 2
-    np.testing.assert_allclose(optimum.discrepancy, optimum.trace["discrepancy"].min(), rtol=1e-9)
+    assert optimum.search.n_evaluations == len(optimum.search.trace["discrepancy"]) == 2
+    np.testing.assert_allclose(
+        optimum.discrepancy, optimum.search.trace["discrepancy"].min(), rtol=1e-9
+    )
     assert optimum.to_datatree()["optimum"].attrs["converged"] == 0
 
 
@@ -837,7 +848,7 @@ def test_bit_identical_twice() -> None:
     assert first.point == second.point
     assert first.stderr == second.stderr
     for key in ("theta", "discrepancy"):
-        np.testing.assert_array_equal(first.trace[key], second.trace[key])
+        np.testing.assert_array_equal(first.search.trace[key], second.search.trace[key])
 
 
 def test_an_optimum_survives_storage(tmp_path: Path) -> None:
@@ -877,7 +888,7 @@ def test_a_search_is_held_where_the_data_do_not_tell_and_names_what_it_is() -> N
         prb.Simulator("y", lambda a, b: a / b, *(a, b), metric=metric, observed=observed)
     optimum = prb.minimize(model, progressbar=False)
     assert optimum.converged
-    assert "Along what the data do not tell the search was held" in optimum.message
+    assert "do not identify were regularised" in optimum.message
     for name in ("mu_a", "sd_a", "mu_b", "sd_b"):
         assert np.isinf(optimum.stderr[name])
         findings = [f for f in optimum.findings if f.code == "not-identified"]
@@ -916,32 +927,31 @@ def test_where_a_gradient_is_no_number_the_search_goes_on() -> None:
 
 
 @pytest.mark.parametrize("supported", [True, False])
-def test_a_search_is_held_no_longer_than_designs_tell_nothing(
+def test_a_ridge_ends_once_designs_identify_its_directions(
     supported: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = normal_model(METRICS["kl"])
     expected = prb.minimize(model, starts=0)
-    judged = minimization._judged
-    away = np.array([0.1, 0.1])
 
-    def held(plan: Any, state: Any, rounds: int) -> Any:
-        # As by a design that was too thin at first to tell anything.
-        if rounds == 0:
-            hold = Hold(expected.theta + away, np.eye(2), 10.0)
-            return replace(state, hold=hold, restart=hold.place)
+    def regularised(search: Any, fit: Any, round_: int, *_: Any) -> Any:
+        # As by a design that was too small at first to identify anything.
+        if round_ == 0:
+            ridge = Ridge(expected.theta + 0.1, np.eye(2), 10.0)
+            return fit, Restart(ridge.center, None, ridge)
         if not supported:
             monkeypatch.setattr(minimization, "shortcomings", lambda *_: {"y": "too few points"})
-        return judged(plan, state, rounds)
+            monkeypatch.setattr(minimization, "refine_at", lambda *_, **__: {})
+        return fit, None
 
-    monkeypatch.setattr(minimization, "_judged", held)
-    found = prb.minimize(model, starts=0, refine=False)
+    monkeypatch.setattr(minimization, "refine_designs", regularised)
+    found = prb.minimize(model, starts=0)
     if supported:
         np.testing.assert_allclose(found.theta, expected.theta, atol=1e-4)
-        assert "was held" not in found.message
+        assert "were regularised" not in found.message
         return
-    # It stays where it was held, and says so.
+    # It stays at the ridge's center, with a message.
     assert np.abs(found.theta - expected.theta).max() > 0.05
-    assert "was held" in found.message
+    assert "were regularised" in found.message
 
 
 def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:

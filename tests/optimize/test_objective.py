@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from prbayes._validate import Floats
-from prbayes.optimize.objective import Hold, Objective, SpentError, StalledError
+from prbayes.optimize.objective import Objective, Ridge, SpentError, StalledError
 
 
 def parabola(theta: Floats) -> Any:
@@ -15,7 +15,9 @@ def parabola(theta: Floats) -> Any:
 
 def objective(function: Any = parabola, **keywords: Any) -> Objective:
     center, units = np.array([1.0, 2.0]), np.array([0.5, 4.0])
-    return Objective(function, center, units, 10.0, **({"gradient": True, "most": 100} | keywords))
+    return Objective(
+        function, center, units, 10.0, **({"gradient": True, "max_evaluations": 100} | keywords)
+    )
 
 
 def test_value_and_gradient_are_in_units_of_size_and_parameters() -> None:
@@ -35,7 +37,7 @@ def test_points_are_recorded_with_their_cost_and_the_best_is_the_lowest() -> Non
 
 
 def test_the_budget_is_not_exceeded() -> None:
-    found = objective(most=4)
+    found = objective(max_evaluations=4)
     found(np.zeros(2))
     found(np.zeros(2))
     with pytest.raises(SpentError):
@@ -59,7 +61,12 @@ def test_where_there_is_no_value_a_line_search_is_led_back(bad: float) -> None:
 
 def test_a_line_search_without_progress_is_stopped() -> None:
     found = Objective(
-        lambda t: (1.0, np.zeros(1), 1), np.zeros(1), np.ones(1), 1.0, gradient=True, most=100
+        lambda t: (1.0, np.zeros(1), 1),
+        np.zeros(1),
+        np.ones(1),
+        1.0,
+        gradient=True,
+        max_evaluations=100,
     )
     found.patience = 4
     for _ in range(5):
@@ -76,7 +83,7 @@ def test_small_gains_count_as_progress_once_they_add_up() -> None:
         np.ones(1),
         1.0,
         gradient=True,
-        most=99,
+        max_evaluations=99,
     )
     found.patience = 4
     found.least_gain = 3.5e-3  # four steps together, within the patience
@@ -92,16 +99,16 @@ def test_small_gains_count_as_progress_once_they_add_up() -> None:
     assert stalled
 
 
-def test_a_search_is_held_along_its_directions_alone() -> None:
+def test_a_ridge_acts_along_its_directions_alone() -> None:
     units = np.array([0.5, 4.0])
     direction = np.array([[0.6], [0.8]])
-    hold = Hold(np.array([1.0, 2.0]), direction, 10.0)
+    ridge = Ridge(np.array([1.0, 2.0]), direction, 10.0)
     across = np.array([0.8, -0.6]) * units
     along = direction[:, 0] * units
-    thetas = hold.place + np.array([across, along, 2 * along])
-    np.testing.assert_allclose(hold(thetas, units), [0.0, 5.0, 20.0], atol=1e-12)
+    thetas = ridge.center + np.array([across, along, 2 * along])
+    np.testing.assert_allclose(ridge(thetas, units), [0.0, 5.0, 20.0], atol=1e-12)
     # The gradient by differences.
-    at = hold.place + 0.3 * across + 0.7 * along
+    at = ridge.center + 0.3 * across + 0.7 * along
     steps = 1e-6 * np.eye(2)
-    slope = (hold(at + steps, units) - hold(at - steps, units)) / 2e-6
-    np.testing.assert_allclose(hold.slope(at, units), slope, rtol=1e-6)
+    slope = (ridge(at + steps, units) - ridge(at - steps, units)) / 2e-6
+    np.testing.assert_allclose(ridge.gradient(at, units), slope, rtol=1e-6)

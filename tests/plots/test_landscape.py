@@ -18,7 +18,7 @@ QUANTILES = stats.norm.ppf((np.arange(30) + 0.5) / 30)
 
 def test_the_landscape_is_not_turned_over(optimum: prb.Optimum, read: SimpleNamespace) -> None:
     pc = prb.plot_landscape(optimum, points=31)
-    trace, point = optimum.trace["theta"], optimum.point
+    trace, point = optimum.search.trace["theta"], optimum.point
     np.testing.assert_allclose(read.xy(pc, "path", "landscape"), [trace[:, 0], np.exp(trace[:, 1])])
     np.testing.assert_allclose(
         read.xy(pc, "optimum", "landscape")[:, 0], [point["mu"], point["sigma"]]
@@ -72,7 +72,7 @@ def test_other_optima_are_marked(read: SimpleNamespace) -> None:
     )
     np.testing.assert_allclose(
         np.sort(np.abs(read.xy(pc, "asked", "landscape")[0]))[-1],
-        np.abs(found.trace["theta"]).max(),
+        np.abs(found.search.trace["theta"]).max(),
     )
 
 

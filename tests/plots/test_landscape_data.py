@@ -28,7 +28,7 @@ def test_the_landscape_has_the_objective_at_its_places(optimum: prb.Optimum) -> 
         height = evaluator(theta[None]).discrepancies[0, 0]
         assert found.heights[i, j] == pytest.approx(height)
     np.testing.assert_allclose(found.optimum, [[optimum.point["sigma"], optimum.point["mu"]]])
-    np.testing.assert_allclose(found.path[:, 1], optimum.trace["theta"][:, 0])
+    np.testing.assert_allclose(found.path[:, 1], optimum.search.trace["theta"][:, 0])
     assert s[0] > 0
     assert s[0] < optimum.point["sigma"] - 2 * optimum.stderr["sigma"]
     assert np.nanmin(found.heights) >= optimum.discrepancy - 1e-9

@@ -15,7 +15,7 @@ def test_the_trace_is_in_the_users_units(
     optimum: prb.Optimum, read: SimpleNamespace, drawn: Callable[..., Any]
 ) -> None:
     pc = drawn("optimizer")
-    trace = optimum.trace
+    trace = optimum.search.trace
     np.testing.assert_allclose(
         read.xy(pc, "asked", "mu"), [trace["evaluations"], trace["theta"][:, 0]]
     )

@@ -254,7 +254,9 @@ def test_an_estimate_at_an_edge_is_refused() -> None:
     model = mean_model(lambda: pm.Normal("mu", 1.3, 0.2), data(12))
     optimum = prb.minimize(model=model, progressbar=False)
     with pytest.raises(ValueError, match="got mu at an edge"):
-        refit_likelihood(optimum.evaluator, replace(optimum, at_edge=("mu",)))
+        refit_likelihood(
+            optimum.evaluator, replace(optimum, search=replace(optimum.search, at_edge=("mu",)))
+        )
     with pytest.raises(ValueError, match="estimates of synthetic data sets at an edge"):
         refit_likelihood(optimum.evaluator, optimum, RefitLikelihoodOptions(reach=0.5))
 

@@ -79,7 +79,7 @@ def test_the_tree_of_an_optimum() -> None:
         == optimum().discrepancies["second"]
     )
     assert float(calibration["scale"].sel(simulator="first")) == 0.02
-    assert tree["trace"].sizes["evaluation"] == optimum().n_evaluations
+    assert tree["trace"].sizes["evaluation"] == optimum().search.n_evaluations
     assert {
         "discrepancy",
         "converged",
@@ -219,7 +219,7 @@ def test_an_optimum_shows_its_answer_in_a_few_lines() -> None:
     found = optimum()
     lines = repr(found).splitlines()
     assert lines[0].startswith(
-        f"Optimum: discrepancy {found.discrepancy:.4g} after {found.n_evaluations} evaluations"
+        f"Optimum: discrepancy {found.discrepancy:.4g} after {found.search.n_evaluations} evaluations"
     )
     assert lines[0].endswith("converged")
     told = [line.strip().partition(" = ") for line in lines[1:] if " ± " in line]

@@ -15,7 +15,12 @@ from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import aligned
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
-from prbayes.optimize.design_refinement import _reach, _widened, grow, refine_at
+from prbayes.optimize.design_refinement import (
+    _enlarge_samples,
+    _redraw_samples,
+    grow,
+    refine_at,
+)
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.importance import SIZES, columns, mixture_of, spread_over
 from prbayes.propagation.points import MixtureSampler
@@ -148,7 +153,7 @@ def test_clouds_grow_for_their_points_and_runs_for_what_emulators_say() -> None:
 def test_runs_are_added_where_emulators_tell_little(
     little: float, runs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("prbayes.optimize.design_refinement._UNTOLD", little)
+    monkeypatch.setattr("prbayes.optimize.design_refinement._POOR_EMULATOR", little)
     far = np.array([[2.5, 0.0, 2.5, 0.0]]) + 0.01 * np.random.default_rng(0).normal(size=(64, 4))
     evaluator, bound = design_of(build())
     assert refine_at(evaluator, far)
@@ -394,9 +399,9 @@ def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
     evaluator = Evaluator.of(model)
     assert aligned(evaluator.nodes)
     far = theta_of(evaluator) + np.array([0.5, -1.5, 0.5, -1.5])
-    _reach(evaluator, far, {"one"})
+    _redraw_samples(evaluator, far, {"one"})
     assert aligned(evaluator.nodes)
-    _widened(evaluator, far, {"two"})
+    _enlarge_samples(evaluator, far, {"two"})
     assert aligned(evaluator.nodes)
     assert {d.n_points for d in evaluator.reweighted.values()} == {2 * SIZES.first}
 

@@ -185,7 +185,9 @@ def test_optimum(calibrated: Any, report: prb.Report, page: Any, row: Any, secti
         assert float(found["estimate"]) == pytest.approx(
             optimum.point[name], abs=optimum.stderr[name] * 6e-3
         )
-    assert f"after {optimum.n_evaluations} evaluations" in " ".join(section(report, "Optimum").text)
+    assert f"after {optimum.search.n_evaluations} evaluations" in " ".join(
+        section(report, "Optimum").text
+    )
 
 
 def test_posterior(calibrated: Any, page: Any, row: Any) -> None:

@@ -96,7 +96,7 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum)
     total = 0
     for most in (100, 150):
         optimum = found(tmp_path, prb.scalar(response), max_runs=most)
-        assert optimum.stopped == f"max_runs = {most} was reached"
+        assert optimum.search.stopped == f"max_runs = {most} was reached"
         assert not optimum.converged
         assert np.isfinite(optimum.discrepancy)
         assert np.isnan(optimum.covariance).all()
@@ -106,10 +106,10 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum)
         (message,) = prb.diagnose(optimum).messages
         assert "is no answer yet" in message
         assert str(tmp_path) in message
-        assert optimum.to_datatree()["optimum"].attrs["stopped"] == optimum.stopped
+        assert optimum.to_datatree()["optimum"].attrs["stopped"] == optimum.search.stopped
     # A budget that is large enough changes nothing.
     optimum = found(tmp_path, max_seconds=1000, max_runs=at_once.n_responses)
-    assert not optimum.stopped
+    assert not optimum.search.stopped
     assert np.array_equal(optimum.theta, at_once.theta)
     assert np.array_equal(optimum.covariance, at_once.covariance)
     assert optimum.message == at_once.message
@@ -133,7 +133,7 @@ def test_minimize_stops_in_time(tmp_path: Path) -> None:
 def test_with_stored_responses_the_best_so_far_is_complete() -> None:
     model, node = build(prb.Reweighted(16), prb.scalar(Counted()))
     optimum = prb.minimize(model, max_runs=10, **QUIET)
-    assert optimum.stopped == "max_runs = 10 was reached"
+    assert optimum.search.stopped == "max_runs = 10 was reached"
     assert not optimum.converged
     assert optimum.discrepancy == pytest.approx(optimum.discrepancies["y"])
     assert optimum.support["y"]["weight_ess"] > 1

@@ -401,8 +401,8 @@ def test_nothing_is_computed_twice_but_one_response_without_a_version(
 def test_an_optimum_tells_what_was_computed_and_what_it_rests_on(tmp_path: Path) -> None:
     first = prb.minimize(model(prb.scalar(times), store=tmp_path))
     again = prb.minimize(model(prb.scalar(times), store=tmp_path))
-    assert first.n_computed == first.n_responses == again.n_responses >= N
-    assert (again.n_computed, again.point) == (1, first.point)
+    assert first.search.n_computed == first.n_responses == again.n_responses >= N
+    assert (again.search.n_computed, again.point) == (1, first.point)
 
 
 def by_factor(factor: float, calls: list[Any] | None = None) -> Any:

@@ -401,5 +401,5 @@ def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinemen
         node.reweighted.design.sample.values, 2.0 * node.reweighted.design.runs.points[0]
     )
     optimum = prb.minimize(model, progressbar=False)
-    assert optimum.n_computed <= 17 + 4
+    assert optimum.search.n_computed <= 17 + 4
     assert optimum.n_responses == node.bound.n_points
