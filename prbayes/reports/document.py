@@ -17,6 +17,7 @@ import xarray as xr
 
 from prbayes._validate import called, file_path, flag, folder_path, plain_text
 from prbayes.optimize.optimum import Optimum
+from prbayes.reports.material import gather
 from prbayes.reports.numbers import cells
 from prbayes.reports.section import Section
 from prbayes.reports.sections import sections_of
@@ -214,17 +215,12 @@ class Report(_Document):
             raise TypeError(
                 f"Report: sections: got {called(sections)}, expected prb.reports.Section objects"
             )
-        contents = tuple(sections) or sections_of(
-            model=model,
-            optimum=optimum,
-            posterior=posterior,
-            validity=validity,
-            comparison=comparison,
-            decision=decision,
-            validation=validation,
-            labels=labels,
-            pictures=pictures,
-        )
+        contents = tuple(sections)
+        if not contents:
+            material = gather(
+                model, optimum, posterior, validity, comparison, decision, validation, labels
+            )
+            contents = sections_of(material, pictures=pictures)
         for section in contents:
             if not isinstance(section, Section):
                 got = type(section).__name__

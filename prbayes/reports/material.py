@@ -158,7 +158,10 @@ def gather(
         observed=observed,
         outputs=outputs,
         diagnoses={
-            label: _diagnosis(result, model) for label, result in (results | live_optima).items()
+            label: diagnose(result, model=_model_of(result, model))
+            if _can_be_diagnosed(result, model)
+            else None
+            for label, result in (results | live_optima).items()
         },
         decisions=decisions,
         validation=dict(validation),
@@ -354,15 +357,17 @@ def _stored_observed(name: str, values: xr.DataArray) -> tuple[Floats, Outputs]:
     return read_observed(name, values)
 
 
-def _diagnosis(result: Optimum | xr.DataTree, model: pm.Model | None) -> Diagnosis | None:
-    """Return the diagnosis of a result; None where it needs the model."""
-    if isinstance(result, Optimum):
-        return diagnose(result)
-    if model is not None:
-        # A result by another metric or prior is diagnosed without the model.
-        identity = identity_in(result)
-        if identity is not None and differences(identity, identity_of_model(model), Level.OPTIMUM):
-            model = None
-    if model is None and "optimum" not in result and "calibration" not in result:
+def _model_of(result: Optimum | xr.DataTree, model: pm.Model | None) -> pm.Model | None:
+    """Return the model, or None for a saved result by another metric or prior."""
+    if model is None or isinstance(result, Optimum):
         return None
-    return diagnose(result, model=model)
+    identity = identity_in(result)
+    if identity is not None and differences(identity, identity_of_model(model), Level.OPTIMUM):
+        return None
+    return model
+
+
+def _can_be_diagnosed(result: Optimum | xr.DataTree, model: pm.Model | None) -> bool:
+    """Return whether a result has what its diagnosis needs, or the model is at hand."""
+    is_complete = isinstance(result, Optimum) or "optimum" in result or "calibration" in result
+    return is_complete or _model_of(result, model) is not None

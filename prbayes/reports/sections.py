@@ -26,7 +26,7 @@ from prbayes.plots.outputs import correlation
 from prbayes.reports.assessment import diagnostics, failures, origin, specimens, validity
 from prbayes.reports.decision import decision
 from prbayes.reports.figures import illustrate, with_graph
-from prbayes.reports.material import Material, gather
+from prbayes.reports.material import Material
 from prbayes.reports.numbers import (
     NOTHING,
     alike,
@@ -44,12 +44,8 @@ from prbayes.reports.summary import answers, next_steps, summary
 from prbayes.response.outputs import SINGLE_OUTPUT
 
 
-def sections_of(*, pictures: bool, **results: Any) -> tuple[Section, ...]:
-    """Return the sections that results allow, with pictures if wanted.
-
-    The results are keywords of `gather`.
-    """
-    material = gather(**results)
+def sections_of(material: Material, *, pictures: bool) -> tuple[Section, ...]:
+    """Return the sections that the material allows, with or without pictures."""
     parts = (
         _summary,
         model,
