@@ -31,13 +31,21 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
 from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
-# Step of differences in prior standard deviations, for densities that are twice differentiable.
-_NARROW_STEP = 1e-3
-# The same for step functions: distribution functions, jumps, and edges of a support.
-_WIDE_STEP = 0.05
-# Largest distance between distribution functions that a step makes: .6 sd of a normal population,
-# over which differences are right to a few per cent.
-_LARGEST_MOVE = 0.24
+
+@dataclass(frozen=True)
+class AsymptoticsOptions:
+    """Steps of differences in prior standard deviations, and limits."""
+
+    narrow_step: float = 1e-3  # for densities, which are twice differentiable
+    wide_step: float = 0.05  # for step functions: distribution functions, jumps, moving supports
+    # Largest distance between distribution functions that a step makes: .6 sd of a normal
+    # population, over which differences are right to a few per cent.
+    largest_move: float = 0.24
+    # Share of an element in unidentified directions above which it is not identified.
+    largest_loading: float = 0.02
+
+
+_OPTIONS = AsymptoticsOptions()
 # Avoids division by zero.
 _TINY = np.finfo(float).tiny
 
@@ -120,16 +128,17 @@ def _stencil_around(evaluator: Evaluator, k: int, theta: Floats, share: float) -
         values, weights = evaluator.populations(theta + stencil(step.size) * step, k)
         return Stencil(share, step, values, weights, node.bound.blocks, node.target)
 
+    largest = _OPTIONS.largest_move
     nominal = within(share * evaluator.hyperparameters.prior_sd)
-    if nominal.moves.max(initial=0.0) <= _LARGEST_MOVE:
+    if nominal.moves.max(initial=0.0) <= largest:
         return nominal
     around = nominal
     for _ in range(8):  # each up to ten times: to 1e-11 of the prior's spread
         # Populations that do not overlap give no estimate of the factor.
-        factor = np.where(around.moves > 0.9, 0.1, 0.5 * _LARGEST_MOVE / around.moves.clip(1e-9))
-        is_too_far = around.moves > _LARGEST_MOVE
+        factor = np.where(around.moves > 0.9, 0.1, 0.5 * largest / around.moves.clip(1e-9))
+        is_too_far = around.moves > largest
         around = within(np.where(is_too_far, factor, 1.0) * around.step)
-        if around.moves.max() <= _LARGEST_MOVE:
+        if around.moves.max() <= largest:
             return around
     # A population that is one number overlaps with no other.
     return nominal
@@ -163,19 +172,19 @@ class Information:
     def jumps(self) -> bool:
         """Whether points lose their response close to theta, where a smooth discrepancy jumps."""
         is_smooth = is_differentiable(self.node.target) and not self.node.bound.stored
-        return is_smooth and self.stencil.share > _NARROW_STEP
+        return is_smooth and self.stencil.share > _OPTIONS.narrow_step
 
     @cached_property
     def stencil(self) -> Stencil:
         """The populations around theta, as close as the discrepancy can be differenced."""
         target, bound = self.node.target, self.node.bound
-        wide = self.widened * _WIDE_STEP
+        wide = self.widened * _OPTIONS.wide_step
         if bound.stored:
             # A moving edge passes several points within a wide step.
-            share = wide if bound.support_moves else _NARROW_STEP
+            share = wide if bound.support_moves else _OPTIONS.narrow_step
             return _stencil_around(self.evaluator, self.k, self.theta, share)
         if is_differentiable(target):
-            narrow = _stencil_around(self.evaluator, self.k, self.theta, _NARROW_STEP)
+            narrow = _stencil_around(self.evaluator, self.k, self.theta, _OPTIONS.narrow_step)
             # Of several outputs a failed one is at the end of its scale, and does not jump.
             is_known = ~np.isnan(narrow.values) if target.event else np.isfinite(narrow.values)
             # Unless a point gains or loses its response within the step.
@@ -463,7 +472,7 @@ class Local:
         """The covariance in theta, (d, d), infinite for elements with a share not identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
         covariance = self.identified @ self.covariance @ self.identified.T * unit
-        is_hidden = (self.unidentified**2).sum(axis=1) > _LARGEST_LOADING
+        is_hidden = (self.unidentified**2).sum(axis=1) > _OPTIONS.largest_loading
         covariance[is_hidden] = np.inf
         covariance[:, is_hidden] = np.inf
         return np.asarray(covariance)
@@ -478,12 +487,8 @@ class Local:
         along = unit @ self.identified
         across = unit @ self.unidentified
         variance = np.einsum("...i,ij,...j->...", along, self.covariance, along)
-        is_hidden = (across**2).sum(axis=-1) > _LARGEST_LOADING * (unit**2).sum(axis=-1)
+        is_hidden = (across**2).sum(axis=-1) > _OPTIONS.largest_loading * (unit**2).sum(axis=-1)
         return np.asarray(np.where(is_hidden, np.inf, np.maximum(variance, 0)))
-
-
-# Share of an element in unidentified directions above which it is not identified.
-_LARGEST_LOADING = 0.02
 
 
 def local_sampling(information: list[Information], scales: Floats, weakest: float = 1.0) -> Local:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -217,14 +217,16 @@ class Hyperparameters:
     # The prior.
 
     @cached_property
-    def _draw_prior(self) -> Callable[[int, int], Floats]:
-        """The function (size, seed) -> draws of thetas, which are computed once."""
-        sampler = PriorSampler(self.model.free_RVs)
-        return cache(lambda size, seed: self.thetas_of(sampler(size, seed)))
+    def _prior_draws(self) -> tuple[PriorSampler, dict[tuple[int, int], Floats]]:
+        """The sampler of the prior, and its draws of thetas by size and seed."""
+        return PriorSampler(self.model.free_RVs), {}
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        return self._draw_prior(size, seed).copy()
+        sampler, draws = self._prior_draws
+        if (size, seed) not in draws:
+            draws[size, seed] = self.thetas_of(sampler(size, seed))
+        return draws[size, seed].copy()
 
     @cached_property
     def prior_sd(self) -> Floats:

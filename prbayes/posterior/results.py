@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,9 @@ class Draws:
     lost: Floats | None = None  # (chains, draws, k): share without response; NaN if stored
     stages: Sequence[Stages] = ()  # of sequential Monte Carlo, by chain
     sample_stats: xr.Dataset | None = None  # of another sampler
+    errors: Floats | None = None  # (k,): of the discrepancies at the best draw
+    # By simulator: shares of the best draw's population that were lost or failed.
+    missing: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     stopped: str = ""  # the budget that ended the run early
 
 
@@ -65,14 +68,8 @@ def posterior_tree(
     n_responses: int,
     seconds: float,
     groups: Mapping[str, xr.Dataset],
-    errors: Floats | None = None,
-    missing: Mapping[str, Mapping[str, float]] | None = None,
 ) -> xr.DataTree:
-    """Return the DataTree of a sampler's draws.
-
-    ``errors``, (k,), are those of the discrepancies at the best draw, and ``missing`` the shares of
-    its population that were lost or failed, by simulator. ``groups`` are those of `arviz_groups`.
-    """
+    """Return the DataTree of a sampler's draws with groups of `arviz_groups`."""
     attrs = {
         "n_responses": n_responses,
         "seconds": seconds,
@@ -84,7 +81,7 @@ def posterior_tree(
         **versions(),
     }
     stats = _stage_stats(draws.stages) if draws.sample_stats is None else draws.sample_stats
-    calibration = _calibration(evaluator, draws, errors, missing or {})
+    calibration = _calibration(evaluator, draws)
     tree = {
         "posterior": _posterior(evaluator, draws.thetas, attrs | _evidence(draws.stages)),
         **groups,
@@ -175,33 +172,26 @@ def _evidence(chains: Sequence[Stages]) -> dict[str, float]:
 # -- calibration -----------------------------------------------------------------------------------
 
 
-def _calibration(
-    evaluator: Evaluator,
-    draws: Draws,
-    errors: Floats | None,
-    missing: Mapping[str, Mapping[str, float]],
-) -> xr.Dataset:
+def _calibration(evaluator: Evaluator, draws: Draws) -> xr.Dataset:
     """Return figures and settings of the simulators, by draw and over all draws."""
     nodes = evaluator.nodes
     chains, n_draws, _ = draws.thetas.shape
     at_best = {
         f"{key}_at_best": (
             "simulator",
-            [missing.get(node.name, {}).get(key, np.nan) for node in nodes],
+            [draws.missing.get(node.name, {}).get(key, np.nan) for node in nodes],
         )
         for key in ("lost_mass", "failed_mass")
     }
     bounds = [node.reweighted for node in nodes]
+    errors = np.full(len(nodes), np.nan) if draws.errors is None else draws.errors
     required = [np.nan if bound is None else bound.required_ess for bound in bounds]
     by_metric = xr.Dataset(
         {
             "discrepancy": (_BY_DRAW, draws.discrepancies),
             **_support(evaluator, draws),
             "theta": (["chain", "draw", "element"], draws.thetas),
-            "discrepancy_error": (
-                "simulator",
-                np.full(len(nodes), np.nan) if errors is None else errors,
-            ),
+            "discrepancy_error": ("simulator", errors),
             **at_best,
             "epsilon": ("simulator", evaluator.epsilon),
             "required_ess": ("simulator", required),

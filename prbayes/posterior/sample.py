@@ -19,6 +19,7 @@ from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
 from prbayes.optimize.optimum import Optimum
+from prbayes.posterior import smc
 from prbayes.posterior.importance import (
     ImportanceOptions,
     Laplace,
@@ -33,7 +34,6 @@ from prbayes.posterior.smc import (
     evaluator_of,
     require_optimum,
     result_of,
-    sample_posterior,
 )
 from prbayes.posterior.target import Target, estimate_target, specimen_target
 from prbayes.response.budget import limited
@@ -173,7 +173,7 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
             if not refine_at(evaluator, thetas[:THETAS]):
                 break
         if draws is None:
-            return sample_posterior(evaluator, settings)
+            return smc.sample(evaluator, settings)
         return result_of(evaluator, draws, settings, optimum, n_before=n_before, clock=clock)
 
 

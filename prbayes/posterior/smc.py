@@ -285,33 +285,34 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
 
 def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``."""
-    if evaluator.nodes and settings.adjustment is None:
-        return _sample_kernel(evaluator, settings)
-    if settings.epsilon is not None:
+    is_pseudo = _is_pseudo(evaluator, settings)
+    if settings.epsilon is not None and not is_pseudo:
         raise ValueError(
             f"epsilon: got {settings.epsilon!r}, expected none: this posterior has no scale to "
             "choose; leave epsilon= out, or pass adjustment=None with a metric"
         )
-    return sample_posterior(evaluator, settings)
-
-
-# -- the posterior ---------------------------------------------------------------------------------
-
-
-def sample_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
-    """Return draws of the posterior: given the estimate, or of a log-likelihood by specimen."""
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    with designs_as_before(evaluator) as restore_designs:
-        optimum = estimate_of(evaluator, settings, "sample_smc")
+    with _epsilons_restored(evaluator), designs_as_before(evaluator) as restore_designs:
+        if is_pseudo:
+            optimum = _set_epsilons(evaluator, settings)
+        else:
+            optimum = estimate_of(evaluator, settings, "sample_smc")
         draws, log_likelihood = _draws_on_designs(evaluator, settings, optimum)
-        if log_likelihood is not None:
+        if is_pseudo:
+            draws = _with_errors(evaluator, draws)
+        elif log_likelihood is not None:
             logs = log_likelihood(draws.thetas.reshape(-1, evaluator.hyperparameters.size))
             draws = replace(draws, log_likelihood=logs.reshape(draws.thetas.shape[:2]))
         tree = result_of(evaluator, draws, settings, optimum, n_before=n_before, clock=clock)
         if draws.stopped:
             restore_designs()
         return tree
+
+
+def _is_pseudo(evaluator: Evaluator, settings: SamplingSettings) -> bool:
+    """Return whether the density is prior times exp(-sum of d_k / epsilon_k)."""
+    return bool(evaluator.nodes) and settings.adjustment is None
 
 
 def estimate_of(evaluator: Evaluator, settings: SamplingSettings, caller: str) -> Optimum | None:
@@ -338,38 +339,44 @@ def result_of(
     n_before: int,
     clock: float,
 ) -> xr.DataTree:
-    """Return the DataTree of draws of the posterior.
+    """Return the DataTree of draws.
 
     Discrepancies are computed if that costs no response. ``n_before`` and ``clock`` are the number
     of responses and the time at the start. Raises DesignError if too much of the populations of
     most draws has no response.
     """
-    budget = _budget_findings(draws, settings)
-    thetas = draws.thetas
-    shape = (*thetas.shape[:2], len(evaluator.nodes))
-    discrepancies = np.full(shape, np.nan)
-    lost = _lost_of_some(evaluator, thetas)
-    _refuse_lost(evaluator, lost)
+    findings = list(_budget_findings(draws, settings))
+    thetas, lost, discrepancies = draws.thetas, draws.lost, draws.discrepancies
+    rows = thetas.reshape(-1, evaluator.hyperparameters.size)
+    is_pseudo = _is_pseudo(evaluator, settings)
+    if not is_pseudo:
+        lost = _lost_of_some(evaluator, thetas)
+        _refuse_lost(evaluator, lost)
+        discrepancies = np.full(lost.shape, np.nan)
+    assert lost is not None
     with unlimited():
-        if evaluator.nodes and not evaluator.responses_per_theta:
-            evaluation = evaluator(thetas.reshape(-1, evaluator.hyperparameters.size))
-            discrepancies = evaluation.discrepancies.reshape(shape)
+        if is_pseudo and settings.with_groups:
+            kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
+            other_terms = evaluator.log_other(rows).reshape(thetas.shape[:2])
+            draws = replace(draws, log_likelihood=kernels.sum(axis=-1) + other_terms)
+        elif not is_pseudo and evaluator.nodes and not evaluator.responses_per_theta:
+            discrepancies = evaluator(rows).discrepancies.reshape(lost.shape)
         draws = replace(draws, discrepancies=discrepancies, lost=lost)
-        groups = (
-            arviz_groups(evaluator, draws, settings.random_seed) if settings.with_groups else {}
-        )
-        findings = [*budget, *_lost_findings(evaluator, lost)]
-        if optimum is None:
-            findings += [
-                f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings
-            ]
-        else:
-            conflicts = prior_conflicts(optimum, evaluator, thetas) if evaluator.nodes else ()
-            findings += [*optimum.findings, *conflicts]
+        groups = {}
+        if settings.with_groups:
+            groups = arviz_groups(evaluator, draws, settings.random_seed)
+        findings += _lost_findings(evaluator, lost)
+        if optimum is not None:
+            findings += optimum.findings
+            if evaluator.nodes and not is_pseudo:
+                findings += prior_conflicts(optimum, evaluator, thetas)
+        elif not is_pseudo:
+            for likelihood in evaluator.likelihoods:
+                findings += prepared(likelihood).findings
         return posterior_tree(
             evaluator,
             draws,
-            adjustment="estimate" if evaluator.nodes else "none",
+            adjustment="estimate" if evaluator.nodes and not is_pseudo else "none",
             findings=findings,
             seed=settings.random_seed,
             n_responses=evaluator.n_responses - n_before,
@@ -455,53 +462,6 @@ def _lost_findings(evaluator: Evaluator, lost: Floats) -> tuple[Finding, ...]:
 # -- the pseudo-posterior --------------------------------------------------------------------------
 
 
-def _sample_kernel(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
-    """Return draws of prior times exp(-sum of d_k / epsilon_k)."""
-    clock = time.perf_counter()
-    n_before = evaluator.n_responses - n_design_runs(evaluator)
-    with _epsilons_restored(evaluator), designs_as_before(evaluator) as restore_designs:
-        optimum = _set_epsilons(evaluator, settings)
-        draws, _ = _draws_on_designs(evaluator, settings, optimum)
-        discrepancies, lost = draws.discrepancies, draws.lost
-        assert discrepancies is not None
-        assert lost is not None
-        errors, missing = None, None
-        try:
-            errors, missing = _at_best(evaluator, draws.thetas, discrepancies)
-        except BudgetError as spent:
-            draws = replace(draws, stopped=draws.stopped or str(spent))
-        else:
-            _refuse_lost(evaluator, lost, missing)
-        with unlimited():
-            groups = {}
-            if settings.with_groups:
-                kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
-                rows = draws.thetas.reshape(-1, evaluator.hyperparameters.size)
-                other_terms = evaluator.log_other(rows).reshape(draws.thetas.shape[:2])
-                logs = kernels.sum(axis=-1) + other_terms
-                draws = replace(draws, log_likelihood=logs)
-                groups = arviz_groups(evaluator, draws, settings.random_seed)
-            tree = posterior_tree(
-                evaluator,
-                replace(draws, sampler={"sampler": "SMC-ABC"}),
-                adjustment="none",
-                findings=(
-                    *_budget_findings(draws, settings),
-                    *_lost_findings(evaluator, lost),
-                    *(() if optimum is None else optimum.findings),
-                ),
-                errors=errors,
-                missing=missing,
-                seed=settings.random_seed,
-                n_responses=evaluator.n_responses - n_before,
-                seconds=time.perf_counter() - clock,
-                groups=groups,
-            )
-        if draws.stopped:
-            restore_designs()
-        return tree
-
-
 @contextmanager
 def _epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
     """Restore the epsilons of the simulators afterwards."""
@@ -542,18 +502,22 @@ def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum |
     return optimum
 
 
-def _at_best(
-    evaluator: Evaluator, thetas: Floats, discrepancies: Floats
-) -> tuple[Floats, dict[str, dict[str, float]]]:
-    """Return errors of the discrepancies, (k,), and missing responses, at the best draw."""
-    total = (discrepancies / evaluator.epsilon).sum(axis=-1)
-    best = thetas[np.unravel_index(total.argmin(), total.shape)]
+def _with_errors(evaluator: Evaluator, draws: Draws) -> Draws:
+    """Return draws with errors of the discrepancies and missing responses at the best one."""
+    assert draws.discrepancies is not None
+    assert draws.lost is not None
+    total = (draws.discrepancies / evaluator.epsilon).sum(axis=-1)
+    best = draws.thetas[np.unravel_index(total.argmin(), total.shape)]
     errors = []
     missing = {}
-    for k, node in enumerate(evaluator.nodes):
-        errors.append(discrepancy_error(node.bound, evaluator.roots(best[None], k)))
-        missing[node.name] = missing_mass(evaluator, best, k)
-    return np.array(errors), missing
+    try:
+        for k, node in enumerate(evaluator.nodes):
+            errors.append(discrepancy_error(node.bound, evaluator.roots(best[None], k)))
+            missing[node.name] = missing_mass(evaluator, best, k)
+    except BudgetError as spent:
+        return replace(draws, stopped=draws.stopped or str(spent))
+    _refuse_lost(evaluator, draws.lost, missing)
+    return replace(draws, errors=np.array(errors), missing=missing)
 
 
 # -- chains ----------------------------------------------------------------------------------------
@@ -579,7 +543,7 @@ def _draws_on_designs(
             refine_at(evaluator, refinements[-1])
             continue
         log_likelihood = None
-        if evaluator.nodes and settings.adjustment is not None:
+        if evaluator.nodes and not _is_pseudo(evaluator, settings):
             assert optimum is not None
             log_likelihood = estimate_target(evaluator, optimum).log_likelihood
         chains = Chains(evaluator, settings, log_likelihood, starts, checkpoint, tuple(refinements))
@@ -653,6 +617,7 @@ class Chains:
         saved = {} if self.checkpoint is None else self.checkpoint.note
         if saved.get("round") != len(self.refinements):
             saved = {}
+        is_pseudo = _is_pseudo(self.evaluator, self.settings)
         coarse = coarser_evaluator(self.evaluator) if self.log_likelihood is None else None
         finished: list[dict[str, Floats]] = []
         stages: list[Stages] = []
@@ -694,7 +659,7 @@ class Chains:
         )
         return Draws(
             thetas=thetas,
-            sampler={"sampler": "SMC"},
+            sampler={"sampler": "SMC-ABC" if is_pseudo else "SMC"},
             discrepancies=discrepancies,
             lost=lost,
             stages=stages,
