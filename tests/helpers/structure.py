@@ -25,7 +25,7 @@ these them theirs given wanted asked chosen made done before after
 # Pronouns, participles and adverbs, which are no nouns of the field.
 VAGUE_NAMES = frozenset(_VAGUE.split())
 _CONCRETE = """
-Design FreshBound ResimulatedBound FunctionMetric AreaMetric ProbabilityResidual KullbackLeibler
+ReweightedBound FreshBound ResimulatedBound FunctionMetric AreaMetric ProbabilityResidual KullbackLeibler
 LogLikelihood Reweighted Resimulated Fresh
 """
 # Classes of metrics and propagations that code outside their files must not test for.
