@@ -91,9 +91,9 @@ def refine_designs(
     fit = replace(fit, design_error=errors.whole)
     if not errors.whole > AGREE:
         return fit, None
-    left = runs_left(evaluator, errors)
+    remaining = runs_left(evaluator, errors)
     note = f"error {errors.whole:.2f} standard errors, {AGREE} are wanted"
-    note += f", about {left} runs to go" if left else ", no more runs are needed"
+    note += f", about {remaining} runs to go" if remaining else ", no more runs are needed"
     previous = n_design_runs(evaluator)
     if not grow(evaluator, nearby, errors):
         return fit, None

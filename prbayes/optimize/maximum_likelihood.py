@@ -93,10 +93,10 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         discrepancies={name: -float(v.sum()) for name, v in log_likelihoods.items()},
         scales=dict.fromkeys(log_likelihoods, 1.0),
         n_responses=evaluator.n_responses - n_previous,
-        prior=settings.prior,
         identity=identity_of(evaluator, prior_minimised=settings.prior),
         search=SearchRecord(
             result=Result.CONVERGED if is_converged else Result.FAILED,
+            prior=settings.prior,
             details=f"{len(modes)} local optimum(s) from {len(starts)} starts.",
             n_evaluations=objective.count,
             n_screened=n_screened,

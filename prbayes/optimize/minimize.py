@@ -511,6 +511,7 @@ def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = 
             fit, rivals = replace(fit, sampling=None), []
     record = SearchRecord(
         result=fit.run.result,
+        prior=search.prior,
         details=f"{fit.run.details} {_details(problem, fit, at_edge, stopped)}".strip(),
         n_evaluations=fit.run.trace.count,
         n_screened=problem.n_screened,
@@ -529,7 +530,9 @@ def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = 
             "expensive.md#a-night-is-not-enough",
         )
         return replace(optimum, findings=report(finding))
-    refuse_lost(evaluator, {name: each["lost_mass"] for name, each in optimum.support.items()})
+    refuse_lost(
+        evaluator, {name: numbers["lost_mass"] for name, numbers in optimum.support.items()}
+    )
     findings = report(
         *breakdown_findings(at_edge, at_jump),
         *heavy_tails(evaluator, fit.theta),

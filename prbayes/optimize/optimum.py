@@ -57,6 +57,8 @@ class SearchRecord:
         How it ended, with a message.
     details : str
         Sentences with the numbers behind the result.
+    prior : bool
+        Whether minus the log prior was part of the objective.
     n_evaluations : int
         Evaluations of the objective by the optimiser. One with an exact gradient counts as one; of
         a gradient by differences each evaluation counts.
@@ -82,6 +84,7 @@ class SearchRecord:
 
     result: Result
     details: str = ""
+    prior: bool = False
     n_evaluations: int = 0
     n_screened: int = 0
     n_computed: int = 0
@@ -131,8 +134,6 @@ class Optimum:
         ``theta``, and ``comparable``, whether the data could as well come from there.
     findings : tuple of Finding
         What is not identified, and what else to know of the answer; also logged.
-    prior : bool
-        Whether minus the log prior was part of the objective.
     identity : Identity or None
         Fingerprint of the problem.
     search : SearchRecord
@@ -149,7 +150,6 @@ class Optimum:
     discrepancies: dict[str, float]
     scales: dict[str, float]
     n_responses: int
-    prior: bool
     identity: Identity | None
     search: SearchRecord
     support: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -247,7 +247,7 @@ class Optimum:
 
 def _heading(optimum: Optimum) -> str:
     """Return the discrepancy and its cost in words."""
-    kind = "Optimum with the prior" if optimum.prior else "Optimum"
+    kind = "Optimum with the prior" if optimum.search.prior else "Optimum"
     label = "discrepancy" if optimum.evaluator.nodes else "minus log-likelihood"
     state = "converged" if optimum.converged else "NOT converged"
     return (
@@ -334,7 +334,6 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         discrepancies=dict(zip(names, map(float, values), strict=True)),
         scales=dict(zip(names, map(float, scales), strict=True)),
         n_responses=n_responses,
-        prior=search.prior,
         identity=identity_of(evaluator, prior_minimised=search.prior),
         search=record,
         support=support,
@@ -483,7 +482,7 @@ def _attributes(optimum: Optimum) -> dict[str, Any]:
     return {
         "discrepancy": optimum.discrepancy,
         "converged": int(optimum.converged),
-        "prior": int(optimum.prior),
+        "prior": int(optimum.search.prior),
         "message": optimum.message,
         "stopped": search.stopped,
         "n_evaluations": search.n_evaluations,

@@ -56,24 +56,12 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class SpecimenPool:
-    """Simulated specimens of one likelihood with the points of each.
+    """Simulated specimens of one likelihood with the points of each."""
 
-    Attributes
-    ----------
-    copies : int
-        Simulated specimens for each observed one, which has their group and missing outputs.
-    points : list of ndarray, shapes (copies * N, K, *event)
-        Inputs.
-    log_a : ndarray, shape (copies * N, K)
-        As of `SpecimenLikelihood.arrays`.
-    z : ndarray, shape (copies * N, K, d)
-        Coordinates of the points.
-    """
-
-    copies: int
-    points: list[Floats]
-    log_a: Floats
-    z: Floats
+    copies: int  # simulated specimens for each observed one, with its group and missing outputs
+    points: list[Floats]  # (copies * N, K, *event): inputs
+    log_a: Floats  # (copies * N, K): the numbers A
+    z: Floats  # (copies * N, K, d): coordinates of the points
 
     def data_set(self, rng: np.random.Generator) -> tuple[list[Floats], Floats]:
         """Return points and numbers A of one data set of N specimens."""
@@ -90,29 +78,21 @@ def specimen_pool(
 ) -> SpecimenPool:
     """Simulate specimens of one population, and draw their points.
 
-    Parameters
-    ----------
-    likelihood : SpecimenLikelihood
-    params : mapping
-        Values by its variables without the group, shapes (1, *shape).
-    rng : Generator
-    size : int
-        Number of specimens, rounded up to a multiple of the observed ones.
+    ``params`` has the values of the variables without the group, (1, *shape). ``size`` is rounded
+    up to a multiple of the number of observed specimens.
     """
     n = len(likelihood.readings)
     copies = max(1, -(-size // n))
     values = draw_readings(likelihood, rng, params, copies * n)[0].reshape(copies * n, -1)
-    measurement = likelihood.readings
-    shape = values.shape
-    measured = np.resize(measurement.is_measured, shape)
+    observed, shape = likelihood.readings, values.shape
     missing = np.full(shape, np.nan)
     readings = Readings(
-        np.where(measured, values, np.nan),
-        np.resize(measurement.error, shape),
-        np.resize(measurement.step, shape),
+        np.where(np.resize(observed.is_measured, shape), values, np.nan),
+        np.resize(observed.error, shape),
+        np.resize(observed.step, shape),
         missing,
         missing,
-        np.resize(measurement.is_relative, shape),
+        np.resize(observed.is_relative, shape),
     )
     options = likelihood.options
     # The tolerance is that of the log-likelihood of a data set, not of the pool.
@@ -138,14 +118,7 @@ def other_specimens(
     likelihoods: Sequence[SpecimenLikelihood],
     data: Sequence[tuple[list[Floats], Floats]],
 ) -> Iterator[None]:
-    """Give compiled likelihoods the points of other specimens meanwhile.
-
-    Parameters
-    ----------
-    likelihoods : sequence of SpecimenLikelihood
-    data : sequence of tuple
-        Points and numbers A, as of `SpecimenPool.data_set`.
-    """
+    """Give compiled likelihoods the points and numbers A of other specimens within the context."""
     shared = [arrays(likelihood) for likelihood in likelihoods]
     before = [([x.get_value() for x in points], log_a.get_value()) for points, log_a in shared]
     try:
@@ -164,37 +137,20 @@ def _set(shared: Sequence[Any], data: Sequence[tuple[list[Floats], Floats]]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Refit:
-    """The estimate of one simulated data set.
+    """The estimate of one simulated data set."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (d,)
-    converged : bool
-    data : list of tuple
-        Points and numbers A of the data set, by likelihood.
-    """
-
-    theta: Floats
+    theta: Floats  # (d,)
     converged: bool
-    data: list[tuple[list[Floats], Floats]]
+    data: list[tuple[list[Floats], Floats]]  # points and numbers A, by likelihood
 
 
 @dataclass(frozen=True, eq=False)
 class SpecimenRefits:
-    """Maximum-likelihood estimates around an optimum.
-
-    Attributes
-    ----------
-    evaluator : Evaluator
-    theta : ndarray, shape (d,)
-        Start of all estimates.
-    covariance : ndarray, shape (d, d)
-        Of the estimate; where it is not finite, the prior's spread scales the parameters.
-    """
+    """Maximum-likelihood estimates around an optimum."""
 
     evaluator: Evaluator
-    theta: Floats
-    covariance: Floats
+    theta: Floats  # (d,): start of all estimates
+    covariance: Floats  # (d, d): unit of the parameters, or the prior's spread if not finite
 
     @property
     def _function(self) -> Any:
@@ -226,10 +182,7 @@ class SpecimenRefits:
     def fit(self, weights: Sequence[Floats] | None = None) -> tuple[Floats, bool]:
         """Return the estimate, (d,), and whether its search converged.
 
-        Parameters
-        ----------
-        weights : sequence of ndarray, shapes (N,), optional
-            Of the specimens, by likelihood, with sum N; all one by default.
+        ``weights`` of the specimens, (N,) by likelihood with sum N, are one by default.
         """
         from scipy.optimize import minimize
 
@@ -281,10 +234,7 @@ class SpecimenRefits:
     def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """Return estimates of weighted data sets, (S, d), and which converged.
 
-        Parameters
-        ----------
-        weights : sequence of ndarray, shapes (S, n_k)
-            Of the specimens of each of `Evaluator.emulated`; of one data set they may have any sum.
+        ``weights``, (S, n_k), are of the specimens of each of `Evaluator.emulated`, with any sum.
         """
         by_likelihood = []
         emulated = self.evaluator.emulated
@@ -312,14 +262,7 @@ def is_specimen_optimum(result: object) -> bool:
 
 
 def specimen_refits(optimum: Optimum, caller: str, *, simulated: bool = False) -> SpecimenRefits:
-    """Return the refits around an optimum, or raise.
-
-    Raises
-    ------
-    ValueError
-        If the model cannot be fitted to other data sets, nothing is known around the optimum, the
-        prior was part of it, or the model has changed since.
-    """
+    """Return the refits around an optimum, or raise if the model cannot be fitted to other data."""
     evaluator = require_sampling(optimum, caller).evaluator
     find = simulation_obstacle if simulated else specimen_refit_obstacle
     obstacle = find(evaluator)

@@ -41,7 +41,7 @@ def check_optimum(optimum: Any, caller: str) -> None:
 def objective_label(optimum: Optimum) -> str:
     """Return the label of the objective."""
     if not optimum.evaluator.nodes:
-        return "minus log-posterior" if optimum.prior else "minus log-likelihood"
+        return "minus log-posterior" if optimum.search.prior else "minus log-likelihood"
     if len(optimum.scales) > 1:
         return "sum of scaled discrepancies"
     metric = optimum.evaluator.nodes[0].metric

@@ -102,7 +102,7 @@ def prior_conflicts(
     The predictive distribution of an estimate is that of draws of the prior with the standard
     errors of the optimum.
     """
-    if optimum.prior or any(rival["comparable"] for rival in optimum.rivals):
+    if optimum.search.prior or any(rival["comparable"] for rival in optimum.rivals):
         return ()
     order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
     covariance = optimum.covariance[np.ix_(order, order)]

@@ -219,7 +219,7 @@ def _check_family(optimum: Optimum) -> tuple[list[Finding], tuple[Finding, ...]]
     if evaluator.responses_per_theta:
         return [], _not_tested("it would take responses")
     fitted: FittedSets | None
-    if optimum.prior:
+    if optimum.search.prior:
         scales = np.array(list(optimum.scales.values()))
         sampling = SamplingDistribution.of(evaluator, optimum.theta, scales)
         fitted = FittedSets.at_theta(sampling, SETS, 0)
@@ -229,7 +229,7 @@ def _check_family(optimum: Optimum) -> tuple[list[Finding], tuple[Finding, ...]]
     if fitted is None or np.isnan(p_value):
         return [], _not_tested("the data tell too little, or too few refits converge")
     misfits = tuple(output_misfits(fitted)) if p_value < UNLIKELY else ()
-    return population_misfit(p_value, with_prior=optimum.prior), misfits
+    return population_misfit(p_value, with_prior=optimum.search.prior), misfits
 
 
 def _compared_outputs(result: xr.DataTree) -> tuple[Finding, ...]:

@@ -174,7 +174,7 @@ def _population_obstacle(optimum: Optimum) -> str:
     obstacle = simulation_obstacle(evaluator)
     if obstacle is not None:
         return obstacle
-    if optimum.prior:
+    if optimum.search.prior:
         return "the prior was part of the optimum"
     if not optimum.converged or not np.isfinite(optimum.covariance).all():
         return "nothing is known of the sampling distribution of this optimum"

@@ -100,7 +100,7 @@ def test_the_mode_with_the_prior() -> None:
     model = normal_model(sigma=sd, prior_sd=prior_sd)
     precision = N / sd**2 + 1 / prior_sd**2
     optimum = fit(model, prior=True)
-    assert optimum.prior
+    assert optimum.search.prior
     assert optimum.point["mu"] == pytest.approx(X.sum() / sd**2 / precision, abs=1e-4)
     assert optimum.stderr["mu"] == pytest.approx(precision**-0.5, abs=1e-4)
     assert fit(model).point["mu"] == pytest.approx(X.mean(), abs=1e-4)

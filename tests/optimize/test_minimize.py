@@ -197,7 +197,7 @@ def test_a_quadratic_case_with_everything_mixed_in() -> None:
         assert optimum.scales == {"y": pytest.approx(1 / N)}
         expected = precision[terms] @ centers[terms] / precision[terms].sum()
         np.testing.assert_allclose(optimum.point["mu"], expected, atol=1e-4)
-        assert (optimum.prior, "with the prior" in repr(optimum)) == (prior, prior)
+        assert (optimum.search.prior, "with the prior" in repr(optimum)) == (prior, prior)
         assert optimum.to_datatree()["optimum"].attrs["prior"] == int(prior)
 
 

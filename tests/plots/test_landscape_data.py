@@ -95,7 +95,7 @@ def test_what_has_no_trace_is_refused(optimum: prb.Optimum, posterior: xr.DataTr
     with pytest.raises(TypeError, match="test: got DataTree, expected an Optimum"):
         check_optimum(posterior, "test")
     with pytest.raises(ValueError, match="test: got an optimum without a trace"):
-        check_optimum(replace(optimum, trace={}), "test")
+        check_optimum(replace(optimum, search=replace(optimum.search, trace={})), "test")
     for plot in (prb.plot_optimizer, prb.plot_landscape):
         with pytest.raises(TypeError, match=f"{plot.__name__}: got DataTree"):
             plot(posterior)  # type: ignore[arg-type]

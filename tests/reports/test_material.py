@@ -12,6 +12,7 @@ import xarray as xr
 import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.model.random_variable import nodes
+from prbayes.optimize.convergence import Result
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import cells
 
@@ -137,8 +138,7 @@ def test_a_name_is_given_once(calibrated: Any) -> None:
 def test_a_saved_optimum_is_diagnosed_as_in_memory(calibrated: Any) -> None:
     lost = replace(
         calibrated.optimum,
-        converged=False,
-        message="stopped",
+        search=replace(calibrated.optimum.search, result=Result.FAILED),
         findings=(Finding("not-identified", "The data do not see mu."),),
     )
     given = dict.fromkeys(("model", "posterior", "validity", "comparison"))
@@ -148,7 +148,7 @@ def test_a_saved_optimum_is_diagnosed_as_in_memory(calibrated: Any) -> None:
     assert saved is not None
     assert memory.messages == saved.messages
     assert saved.messages[0] == "The data do not see mu."
-    assert "did not converge (stopped)" in saved.messages[1]
+    assert "did not converge (The minimiser failed." in saved.messages[1]
 
 
 def test_deterministics_are_compared(calibrated: Any) -> None:

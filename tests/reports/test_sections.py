@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
+from prbayes.optimize.convergence import Result
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import NOTHING, cells
 from prbayes.reports.sections import _other_optimum, data, metric
@@ -254,12 +255,13 @@ def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
         {"point": {"mu": mu, "w": np.ones(2)}, "discrepancy": 0.25, "comparable": comparable}
         for mu, comparable in ((-1.5, True), (3.0, False))
     )
-    optimum = dataclasses.replace(
-        calibrated.optimum, rivals=rivals, converged=False, message="stopped."
+    search = dataclasses.replace(
+        calibrated.optimum.search, result=Result.FAILED, details="It stopped."
     )
+    optimum = dataclasses.replace(calibrated.optimum, rivals=rivals, search=search)
     text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
     assert text[0].startswith("The optimiser did not converge after ")
-    assert text[0].endswith("of the objective: stopped.")
+    assert text[0].endswith("of the objective: The minimiser failed. It stopped.")
     assert text[1] == (
         "Another optimum is at mu = -1.500, with discrepancy 0.2500: "
         "the data could as well come from there."

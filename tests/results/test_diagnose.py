@@ -205,7 +205,9 @@ def test_a_stored_optimum_tells_what_the_optimum_does() -> None:
 def test_an_edge_is_said_once() -> None:
     model, _ = sampled()
     finding = Finding("flat-edge", "mu ran to the edge.")
-    edge = replace(prb.minimize(model), converged=False, at_edge=("mu",), findings=(finding,))
+    optimum = prb.minimize(model)
+    search = replace(optimum.search, result=Result.AT_EDGE, at_edge=("mu",))
+    edge = replace(optimum, search=search, findings=(finding,))
     assert prb.diagnose(edge).findings == (finding,)
 
 
