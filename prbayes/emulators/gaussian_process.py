@@ -98,7 +98,7 @@ class GaussianProcess(Surface):
     @one_thread()
     def tuned(self, x: Floats, y: Floats) -> GaussianProcess:
         """Return the same with the likeliest lengths and nugget."""
-        from scipy.optimize import minimize
+        from scipy.optimize import minimize as scipy_minimize
 
         rows = np.linspace(0, len(x) - 1, min(MOST_TUNED, len(x))).astype(int)
         likelihood = Likelihood(KERNELS[self.kernel], x[rows], y[rows] - y[rows].mean())
@@ -109,7 +109,7 @@ class GaussianProcess(Surface):
         # short ones alone a near-polynomial. With many points both give the same.
         starts = [(0.7, 1e-2), (2.0, 1e-6)] if len(rows) <= 128 else [(0.7, 1e-2)]
         fits = [
-            minimize(
+            scipy_minimize(
                 likelihood,
                 np.log([*[length * np.sqrt(d)] * d, nugget]),
                 jac=True,

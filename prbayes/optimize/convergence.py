@@ -268,11 +268,12 @@ def _run_scipy(
     search: Search, objective: Objective, start: Floats, **settings: Any
 ) -> tuple[Result, str]:
     """Run a minimiser of scipy; return the result and its details."""
-    from scipy import optimize  # takes longer to import than the whole package
+    # Takes longer to import than the whole package.
+    from scipy.optimize import minimize as scipy_minimize
 
     try:
         with progress("evaluations") as objective.report:
-            outcome = optimize.minimize(objective, start, **settings)
+            outcome = scipy_minimize(objective, start, **settings)
     except SpentError:
         return Result.MAX_EVALUATIONS, f"max_evaluations = {search.max_evaluations}."
     except BudgetError:

@@ -368,9 +368,20 @@ def _enlarge_samples(
 
 
 @contextmanager
-def temporary_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
-    """Redraw emulated samples for the populations at thetas within the context."""
-    with _temporary_samples(evaluator, thetas, set(evaluator.reweighted), same_surfaces=True):
+def temporary_samples(
+    evaluator: Evaluator,
+    thetas: Floats,
+    names: set[str] | None = None,
+    *,
+    same_surfaces: bool = True,
+) -> Iterator[None]:
+    """Redraw emulated samples for the populations at thetas within the context.
+
+    Those of all designs, or of the simulators with the given names and their siblings.
+    """
+    names = set(evaluator.reweighted) if names is None else names
+    with designs_restored([bound for _, bound in _emulated_designs(evaluator, names)]):
+        _redraw_samples(evaluator, thetas, names, same_surfaces=same_surfaces)
         yield
 
 
@@ -379,16 +390,7 @@ def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[No
     """Do the same in designs of a model that was never calibrated, which cover the prior alone."""
     bounds = evaluator.reweighted.items()
     names = {name for name, bound in bounds if len(bound.design.groups) == 1}
-    with _temporary_samples(evaluator, thetas, names, same_surfaces=False):
-        yield
-
-
-@contextmanager
-def _temporary_samples(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool
-) -> Iterator[None]:
-    with designs_restored([bound for _, bound in _emulated_designs(evaluator, names)]):
-        _redraw_samples(evaluator, thetas, names, same_surfaces=same_surfaces)
+    with temporary_samples(evaluator, thetas, names, same_surfaces=False):
         yield
 
 

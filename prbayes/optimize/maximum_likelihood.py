@@ -203,7 +203,7 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
 
 def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimum:
     """Return the local minimum that BFGS reaches, with its inverse Hessian."""
-    from scipy.optimize import minimize
+    from scipy.optimize import minimize as scipy_minimize
 
     unit, first = objective.unit, objective.count
 
@@ -212,7 +212,7 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimu
         return value, gradient * unit
 
     remaining = max(10, settings.max_evaluations - objective.count)
-    result = minimize(
+    result = scipy_minimize(
         standardised,
         start / unit,
         jac=True,
@@ -223,7 +223,7 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimu
     value, _ = objective(theta)
     if not result.success and np.isfinite(value):
         # The optimum of a moving support is at a jump: continue without gradients.
-        simplex = minimize(
+        simplex = scipy_minimize(
             lambda u: objective(u * unit)[0],
             theta / unit,
             method="Nelder-Mead",
@@ -321,7 +321,7 @@ def share_mode(
     in units of the prior. So a ridge, straight or curved, is one mode.
     """
     from scipy.linalg import null_space
-    from scipy.optimize import minimize
+    from scipy.optimize import minimize as scipy_minimize
 
     start, step = first.theta / unit, (second.theta - first.theta) / unit
     across = null_space(step[None])
@@ -336,7 +336,7 @@ def share_mode(
         value, _ = profile(offset, at)
         if value > height and offset.size:
             # Off the line, on which a symmetric objective has no slope.
-            value = minimize(profile, offset + 0.01, args=(at,), jac=True, method="BFGS").fun
+            value = scipy_minimize(profile, offset + 0.01, args=(at,), jac=True, method="BFGS").fun
         if value > height:
             return False
     return True
@@ -350,7 +350,7 @@ def _prior_ends(
     In unconstrained space the end is at infinity, and nothing changes on the way there. Back at the
     median of the prior the log-likelihood is lower by more than three nats, whatever the others do.
     """
-    from scipy.optimize import minimize
+    from scipy.optimize import minimize as scipy_minimize
 
     hyperparameters = evaluator.hyperparameters
     theta, unit = optimum.theta, hyperparameters.prior_sd
@@ -376,7 +376,7 @@ def _prior_ends(
         lowest = along(origin)
         if theta.size > 1 and np.isfinite(lowest):
             options = {"maxfev": 100 * theta.size, "xatol": 1e-2, "fatol": 1e-2}
-            lowest = minimize(along, origin, method="Nelder-Mead", options=options).fun
+            lowest = scipy_minimize(along, origin, method="Nelder-Mead", options=options).fun
         if lowest > optimum.value + 3.0:
             ends.append(PriorEnd(hyperparameters.readable_names[i], value, bound))
     return ends

@@ -72,18 +72,20 @@ class Method:
         """Raise for options that scipy's method does not have, of which it only warns."""
         if not all(isinstance(name, str) for name in self.options):
             raise TypeError(f"options: got {list(self.options)} as names, expected texts")
-        from scipy import optimize  # takes longer to import than the whole package
+        # Takes longer to import than the whole package.
+        from scipy.optimize import OptimizeWarning
+        from scipy.optimize import minimize as scipy_minimize
 
         # Scipy checks names when it runs: here from the minimum of a parabola. Bad values raise
         # later, on the problem itself.
         options = {name: value for name, value in self.options.items() if name != "disp"}
         with warnings.catch_warnings(record=True) as caught, suppress(Exception):
             warnings.simplefilter("always")
-            optimize.minimize(
+            scipy_minimize(
                 lambda x: (x @ x, 2 * x), np.zeros(2), method=method, jac=True, options=options
             )
         for warning in caught:
-            if issubclass(warning.category, optimize.OptimizeWarning):
+            if issubclass(warning.category, OptimizeWarning):
                 raise ValueError(
                     f"options: got {dict(self.options)}, expected options of scipy's {method}; "
                     f"scipy says: {warning.message}"

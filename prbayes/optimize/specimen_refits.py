@@ -184,7 +184,7 @@ class SpecimenRefits:
 
         ``weights`` of the specimens, (N,) by likelihood with sum N, are one by default.
         """
-        from scipy.optimize import minimize
+        from scipy.optimize import minimize as scipy_minimize
 
         if weights is None:
             weights = [np.ones(len(each.readings)) for each in self.evaluator.likelihoods]
@@ -196,7 +196,7 @@ class SpecimenRefits:
                 return np.inf, np.zeros_like(u)
             return float(value), root.T @ np.where(np.isfinite(gradient), gradient, 0.0)
 
-        result = minimize(
+        result = scipy_minimize(
             objective,
             np.zeros(self.theta.size),
             jac=True,

@@ -219,7 +219,7 @@ def _minimised_on_population(
 
     A minimiser that stored responses do not support is not taken.
     """
-    from scipy.optimize import minimize
+    from scipy.optimize import minimize as scipy_minimize
 
     targets = []
     for k, node in enumerate(evaluator.nodes):
@@ -237,7 +237,7 @@ def _minimised_on_population(
         value, up, down = np.split(totals, [1, 1 + len(shift)])
         return float(value[0]), (up - down) / 2e-4
 
-    minimum = minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
+    minimum = scipy_minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
     minimiser = move_inside(prepared, point + minimum.x * prior_sd, options)
     sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
     is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses

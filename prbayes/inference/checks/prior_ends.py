@@ -76,7 +76,7 @@ def _is_pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
 
     At the best values of the other elements there: an element that they can replace is not pushed.
     """
-    from scipy.optimize import minimize
+    from scipy.optimize import minimize as scipy_minimize
 
     evaluator, theta = sampling.evaluator, sampling.theta
     noise = np.array([information.noise_floor for information in sampling.information])
@@ -110,7 +110,7 @@ def _is_pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
         "fatol": 1e-4,
         "xatol": 1e-2,
     }
-    back[rest] += minimize(along, start, method="Nelder-Mead", options=options).x * unit
+    back[rest] += scipy_minimize(along, start, method="Nelder-Mead", options=options).x * unit
     return is_worse(back)
 
 
