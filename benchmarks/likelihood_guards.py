@@ -27,6 +27,7 @@ from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.population_draws import Populations
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
+from prbayes.optimize.specimen_refits import simulation_obstacle
 from prbayes.results.likelihood_checks import check_draws
 
 OUT = record.RESULTS / "likelihood_guards.json"
@@ -90,7 +91,9 @@ def of_draws(evaluator: Evaluator, populations: Populations) -> dict[str, Any]:
     points = prepared(likelihood).points
     draws = populations.posterior(points.z, points.log_a).thetas
     result = xr.DataTree.from_dict({"posterior": xr.Dataset()})
-    checked = check_draws(evaluator, result, draws.reshape(2, -1, evaluator.hyperparameters.size))
+    optimum = None if simulation_obstacle(evaluator) else prb.minimize(evaluator.model)
+    thetas = draws.reshape(2, -1, evaluator.hyperparameters.size)
+    checked = check_draws(evaluator, result, thetas, optimum)
     return {
         "codes": [finding.code for finding in checked.findings],
         "untested": [name for name in TESTS if any(name in text for text in checked.untested)],

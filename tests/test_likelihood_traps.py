@@ -814,7 +814,8 @@ def test_draws_report_a_conflict() -> None:
     rng = np.random.default_rng(0)
     draws = thetas[rng.choice(len(thetas), 400, p=weights / weights.sum())]
     posterior = xr.DataTree.from_dict({"posterior": xr.Dataset()})
-    findings = check_draws(evaluator, posterior, draws.reshape(2, 200, 2)).findings
+    optimum = prb.minimize(model, progressbar=False)
+    findings = check_draws(evaluator, posterior, draws.reshape(2, 200, 2), optimum).findings
     assert [each.code for each in findings] == ["prior-conflict"]
 
 

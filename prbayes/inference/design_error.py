@@ -15,7 +15,6 @@ from prbayes.inference.refits import (
     minimise_sets,
 )
 from prbayes.inference.resampling import DataSets, observed_set
-from prbayes.numerics.batched_bfgs import Descent
 from prbayes.propagation.base import N_BLOCKS
 
 
@@ -116,8 +115,10 @@ def _spread_of_parts(sampling: SamplingDistribution, observed: DataSets) -> Floa
         part = replace(evaluator, nodes=nodes, has_graph=False)
         objective = BatchObjective.of(part, sampling.scales, observed)
         descent = descent or descent_of(sampling, objective, is_rough=True)
-        minima.append(_minimum(sampling, objective, descent))
-    finite = np.array([x for x in minima if np.isfinite(x).all()])
+        (minimum,), (is_converged,) = minimise_sets(sampling, objective, descent)
+        if is_converged and np.isfinite(minimum).all():
+            minima.append(minimum)
+    finite = np.array(minima)
     if len(finite) < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
     return np.asarray(finite.std(axis=0, ddof=1))

@@ -380,8 +380,10 @@ def temporary_samples(
     Those of all designs, or of the simulators with the given names and their siblings.
     """
     names = set(evaluator.reweighted) if names is None else names
-    with designs_restored([bound for _, bound in _emulated_designs(evaluator, names)]):
-        _redraw_samples(evaluator, thetas, names, same_surfaces=same_surfaces)
+    designs = _emulated_designs(evaluator, names)
+    with designs_restored([bound for _, bound in designs]):
+        for k, bound in designs:
+            bound.reach(_components(evaluator, thetas, k), same_surfaces=same_surfaces)
         yield
 
 

@@ -35,6 +35,7 @@ from prbayes.model.elements import (
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
+from prbayes.optimize.minimize import Minimisation, find_optimum
 from prbayes.optimize.optimum import (
     NO_RESPONSE,
     SMALLEST_SHARE,
@@ -42,6 +43,7 @@ from prbayes.optimize.optimum import (
     compared_in,
     require_of_model,
 )
+from prbayes.optimize.specimen_refits import simulation_obstacle
 from prbayes.response.inputs import model_on_context
 from prbayes.results.likelihood_checks import Checked, check_draws, check_optimum, separate_modes
 
@@ -391,7 +393,12 @@ def _diagnose_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
     modes: tuple[Finding, ...] = ()
     if is_by_specimen:
         shape = (posterior.sizes["chain"], posterior.sizes["draw"], -1)
-        checked = check_draws(evaluator, result, None if thetas is None else thetas.reshape(shape))
+        optimum = None
+        if evaluator is not None and thetas is not None:
+            thetas = thetas.reshape(shape)
+            if simulation_obstacle(evaluator) is None:
+                optimum = find_optimum(evaluator, Minimisation())
+        checked = check_draws(evaluator, result, thetas, optimum)
         columns = _columns(variables)
         modes = separate_modes(np.stack(list(columns.values()), axis=-1), list(columns))
     failures, harmless = _stored_failures(result)

@@ -33,7 +33,6 @@ from prbayes.model.parameters import roots_of
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.minimize import Minimisation, find_optimum
 from prbayes.optimize.optimum import Optimum
 from prbayes.optimize.specimen_refits import (
     simulation_obstacle,
@@ -263,8 +262,16 @@ def scored_specimens(
 # -- draws -----------------------------------------------------------------------------------
 
 
-def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None) -> Checked:
-    """Return the reports of the checks of draws; without a model, evaluator and thetas are None."""
+def check_draws(
+    evaluator: Evaluator | None,
+    result: xr.DataTree,
+    thetas: Floats | None,
+    optimum: Optimum | None,
+) -> Checked:
+    """Return the reports of the checks of draws.
+
+    Without a model, evaluator and thetas are None; without simulated data sets, the optimum is.
+    """
     checked = Checked(findings=influence(result))
     if evaluator is None or thetas is None:
         return checked + Checked(
@@ -275,10 +282,9 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
         )
     center = thetas.reshape(-1, evaluator.hyperparameters.size).mean(axis=0)
     checked += Checked(failing_region_findings(evaluator, center), emulator_remarks(evaluator))
-    obstacle = simulation_obstacle(evaluator)
-    if obstacle is not None:
+    if optimum is None:
+        obstacle = simulation_obstacle(evaluator) or ""
         return checked + _not_tested(_FAMILY, obstacle) + _not_tested(_CONFLICT, obstacle)
-    optimum = find_optimum(evaluator, Minimisation())
     return checked + _check_population(optimum) + _check_conflict(optimum, thetas)
 
 

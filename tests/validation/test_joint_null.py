@@ -125,7 +125,9 @@ def test_refusals_of_the_joint_null(posterior: Posterior) -> None:
         x = pm.Normal.dist(pm.Normal("mu", 10, 3), 1.0)
         metric = prb.FunctionMetric(lambda s, o: np.abs(s.mean(-1) - o.mean()))
         prb.Simulator("y", same, x, metric=metric, observed=DATA, propagation=prb.Resimulated(64))
-    with pytest.raises(ValueError, match="a FunctionMetric, .*the model cannot be calibrated anew"):
+    with pytest.raises(
+        ValueError, match=r"a FunctionMetric, .*the model cannot be calibrated anew"
+    ):
         prb.validation.JointNull(prb.minimize(model, method="Nelder-Mead"))
 
 
