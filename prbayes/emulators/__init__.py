@@ -1,1 +1,1 @@
-"""Emulators: what a response is about between its runs, and by how much that is wrong."""
+"""Interpolation of a response between its runs, with estimates of the error."""

@@ -1,1 +1,1 @@
-"""Inference checks of the hyperparameters, on arrays without PyMC."""
+"""Sampling distribution of the estimate: covariances, refits, goodness of fit and checks."""

@@ -1,4 +1,4 @@
-"""Calibration metrics: how much simulated responses disagree with measured ones.
+"""Calibration metrics: distances between simulated and measured responses.
 
 Smaller is better.
 """

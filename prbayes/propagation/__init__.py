@@ -1,4 +1,4 @@
-"""How a population of inputs becomes responses, and what one evaluation of it costs."""
+"""Propagation of a population of inputs to responses: stored, simulated again, or by specimen."""
 
 from prbayes.propagation.base import Bound, DesignError, Propagation
 
