@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from prbayes.metrics.density import GaussianKDE as GaussianKDE
     from prbayes.metrics.density import Histogram as Histogram
     from prbayes.metrics.divergence import KullbackLeibler as KullbackLeibler
-    from prbayes.metrics.joint import Joint as Joint
+    from prbayes.metrics.divergence import ProbabilityResidual as ProbabilityResidual
     from prbayes.metrics.likelihood import LogLikelihood as LogLikelihood
-    from prbayes.metrics.residual import ProbabilityResidual as ProbabilityResidual
+    from prbayes.metrics.multivariate import Joint as Joint
     from prbayes.model.cost import cost as cost
     from prbayes.model.epsilon import set_epsilon as set_epsilon
     from prbayes.model.pymc_distance import abc_distance as abc_distance
@@ -79,10 +79,9 @@ _NAMES = {
     "metrics.correlation": ("MarginalCorrelation",),
     "metrics.custom": ("FunctionMetric",),
     "metrics.density": ("GaussianKDE", "Histogram"),
-    "metrics.divergence": ("KullbackLeibler",),
-    "metrics.joint": ("Joint",),
+    "metrics.divergence": ("KullbackLeibler", "ProbabilityResidual"),
     "metrics.likelihood": ("LogLikelihood",),
-    "metrics.residual": ("ProbabilityResidual",),
+    "metrics.multivariate": ("Joint",),
     "model.cost": ("cost",),
     "model.epsilon": ("set_epsilon",),
     "model.pymc_distance": ("abc_distance",),

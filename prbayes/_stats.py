@@ -1,4 +1,4 @@
-"""Distribution functions, quantiles and envelopes of weighted samples.
+"""Distribution functions, quantiles, envelopes, combined p-values and sums of exponentials.
 
 A distribution function at fixed points is linear in the weights; the rest depends on the order of
 the values alone. `ranked` finds that order, and `cumulated` sums weights in it.
@@ -176,3 +176,43 @@ def envelope(replicates: Floats, level: float) -> tuple[Floats, Floats]:
     depth.sort()
     k = max(1, int(depth[int(level * size)]))
     return columns[k - 1], columns[size - k]
+
+
+def upper_p_values(statistics: Floats, null: Floats) -> Floats:
+    """Return p-values of C statistics of S data sets, (S, C), large values rejecting.
+
+    ``null``, (B, C), has the statistics of bootstrap samples.
+    """
+    sorted_null = np.sort(null, axis=0)
+    smaller = [
+        np.searchsorted(column, values)
+        for column, values in zip(sorted_null.T, statistics.T, strict=True)
+    ]
+    return (len(null) - np.stack(smaller, axis=-1) + 1) / (len(null) + 1)
+
+
+def adjusted_p_values(observed: Floats, null: Floats) -> Floats:
+    """Return p-values adjusted for the choice among the statistics, (C,).
+
+    The smallest is the p-value of the combined test: the share of bootstrap samples whose smallest
+    p-value is as small.
+    """
+    p_values = upper_p_values(observed[None], null)[0]
+    smallest = np.sort(upper_p_values(null, null).min(axis=1))
+    adjusted: Floats = (np.searchsorted(smallest, p_values, side="right") + 1) / (len(null) + 1)
+    return adjusted
+
+
+def log_sum_exp(terms: Floats) -> Floats:
+    """Return the log of the sum of exponentials over the last axis.
+
+    -inf where there are no terms, or all are -inf.
+    """
+    if terms.shape[-1] == 1:
+        return terms[..., 0].copy()
+    largest = terms.max(axis=-1, keepdims=True, initial=-np.inf)
+    largest = np.where(np.isfinite(largest), largest, 0.0)
+    scaled = terms - largest
+    np.exp(scaled, out=scaled)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(scaled.sum(axis=-1)) + largest[..., 0])

@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 
 from prbayes._validate import Floats
-from prbayes.emulators.cross_validation import CrossValidation
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.ranges import Range, Ranges
+from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
 from prbayes.response.failures import Abort, Replace
 from prbayes.response.outputs import outputs_of_keys

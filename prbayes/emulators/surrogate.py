@@ -25,15 +25,18 @@ from prbayes._validate import (
     seed_number,
     share,
 )
-from prbayes.emulators.cross_validation import CrossValidation, cross_validated, points_needed
 from prbayes.emulators.io import read, write
-from prbayes.emulators.multifidelity import (
+from prbayes.emulators.ranges import Ranges, read_ranges
+from prbayes.emulators.selection import CrossValidation, cross_validated, points_needed
+from prbayes.emulators.surfaces import (
     MultifidelityModel,
     MultifidelitySurface,
+    Predict,
+    RadialBasis,
+    Surface,
     fit_multifidelity,
+    fitted,
 )
-from prbayes.emulators.ranges import Ranges, read_ranges
-from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.numerics.points import sobol
 from prbayes.response.call import Points, compute
 from prbayes.response.chunks import CallSettings, Tally, respond

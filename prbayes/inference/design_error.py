@@ -15,7 +15,7 @@ from prbayes.inference.refits import (
     minimise_sets,
 )
 from prbayes.inference.resampling import DataSets, observed_set
-from prbayes.numerics.batched_bfgs import Descent
+from prbayes.numerics.batched_minimisers import Descent
 from prbayes.propagation.base import N_BLOCKS
 
 

@@ -23,8 +23,7 @@ from prbayes.inference.identifiability import oriented
 from prbayes.inference.requirements import needs_refits
 from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, simulated_sets
 from prbayes.model.evaluator import Evaluator
-from prbayes.numerics.batched_bfgs import Descent
-from prbayes.numerics.batched_simplex import descend_by_simplex
+from prbayes.numerics.batched_minimisers import Descent, descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
 
 # Smallest share of refits that converge. Without the outermost tenth at one end, a normal sampling

@@ -9,10 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import AT_ONCE, Floats, positive_number, sample_weights
-from prbayes.metrics.base import Basis, DenseBasis, Discrepancy, Features, Minimum, Part
+from prbayes.metrics.base import (
+    Basis,
+    Centered,
+    DenseBasis,
+    Discrepancy,
+    Features,
+    Minimum,
+    Part,
+    Projection,
+    Standardized,
+)
 from prbayes.metrics.grid import product
 from prbayes.metrics.multivariate import CompositeDiscrepancy, LiftedMetric, failure_caps
-from prbayes.metrics.views import Centered, Projection, Standardized
 from prbayes.metrics.whitening import units
 
 # Least variance, in squared spreads of an observed output: a constant has no correlations.

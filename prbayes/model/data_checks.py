@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtrc
 
 from prbayes._finding import Finding, report
+from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats
 from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.readings import Readings
-from prbayes.numerics.min_p import adjusted_p_values
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.roots import Response, Roots
 from prbayes.response.failures import ResponseError

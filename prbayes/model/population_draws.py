@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri, ndtri
 
+from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import Hyperparameters, log_posterior, roots_of
-from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.numerics.points import sobol
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare

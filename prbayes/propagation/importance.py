@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.emulators.multifidelity import MultifidelityModel
 from prbayes.emulators.selection import (
     Runs,
     candidate_surfaces,
@@ -19,6 +18,7 @@ from prbayes.emulators.selection import (
     predict_without_blocks,
     select_surfaces,
 )
+from prbayes.emulators.surfaces import MultifidelityModel
 from prbayes.numerics.threads import one_thread
 from prbayes.propagation.base import N_BLOCKS
 from prbayes.response.budget import unlimited

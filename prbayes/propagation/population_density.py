@@ -25,8 +25,8 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
-from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.numerics.threads import one_thread
 from prbayes.response.distributions import PopulationSampler, compiled_log_density, is_mvnormal
 from prbayes.response.inputs import Inputs

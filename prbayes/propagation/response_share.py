@@ -20,8 +20,8 @@ from typing import Protocol
 import numpy as np
 from scipy.special import logsumexp, stdtrit
 
+from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats
-from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.coordinates import Coordinates

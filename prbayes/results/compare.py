@@ -18,10 +18,9 @@ from prbayes._validate import Floats, called
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.density import GaussianKDE
-from prbayes.metrics.divergence import KullbackLeibler
-from prbayes.metrics.joint import Joint
+from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.metrics.residual import ProbabilityResidual
+from prbayes.metrics.multivariate import Joint
 from prbayes.model.coverage import shortcomings
 from prbayes.model.elements import (
     coordinates,

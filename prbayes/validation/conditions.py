@@ -11,8 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats, Seed, called, flag, real_array, sample_labels, seed_number
+from prbayes.metrics.base import Centered, Projection, View
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
-from prbayes.metrics.views import Centered, Projection, View
 from prbayes.metrics.whitening import whitening
 from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
 from prbayes.response.outputs import Outputs, read_observed

@@ -10,8 +10,8 @@ from prbayes._stats import finite_sample, quantile
 from prbayes._validate import Floats
 from prbayes.metrics.base import Discrepancy, Metric, Part
 from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, spread
-from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.multivariate import Joint
 
 
 def scoring_target(observed: Floats, weights: Floats) -> Discrepancy:

@@ -12,9 +12,8 @@ from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE, Histogram
-from prbayes.metrics.divergence import KullbackLeibler
+from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.metrics.residual import ProbabilityResidual
 
 BANDWIDTH = 0.4
 

@@ -11,8 +11,8 @@ from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum, is_additive
 from prbayes.metrics.correlation import MarginalCorrelation
 from prbayes.metrics.density import is_differentiable
-from prbayes.metrics.joint import Joint
-from prbayes.metrics.residual import ProbabilityResidual
+from prbayes.metrics.divergence import ProbabilityResidual
+from prbayes.metrics.multivariate import Joint
 
 NAN = np.nan
 

@@ -1,14 +1,96 @@
+"""Differences of densities in closed form, and on bins."""
+
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from prbayes._validate import Floats
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import GaussianKDE, Histogram
-from prbayes.metrics.divergence import DivergenceDiscrepancy, KullbackLeibler
+from prbayes.metrics.divergence import DivergenceDiscrepancy, KullbackLeibler, ProbabilityResidual
+
+INF = np.inf
+Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
+Normal = Callable[..., Floats]
+
+
+def prepared(metric: ProbabilityResidual, observed: Floats, weights: Floats | None = None) -> Any:
+    return metric.against(observed, weights)
+
+
+@pytest.mark.parametrize(
+    "case", [(0, 1, 0, 1.3), (0.5, 1, 0, 1), (-0.8, 0.8, 0.2, 1), (1, 1.2, 0, 1)]
+)
+@pytest.mark.parametrize("h", [0.4, 0.6])
+@pytest.mark.parametrize("a", [1e-3, 1.0, 70.0])
+def test_the_residual_of_normal_densities(
+    normal: Normal, case: tuple[float, ...], h: float, a: float
+) -> None:
+    m, s, mu, sd = case
+    x, z = a * normal(m, s, 100_000), a * normal(mu, sd, 99_000)
+    vp, vq, d = a**2 * (s**2 + h**2), a**2 * (sd**2 + h**2), a * (m - mu)
+    expected = (vp**-0.5 + vq**-0.5) / np.sqrt(4 * np.pi) - 2 * norm.pdf(d, 0, np.sqrt(vp + vq))
+    residual = prepared(ProbabilityResidual(GaussianKDE(a * h)), z)
+    np.testing.assert_allclose(residual(x) / residual.scale_factor, expected, rtol=3e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("h", [0.2, 1.0])
+def test_residual_is_a_squared_maximum_mean_discrepancy(draw: Draw, seed: int, h: float) -> None:
+    x, w, z, u = draw(seed, 5 + 3 * seed, 9)
+    x = np.clip(x, z.min() - h / 2, z.max() + h / 2)  # well inside the grid
+    y, v = np.r_[x, z], np.r_[w, -u]
+    d = prepared(ProbabilityResidual(GaussianKDE(h)), z, u)
+    expected = d.scale_factor * v @ norm.pdf(y, y[:, None], np.sqrt(2) * h) @ v
+    np.testing.assert_allclose(d(x, w), expected, rtol=1e-4)
+
+
+def test_with_a_histogram_the_residual_is_the_sum_over_bins() -> None:
+    d = prepared(ProbabilityResidual(Histogram(2), scale_base=1), np.array([0.0, 1.0, 3.0, 4.0]))
+    # Two bins of width 2: q = (1/4, 1/4), and nothing outside; p = (1/6, 0), 1/6 below, 1/6 above.
+    expected = (1 / 4 - 1 / 6) ** 2 + (1 / 4) ** 2 + 2 * (1 / 6) ** 2
+    assert d([0.5, -9.0, 9.0]) == pytest.approx(expected)
+    assert d.scale == pytest.approx(2 / 16)
+
+
+@pytest.mark.parametrize(("sd", "power"), [(8e-5, 3), (80.0, -3), (0.08, 0), (0.3, 0), (0.03, 1)])
+@pytest.mark.parametrize("base", [100.0, 10.0, 1.0])
+def test_scale_factor(normal: Normal, sd: float, power: int, base: float) -> None:
+    z = normal(5, sd)
+    kde = GaussianKDE(sd / 50)
+    d, plain = (prepared(ProbabilityResidual(kde, scale_base=c), z) for c in (base, 1))
+    assert 10**power <= d.density.max() < 10 ** (power + 1)
+    assert d.scale_factor == pytest.approx(base**-power)
+    np.testing.assert_allclose(d(z + sd), plain(z + sd) * base**-power, rtol=1e-12)
+    without_density = d(np.full(3, INF)) - d.scale_factor / d.cells.widths[-1]
+    np.testing.assert_allclose(d.scale, without_density, rtol=1e-10)
+
+
+def test_other_observed_values_keep_the_scale_factor_and_the_cells() -> None:
+    z = np.linspace(0, 1, 40)
+    d = prepared(ProbabilityResidual(GaussianKDE(0.01)), z)
+    tight = np.full(5, 0.5)
+    other = d.with_observed(tight)
+    own = prepared(ProbabilityResidual(GaussianKDE(0.01)), np.append(tight, 0.5001))
+    assert d.scale_factor == other.scale_factor == other.rows(slice(None)).scale_factor == 1
+    assert own.scale_factor < 1
+    assert other.cells is d.cells
+    np.testing.assert_allclose(other.density, d.cells.density(tight, np.full(5, 0.2)))
+
+
+def test_wrong_settings() -> None:
+    assert ProbabilityResidual().scale_base == 100
+    with pytest.raises(ValueError, match="scale_base: got 0, expected a positive finite number"):
+        ProbabilityResidual(scale_base=0)
+    with pytest.raises(TypeError, match="density: got the class GaussianKDE, expected prb"):
+        ProbabilityResidual(GaussianKDE)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="density: got str 'kde', expected prb"):
+        ProbabilityResidual("kde")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -29,7 +111,7 @@ def test_the_divergence_of_normal_densities(
     np.testing.assert_allclose(KullbackLeibler(kde, reverse=True)(x, z), reverse, rtol=3e-3)
 
 
-def test_with_a_histogram_it_is_the_sum_over_bins() -> None:
+def test_with_a_histogram_the_divergence_is_the_sum_over_bins() -> None:
     observed, simulated = [0.0, 0.5, 1.5, 4.0], [0.1, 3.0]
     # Two bins: q = (3/4, 1/4), p = (1/2, 1/2).
     forward = 3 / 4 * np.log(3 / 2) + 1 / 4 * np.log(1 / 2)

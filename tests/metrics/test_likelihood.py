@@ -15,10 +15,9 @@ from prbayes.metrics.density import (
     likelihood_bandwidth,
     twice_silverman,
 )
-from prbayes.metrics.divergence import KullbackLeibler
-from prbayes.metrics.joint import Joint
+from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LikelihoodDiscrepancy, LogLikelihood, kernel_width
-from prbayes.metrics.residual import ProbabilityResidual
+from prbayes.metrics.multivariate import Joint
 
 Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
 

@@ -16,7 +16,7 @@ from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.model.coverage import shortcomings
 from prbayes.model.evaluator import Evaluator
-from prbayes.numerics.batched_bfgs import descend
+from prbayes.numerics.batched_minimisers import descend
 from prbayes.optimize.design_refinement import refine_at
 from prbayes.optimize.local_optima import (
     Reference,

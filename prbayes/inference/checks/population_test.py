@@ -23,8 +23,8 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from prbayes._finding import Finding
+from prbayes._stats import adjusted_p_values, upper_p_values
 from prbayes._validate import Floats
-from prbayes.numerics.min_p import adjusted_p_values, upper_p_values
 
 
 def normal_scores(u: Floats) -> Floats:

@@ -7,6 +7,7 @@ import pytest
 from scipy.special import logsumexp, ndtr, ndtri
 from scipy.stats import norm
 
+from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats
 from prbayes.inference.checks.population_test import (
     PopulationTest,
@@ -18,7 +19,6 @@ from prbayes.inference.checks.population_test import (
     power_text,
     zhang_statistic,
 )
-from prbayes.numerics.min_p import adjusted_p_values
 
 # The alternatives of the study: standardised inputs.
 

@@ -1,12 +1,13 @@
-"""BFGS on many rows in step."""
+"""BFGS and the simplex on many rows in step."""
 
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 from prbayes._validate import Floats
-from prbayes.numerics.batched_bfgs import _updated, descend
+from prbayes.numerics.batched_minimisers import _updated, descend, descend_by_simplex
 
 
 def test_quadratics_with_their_own_data() -> None:
@@ -127,3 +128,65 @@ def test_one_sided_differences_arrive_within_a_fraction_of_a_step(
     expected = step / 2 * abs(1 / stiffer - 1) * np.sqrt(2) + 1e-3
     assert np.abs(x - centers).max() < expected
     assert set(points) == {3}  # here, and one step along each axis
+
+
+CENTERS = np.random.default_rng(1).normal(size=(20, 3))
+SIZES = (1.0, -0.5)
+
+
+def gap(x: Floats, rows: Any) -> Floats:
+    return np.asarray(x - CENTERS[rows][:, None, : x.shape[-1]])
+
+
+FUNCTIONS = {
+    "parabola": lambda x, rows: (gap(x, rows) ** 2 * [1.0, 3.0, 0.5][: x.shape[-1]]).sum(axis=-1),
+    "kink": lambda x, rows: np.abs(gap(x, rows)).max(axis=-1),
+    "edges": lambda x, rows: np.abs(gap(x, rows)).sum(axis=-1),
+}
+
+
+@pytest.mark.parametrize("r", [1, 2, 3])
+@pytest.mark.parametrize("name", list(FUNCTIONS))
+def test_every_row_finds_its_own_minimum(name: str, r: int) -> None:
+    value = FUNCTIONS[name]
+    x, values, converged = descend_by_simplex(value, np.zeros((20, r)), sizes=SIZES)
+    assert converged.all()
+    # A hundredth of the mean gain is the range over the last simplex, whose middle is not looked
+    # at.
+    gain = value(np.zeros((20, 1, r)), np.arange(20)).mean()
+    assert values.max() < 0.06 * gain
+    np.testing.assert_array_equal(values, value(x[:, None], np.arange(20))[:, 0])
+
+
+def test_a_row_does_not_depend_on_the_others_path() -> None:
+    alone = optimize.minimize(
+        lambda t: FUNCTIONS["parabola"](t[None, None], np.array([4]))[0, 0],
+        np.zeros(2),
+        method="Nelder-Mead",
+    )
+    x, _, _ = descend_by_simplex(FUNCTIONS["parabola"], np.zeros((20, 2)), sizes=SIZES)
+    np.testing.assert_allclose(x[4], alone.x, atol=0.2)
+
+
+def test_what_is_flat_stays_and_what_is_infinite_is_left() -> None:
+    x, values, _ = descend_by_simplex(
+        lambda x, rows: np.zeros(x.shape[:2]), np.ones((3, 2)), sizes=[1.0]
+    )
+    np.testing.assert_array_equal(values, 0)
+    np.testing.assert_array_equal(x, 1)
+
+    def half(x: Floats, rows: Any) -> Floats:
+        return np.where(x[..., 0] < 0.1, np.inf, x[..., 0] ** 2)
+
+    x, values, _ = descend_by_simplex(half, np.full((2, 1), 2.0), sizes=[-1.0])
+    assert (x >= 0.1).all()
+    assert (x < 0.3).all()
+
+
+def test_no_parameters() -> None:
+    x, values, converged = descend_by_simplex(
+        lambda x, rows: np.full(x.shape[:2], 7.0), np.empty((3, 0)), sizes=SIZES
+    )
+    assert x.shape == (3, 0)
+    np.testing.assert_array_equal(values, 7)
+    assert converged.all()
