@@ -20,8 +20,8 @@ from scipy.stats import norm
 import prbayes as prb
 from benchmarks.scoreboard.problems import frame
 from prbayes._finding import Finding
-from prbayes.inference.checks.population_test import population_statistics, population_test
-from prbayes.inference.checks.prior_conflict import conflict_findings
+from prbayes.inference.checks.population import population_statistics, population_test
+from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.data_checks import data_findings
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.measurement import SpecimenLikelihood

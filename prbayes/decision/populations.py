@@ -16,7 +16,7 @@ from scipy.special import ndtr, ndtri
 
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.decision.quantities import Quantity
-from prbayes.inference.identifiability import oriented
+from prbayes.inference.asymptotics import oriented
 from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import as_attributes, identity_of_model

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.inference.batched_objective import BatchObjective
 from prbayes.inference.refits import (
+    BatchObjective,
     SamplingDistribution,
     descent_of,
     is_stored,

@@ -17,8 +17,7 @@ from prbayes._finding import Finding
 from prbayes._stats import distribution_function
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import number_parts
-from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit
-from prbayes.inference.requirements import refit_obstacle
+from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
 from prbayes.metrics.multivariate import failure_caps
 from prbayes.model.random_variable import Node

@@ -1,4 +1,8 @@
-"""Refits: the minimisers of many data sets, and the sampling distribution that they follow."""
+"""Refits: the minimisers of many data sets, and the sampling distribution that they follow.
+
+Requirements on metrics and propagations are given as obstacles: a reason in words, as the end of a
+sentence.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +21,14 @@ from prbayes.inference.asymptotics import (
     Local,
     first_order_shifts,
     local_sampling,
+    oriented,
 )
-from prbayes.inference.batched_objective import BatchObjective
-from prbayes.inference.identifiability import oriented
-from prbayes.inference.requirements import needs_refits
 from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, simulated_sets
-from prbayes.model.evaluator import Evaluator
+from prbayes.metrics.base import Basis, Discrepancy, Minimum
+from prbayes.model.evaluator import Evaluator, has_other_terms
 from prbayes.numerics.batched_minimisers import Descent, descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
+from prbayes.numerics.threads import one_thread
 
 # Smallest share of refits that converge. Without the outermost tenth at one end, a normal sampling
 # distribution is too narrow by 16 %.
@@ -407,3 +411,136 @@ def drawn_in(points: Floats, most: float) -> Floats:
     low, middle, high = np.quantile(points, _QUANTILES, axis=0)
     far = most * (high - low) / 3.2
     return np.clip(points, middle - far, middle + far)
+
+
+@dataclass(frozen=True, eq=False)
+class BatchObjective:
+    """The sum of d_k / scale_k against each of B data sets; no response is computed."""
+
+    evaluator: Evaluator  # all its responses are stored
+    scales: Floats  # (K,): by simulator of the model
+    simulators: tuple[int, ...]  # indices of the simulators in the sum
+    targets: list[Discrepancy]  # by simulator in the sum, each against all B data sets
+    values: list[Floats]  # (n_k,) or (n_k, m): the stored responses
+    bases: list[Basis]  # from weights of stored responses to features
+    # (n_k,): the block of each point of the design. If there are several, the b-th data set is
+    # compared with the b-th block alone.
+    blocks: Sequence[NDArray[np.intp]] = ()
+
+    @classmethod
+    def of(
+        cls,
+        evaluator: Evaluator,
+        scales: Floats,
+        sets: DataSets,
+        *,
+        simulators: Sequence[int] | None = None,
+        blocks: Sequence[NDArray[np.intp]] = (),
+        stored: Sequence[Floats | None] = (),
+    ) -> BatchObjective:
+        """Prepare the observed sides of all data sets; of all simulators by default.
+
+        ``stored``, by simulator, replaces the responses at the designs' points unless it is None.
+        """
+        if simulators is None:
+            simulators = range(len(evaluator.nodes))
+        # Copied row by row: sums over rows then do not depend on the layout of the weights.
+        rows = np.arange(len(sets.weights[0]))
+        targets, values, bases = [], [], []
+        for k in simulators:
+            node = evaluator.nodes[k]
+            target = node.target.with_observed(sets.values[k], sets.weights[k][rows, None])
+            replacement = stored[k] if stored else None
+            if replacement is None:
+                responses = evaluator.reweighted[node.name].design.sample.values
+            else:
+                responses = replacement
+            targets.append(target)
+            values.append(responses)
+            bases.append(target.basis(responses))
+        return cls(evaluator, scales, tuple(simulators), targets, values, bases, blocks)
+
+    @property
+    def n_sets(self) -> int:
+        """Number of data sets."""
+        return len(self.targets[0].weights)
+
+    @one_thread()
+    def __call__(self, thetas: Floats, rows: Any) -> Floats:
+        """Return the values for data sets ``rows`` at several thetas each, (A, s, d) -> (A, s).
+
+        With thetas of shape (1, s, d) all data sets are compared with the same populations. NaN,
+        as where a design has no point, becomes infinite.
+        """
+        portions = self.portions(len(thetas), thetas.shape[1])
+        if len(portions) < 2:
+            return self._values(thetas, rows)
+        numbers = np.arange(self.n_sets)[rows]
+        return np.concatenate([self._values(thetas[p], numbers[p]) for p in portions])
+
+    def portions(self, number: int, populations: int = 1) -> list[slice]:
+        """Divide data sets, each with several populations, into portions of a million weights."""
+        most = max(len(values) for values in self.values)
+        at_once = max(1, (1 << 20) // (most * populations))
+        return [slice(first, first + at_once) for first in range(0, number, at_once)]
+
+    def _values(self, thetas: Floats, rows: Any) -> Floats:
+        """Return the values for some data sets."""
+        total: Any = 0.0
+        for i, k in enumerate(self.simulators):
+            features = self.bases[i].rows(rows).features(self.weights(thetas, rows, i))
+            total = total + self.targets[i].rows(rows).outer(*features, xp=np) / self.scales[k]
+        return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
+
+    def weights(self, thetas: Floats, rows: Any, i: int) -> Floats:
+        """Return weights of the stored responses, (A, s, n), on the whole design or on blocks."""
+        stacked = thetas.reshape(-1, thetas.shape[-1])
+        _, weights = self.evaluator.populations(stacked, self.simulators[i])
+        weights = weights.reshape(*thetas.shape[:-1], -1)
+        if not self.blocks or not self.blocks[i].any():
+            return weights
+        block_of_set = np.arange(self.n_sets)[rows, None, None]
+        weights = weights * (self.blocks[i] == block_of_set)
+        total = weights.sum(axis=-1, keepdims=True)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(weights / total)
+
+
+def simulator_obstacle(evaluator: Evaluator, k: int) -> str | None:
+    """Return why the minimiser of one simulator's discrepancy has no sampling distribution."""
+    node = evaluator.nodes[k]
+    if node.bound.random:
+        return f"{node.name} has prb.Fresh, whose discrepancy is random"
+    if node.metric.minimum is Minimum.UNKNOWN and not node.bound.stored:
+        return (
+            f"{node.name} has a {type(node.metric).__name__}, whose standard errors need refits, "
+            "and these need stored responses: use propagation=prb.Reweighted()"
+        )
+    return None
+
+
+def sampling_obstacle(evaluator: Evaluator) -> str | None:
+    """Return why there is no sampling distribution of the minimiser, or None."""
+    for k in range(len(evaluator.nodes)):
+        obstacle = simulator_obstacle(evaluator, k)
+        if obstacle is not None:
+            return obstacle
+    # If one simulator needs refits, all of them are refitted.
+    computed = [node.name for node in evaluator.nodes if not node.bound.stored]
+    if computed and needs_refits(evaluator):
+        names = ", ".join(computed)
+        return f"another metric needs refits, and the responses of {names} are not stored"
+    return None
+
+
+def refit_obstacle(evaluator: Evaluator) -> str | None:
+    """Return why the model cannot be calibrated to other data sets, or None."""
+    obstacle = sampling_obstacle(evaluator)
+    if obstacle is None and has_other_terms(evaluator):
+        return "the model has likelihood terms or potentials besides its simulators"
+    return obstacle
+
+
+def needs_refits(evaluator: Evaluator) -> bool:
+    """Return whether a metric declares nothing of its minimum, so that refits measure it."""
+    return any(node.metric.minimum is Minimum.UNKNOWN for node in evaluator.nodes)

@@ -11,12 +11,10 @@ import numpy as np
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Information, Local
+from prbayes.inference.asymptotics import Information, Local, oriented
 from prbayes.inference.checks.identification import unidentified_findings
 from prbayes.inference.design_error import DesignErrors, design_error
-from prbayes.inference.identifiability import oriented
-from prbayes.inference.refits import SamplingDistribution
-from prbayes.inference.requirements import sampling_obstacle
+from prbayes.inference.refits import SamplingDistribution, sampling_obstacle
 from prbayes.inference.resampling import families, siblings
 from prbayes.model.coverage import Shortcoming, shortcomings
 from prbayes.model.evaluator import Evaluator, n_design_runs

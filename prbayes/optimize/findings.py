@@ -8,7 +8,7 @@ import numpy as np
 
 from prbayes._finding import Finding
 from prbayes.inference.checks.identification import confounding_findings, unidentified_findings
-from prbayes.inference.checks.prior_ends import prior_end_findings, prior_ends
+from prbayes.inference.checks.prior import prior_end_findings, prior_ends
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.metrics.multivariate import components_missed
 from prbayes.model.elements import readable_variables, split_elements, table_elements

@@ -15,8 +15,8 @@ import numpy as np
 
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
-from prbayes.inference.checks.failing_region import failing_region_findings
-from prbayes.inference.checks.prior_ends import PriorEnd, end_of_range, prior_end_findings
+from prbayes.inference.checks.population import failing_region_findings
+from prbayes.inference.checks.prior import PriorEnd, end_of_range, prior_end_findings
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.parameters import THETAS

@@ -26,9 +26,12 @@ from prbayes._validate import (
     real_array,
     seed_number,
 )
-from prbayes.inference.checks.flat_edge import breakdown_findings, elements_at_edge
-from prbayes.inference.checks.metric_suitability import data_between_runs, heavy_tails
-from prbayes.inference.checks.smoothing_bias import smoothing_bias
+from prbayes.inference.checks.identification import breakdown_findings, elements_at_edge
+from prbayes.inference.checks.metric_suitability import (
+    data_between_runs,
+    heavy_tails,
+    smoothing_bias,
+)
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import jumping_simulators
 from prbayes.inference.resampling import SETS

@@ -13,9 +13,13 @@ from prbayes._display import view
 from prbayes._finding import Finding, as_json
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
-from prbayes.inference.checks.flat_edge import breakdown_findings, no_information
-from prbayes.inference.refits import SamplingDistribution, sampling_of_functions
-from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
+from prbayes.inference.checks.identification import breakdown_findings, no_information
+from prbayes.inference.refits import (
+    SamplingDistribution,
+    refit_obstacle,
+    sampling_obstacle,
+    sampling_of_functions,
+)
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import optimum_elements, readable_variables, single_elements

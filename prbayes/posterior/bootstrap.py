@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
-from prbayes.inference.identifiability import unidentified_directions
+from prbayes.inference.asymptotics import unidentified_directions
 from prbayes.inference.refits import is_prepared_by_data, refit, refit_prepared
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
 from prbayes.model.locking import locked

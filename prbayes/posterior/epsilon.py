@@ -14,11 +14,10 @@ from prbayes.inference.asymptotics import (
     LinearArea,
     first_order_shifts,
     identified_by_area,
+    identified_by_curvature,
     local_sampling,
 )
-from prbayes.inference.identifiability import identified_by_curvature
-from prbayes.inference.refits import simplex_refits
-from prbayes.inference.requirements import simulator_obstacle
+from prbayes.inference.refits import simplex_refits, simulator_obstacle
 from prbayes.inference.resampling import DataSets, groups
 from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.model.epsilon import Epsilon, refuse_without_epsilon

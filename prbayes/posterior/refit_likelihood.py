@@ -23,9 +23,8 @@ from scipy.sparse import csr_array, vstack
 from scipy.special import logsumexp, ndtri
 
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.inference.batched_objective import BatchObjective
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.inference.refits import SamplingDistribution, refit
+from prbayes.inference.refits import BatchObjective, SamplingDistribution, refit
 from prbayes.inference.resampling import (
     DataSets,
     groups,

@@ -8,7 +8,7 @@ import numpy as np
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
-from prbayes.inference.checks.prior_conflict import conflict_findings
+from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import log_posterior
 from prbayes.optimize.optimum import Optimum, optima_of

@@ -21,8 +21,7 @@ from prbayes.inference.goodness_of_fit import (
     output_misfits,
     population_misfit,
 )
-from prbayes.inference.refits import SamplingDistribution
-from prbayes.inference.requirements import refit_obstacle
+from prbayes.inference.refits import SamplingDistribution, refit_obstacle
 from prbayes.inference.resampling import SETS
 from prbayes.model.coverage import ENOUGH, shortcoming
 from prbayes.model.elements import (

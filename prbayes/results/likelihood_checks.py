@@ -18,16 +18,16 @@ import xarray as xr
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
-from prbayes.inference.checks.failing_region import failing_region_findings
-from prbayes.inference.checks.population_test import (
+from prbayes.inference.asymptotics import oriented
+from prbayes.inference.checks.population import (
+    failing_region_findings,
     normal_scores,
     population_findings,
     population_statistics,
     population_test,
     power_text,
 )
-from prbayes.inference.checks.prior_conflict import conflict_findings
-from prbayes.inference.identifiability import oriented
+from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import roots_of
 from prbayes.model.specimen_likelihood import arrays

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats
-from prbayes.inference.checks.population_test import (
+from prbayes.inference.checks.population import (
     PopulationTest,
     mixture_ratio,
     normal_scores,
