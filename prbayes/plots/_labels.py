@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 
-from prbayes.model.elements import variable_of
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import variable_of
 from prbayes.response.inputs import aleatory_names
 
 STATISTIC_LABELS = {

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.model.elements import (
+from prbayes.model.description import labelled
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import (
     optimum_elements,
     single_elements,
     split_elements,
     variable_of,
 )
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.labels import labelled
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots._ensemble import supported
 from prbayes.plots._labels import metric_label

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes.model.elements import (
+from prbayes.model.parameters import (
     optimum_elements,
     readable_variables,
     single_elements,
