@@ -11,9 +11,9 @@ from prbayes.inference.checks.identification import confounding_findings, uniden
 from prbayes.inference.checks.prior import prior_end_findings, prior_ends
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.metrics.multivariate import components_missed
-from prbayes.model.elements import readable_variables, split_elements, table_elements
+from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.labels import labelled
+from prbayes.model.parameters import readable_variables, split_elements, table_elements
 from prbayes.optimize.design_refinement import AGREE
 from prbayes.optimize.local_optima import Rival
 from prbayes.propagation.importance import SIZES

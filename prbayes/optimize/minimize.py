@@ -35,13 +35,12 @@ from prbayes.inference.checks.metric_suitability import (
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import jumping_simulators
 from prbayes.inference.resampling import SETS
-from prbayes.model.budgets import explained, kept
-from prbayes.model.coverage import shortcomings
-from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior
+from prbayes.model.cost import explained, kept
+from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
-from prbayes.model.specimen_variable import specimen_likelihoods
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.convergence import Fit, Search, Trace, approach, minimise, settle
 from prbayes.optimize.design_refinement import (
     MAX_ROUNDS,

@@ -31,15 +31,14 @@ from prbayes._validate import IN_CACHE, Floats
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.guards import half_difference
-from prbayes.propagation.normal_populations import (
+from prbayes.propagation.population_density import (
     Normal,
     bootstrap_normals,
     fit_normal,
     normal_log_density,
 )
 from prbayes.propagation.roots import Response, Roots, rows_by_specimen
-from prbayes.propagation.specimen_emulation import PointOptions
+from prbayes.propagation.specimen_emulation import PointOptions, half_difference
 
 
 @dataclass(frozen=True, eq=False)

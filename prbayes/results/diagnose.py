@@ -23,17 +23,16 @@ from prbayes.inference.goodness_of_fit import (
 )
 from prbayes.inference.refits import SamplingDistribution, refit_obstacle
 from prbayes.inference.resampling import SETS
-from prbayes.model.coverage import ENOUGH, shortcoming
-from prbayes.model.elements import (
+from prbayes.model.evaluator import ENOUGH, Evaluator, shortcoming
+from prbayes.model.fingerprint import Level
+from prbayes.model.locking import locked
+from prbayes.model.parameters import (
     finite_draws,
     single_elements,
     split_elements,
     stacked_draws,
     table_elements,
 )
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.fingerprint import Level
-from prbayes.model.locking import locked
 from prbayes.optimize.minimize import Minimisation, find_optimum
 from prbayes.optimize.optimum import (
     NO_RESPONSE,
@@ -358,9 +357,10 @@ def _stored_share(result: xr.DataTree, key: str = "lost_mass") -> dict[str, floa
 
 
 def _not_converged(message: str) -> Finding:
+    reason = message.removesuffix(".")
     return Finding(
         "not-converged",
-        f"The optimiser did not converge ({message.removesuffix('.')}); try another start or method.",
+        f"The optimiser did not converge ({reason}); try another start or method.",
         "choose.md#optimiser-or-sampler",
     )
 

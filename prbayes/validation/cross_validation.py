@@ -13,9 +13,9 @@ from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.inference.refits import refit
 from prbayes.inference.resampling import DataSets, specimens
+from prbayes.model.description import versions
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
-from prbayes.model.labels import versions
 from prbayes.model.locking import locked
 from prbayes.model.measurement import specimen_numbers
 from prbayes.optimize.optimum import Optimum, require_refits

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from prbayes._validate import Floats, called, positive_integer
 from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
-from prbayes.model.coverage import shortcomings
+from prbayes.model.evaluator import shortcomings
 from prbayes.model.fingerprint import Level, require_same
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, require_refits
