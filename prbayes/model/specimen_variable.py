@@ -34,7 +34,7 @@ from prbayes.model.random_variable import (
     rv_signature,
 )
 from prbayes.model.specimen_likelihood import draw_readings, log_likelihood_graph
-from prbayes.response.groups import is_group
+from prbayes.response.inputs import is_group
 
 
 class SpecimenRV(RandomVariable):  # type: ignore[misc]

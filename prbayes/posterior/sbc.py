@@ -20,7 +20,7 @@ from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator, has_other_terms, specimen_params
 from prbayes.model.labels import labelled, versions
 from prbayes.model.locking import locked
-from prbayes.optimize.specimen_refits import (
+from prbayes.optimize.maximum_likelihood import (
     other_specimens,
     simulation_obstacle,
     specimen_pool,

@@ -35,6 +35,7 @@ from prbayes.model.elements import (
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
+from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.optimize.minimize import Minimisation, find_optimum
 from prbayes.optimize.optimum import (
     NO_RESPONSE,
@@ -43,7 +44,6 @@ from prbayes.optimize.optimum import (
     compared_in,
     require_of_model,
 )
-from prbayes.optimize.specimen_refits import simulation_obstacle
 from prbayes.response.inputs import model_on_context
 from prbayes.results.likelihood_checks import Checked, check_draws, check_optimum, separate_modes
 

@@ -24,8 +24,8 @@ from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.labels import versions
 from prbayes.model.locking import locked
 from prbayes.model.measurement import specimen_numbers
+from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_refits
-from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
 
 
 @locked
