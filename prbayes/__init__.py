@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     from prbayes.optimize.minimize import refine as refine
     from prbayes.optimize.optimum import Optimum as Optimum
     from prbayes.plots.comparison import plot_comparison as plot_comparison
+    from prbayes.plots.convergence import plot_optimizer as plot_optimizer
+    from prbayes.plots.convergence import plot_stages as plot_stages
     from prbayes.plots.landscape import plot_landscape as plot_landscape
-    from prbayes.plots.optimizer import plot_optimizer as plot_optimizer
     from prbayes.plots.outputs import plot_outputs as plot_outputs
     from prbayes.plots.population import plot_population as plot_population
     from prbayes.plots.posterior import plot_posterior as plot_posterior
     from prbayes.plots.responses import plot_responses as plot_responses
-    from prbayes.plots.stages import plot_stages as plot_stages
     from prbayes.plots.validity import plot_validity as plot_validity
     from prbayes.posterior.bootstrap import bootstrap as bootstrap
     from prbayes.posterior.epsilon import calibrate_epsilon as calibrate_epsilon
@@ -90,13 +90,12 @@ _NAMES = {
     "optimize.minimize": ("minimize", "refine"),
     "optimize.optimum": ("Optimum",),
     "plots.comparison": ("plot_comparison",),
+    "plots.convergence": ("plot_optimizer", "plot_stages"),
     "plots.landscape": ("plot_landscape",),
-    "plots.optimizer": ("plot_optimizer",),
     "plots.outputs": ("plot_outputs",),
     "plots.population": ("plot_population",),
     "plots.posterior": ("plot_posterior",),
     "plots.responses": ("plot_responses",),
-    "plots.stages": ("plot_stages",),
     "plots.validity": ("plot_validity",),
     "posterior.bootstrap": ("bootstrap",),
     "posterior.epsilon": ("calibrate_epsilon",),

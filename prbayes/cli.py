@@ -116,7 +116,7 @@ def _report(options: argparse.Namespace) -> list[Path]:
 
 def _results(files: Sequence[Path]) -> dict[str, Any]:
     """Return the contents of files as keywords of a report."""
-    from prbayes.reports.schema import kind_of_decision
+    from prbayes.reports.material import kind_of_decision
 
     paths = list(dict.fromkeys(files))
     stems = [path.stem for path in paths]
@@ -147,7 +147,7 @@ def _opened(path: Path) -> xr.DataTree:
         raise UserError(f"{path}: there is no such file")
     import xarray as xr
 
-    from prbayes.reports.schema import complaints, kind_of_decision
+    from prbayes.reports.material import complaints, kind_of_decision
 
     try:
         with xr.open_datatree(path, engine="h5netcdf") as stored:

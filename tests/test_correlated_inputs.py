@@ -14,6 +14,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
+from prbayes.inference.asymptotics import local_sampling
 from prbayes.inference.refits import SamplingDistribution, refit, sampling_of_functions
 from prbayes.inference.resampling import DataSets
 from prbayes.model.evaluator import Evaluator
@@ -124,10 +125,10 @@ def test_tables_have_the_correlation_once(optimum: prb.Optimum) -> None:
 
 @pytest.mark.parametrize("faint", [3.0, 30.0])
 def test_how_faint_a_direction_may_be_changes_nothing_of_what_is_known(
-    faint: float, optimum: prb.Optimum, monkeypatch: pytest.MonkeyPatch
+    faint: float, optimum: prb.Optimum
 ) -> None:
-    monkeypatch.setattr("prbayes.inference.refits._FAINT", faint)
-    functions = sampling_of_functions(optimum.sampling())
+    sampling = optimum.sampling()
+    functions = local_sampling(sampling.information, sampling.scales, faint)
     _, stderr = point_and_stderr(optimum.evaluator, optimum.theta, optimum.covariance, functions)
     for name in ("chol_stds", "chol_corr"):
         np.testing.assert_allclose(stderr[name], optimum.stderr[name], rtol=1e-6)

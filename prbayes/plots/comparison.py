@@ -9,8 +9,18 @@ import numpy as np
 import xarray as xr
 
 from prbayes._validate import Floats, flag
-from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, refuse_look, round_ticks
-from prbayes.plots._labels import METRIC_LABELS, named, refuse_labels
+from prbayes.plots.canvas import (
+    BLUE,
+    DOTTED,
+    GREY,
+    INK,
+    METRIC_LABELS,
+    Canvas,
+    named,
+    refuse_labels,
+    refuse_look,
+    round_ticks,
+)
 from prbayes.results.compare import COSTS
 
 

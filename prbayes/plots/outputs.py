@@ -15,7 +15,7 @@ from prbayes._validate import Floats, called
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
-from prbayes.plots._canvas import (
+from prbayes.plots.canvas import (
     BLUE,
     DASHED,
     INK,
@@ -24,14 +24,13 @@ from prbayes.plots._canvas import (
     Canvas,
     Limits,
     Panel,
+    refuse_labels,
     refuse_look,
     round_ticks,
 )
-from prbayes.plots._curves import axis_range, central_range
-from prbayes.plots._ensemble import if_supported, read_before, read_result
-from prbayes.plots._labels import refuse_labels
-from prbayes.plots._panels import Output, outputs_of
-from prbayes.plots._regions import outlines
+from prbayes.plots.curves import axis_range, central_range, outlines
+from prbayes.plots.ensemble import if_supported, read_before, read_result
+from prbayes.plots.responses import Output, outputs_of
 
 # Most outputs of one picture: the pairs of more are too small to be read.
 _MOST = 7

@@ -18,11 +18,18 @@ from prbayes.model.elements import element_name, variable_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
-from prbayes.plots._canvas import BLUE, DASHED, SOLID, Canvas, Panel, refuse_look
-from prbayes.plots._curves import GRID_POINTS, central_range, smooth_densities
-from prbayes.plots._ensemble import Calibrated, Ensemble, read_result
-from prbayes.plots._labels import named, refuse_labels
-from prbayes.plots._regions import outlines
+from prbayes.plots.canvas import (
+    BLUE,
+    DASHED,
+    SOLID,
+    Canvas,
+    Panel,
+    named,
+    refuse_labels,
+    refuse_look,
+)
+from prbayes.plots.curves import GRID_POINTS, central_range, outlines, smooth_densities
+from prbayes.plots.ensemble import Calibrated, Ensemble, read_result
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, is_mvnormal
 from prbayes.response.inputs import Inputs, aleatory_names

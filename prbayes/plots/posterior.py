@@ -25,7 +25,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level, require_together
 from prbayes.model.labels import labelled
 from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
-from prbayes.plots._canvas import (
+from prbayes.plots.canvas import (
     BLUE,
     DASHED,
     DIAMOND,
@@ -34,11 +34,12 @@ from prbayes.plots._canvas import (
     VERMILION,
     Canvas,
     Panel,
+    named,
+    refuse_labels,
     refuse_look,
     round_ticks,
 )
-from prbayes.plots._curves import bounded_density, central_levels
-from prbayes.plots._labels import named, refuse_labels
+from prbayes.plots.curves import bounded_density, central_levels
 
 
 def plot_posterior(

@@ -10,8 +10,8 @@ import xarray as xr
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import share
-from prbayes.plots._canvas import BLUE, INK, Canvas, Panel, refuse_look
-from prbayes.plots._curves import (
+from prbayes.plots.canvas import BLUE, INK, Canvas, Panel, named, refuse_labels, refuse_look
+from prbayes.plots.curves import (
     GRID_POINTS,
     axis_range,
     central_range,
@@ -19,7 +19,6 @@ from prbayes.plots._curves import (
     pointwise_band,
     staircase,
 )
-from prbayes.plots._labels import named, refuse_labels
 from prbayes.validation.conditions import Comparable, comparables
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes.plots._canvas import (
+from prbayes.plots.canvas import (
     BLUE,
     CIRCLE,
     DIAMOND,
@@ -16,9 +16,10 @@ from prbayes.plots._canvas import (
     GREY,
     VERMILION,
     Canvas,
+    named,
+    refuse_labels,
     refuse_look,
 )
-from prbayes.plots._labels import named, refuse_labels
 
 
 def plot_sensitivity(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._validate import Floats
-from prbayes.plots._canvas import (
+from prbayes.plots.canvas import (
     BLUE,
     DASHED,
     DOTTED,
@@ -21,7 +21,7 @@ from prbayes.plots._canvas import (
     Panel,
     refuse_look,
 )
-from prbayes.plots._curves import steps
+from prbayes.plots.curves import steps
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.conditions import DIRECTION
 

@@ -15,18 +15,16 @@ from prbayes._finding import Finding, report
 from prbayes.model.elements import variable_of
 from prbayes.model.emulated import population_simulators
 from prbayes.plots.comparison import plot_comparison
+from prbayes.plots.convergence import plot_optimizer, plot_stages
 from prbayes.plots.landscape import plot_landscape
-from prbayes.plots.optimizer import plot_optimizer
 from prbayes.plots.outputs import plot_outputs
 from prbayes.plots.population import plot_population
 from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.prediction import plot_prediction
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.sensitivity import plot_sensitivity
-from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
-from prbayes.reports.material import Material
-from prbayes.reports.schema import kind_of_decision
+from prbayes.reports.material import Material, kind_of_decision
 from prbayes.reports.section import Section, image
 
 _log = logging.getLogger("prbayes")

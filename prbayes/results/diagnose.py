@@ -359,9 +359,10 @@ def _stored_share(result: xr.DataTree, key: str = "lost_mass") -> dict[str, floa
 
 
 def _not_converged(message: str) -> Finding:
+    reason = message.removesuffix(".")
     return Finding(
         "not-converged",
-        f"The optimiser did not converge ({message}); try another start or method.",
+        f"The optimiser did not converge ({reason}); try another start or method.",
         "choose.md#optimiser-or-sampler",
     )
 

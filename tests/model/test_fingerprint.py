@@ -603,7 +603,7 @@ def test_an_optimum_with_the_prior_is_refused_where_the_minimiser_is_meant(use: 
 
 
 def test_an_optimum_with_the_prior_serves_elsewhere_and_says_so() -> None:
-    assert with_prior().prior
+    assert with_prior().search.prior
     assert with_prior().identity is not None
     assert with_prior().identity.prior_minimised
     prb.compare({"without": optimum(), "with": with_prior()}, model=base())

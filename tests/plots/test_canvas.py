@@ -11,7 +11,14 @@ import xarray as xr
 from matplotlib.image import imread
 
 import prbayes as prb
-from prbayes.plots._canvas import draw_legend, log_ticks, round_ticks, spans_decades
+from prbayes.plots.canvas import (
+    draw_legend,
+    log_ticks,
+    metric_label,
+    named,
+    round_ticks,
+    spans_decades,
+)
 
 PICTURES = (
     "responses",
@@ -136,3 +143,45 @@ def test_a_logarithm_needs_positive_values_of_different_orders() -> None:
     assert not spans_decades(np.array([-1.0, 500.0]))
     assert not spans_decades(np.array([0.0, 500.0]))
     assert not spans_decades(np.array([np.nan, np.inf]))
+
+
+# -- labels ----------------------------------------------------------------------------------
+
+
+def test_elements_take_the_label_of_their_variable() -> None:
+    labels = {"mu": "mean", "mu[1]": "second mean"}
+    found = [named(name, labels) for name in ("mu[0]", "mu[1]", "nu", "nu[0]", "mu")]
+    assert found == ["mean[0]", "second mean", "nu", "nu[0]", "mean"]
+    assert named("mu[0]", None) == "mu[0]"
+
+
+LABELLED = ("responses", "population", "posterior", "optimizer", "landscape", "comparison")
+
+
+@pytest.mark.parametrize("picture", LABELLED)
+def test_a_label_of_nothing_is_refused(
+    picture: str, pictures: dict[str, Callable[..., Any]]
+) -> None:
+    with pytest.raises(KeyError, match=r"labels: got 'crak', which is no name of what is shown"):
+        pictures[picture](labels={"crak": "crack length (mm)"})
+
+
+def test_one_mapping_serves_all_pictures_of_a_model(
+    pictures: dict[str, Callable[..., Any]],
+) -> None:
+    labels = {"mu": "mean", "y": "response", "x": "input"}
+    for picture in LABELLED:
+        pictures[picture](labels=labels)
+    with pytest.raises(KeyError, match="'nu'"):
+        pictures["responses"](labels=labels | {"nu": "typing error"})
+
+
+def test_metrics_of_several_outputs_are_called_by_that_of_one() -> None:
+    area = prb.AreaMetric()
+    assert metric_label(repr(area)) == "area metric"
+    assert metric_label(repr(prb.Joint(area))) == "joint area metric"
+    other = prb.MarginalCorrelation(prb.KullbackLeibler())
+    assert (
+        metric_label(repr(other)) == "Kullback-Leibler divergence of marginals, with correlations"
+    )
+    assert metric_label("Mine(Other(3))") == "Mine"

@@ -11,7 +11,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.plots._ensemble import Calibrated, Ensemble, read_before, read_result, supported
+from prbayes.plots.ensemble import Calibrated, Ensemble, read_before, read_result, supported
 
 
 def test_an_optimum_stands_for_its_sampling_distribution(optimum: prb.Optimum) -> None:

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import stats
 
 import prbayes as prb
-from prbayes.plots._canvas import BLUE, VERMILION
+from prbayes.plots.canvas import BLUE, VERMILION
 
 
 def test_the_posterior_stands_against_the_optimum(

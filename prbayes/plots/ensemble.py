@@ -17,8 +17,8 @@ from prbayes.model.coverage import VISIBLE, supports_each
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
 from prbayes.optimize.optimum import Optimum, require_of_model
-from prbayes.plots._canvas import BLUE, Panel
-from prbayes.plots._curves import pointwise_band
+from prbayes.plots.canvas import BLUE, Panel
+from prbayes.plots.curves import pointwise_band
 from prbayes.propagation.base import DesignError
 from prbayes.response.inputs import model_on_context
 from prbayes.results.predict import populations_of
