@@ -38,8 +38,8 @@ from benchmarks.scoreboard.problem import (
 )
 from benchmarks.scoreboard.problem import Problem as Population
 from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.base import DesignError
 
 OUT = record.RESULTS / "likelihood_coverage.json"

@@ -24,9 +24,8 @@ from benchmarks.likelihood_coverage import PROBLEMS, Problem, likelihood_of, the
 from benchmarks.scoreboard.problem import Input, normal, truncated
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
-from prbayes.model.population_draws import Populations
 from prbayes.model.specimen_likelihood import arrays
-from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_preparation import Populations, prepared
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.results.likelihood_checks import check_draws
 

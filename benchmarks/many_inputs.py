@@ -25,8 +25,7 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.responses import RESPONSES
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.population_draws import PopulationDraws, Populations
-from prbayes.model.specimen_preparation import Runs, prepared
+from prbayes.model.specimen_preparation import PopulationDraws, Populations, Runs, prepared
 from prbayes.propagation.charts import ReferencePopulation
 from prbayes.propagation.fibre_points import FibreProposals
 from prbayes.propagation.specimen_emulation import DifferencedResponse

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from prbayes.metrics.likelihood import LogLikelihood as LogLikelihood
     from prbayes.metrics.residual import ProbabilityResidual as ProbabilityResidual
     from prbayes.model.cost import cost as cost
-    from prbayes.model.epsilon import set_epsilon as set_epsilon
-    from prbayes.model.pymc_distance import abc_distance as abc_distance
+    from prbayes.model.random_variable import abc_distance as abc_distance
     from prbayes.model.simulator import Simulator as Simulator
     from prbayes.optimize.minimize import minimize as minimize
     from prbayes.optimize.minimize import refine as refine
@@ -47,10 +46,11 @@ if TYPE_CHECKING:
     from prbayes.plots.validity import plot_validity as plot_validity
     from prbayes.posterior.bootstrap import bootstrap as bootstrap
     from prbayes.posterior.epsilon import calibrate_epsilon as calibrate_epsilon
+    from prbayes.posterior.epsilon import set_epsilon as set_epsilon
     from prbayes.posterior.sample import sample as sample
     from prbayes.posterior.sbc import simulation_based_calibration as simulation_based_calibration
     from prbayes.posterior.smc import sample_smc as sample_smc
-    from prbayes.propagation.fresh import Fresh as Fresh
+    from prbayes.propagation.resimulated import Fresh as Fresh
     from prbayes.propagation.resimulated import Resimulated as Resimulated
     from prbayes.propagation.reweighted import Reweighted as Reweighted
     from prbayes.reports.document import Report as Report
@@ -84,8 +84,7 @@ _NAMES = {
     "metrics.likelihood": ("LogLikelihood",),
     "metrics.residual": ("ProbabilityResidual",),
     "model.cost": ("cost",),
-    "model.epsilon": ("set_epsilon",),
-    "model.pymc_distance": ("abc_distance",),
+    "model.random_variable": ("abc_distance",),
     "model.simulator": ("Simulator",),
     "optimize.minimize": ("minimize", "refine"),
     "optimize.optimum": ("Optimum",),
@@ -98,12 +97,11 @@ _NAMES = {
     "plots.responses": ("plot_responses",),
     "plots.validity": ("plot_validity",),
     "posterior.bootstrap": ("bootstrap",),
-    "posterior.epsilon": ("calibrate_epsilon",),
+    "posterior.epsilon": ("calibrate_epsilon", "set_epsilon"),
     "posterior.sample": ("sample",),
     "posterior.sbc": ("simulation_based_calibration",),
     "posterior.smc": ("sample_smc",),
-    "propagation.fresh": ("Fresh",),
-    "propagation.resimulated": ("Resimulated",),
+    "propagation.resimulated": ("Fresh", "Resimulated"),
     "propagation.reweighted": ("Reweighted",),
     "reports.document": ("Report",),
     "response.call": ("scalar",),

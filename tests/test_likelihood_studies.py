@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import likelihood_coverage, likelihood_guards, many_inputs, readings_coverage
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.population_draws import Populations
+from prbayes.model.specimen_preparation import Populations
 
 pytestmark = pytest.mark.long
 

@@ -25,8 +25,8 @@ from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.data_checks import data_findings
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.specimen_emulation import PointOptions
 from prbayes.response.failures import ResponseError

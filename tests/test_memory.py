@@ -19,9 +19,8 @@ import prbayes as prb
 from prbayes.metrics.density import twice_silverman
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
-from prbayes.model.specimen_likelihood import arrays
+from prbayes.model.specimen_likelihood import arrays, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.model.specimen_variable import specimen_likelihoods
 
 MIB = 1 << 20
 GROWTH = """

@@ -17,9 +17,9 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.inference.refits import SamplingDistribution, drawn_in
 from prbayes.inference.resampling import observable
 from prbayes.metrics.base import Metric
-from prbayes.model.elements import split_elements, table_elements
-from prbayes.model.labels import labelled
+from prbayes.model.description import labelled
 from prbayes.model.locking import locked
+from prbayes.model.parameters import split_elements, table_elements
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable

@@ -17,14 +17,14 @@ from scipy.special import ndtr, ndtri
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.decision.quantities import Quantity
 from prbayes.inference.identifiability import oriented
+from prbayes.model.description import versions
 from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import as_attributes, identity_of_model
-from prbayes.model.labels import versions
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.points import through_inverses
+from prbayes.propagation.importance import through_inverses
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import compiled_log_density

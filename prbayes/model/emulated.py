@@ -22,12 +22,11 @@ from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.base import Metric
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
 from prbayes.model.random_variable import Node, nodes
+from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.model.specimen_variable import measurements_of, specimen_likelihoods
 from prbayes.propagation.base import MAX_LOST, DesignError
-from prbayes.propagation.coordinates import Coordinates
-from prbayes.propagation.points import new_specimens
-from prbayes.propagation.specimen_emulation import Surface
+from prbayes.propagation.importance import new_specimens
+from prbayes.propagation.specimen_emulation import Coordinates, Surface
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs

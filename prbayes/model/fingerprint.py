@@ -29,7 +29,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement
 from prbayes.model.parameters import fixed_points, plain_names
 from prbayes.model.random_variable import Node, nodes
-from prbayes.model.specimen_variable import measurements_of, specimen_likelihoods
+from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.response.compile import interpreted
 from prbayes.response.inputs import Inputs
 

@@ -21,9 +21,8 @@ from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
 from prbayes.model.parameters import Hyperparameters
 from prbayes.propagation.base import Propagation
-from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.population_density import PopulationDensity
-from prbayes.propagation.specimen_emulation import Emulation, PointOptions
+from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions
 from prbayes.response.distributions import prior_draws
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs

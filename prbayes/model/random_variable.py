@@ -29,6 +29,7 @@ from pymc.logprob.utils import CheckParameterValue
 from pytensor.compile.mode import optdb
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Apply, Constant
+from pytensor.graph.op import Op
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.op import RandomVariable
@@ -639,3 +640,61 @@ def required_simulators(model: pm.Model) -> dict[Any, AnySimulator]:
             "`with pm.Model()`"
         )
     return by_variable
+
+
+class abc_distance(Op):  # noqa: N801 (reads as a function in a model)
+    """Turn a metric into the ``distance=`` of a stock `pymc.Simulator`.
+
+    Parameters
+    ----------
+    metric : Metric
+
+    Raises
+    ------
+    TypeError
+        If ``metric`` is not a metric object.
+
+    Notes
+    -----
+    `pymc.Simulator` draws new responses at every evaluation, each given to all observations;
+    numbers of simulated and observed responses may differ. A simulated sample with NaN has
+    log-density -inf.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> def simulate(rng, mu, size):
+    ...     return rng.normal(mu, 1.0, size=500)
+    >>> with pm.Model() as model:
+    ...     distance = prb.abc_distance(prb.AreaMetric())
+    ...     y = pm.Simulator("y", simulate, pm.Normal("mu"), distance=distance,
+    ...                      epsilon=0.02, observed=np.array([0.5, 1.0, 4.0]))
+    """
+
+    __props__ = ("metric",)
+    gufunc_signature = "(),(n),(m)->()"
+
+    def __init__(self, metric: Metric) -> None:
+        if not isinstance(metric, Metric):
+            raise TypeError(
+                f"abc_distance: got {called(metric)}, expected a metric object "
+                "such as prb.AreaMetric()"
+            )
+        self.metric = metric
+        self._prepared: tuple[Floats, Discrepancy] | None = None
+
+    def make_node(self, epsilon: Any, observed: Any, simulated: Any) -> Apply[Any, Any]:
+        """Apply to epsilon and the two samples."""
+        tensors = [pt.as_tensor(v) for v in (epsilon, observed, simulated)]
+        return Apply(self, tensors, [pt.dscalar()])
+
+    def perform(self, node: Any, inputs: Sequence[Any], outputs: Any) -> None:
+        """Return the log-density; the observed side is prepared once."""
+        epsilon, observed, simulated = inputs
+        if self._prepared is None or not np.array_equal(self._prepared[0], observed):
+            self._prepared = (np.array(observed), self.metric.against(observed))
+        _, target = self._prepared
+        value = -np.inf
+        if not (np.isnan(simulated) | np.isneginf(simulated)).any():
+            value = log_kernel(target(simulated), epsilon)
+        outputs[0][0] = np.asarray(value, dtype=np.float64)

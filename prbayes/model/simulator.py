@@ -41,7 +41,7 @@ from prbayes.model.random_variable import (
     shared_epsilon,
     simulators,
 )
-from prbayes.model.specimen_variable import (
+from prbayes.model.specimen_likelihood import (
     SpecimenDistribution,
     measurements_of,
     set_likelihood,

@@ -1,6 +1,10 @@
 """Importance points of measured specimens, from runs and an emulator.
 
 The log-likelihood by specimen is computed at these points. They contain no hyperparameter.
+
+Posterior draws of the hyperparameters, given such points, give the population in which the fibres
+of specimens are covered, and the unit of Monte Carlo errors. Adaptive importance sampling with a
+multivariate t proposal needs no gradient.
 """
 
 from __future__ import annotations
@@ -8,13 +12,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri, ndtri
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats
+from prbayes._validate import IN_CACHE, Floats
 from prbayes.model.data_checks import (
     data_findings,
     emulator_findings,
@@ -26,9 +31,12 @@ from prbayes.model.data_checks import (
     unreached,
 )
 from prbayes.model.measurement import SpecimenLikelihood
-from prbayes.model.population_draws import Populations
+from prbayes.model.parameters import Hyperparameters, log_posterior, roots_of
+from prbayes.numerics.log_sum_exp import log_sum_exp
+from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre_points import fibre_points
+from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare, response_share
 from prbayes.propagation.specimen_emulation import Emulation, emulate
 from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
@@ -227,3 +235,172 @@ def _data_findings(likelihood: SpecimenLikelihood, *, several_roots: bool) -> tu
             rounded=np.where(is_stated, np.maximum(steps, 1e-300), np.nan),
         )
     return tuple(findings)
+
+
+@dataclass(frozen=True, eq=False)
+class Populations:
+    """Populations of a model's hyperparameters, evaluated at points of its specimens."""
+
+    likelihood: SpecimenLikelihood
+
+    @cached_property
+    def hyperparameters(self) -> Hyperparameters:
+        """The hyperparameters of the model."""
+        return self.likelihood.hyperparameters
+
+    def log_likelihoods(
+        self, thetas: Floats, z: Floats, log_a: Floats, smoothing: Floats | None = None
+    ) -> Floats:
+        """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
+
+        With `smoothing`, a covariance (d, d), populations are normal with the moments of the
+        coordinates z, and wider by it: the log-likelihood is then smooth where points lie farther
+        apart than a population is wide.
+        """
+        n, count, d = z.shape
+        likelihood = self.likelihood
+        result = np.empty((len(thetas), n))
+        x = likelihood.coordinates.inputs(z)
+        weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
+        for group, rows in likelihood.by_group:
+            if smoothing is None:
+                roots = roots_of(self.hyperparameters, thetas, likelihood.inputs, group)
+                points = WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], weights[rows])
+                result[:, rows] = likelihood.density.log_likelihoods(roots, points)
+                continue
+            step = max(1, IN_CACHE // (len(rows) * count))
+            for first in range(0, len(thetas), step):
+                block = slice(first, first + step)
+                roots = roots_of(self.hyperparameters, thetas[block], likelihood.inputs, group)
+                logs = self._normal_log_density(roots, z[rows].reshape(-1, d), smoothing)
+                logs = np.where(np.isnan(logs), -np.inf, logs)
+                logs = logs.reshape(-1, len(rows), count)
+                result[block, rows] = log_sum_exp(logs + weights[rows])
+        return result
+
+    def prior_specimens(self) -> Floats:
+        """Return coordinates of specimens of the prior predictive population, (n, d)."""
+        return specimens_of(self, self.hyperparameters.prior_thetas(2048, 0), 1)
+
+    def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
+        """Return log S of the population of each specimen, summed over the specimens, (S,)."""
+        likelihood = self.likelihood
+        result = np.zeros(len(thetas))
+        for group, rows in likelihood.by_group:
+            roots = roots_of(self.hyperparameters, thetas, likelihood.inputs, group)
+            log_share = share.of_populations(likelihood.density, roots, likelihood.coordinates)
+            result += len(rows) * log_share
+        return result
+
+    def _normal_log_density(
+        self, roots: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
+    ) -> Floats:
+        """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
+        sampler, rng = self.likelihood.density.sampler, np.random.default_rng(0)
+        sample = self.likelihood.coordinates.of(sampler(roots, specimens, rng)[0], 2)
+        mean = sample.mean(axis=1, keepdims=True)
+        centred = sample - mean
+        root = np.linalg.cholesky(centred.swapaxes(1, 2) @ centred / specimens + smoothing)
+        inverse = np.linalg.inv(root)
+        log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1, keepdims=True)
+        constant = z.shape[1] / 2 * np.log(2 * np.pi)
+        result = np.zeros((len(mean), len(z)))
+        for axis in inverse.swapaxes(0, 1):
+            standard = axis @ z.T
+            standard -= (axis * mean[:, 0]).sum(axis=1, keepdims=True)
+            result += np.square(standard, out=standard)
+        result *= -0.5
+        result -= log_det + constant
+        return result
+
+    def posterior(
+        self,
+        z: Floats,
+        log_a: Floats,
+        smoothing: Floats | None = None,
+        share: ResponseShare | None = None,
+        seed: int = 0,
+    ) -> PopulationDraws:
+        """Return draws of the posterior of the hyperparameters given points of the specimens.
+
+        Weights are tempered until their effective sample size is ten times the number of
+        hyperparameters, so that a few draws do not decide the next proposal. Points and smoothing
+        are those of `log_likelihoods`; the share is that of a population with a response.
+        """
+        names = self.hyperparameters
+        d = names.size
+
+        def log_likelihood(thetas: Floats) -> Floats:
+            total = self.log_likelihoods(thetas, z, log_a, smoothing).sum(axis=1)
+            return total if share is None else total - self.log_share(thetas, share)
+
+        thetas = names.prior_points(2048, seed)
+        log_weights = log_posterior(names, thetas, log_likelihood) - names.log_prior(thetas)
+        weights, _ = _tempered(log_weights, 10 * d)
+        for attempt in range(12):
+            mean = weights @ thetas
+            away = thetas - mean
+            covariance = (away.T * weights) @ away + 1e-12 * np.diag(names.prior_sd**2)
+            root = np.linalg.cholesky(1.2 * covariance)
+            u = sobol(1024, d + 1, seed + 1 + attempt)
+            radius = np.sqrt(5 / chdtri(5, u[:, d]))
+            standard = ndtri(u[:, :d]) * radius[:, None]
+            thetas = mean + standard @ root.T
+            log_proposal = -(5 + d) / 2 * np.log1p((standard**2).sum(axis=1) / 5)
+            log_density = log_posterior(names, thetas, log_likelihood)
+            weights, temper = _tempered(log_density - log_proposal, 10 * d)
+            if temper == 1.0 and attempt >= 2 and 1 / (weights**2).sum() > 200:
+                break
+        rng = np.random.default_rng([seed, 5])
+        return PopulationDraws(self, thetas[rng.choice(len(thetas), 256, p=weights)])
+
+
+def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
+    """Return normalised weights, tempered to an effective sample size, and the temper."""
+    if not np.isfinite(log_weights).any():
+        raise ValueError(
+            "log-likelihood: got no population of the prior that reaches the specimens, expected "
+            "one at least; look at the priors and at the data's units"
+        )
+    temper = 1.0
+    while True:
+        scaled = temper * (log_weights - log_weights.max())
+        weights = np.exp(np.nan_to_num(scaled, nan=-np.inf))
+        weights /= weights.sum()
+        if 1 / (weights**2).sum() >= least or temper < 1e-6:
+            return weights, temper
+        temper *= 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class PopulationDraws:
+    """Draws of the hyperparameters, (S, d)."""
+
+    populations: Populations
+    thetas: Floats
+
+    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
+        """Return log p(y_i | theta) at the draws, (S, N)."""
+        return self.populations.log_likelihoods(self.thetas, z, log_a)
+
+    def log_share(self, share: ResponseShare) -> Floats:
+        """Return the sum over the specimens of log S, the log share with a response, (S,)."""
+        return self.populations.log_share(self.thetas, share)
+
+    def specimens(self, n_of_each: int = 16, seed: int = 0) -> Floats:
+        """Return coordinates of specimens of all groups and draws, (n, d)."""
+        return specimens_of(self.populations, self.thetas, n_of_each, seed)
+
+
+def specimens_of(populations: Populations, thetas: Floats, n_of_each: int, seed: int = 0) -> Floats:
+    """Return coordinates of specimens of the populations at thetas, (n, d)."""
+    rng = np.random.default_rng([seed, 3])
+    likelihood = populations.likelihood
+    parts = []
+    for group, _ in likelihood.by_group:
+        roots = roots_of(populations.hyperparameters, thetas, likelihood.inputs, group)
+        specimens, _ = likelihood.density.sampler(roots, n_of_each, rng)
+        z = likelihood.coordinates.of(specimens, 2)
+        parts.append(z.reshape(-1, z.shape[-1]))
+    z = np.concatenate(parts)
+    return z[np.isfinite(z).all(axis=1)]

@@ -18,8 +18,7 @@ from prbayes.inference.identifiability import oriented
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import sampling_obstacle
 from prbayes.inference.resampling import families, siblings
-from prbayes.model.coverage import Shortcoming, shortcomings
-from prbayes.model.evaluator import Evaluator, n_design_runs
+from prbayes.model.evaluator import Evaluator, Shortcoming, n_design_runs, shortcomings
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.convergence import (
     OVERLAP_ENOUGH,

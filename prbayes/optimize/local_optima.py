@@ -10,8 +10,7 @@ import numpy as np
 
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
-from prbayes.model.coverage import shortcomings
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_bfgs import descend
 from prbayes.optimize.design_refinement import (
     FEW_SETS,

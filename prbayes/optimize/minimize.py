@@ -35,15 +35,19 @@ from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import SamplingDistribution, jumping_simulators
 from prbayes.inference.resampling import SETS
 from prbayes.metrics.multivariate import components_missed
-from prbayes.model.budgets import explained, kept
-from prbayes.model.coverage import shortcomings
-from prbayes.model.elements import readable_variables, split_elements, table_elements
-from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior
-from prbayes.model.labels import labelled
+from prbayes.model.cost import explained, kept
+from prbayes.model.description import labelled
+from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
 from prbayes.model.locking import locked
-from prbayes.model.parameters import THETAS, Hyperparameters
+from prbayes.model.parameters import (
+    THETAS,
+    Hyperparameters,
+    readable_variables,
+    split_elements,
+    table_elements,
+)
 from prbayes.model.random_variable import simulators
-from prbayes.model.specimen_variable import specimen_likelihoods
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.convergence import Fit, Search, Trace, approach, minimise, settle
 from prbayes.optimize.design_refinement import (
     AGREE,

@@ -17,8 +17,14 @@ from prbayes.inference.checks.flat_edge import breakdown_findings, no_informatio
 from prbayes.inference.refits import SamplingDistribution, sampling_of_functions
 from prbayes.inference.requirements import refit_obstacle, sampling_obstacle
 from prbayes.metrics.multivariate import components_summary
-from prbayes.model.description import as_attribute, without_addresses
-from prbayes.model.elements import optimum_elements, readable_variables, single_elements
+from prbayes.model.description import (
+    as_attribute,
+    failures_dataset,
+    labelled,
+    observed_dataset,
+    versions,
+    without_addresses,
+)
 from prbayes.model.evaluator import (
     Evaluator,
     has_other_terms,
@@ -35,9 +41,8 @@ from prbayes.model.fingerprint import (
     identity_of_model,
     require_same,
 )
-from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
 from prbayes.model.locking import locked
-from prbayes.model.parameters import THETAS
+from prbayes.model.parameters import THETAS, optimum_elements, readable_variables, single_elements
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.convergence import Fit, Result, Search, apart_from_data

@@ -15,8 +15,8 @@ import numpy as np
 import xarray as xr
 
 from prbayes._validate import Floats, called, texts
-from prbayes.model.elements import variable_of
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import variable_of
 from prbayes.response.inputs import aleatory_names
 
 # Colours that colour-blind readers distinguish (Okabe and Ito, Color Universal Design, 2008); line

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, Floats, positive_integer
-from prbayes.model.coverage import VISIBLE, supports_each
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import VISIBLE, Evaluator, supports_each
 from prbayes.model.fingerprint import Level
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots.canvas import BLUE, Panel

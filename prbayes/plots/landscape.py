@@ -10,11 +10,11 @@ import numpy as np
 import pymc as pm
 
 from prbayes._validate import Floats, called, positive_integer
-from prbayes.model.elements import optimum_elements, single_elements, split_elements, variable_of
+from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Level
-from prbayes.model.labels import labelled
 from prbayes.model.locking import locked
+from prbayes.model.parameters import optimum_elements, single_elements, split_elements, variable_of
 from prbayes.optimize.optimum import Optimum, require_of_model
 from prbayes.plots.canvas import (
     BLUE,

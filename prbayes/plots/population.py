@@ -14,9 +14,9 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, share
-from prbayes.model.elements import element_name, variable_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
+from prbayes.model.parameters import element_name, variable_of
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,

@@ -13,7 +13,10 @@ from scipy.stats import norm
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, share
-from prbayes.model.elements import (
+from prbayes.model.description import labelled
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.fingerprint import Level, require_together
+from prbayes.model.parameters import (
     readable_elements,
     single_elements,
     split_elements,
@@ -21,9 +24,6 @@ from prbayes.model.elements import (
     table_elements,
     variable_of,
 )
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.fingerprint import Level, require_together
-from prbayes.model.labels import labelled
 from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.plots.canvas import (
     BLUE,

@@ -14,7 +14,16 @@ import xarray as xr
 from prbayes._finding import Finding, as_json
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, called, flag
 from prbayes.metrics.multivariate import components_summary
-from prbayes.model.description import as_attribute, without_addresses
+from prbayes.model.description import (
+    arviz_attributes,
+    as_attribute,
+    failures_dataset,
+    labelled,
+    labelled_responses,
+    observed_dataset,
+    versions,
+    without_addresses,
+)
 from prbayes.model.evaluator import (
     Evaluator,
     likelihood_of,
@@ -22,14 +31,6 @@ from prbayes.model.evaluator import (
     specimen_params,
 )
 from prbayes.model.fingerprint import as_attributes, identity_of
-from prbayes.model.labels import (
-    arviz_attributes,
-    failures_dataset,
-    labelled,
-    labelled_responses,
-    observed_dataset,
-    versions,
-)
 from prbayes.model.measurement import specimen_labels
 from prbayes.model.specimen_likelihood import draw_readings
 from prbayes.model.specimen_preparation import prepared

@@ -13,7 +13,7 @@ import xarray as xr
 
 from prbayes._progress import shown
 from prbayes._validate import Seed, positive_integer, seed_number
-from prbayes.model.budgets import designs_as_before, explained
+from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS

@@ -16,10 +16,10 @@ from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
-from prbayes.model.elements import split_elements
+from prbayes.model.description import labelled, versions
 from prbayes.model.evaluator import Evaluator, has_other_terms, specimen_params
-from prbayes.model.labels import labelled, versions
 from prbayes.model.locking import locked
+from prbayes.model.parameters import split_elements
 from prbayes.optimize.maximum_likelihood import (
     other_specimens,
     simulation_obstacle,

@@ -20,15 +20,14 @@ from threadpoolctl import threadpool_limits
 from prbayes._finding import Finding, report
 from prbayes._progress import CONSOLE, lines, live, shown
 from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
-from prbayes.model.budgets import designs_as_before, explained
-from prbayes.model.coverage import shortcomings
-from prbayes.model.epsilon import checked_epsilon
+from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import (
     Evaluator,
     coarser_evaluator,
     is_current,
     missing_mass,
     n_design_runs,
+    shortcomings,
 )
 from prbayes.model.fingerprint import identity_of, require_same
 from prbayes.model.locking import locked
@@ -38,7 +37,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
 from prbayes.optimize.optimum import Optimum, require_sampling
-from prbayes.posterior.epsilon import calibrate_epsilon
+from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
 from prbayes.posterior.importance import LogDensity
 from prbayes.posterior.kernel import BatchedKernel, Checkpoint, starting_thetas, stored_settings
 from prbayes.posterior.results import (

@@ -40,8 +40,7 @@ from prbayes.inference.resampling import (
     stored_populations,
 )
 from prbayes.metrics.score import prepared_on_population
-from prbayes.model.coverage import TOLERABLE, supports_each
-from prbayes.model.evaluator import Evaluator, coarse_where_sufficient
+from prbayes.model.evaluator import TOLERABLE, Evaluator, coarse_where_sufficient, supports_each
 from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread

@@ -1,7 +1,7 @@
 """Charts of fibres: local coordinates of the solutions of f(x) = y for fewer outputs than inputs.
 
 A chart describes a part of the fibre {x : f(x) = y} by d - m free coordinates; Newton's method
-solves for the m others. `prbayes.propagation.fibre` derives the density that charts lead to.
+solves for the m others. `prbayes.propagation.fibre_points` derives the density that charts lead to.
 """
 
 from __future__ import annotations

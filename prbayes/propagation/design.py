@@ -19,13 +19,14 @@ from prbayes.propagation.importance import (
     CoarseResponse,
     DesignEmulator,
     EmulatedPoints,
+    Mixture,
+    MixtureSampler,
     Sample,
     fit_emulator,
     mixture_of,
     spread_over,
 )
 from prbayes.propagation.moving_support import averaged_log_density, cells_around, moving_inputs
-from prbayes.propagation.points import Mixture, MixtureSampler
 from prbayes.propagation.population_density import PopulationDensity, normalise
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import log_density

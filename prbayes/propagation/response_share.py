@@ -24,9 +24,8 @@ from prbayes._validate import Floats
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
-from prbayes.propagation.specimen_emulation import Emulation, PointOptions, first_runs
+from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions, first_runs
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,15 +31,14 @@ from prbayes.metrics.readings import Readings
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.guards import half_difference
-from prbayes.propagation.normal_populations import (
+from prbayes.propagation.population_density import (
     Normal,
     bootstrap_normals,
     fit_normal,
     normal_log_density,
 )
 from prbayes.propagation.roots import Response, Roots, rows_by_specimen
-from prbayes.propagation.specimen_emulation import PointOptions
+from prbayes.propagation.specimen_emulation import PointOptions, half_difference
 
 
 @dataclass(frozen=True, eq=False)

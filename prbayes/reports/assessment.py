@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._stats import INTERVAL
-from prbayes.model.elements import (
+from prbayes.model.parameters import (
     optimum_elements,
     readable_variables,
     single_elements,

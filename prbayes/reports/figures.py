@@ -12,8 +12,8 @@ from typing import Any
 import pymc as pm
 
 from prbayes._finding import Finding, report
-from prbayes.model.elements import variable_of
 from prbayes.model.emulated import population_simulators
+from prbayes.model.parameters import variable_of
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.convergence import plot_optimizer, plot_stages
 from prbayes.plots.landscape import plot_landscape

@@ -12,7 +12,8 @@ import xarray as xr
 
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats
-from prbayes.model.elements import (
+from prbayes.model.description import labelled
+from prbayes.model.parameters import (
     optimum_elements,
     readable_elements,
     single_elements,
@@ -20,7 +21,6 @@ from prbayes.model.elements import (
     stacked_draws,
     table_elements,
 )
-from prbayes.model.labels import labelled
 from prbayes.optimize.optimum import compared_in
 from prbayes.plots.canvas import named
 from prbayes.plots.outputs import correlation

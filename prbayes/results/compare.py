@@ -22,8 +22,12 @@ from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
-from prbayes.model.coverage import shortcomings
-from prbayes.model.elements import (
+from prbayes.model.description import labelled
+from prbayes.model.emulated import PopulationSimulator
+from prbayes.model.evaluator import Evaluator, shortcomings, specimen_log_likelihoods
+from prbayes.model.fingerprint import as_attributes, require_together
+from prbayes.model.locking import locked
+from prbayes.model.parameters import (
     coordinates,
     element_names,
     optimum_elements,
@@ -35,13 +39,8 @@ from prbayes.model.elements import (
     variable_of,
     with_coordinates,
 )
-from prbayes.model.emulated import PopulationSimulator
-from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
-from prbayes.model.fingerprint import as_attributes, require_together
-from prbayes.model.labels import labelled
-from prbayes.model.locking import locked
 from prbayes.model.random_variable import simulators
-from prbayes.model.specimen_variable import specimen_likelihoods
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.design_refinement import temporary_first_samples
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.response.inputs import event_shape

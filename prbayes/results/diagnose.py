@@ -24,17 +24,16 @@ from prbayes.inference.goodness_of_fit import (
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.requirements import refit_obstacle
 from prbayes.inference.resampling import SETS
-from prbayes.model.coverage import ENOUGH, shortcoming
-from prbayes.model.elements import (
+from prbayes.model.evaluator import ENOUGH, Evaluator, shortcoming
+from prbayes.model.fingerprint import Level
+from prbayes.model.locking import locked
+from prbayes.model.parameters import (
     finite_draws,
     single_elements,
     split_elements,
     stacked_draws,
     table_elements,
 )
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.fingerprint import Level
-from prbayes.model.locking import locked
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.optimize.minimize import Minimisation, find_optimum
 from prbayes.optimize.optimum import (

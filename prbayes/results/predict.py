@@ -18,26 +18,26 @@ from prbayes._finding import Finding, as_json, report
 from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import Floats, Seed, flag, plain_text, positive_integer, seed_number
-from prbayes.model.coverage import TOLERABLE, shortcoming
-from prbayes.model.elements import finite_draws
+from prbayes.model.description import versions
 from prbayes.model.emulated import (
     EmulatedResponse,
     EmulatedSimulator,
     PopulationSimulator,
     population_simulators,
 )
+from prbayes.model.evaluator import TOLERABLE, shortcoming
 from prbayes.model.fingerprint import (
     Level,
     as_attributes,
     identity_of_model,
     require_same_responses,
 )
-from prbayes.model.labels import versions
 from prbayes.model.locking import locked
+from prbayes.model.parameters import finite_draws
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
-from prbayes.propagation.points import new_specimens
+from prbayes.propagation.importance import new_specimens
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.failures import Abort, ResponseError

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._display import view
 from prbayes._progress import shown
 from prbayes._validate import Floats, Seed, share
+from prbayes.model.description import versions
 from prbayes.model.fingerprint import Identity, as_attributes
-from prbayes.model.labels import versions
 from prbayes.model.locking import locked
 from prbayes.results.predict import data_digest
 from prbayes.validation.conditions import DIRECTION, Case, Predicted, read_case

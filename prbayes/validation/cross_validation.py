@@ -19,9 +19,9 @@ from prbayes.metrics.base import Discrepancy, Metric, Part
 from prbayes.metrics.density import DensityDiscrepancy, GaussianKDE, spread
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.model.description import versions
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
-from prbayes.model.labels import versions
 from prbayes.model.locking import locked
 from prbayes.model.measurement import specimen_numbers
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits

@@ -21,7 +21,7 @@ from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, called, positive_integer, positive_number, share
 from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
-from prbayes.model.coverage import shortcomings
+from prbayes.model.evaluator import shortcomings
 from prbayes.model.fingerprint import Level, require_same
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, require_refits

@@ -19,8 +19,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
-from prbayes.model.specimen_likelihood import draw_readings
-from prbayes.model.specimen_variable import specimen_likelihoods
+from prbayes.model.specimen_likelihood import draw_readings, specimen_likelihoods
 from prbayes.propagation.specimen_emulation import PointOptions
 from prbayes.response.compile import PLAIN
 from prbayes.validation.cross_validation import _mean_log_losses

@@ -19,9 +19,8 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.model.specimen_likelihood import draw_readings, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.model.specimen_variable import specimen_likelihoods
 from prbayes.propagation.base import DesignError
 from prbayes.response.compile import PLAIN
 

@@ -8,8 +8,7 @@ import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.inference.asymptotics import Local
 from prbayes.inference.design_error import DesignErrors
-from prbayes.model.coverage import shortcomings
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.optimize.design_refinement import (
     pilot,
     refuse,

@@ -14,8 +14,7 @@ from four_metrics import METRICS, R256, same, slow
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
-from prbayes.model.coverage import shortcomings
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_bfgs import descend
 from prbayes.optimize.design_refinement import refine_at
 from prbayes.optimize.local_optima import (

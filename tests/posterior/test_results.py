@@ -12,8 +12,8 @@ import xarray as xr
 from scipy.stats import norm
 
 import prbayes as prb
+from prbayes.model.description import versions
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.labels import versions
 from prbayes.posterior import results
 from prbayes.posterior.results import Draws, posterior_tree
 

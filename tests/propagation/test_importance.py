@@ -22,8 +22,7 @@ from prbayes.optimize.design_refinement import (
     refine_at,
 )
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.importance import SIZES, columns, mixture_of, spread_over
-from prbayes.propagation.points import MixtureSampler
+from prbayes.propagation.importance import SIZES, MixtureSampler, columns, mixture_of, spread_over
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.budget import BudgetError

@@ -1,4 +1,4 @@
-"""Common points through inverse distribution functions, for each theta anew."""
+"""Responses computed for every theta: the same base points, or new draws."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor
+import pytensor.tensor as pt
 import pytest
 from scipy import stats
 
@@ -100,3 +102,140 @@ def test_discrete_inputs_are_refused() -> None:
                 observed=OBSERVED,
                 propagation=prb.Resimulated(64),
             )
+
+
+def fresh_bound(n: int = 40, random_seed: int = 0) -> Bound:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y",
+            np.square,
+            x,
+            metric=prb.AreaMetric(),
+            observed=[0.5, 1.0, 1.5],
+            epsilon=0.1,
+            propagation=prb.Fresh(n, random_seed=random_seed),
+        )
+    return next(iter(nodes(model).values())).bound
+
+
+PARAMS = [np.array([0.5]), np.array([1.0])]
+
+
+def test_every_evaluation_draws_anew_and_counts() -> None:
+    found = fresh_bound()
+    count = found.responses.count
+    first, second = (found.populations(PARAMS)[0] for _ in range(2))
+    assert not np.isin(first, second).any()
+    assert found.draws == 2
+    assert found.responses.count - count == 80
+
+
+def test_seed_and_number_of_draws_determine_the_next_ones() -> None:
+    one, two, other = fresh_bound(), fresh_bound(), fresh_bound(random_seed=1)
+    values = [b.populations(PARAMS)[0] for b in (one, two, other)]
+    np.testing.assert_array_equal(values[0], values[1])
+    assert not np.array_equal(values[0], values[2])
+    one.draws = 0
+    np.testing.assert_array_equal(one.populations(PARAMS)[0], values[0])
+
+
+def test_the_operation_takes_a_batch_and_has_no_gradient() -> None:
+    found = fresh_bound()
+    mu, sigma = pt.dvector(), pt.dvector()
+    graph = found._discrepancy([mu, sigma])
+    values = pytensor.function([mu, sigma], graph)(np.zeros(3), np.array([1.0, -1.0, 2.0]))
+    assert values.shape == (3,)
+    np.testing.assert_array_equal(np.isfinite(values), [True, False, True])
+    with pytest.raises(TypeError, match="its log-density is random and has no gradient"):
+        pt.grad(graph.sum(), mu)
+
+
+def test_chains_in_processes_of_their_own_draw_different_specimens() -> None:
+    """Processes begin as copies, with the same seeds and counts; what they ask for differs."""
+    here, there = fresh_bound(), fresh_bound()
+    a = here.populations([np.array([0.5]), np.array([1.0])])[0]
+    b = there.populations([np.array([0.51]), np.array([1.0])])[0]
+    # The same noise would be moved by .01.
+    assert np.abs(np.sqrt(np.sort(b[0])) - np.sqrt(np.sort(a[0]))).max() > 0.05
+
+
+def test_predictive_draws_follow_the_seed_and_are_new_specimens() -> None:
+    found = fresh_bound(n=5)
+    params = [np.array(0.5), np.array(1.0)]
+    one, same, other = (found.draw(np.random.default_rng(s), 50, params) for s in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.isin(one, other).any()
+    assert np.unique(one).size == 50
+    assert np.isnan(found.draw(np.random.default_rng(1), 3, [np.array(0.5), np.array(-1.0)])).all()
+
+
+def model() -> pm.Model:
+    with pm.Model() as found:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        prb.Simulator(
+            "y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 1.5], epsilon=0.5,
+            propagation=prb.Fresh(20),
+        )  # fmt: skip
+    return found
+
+
+def test_a_sampler_s_seed_decides_the_draws_of_every_run() -> None:
+    one = model()
+    runs = [
+        prb.sample_smc(
+            30, chains=2, model=one, adjustment=None, random_seed=seed, progressbar=False
+        )
+        for seed in (1, 1, 2)
+    ]
+    first, again, other = (run.calibration["discrepancy"].values for run in runs)
+    np.testing.assert_array_equal(first, again)
+    assert not np.isin(first, other).any()
+
+
+@pytest.mark.long
+def test_prior_predictive_sampling_follows_its_seed() -> None:
+    drawn = [
+        pm.sample_prior_predictive(3, model=model(), random_seed=seed).prior_predictive["y"].values
+        for seed in (1, 1, 2)
+    ]
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert not np.isin(drawn[0], drawn[2]).any()
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (
+            lambda mu, sigma: pm.SkewNormal.dist(mu=mu, sigma=sigma, alpha=2.0),
+            stats.skewnorm(2.0, 2.0, 0.5),
+        ),
+        (lambda mu, sigma: pm.Rice.dist(nu=mu, sigma=sigma), stats.rice(4.0, scale=0.5)),
+        (lambda mu, sigma: pm.Moyal.dist(mu, sigma), stats.moyal(2.0, 0.5)),
+        (
+            lambda mu, sigma: pm.TruncatedNormal.dist(mu, sigma, lower=2.0),
+            stats.halfnorm(2.0, 0.5),
+        ),
+        (
+            lambda mu, sigma: pm.Truncated.dist(pm.Laplace.dist(mu, sigma), lower=mu),
+            stats.expon(2.0, 0.5),
+        ),
+    ],
+    ids=["SkewNormal", "Rice", "Moyal", "TruncatedNormal", "Truncated"],
+)
+def test_inputs_that_pymc_draws_by_functions_of_its_own(make: Any, expected: Any) -> None:
+    with pm.Model() as model:
+        x = make(pm.Normal("mu", 2, 0.5), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", np.positive, x, metric=prb.AreaMetric(), observed=expected.ppf([0.2, 0.5, 0.8]),
+            epsilon=0.5, propagation=prb.Fresh(400),
+        )  # fmt: skip
+    found = next(iter(nodes(model).values())).bound
+    given = {"mu": np.array([2.0]), "sigma": np.array([0.5])}
+    values, weights = found.populations([given[str(r.name)] for r in found.inputs.roots])
+    assert values.shape == weights.shape == (1, 400)
+    # A fixed seed: far from the one in a thousand that another distribution would give.
+    assert stats.kstest(values[0], expected.cdf).pvalue > 0.01
+    assert np.isfinite(
+        prb.sample_smc(20, chains=2, model=model, adjustment=None).posterior["mu"]
+    ).all()

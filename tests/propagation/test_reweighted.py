@@ -16,8 +16,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.metrics.multivariate import CompositeDiscrepancy
-from prbayes.model.coverage import shortcomings
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.model.random_variable import nodes
 from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 from prbayes.response.distributions import PopulationSampler

@@ -15,7 +15,7 @@ from scipy.stats import multivariate_normal, norm
 from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.normal_populations import normal_log_density
+from prbayes.propagation.population_density import normal_log_density
 from prbayes.propagation.specimen_emulation import (
     Emulation,
     PointOptions,

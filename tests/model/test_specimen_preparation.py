@@ -13,8 +13,8 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.model.population_draws import Populations, specimens_of
-from prbayes.model.specimen_variable import specimen_likelihoods
+from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_preparation import Populations, specimens_of
 
 N, SD, PRIOR_SD = 12, 0.5, 2.0
 X = np.random.default_rng(4).normal(1.0, SD, N)

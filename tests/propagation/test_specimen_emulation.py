@@ -1,17 +1,158 @@
+"""Coordinates in which a response is emulated, and guards: their numbers and what they flag."""
+
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+import pymc as pm
 import pytest
 from scipy.interpolate import RBFInterpolator
 from scipy.special import logsumexp, ndtri
 from scipy.stats import norm, qmc
 
 from prbayes._validate import Floats
-from prbayes.propagation.guards import (
+from prbayes.propagation.specimen_emulation import (
+    Coordinates,
     half_difference,
     missing_share,
     predicted_bias,
 )
+from prbayes.response.inputs import read_inputs
+
+
+def coordinates(write: Callable[..., list[Any]]) -> Coordinates:
+    """Return the coordinates of inputs, which get a factor whose prior is nearly one."""
+    with pm.Model() as model:
+        inputs = write(pm.Normal("factor", 1.0, 1e-9))
+        return Coordinates.of_prior(read_inputs("y", inputs, model))
+
+
+def three_inputs(factor: Any) -> list[Any]:
+    mu = pm.Normal("mu", 3.0, 0.5)
+    covariance = np.array([[1.0, 0.6], [0.6, 2.0]])
+    return [
+        pm.Normal.dist(mu, 2.0),
+        pm.LogNormal.dist(mu, 1.0),
+        pm.MvNormal.dist(factor * np.array([10.0, -20.0]), covariance),
+    ]
+
+
+THREE = coordinates(three_inputs)
+
+
+def test_inputs_and_coordinates_are_inverse() -> None:
+    z = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 7, 4))
+    inputs = THREE.inputs(z)
+    assert [x.shape for x in inputs] == [(5, 7), (5, 7), (5, 7, 2)]
+    assert THREE.size == 4
+    assert THREE.shapes == ((), (), (2,))
+    assert np.allclose(THREE.of(inputs, 2), z, atol=1e-12)
+
+
+def test_the_log_jacobian_is_that_of_differences() -> None:
+    z = np.random.default_rng(0).uniform(-1, 1, (6, 4))
+
+    def flat(z: Any) -> Any:
+        return np.concatenate([x.reshape(len(z), -1) for x in THREE.inputs(z)], axis=1)
+
+    step = 1e-6
+    jacobian = np.stack(
+        [(flat(z + step * e) - flat(z - step * e)) / (2 * step) for e in np.eye(4)], axis=2
+    )
+    assert np.allclose(THREE.log_jacobian(z), np.log(np.abs(np.linalg.det(jacobian))), atol=1e-7)
+
+
+def test_vector_inputs_keep_their_order() -> None:
+    z = np.zeros((1, 4))
+    z[0, 3] = 1.0
+    before, after = (THREE.inputs(v)[2][0] for v in (np.zeros((1, 4)), z))
+    assert after[0] == before[0]
+    assert after[1] > before[1]
+    assert np.allclose(before, [10.0, -20.0], atol=0.3)
+
+
+def test_the_prior_range_is_from_minus_one_to_one() -> None:
+    one = coordinates(lambda factor: [pm.Normal.dist(pm.Normal("mu", 5.0, 3.0), 4.0 * factor)])
+    # The prior predictive distribution is N(5, 5); its .005 quantile is -2.576. Standard error of
+    # a quantile of 4096 draws: sqrt(.005 / 4096) / density(2.576) = .077 sd
+    assert np.allclose(
+        one.inputs(np.array([[-1.0], [1.0]]))[0], [5 - 12.88, 5 + 12.88], atol=5 * 0.39
+    )
+    assert one.bounds[0, 0] < -1
+    assert one.bounds[1, 0] > 1
+
+
+def test_the_bounds_are_those_of_data_sets_of_the_prior() -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 1.0)
+        inputs = read_inputs("y", [pm.Normal.dist(mu, 1.0)], model)
+    few, many = (Coordinates.of_prior(inputs, n) for n in (1, 2000))
+    assert np.array_equal(few.center, many.center)
+    assert np.array_equal(few.half_width, many.half_width)
+    # The probability that a new data set of 2000 specimens exceeds the upper end: 1 in 4097 on
+    # average over the draws, exponentially distributed.
+    population = np.random.default_rng(0).normal(size=(1 << 16, 1))
+    ends = np.array([few.inputs(few.bounds)[0][1], many.inputs(many.bounds)[0][1]])
+    exceeded = -np.expm1(2000 * norm.logcdf(ends, population, 1)).mean(axis=0)
+    assert exceeded[0] > 50 / 4097
+    assert exceeded[1] < 5 / 4097
+
+
+@pytest.mark.parametrize(
+    ("dist", "is_log"),
+    [
+        (lambda f: pm.LogNormal.dist(0.0, f), True),  # ratio of the ends exp(5.2) = 170
+        (lambda f: pm.LogNormal.dist(0.0, 0.2 * f), False),  # exp(1.03) = 2.8
+        (lambda f: pm.LogNormal.dist(0.0, 0.5 * f), True),  # exp(2.6) = 13
+        (lambda f: pm.Normal.dist(0.0, 100.0 * f), False),  # has negative values
+        (lambda f: pm.Gamma.dist(0.5, f), True),
+        (lambda f: pm.Uniform.dist(1.0, 5.0 * f), False),
+        (lambda f: pm.Uniform.dist(0.001, 5.0 * f), True),
+    ],
+)
+def test_positive_inputs_over_more_than_a_decade_are_logarithms(dist: Any, is_log: bool) -> None:
+    one = coordinates(lambda factor: [dist(factor)])
+    assert one.is_log.tolist() == [is_log]
+    x = np.array([1.5])
+    assert np.allclose(one.inputs(one.of([x], 1))[0], x)
+
+
+def test_each_element_of_a_vector_is_a_logarithm_or_not() -> None:
+    assert coordinates(
+        lambda factor: [pm.LogNormal.dist(np.zeros(2), factor * np.array([0.1, 2.0]), shape=2)]
+    ).is_log.tolist() == [False, True]
+
+
+def test_inputs_outside_the_log_range_have_no_number() -> None:
+    one = coordinates(lambda factor: [pm.LogNormal.dist(0.0, factor)])
+    z = one.of([np.array([-1.0, 0.0, 1.0])], 1).ravel()
+    assert np.isnan(z[0])
+    assert z[1] == -np.inf
+    assert np.isfinite(z[2])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_units_of_inputs_change_the_jacobian_alone(unit: float) -> None:
+    def pair(factor: Any, unit: float) -> list[Any]:
+        return [pm.Normal.dist(0.0, unit * factor), pm.LogNormal.dist(np.log(unit), 1.0)]
+
+    first, second = (coordinates(lambda factor, unit=u: pair(factor, unit)) for u in (1.0, unit))
+    assert np.allclose(first.bounds, second.bounds, atol=1e-9)
+    z = np.array([[0.3, -0.4]])
+    for a, b in zip(first.inputs(z), second.inputs(z), strict=True):
+        assert np.allclose(unit * a, b, rtol=1e-9, atol=1e-9 * unit)
+    change = second.log_jacobian(z) - first.log_jacobian(z)
+    assert np.allclose(change, 2 * np.log(unit), atol=1e-9)
+
+
+def test_the_same_prior_gives_the_same_coordinates() -> None:
+    again = coordinates(three_inputs)
+    assert np.array_equal(again.center, THREE.center)
+    assert np.array_equal(again.half_width, THREE.half_width)
+    assert np.array_equal(again.bounds, THREE.bounds)
+
 
 PREDICTED_BIAS = 0.15
 
