@@ -27,7 +27,7 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS
 from prbayes.optimize.convergence import Search, Trace, approach, minimise, settle
-from prbayes.optimize.methods import Method
+from prbayes.optimize.objective import Method
 
 SIZE = 1000
 REACH = {

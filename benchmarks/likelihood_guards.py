@@ -26,7 +26,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import Populations, prepared
-from prbayes.optimize.specimen_refits import simulation_obstacle
+from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.results.likelihood_checks import check_draws
 
 OUT = record.RESULTS / "likelihood_guards.json"

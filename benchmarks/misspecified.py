@@ -26,7 +26,7 @@ from benchmarks import record
 from benchmarks.systems import METRICS
 from prbayes.model.evaluator import Evaluator
 from prbayes.optimize.convergence import Search, Trace, approach, minimise, settle
-from prbayes.optimize.methods import Method
+from prbayes.optimize.objective import Method
 
 SIZES = (20, 50, 1000, 100_000)
 LEVELS = (np.arange(100_000) + 0.5) / 100_000

@@ -28,7 +28,7 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS
 from prbayes.optimize.convergence import Search, Trace, minimise, settle
-from prbayes.optimize.methods import Method
+from prbayes.optimize.objective import Method
 
 SIZES = (20, 50, 1000, 100_000)
 POINTS = {

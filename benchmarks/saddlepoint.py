@@ -44,15 +44,14 @@ from scipy.interpolate import RectBivariateSpline
 import prbayes as prb
 from benchmarks import record, refit_pivots
 from prbayes.metrics.density import twice_silverman
-from prbayes.posterior.estimate_likelihood import (
+from prbayes.posterior.importance import importance_sample, laplace
+from prbayes.posterior.saddlepoint import (
     EstimateLikelihood,
     StoredScores,
     estimate_likelihood,
 )
-from prbayes.posterior.importance import importance_sample, laplace
-from prbayes.posterior.refit_likelihood import RefitLikelihood, refit_likelihood
 from prbayes.posterior.sample import modes_of
-from prbayes.posterior.target import Target
+from prbayes.posterior.target import RefitLikelihood, Target, refit_likelihood
 
 OUT = record.RESULTS / "saddlepoint.json"
 METRICS = {"KLD": prb.KullbackLeibler(), "PR": prb.ProbabilityResidual()}

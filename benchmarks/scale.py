@@ -126,7 +126,7 @@ def tasks(size: int) -> dict[str, float]:
     import cloudpickle
     import distributed
 
-    from prbayes.response import call, chunks
+    from prbayes.response import call
 
     numbers = np.random.default_rng(1).normal(size=(size, 5))
     function = call.scalar(lambda *x: sum(x))
@@ -139,12 +139,12 @@ def tasks(size: int) -> dict[str, float]:
     )
     with cluster, distributed.Client(cluster) as client:
         executor = _Untold(client.get_executor(pure=False))
-        how = chunks.CallSettings("y", function, executor)  # type: ignore[arg-type]
+        how = call.CallSettings("y", function, executor)  # type: ignore[arg-type]
         points = call.Points(list(numbers.T), [True] * 5)
-        chunks.respond(how, points.at(np.arange(10)), chunks.Tally())  # the workers are up
-        chunks.chunk_size = lambda *_: 1
+        call.respond(how, points.at(np.arange(10)), call.Tally())  # the workers are up
+        call.chunk_size = lambda *_: 1
         before, clock = peak(), time.perf_counter()
-        chunks.respond(how, points, chunks.Tally())
+        call.respond(how, points, call.Tally())
         spent = time.perf_counter() - clock
     one, packed = points.at(np.arange(1)), call.packed(function)
     task = cloudpickle.dumps((call.compute_packed, packed, one, False))

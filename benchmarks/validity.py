@@ -35,7 +35,7 @@ from scipy.stats import invwishart
 
 import prbayes as prb
 from benchmarks import record
-from prbayes.validation.probability_transform import area
+from prbayes.validation.conditions import area
 
 LEVELS = (0.01, 0.05, 0.10)
 FITTED = (15, 30, 100)

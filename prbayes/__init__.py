@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from prbayes.results.predict import predict as predict
     from prbayes.validation.area_test import area_test as area_test
     from prbayes.validation.cross_validation import cross_validate as cross_validate
-    from prbayes.validation.model_comparison import rank as rank
+    from prbayes.validation.cross_validation import rank as rank
 
 __version__ = version("prbayes")
 
@@ -111,8 +111,7 @@ _NAMES = {
     "results.diagnose": ("Diagnosis", "diagnose"),
     "results.predict": ("predict",),
     "validation.area_test": ("area_test",),
-    "validation.cross_validation": ("cross_validate",),
-    "validation.model_comparison": ("rank",),
+    "validation.cross_validation": ("cross_validate", "rank"),
 }
 _NAMESPACES = (
     "datasets",

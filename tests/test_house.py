@@ -609,11 +609,6 @@ INNER = {
         "pytensor.tensor.random.type.RandomGeneratorType",
         "pytensor.tensor.variable.TensorVariable",
     },
-    "response.groups": {
-        "pytensor.graph.basic.Variable",
-        "pytensor.tensor.random.op.RandomVariable",
-        "pytensor.tensor.variable.TensorVariable",
-    },
     "response.inputs": {
         "pymc.distributions.distribution.SymbolicRandomVariable",
         "pytensor.graph.basic.Variable",

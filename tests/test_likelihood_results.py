@@ -18,7 +18,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes.model.evaluator import specimen_log_likelihoods, specimen_params
 from prbayes.model.specimen_likelihood import arrays
-from prbayes.optimize.specimen_refits import other_specimens, specimen_pool, specimen_refits
+from prbayes.optimize.maximum_likelihood import other_specimens, specimen_pool, specimen_refits
 from prbayes.results.likelihood_checks import (
     NormalScores,
     influence,

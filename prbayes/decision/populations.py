@@ -28,8 +28,7 @@ from prbayes.propagation.importance import through_inverses
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import compiled_log_density
-from prbayes.response.groups import refuse_groups
-from prbayes.response.inputs import Inputs, read_inputs
+from prbayes.response.inputs import Inputs, read_inputs, refuse_groups
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses
 from prbayes.results.predict import (

@@ -38,8 +38,7 @@ from prbayes.emulators.surfaces import (
     fitted,
 )
 from prbayes.numerics.points import sobol
-from prbayes.response.call import Points, compute
-from prbayes.response.chunks import CallSettings, Tally, respond
+from prbayes.response.call import CallSettings, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import check_call_settings, refuse_coarse, refuse_misfit

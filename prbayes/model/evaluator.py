@@ -41,7 +41,7 @@ from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, ninf_for_invalid, untraced
-from prbayes.response.groups import is_group
+from prbayes.response.inputs import is_group
 
 # Points of a design from which on samplers start with an eighth of them.
 _LARGE = SIZES.first

@@ -24,8 +24,7 @@ from prbayes.model.random_variable import priors_alone
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid, untraced
 from prbayes.response.distributions import PriorPoints, PriorSampler
-from prbayes.response.groups import is_group
-from prbayes.response.inputs import Inputs, event_shape
+from prbayes.response.inputs import Inputs, event_shape, is_group
 
 # Size of a sample of thetas from a prior or a posterior; thetas cost time, but no response.
 THETAS = 256

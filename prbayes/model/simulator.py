@@ -51,8 +51,15 @@ from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compile import PLAIN
 from prbayes.response.distributions import refuse_without_density
-from prbayes.response.groups import Groups, group_indices, is_group
-from prbayes.response.inputs import Inputs, is_labelled, model_on_context, read_inputs
+from prbayes.response.inputs import (
+    Groups,
+    Inputs,
+    group_indices,
+    is_group,
+    is_labelled,
+    model_on_context,
+    read_inputs,
+)
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 

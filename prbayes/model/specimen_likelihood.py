@@ -54,7 +54,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare
 from prbayes.response.distributions import log_density
-from prbayes.response.groups import is_group
+from prbayes.response.inputs import is_group
 
 
 def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:

@@ -24,8 +24,7 @@ from prbayes.metrics.density import overlap
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, differences
-from prbayes.optimize.methods import Method
-from prbayes.optimize.objective import Function, Objective, Ridge, SpentError, StalledError
+from prbayes.optimize.objective import Function, Method, Objective, Ridge, SpentError, StalledError
 from prbayes.response.budget import BudgetError
 
 # Relative gain that no longer counts: far below the noise of any data, which is 1 / N.

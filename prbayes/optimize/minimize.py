@@ -7,7 +7,7 @@ support the minimum. Then it looks for other optima.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any
@@ -26,23 +26,38 @@ from prbayes._validate import (
     real_array,
     seed_number,
 )
-from prbayes.inference.checks.identification import breakdown_findings, elements_at_edge
+from prbayes.inference.checks.identification import (
+    breakdown_findings,
+    confounding_findings,
+    elements_at_edge,
+    unidentified_findings,
+)
 from prbayes.inference.checks.metric_suitability import (
     data_between_runs,
     heavy_tails,
     smoothing_bias,
 )
+from prbayes.inference.checks.prior import prior_end_findings, prior_ends
 from prbayes.inference.design_error import design_error
-from prbayes.inference.refits import jumping_simulators
+from prbayes.inference.refits import SamplingDistribution, jumping_simulators
 from prbayes.inference.resampling import SETS
+from prbayes.metrics.multivariate import components_missed
 from prbayes.model.cost import explained, kept
+from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
 from prbayes.model.locking import locked
-from prbayes.model.parameters import THETAS, Hyperparameters
+from prbayes.model.parameters import (
+    THETAS,
+    Hyperparameters,
+    readable_variables,
+    split_elements,
+    table_elements,
+)
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.convergence import Fit, Search, Trace, approach, minimise, settle
 from prbayes.optimize.design_refinement import (
+    AGREE,
     MAX_ROUNDS,
     Restart,
     noise_floors,
@@ -52,12 +67,11 @@ from prbayes.optimize.design_refinement import (
     refuse_lost,
     sampling_distribution,
 )
-from prbayes.optimize.findings import optimum_findings
 from prbayes.optimize.local_optima import Rival, find_rivals
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
-from prbayes.optimize.methods import Method
-from prbayes.optimize.objective import Ridge, initial_scales
+from prbayes.optimize.objective import Method, Ridge, initial_scales
 from prbayes.optimize.optimum import Optimum, SearchRecord, n_computed, optimum_of
+from prbayes.propagation.importance import SIZES
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -581,3 +595,66 @@ def _details(problem: _Problem, fit: Fit, at_edge: tuple[str, ...], stopped: str
             "prior, which is not minimised: their values are arbitrary; use prb.sample_smc."
         )
     return " ".join(sentences)
+
+
+def optimum_findings(
+    evaluator: Evaluator,
+    sampling: SamplingDistribution | None,
+    rivals: Sequence[Rival],
+    design_error: float,
+) -> tuple[Finding, ...]:
+    """Report what the metric leaves out, the design's error, other optima, and identification."""
+    missed = {node.name: components_missed(node.target) for node in evaluator.nodes}
+    findings = [
+        Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
+    ]
+    # An estimate from eight blocks is itself uncertain by a quarter.
+    if design_error > 1.5 * AGREE:
+        findings.append(_design_finding(evaluator, design_error))
+    findings += [_second_mode(evaluator, rival) for rival in rivals if rival.comparable]
+    if sampling is not None:
+        ends = prior_ends(sampling)
+        page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
+        findings += prior_end_findings(ends, page)
+        names = {end.name for end in ends}
+        findings += unidentified_findings(evaluator, sampling.local, names)
+        findings += confounding_findings(evaluator, sampling.local)
+    return tuple(findings)
+
+
+def _design_finding(evaluator: Evaluator, error: float) -> Finding:
+    """Report a large error of the optimum by the design."""
+    designs = [bound.design for bound in evaluator.reweighted.values()]
+    runs = max(design.n_runs for design in designs)
+    if min(len(design.emulated or ()) for design in designs) < SIZES.largest:
+        advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
+    else:
+        advice = (
+            f"between its {runs} runs are {SIZES.largest} emulated points, the most there are: "
+            "more runs help as far as the emulator is off, which the message says, and the rest "
+            "counts as another error of the optimum"
+        )
+    return Finding(
+        "design-error",
+        f"The optimum of another design would differ by about {error:.2f} standard errors, "
+        f"expected at most {AGREE}; {advice}.",
+        "choose.md#how-many-responses",
+    )
+
+
+def _second_mode(evaluator: Evaluator, rival: Rival) -> Finding:
+    """Report another optimum."""
+    hyperparameters = evaluator.hyperparameters
+    # Beside a second point, so that constants can be recognised.
+    points = hyperparameters.constrained(np.stack([rival.theta, hyperparameters.initial]))
+    names = readable_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
+    values = labelled(evaluator, {name: points[name] for name in names}, {"point": 2}).data_vars
+    elements = split_elements(values)
+    place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in table_elements(values))
+    return Finding(
+        "second-mode",
+        f"The data could as well come from {place}: another optimum, or mirror "
+        "solution, whose discrepancy differs by no more than sampling noise; state a prior that "
+        "excludes one, or report both.",
+        "optimum_or_abc.md#two-answers",
+    )

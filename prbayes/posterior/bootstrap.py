@@ -15,8 +15,8 @@ from prbayes.inference.asymptotics import unidentified_directions
 from prbayes.inference.refits import is_prepared_by_data, refit, refit_prepared
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
 from prbayes.model.locking import locked
+from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_refits
-from prbayes.optimize.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.posterior.results import bootstrap_tree
 
 

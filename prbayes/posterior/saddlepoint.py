@@ -1,7 +1,9 @@
-r"""Saddlepoint density of a mean of independent scores.
+r"""Saddlepoint likelihood of the hyperparameters given a metric's estimate, from stored responses.
 
-The density of an M-estimating equation at its root follows from the cumulant function of one
-specimen's score (Field and Hampel 1982, doi:10.1093/biomet/69.1.29):
+The statistic is the metric's gradient at the estimate, the mean of the specimens' scores. Its
+density for any theta is a saddlepoint approximation over the weights of the stored responses: no
+refit and no synthetic data set. The density of an M-estimating equation at its root follows from
+the cumulant function of one specimen's score (Field and Hampel 1982, doi:10.1093/biomet/69.1.29):
 
 .. math:: \log L = N K(a) - \tfrac{1}{2} \log\det N K''(a), \quad
           K(a) = \log \sum_m w_m e^{a' \psi_m}, \quad K'(a) = 0.
@@ -12,13 +14,28 @@ Independent simulators add their cumulant functions :math:`N_j K_j(a)` with one 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._validate import Floats
+from prbayes._validate import IN_CACHE, Floats
+from prbayes.inference.resampling import SETS, aligned, groups, observable, specimens
+from prbayes.metrics.base import is_additive
+from prbayes.metrics.score import (
+    ScoreOptions,
+    ShiftedResponses,
+    WeightSlopes,
+    prepared_on_population,
+    specimen_scores,
+    tabulated_scores,
+)
+from prbayes.model.evaluator import Evaluator, coarse_where_sufficient
+from prbayes.numerics.threads import one_thread
+from prbayes.optimize.design_refinement import noise_floors
+from prbayes.optimize.optimum import Optimum, optima_of
 
 
 @dataclass(frozen=True)
@@ -32,6 +49,349 @@ class SaddlepointOptions:
     smallest_variance: float = 1e-4
     smallest_value: float = -1000.0  # of the cumulant function; below, the density is zero
     smallest_eigenvalue: float = 1e-6  # of the correlation matrix of scores that vary
+
+
+@dataclass(frozen=True)
+class EstimateLikelihoodOptions:
+    """Options of the likelihood given an estimate; steps are in prior standard deviations."""
+
+    score: ScoreOptions = field(default_factory=ScoreOptions)
+    saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
+    # Times that metrics are minimised again, with whitening and bandwidth of the population at the
+    # previous estimate. With zero they are those of the observed data.
+    rounds: int = 2
+    few_specimens: int = 10  # below, metrics of one output are minimised again as well
+    step: float = 1e-5  # of differences of log weights
+    wide_step: float = 0.05  # the same if the support of an input moves
+    resimulated_step: float = 1e-3  # of differences of responses that are computed at each theta
+    # Smallest effective number of stored responses at the point of the score. An estimate at an
+    # edge is moved inside until it is reached.
+    effective_responses: float = 50.0
+    # Distance from the middle of the prior, beyond which an element may be at an edge; and smallest
+    # standard deviation of its likelihood score there, relative to the largest of all elements.
+    distance: float = 3.0
+    smallest_spread: float = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateLikelihood:
+    """The likelihood given the estimate."""
+
+    evaluator: Evaluator
+    starts: Floats  # (M, d): the point of the score, and optima that are as good as the estimate
+    # By set of simulators that share specimens.
+    groups: tuple[StoredScores | ResimulatedScores, ...]
+    combinations: Floats  # (d, r): combinations of the scores that vary
+    # (d,): unit of `laplace`: a standard deviation of the prior, or a hundred standard errors if
+    # these are less. With a prior far wider than the population, its unit would miss all data.
+    scale: Floats
+    options: SaddlepointOptions
+
+    @property
+    def point(self) -> Floats:
+        """The point of the score, (d,): the estimate, or a point inside if it is at an edge."""
+        return np.asarray(self.starts[0])
+
+    @one_thread()
+    def log_likelihood(self, thetas: Floats) -> Floats:
+        """Return the log-density of the score at the estimate, (S, d) -> (S,)."""
+        if self.combinations.shape[1] == 0:
+            return np.zeros(len(thetas))
+        rows = min(group.rows for group in self.groups)
+        blocks = []
+        for first in range(0, len(thetas), rows):
+            block = thetas[first : first + rows]
+            pairs = [group.population(self.evaluator, block) for group in self.groups]
+            log_weights, scores = zip(*pairs, strict=True)
+            blocks.append(log_density(log_weights, scores, self.options))
+        return np.concatenate(blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredScores:
+    """Scores of the stored responses of simulators that share specimens."""
+
+    simulator: int  # one of them
+    is_observable: NDArray[np.bool_]  # (M,): stored responses that all simulators can observe
+    scores: Scores  # of these
+
+    @property
+    def rows(self) -> int:
+        """Number of populations whose weights stay in the cache of the processor."""
+        return max(16, IN_CACHE // len(self.scores.values))
+
+    def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
+        """Return log weights of populations, (S, M'), and the scores of their responses."""
+        _, weights = evaluator.populations(thetas, self.simulator)
+        if not self.is_observable.all():
+            weights = weights[:, self.is_observable]
+            with np.errstate(invalid="ignore"):
+                weights /= weights.sum(axis=1, keepdims=True)
+        with np.errstate(divide="ignore"):
+            return np.log(weights), self.scores
+
+    def combined(self, combinations: Floats) -> StoredScores:
+        """Return combinations of the scores, (d, r)."""
+        return replace(self, scores=Scores(self.scores.values @ combinations, self.scores.size))
+
+
+@dataclass(frozen=True, eq=False)
+class ResimulatedScores:
+    """Scores of responses computed at each theta, of simulators that share specimens."""
+
+    tables: tuple[tuple[int, Callable[[Floats], Floats]], ...]  # simulators: responses to scores
+    mean: Floats  # (d,): of the observed specimens' scores
+    size: int  # number of observed specimens
+    combinations: Floats  # (d, r)
+    rows: ClassVar[int] = 1
+
+    def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
+        """Return log weights of one population, (1, M'), and the scores of its responses."""
+        values: Any = -self.mean
+        is_observable: Any = True
+        for k, table in self.tables:
+            responses, _ = evaluator.populations(thetas, k)
+            values = values + table(responses[0])
+            is_observable &= observable(responses[0], evaluator.nodes[k].target)
+        count = int(is_observable.sum())
+        if not count:
+            zeros = np.zeros((1, len(self.mean)))
+            return np.full((1, 1), -np.inf), Scores(zeros @ self.combinations, self.size)
+        log_weights = np.full((1, count), -np.log(count))
+        return log_weights, Scores(values[is_observable] @ self.combinations, self.size)
+
+    def combined(self, combinations: Floats) -> ResimulatedScores:
+        """Return combinations of the scores, (d, r)."""
+        return replace(self, combinations=combinations)
+
+
+def estimate_likelihood(
+    evaluator: Evaluator,
+    optimum: Optimum,
+    options: EstimateLikelihoodOptions = EstimateLikelihoodOptions(),
+) -> EstimateLikelihood:
+    """Return the likelihood of the hyperparameters given the minimiser of their metrics.
+
+    Responses are stored, or computed at each theta from common random numbers. Simulators that
+    share specimens add the scores of a specimen; independent simulators add their cumulant
+    functions. Raises ValueError if the gradient of the objective is no mean over specimens.
+    """
+    obstacle = score_obstacle(evaluator)
+    if obstacle is not None:
+        raise ValueError(f"metric: {obstacle}; expected a refit_likelihood")
+    optima = optima_of(optimum, evaluator)
+    point = move_inside(evaluator, optima[0], options)
+    scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
+    # Whitening or bandwidths by few observed specimens would bias the estimate: if they happen to
+    # scatter little, the bandwidth is small and the weight in the sum of simulators large.
+    nodes = evaluator.nodes
+    has_several_outputs = any(node.target.event for node in nodes)
+    fewest = min(len(node.observed) for node in nodes)
+    if has_several_outputs or len(nodes) > 1 or fewest < options.few_specimens:
+        for _ in range(options.rounds):
+            evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
+    evaluator = coarse_where_sufficient(evaluator, point)
+    score_groups = [
+        _group_scores(evaluator, members, point, scales, options)
+        for members in groups(evaluator.nodes)
+    ]
+    pairs = [group.population(evaluator, point[None]) for group in score_groups]
+    log_weights, scores = zip(*pairs, strict=True)
+    untilted = cumulants(log_weights, scores, np.zeros((1, len(point))))
+    size = sum(score.size for score in scores)
+    combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
+    return EstimateLikelihood(
+        evaluator=evaluator,
+        starts=np.vstack([point, optima[1:]]),
+        groups=tuple(group.combined(combinations) for group in score_groups),
+        combinations=combinations,
+        scale=_scale(evaluator, point, optimum, options),
+        options=options.saddlepoint,
+    )
+
+
+def _scale(
+    evaluator: Evaluator, point: Floats, optimum: Optimum, options: EstimateLikelihoodOptions
+) -> Floats:
+    """Return a hundred standard errors of each element, or the prior's spread if it is less."""
+    hyperparameters = evaluator.hyperparameters
+    if all(node.bound.stored for node in evaluator.nodes):
+        size = sum(len(node.observed) for node in evaluator.nodes)
+        precision = _likelihood_spread(evaluator, point, options) * np.sqrt(size)
+        return np.asarray(100 / np.maximum(precision, 100) * hyperparameters.prior_sd)
+    order = [optimum.names.index(name) for name in hyperparameters.names]
+    errors = np.sqrt(np.diag(optimum.covariance))[order]
+    return np.asarray(np.minimum(100 * errors, hyperparameters.prior_sd))
+
+
+def _minimised_on_population(
+    evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
+) -> tuple[Evaluator, Floats, Floats]:
+    """Return metrics with whitening and bandwidths of the population, scales and minimiser.
+
+    A minimiser that stored responses do not support is not taken.
+    """
+    from scipy.optimize import minimize as scipy_minimize
+
+    targets = []
+    for k, node in enumerate(evaluator.nodes):
+        responses, weights = evaluator.populations(point[None], k)
+        targets.append(prepared_on_population(node.target, responses[0], weights[0]))
+    prepared = evaluator.with_targets(targets)
+    unset = np.isnan(prepared.epsilon)
+    if len(targets) > 1 and unset.any():
+        scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
+    prior_sd = evaluator.hyperparameters.prior_sd
+
+    def objective(shift: Floats) -> tuple[float, Floats]:
+        thetas = _stencil(point + shift * prior_sd, 1e-4 * prior_sd)
+        totals = prepared.total(thetas, scales)
+        value, up, down = np.split(totals, [1, 1 + len(shift)])
+        return float(value[0]), (up - down) / 2e-4
+
+    minimum = scipy_minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
+    minimiser = move_inside(prepared, point + minimum.x * prior_sd, options)
+    sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
+    is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses
+    return prepared, scales, minimiser if is_supported else point
+
+
+def _group_scores(
+    evaluator: Evaluator,
+    members: Sequence[int],
+    point: Floats,
+    scales: Floats,
+    options: EstimateLikelihoodOptions,
+) -> StoredScores | ResimulatedScores:
+    """Return the scores of specimens in the sum of their simulators' discrepancies."""
+    numbers, total = specimens(evaluator.nodes)
+    nodes = [evaluator.nodes[k] for k in members]
+    n = len(nodes[0].observed)
+    observed = np.zeros((n, len(point)))
+    functions = []
+    populations: list[WeightSlopes | ShiftedResponses] = []
+    for k, node in zip(members, nodes, strict=True):
+        # The gradient of the objective is a sum of these over specimens, in units of the prior.
+        factor = evaluator.hyperparameters.prior_sd / (n * scales[k])
+        differences = _weight_slopes if node.bound.stored else _shifted_responses
+        population = differences(evaluator, k, point, options)
+        populations.append(population)
+        score = partial(
+            specimen_scores, node.target, population, options=options.score, total=total
+        )
+        observed += factor * score(node.observed[np.argsort(numbers[k])])
+        functions.append((factor, score))
+    mean = observed.mean(axis=0)
+    if not all(node.bound.stored for node in nodes):
+        tables = []
+        for k, (factor, _), population in zip(members, functions, populations, strict=True):
+            assert isinstance(population, ShiftedResponses)
+            node = evaluator.nodes[k]
+            table = tabulated_scores(node.target, population, node.observed, options.score, total)
+            tables.append((k, partial(_scaled, table, factor)))
+        return ResimulatedScores(tuple(tables), mean, n, combinations=np.eye(len(point)))
+    is_observable = np.ones(len(populations[0].responses), dtype=bool)
+    for node, population in zip(nodes, populations, strict=True):
+        is_observable &= observable(population.responses, node.target)
+    stored = -mean + sum(
+        factor * score(population.responses[is_observable])
+        for (factor, score), population in zip(functions, populations, strict=True)
+    )
+    return StoredScores(members[0], is_observable, Scores(stored, n))
+
+
+def _scaled(table: Callable[[Floats], Floats], factor: Floats, responses: Floats) -> Floats:
+    """Return scores in units of the objective."""
+    return factor * table(responses)
+
+
+def _stencil(theta: Floats, steps: Floats) -> Floats:
+    """Return theta, and theta plus and minus a step along each element, (1 + 2 d, d)."""
+    axes = np.diag(steps)
+    return np.vstack([theta, theta + axes, theta - axes])
+
+
+def _shifted_responses(
+    evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
+) -> ShiftedResponses:
+    """Return the k-th simulator's responses at theta and a step away along each element."""
+    steps = options.resimulated_step * evaluator.hyperparameters.prior_sd
+    responses, _ = evaluator.populations(_stencil(theta, steps), k)
+    center, upper, lower = np.split(responses, [1, 1 + len(theta)])
+    return ShiftedResponses(center[0], upper, lower, steps)
+
+
+def _weight_slopes(
+    evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
+) -> WeightSlopes:
+    """Return the k-th simulator's stored responses with weights, and their derivatives."""
+    moves = evaluator.nodes[k].bound.support_moves
+    steps = (options.wide_step if moves else options.step) * evaluator.hyperparameters.prior_sd
+    responses, weights = evaluator.populations(_stencil(theta, steps), k)
+    center, up, down = np.split(weights, [1, 1 + len(theta)])
+    # Log weights are nearly parabolas, whose differences are right at any step. A weight that
+    # vanishes within the step has none.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = center * (np.log(up) - np.log(down))
+    differences = np.where(np.isfinite(relative), relative, up - down)
+    return WeightSlopes(responses[0], center[0], differences / (2 * steps)[:, None])
+
+
+def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
+    """Return the estimate, (d,), or a point inside if it is at an edge.
+
+    At an edge the scores of an element vanish, or stored responses are too few for them. The score
+    at a point inside is as good a statistic. Elements at an edge are moved towards the middle of
+    their prior.
+    """
+    if not all(node.bound.stored for node in evaluator.nodes):
+        return theta
+    hyperparameters = evaluator.hyperparameters
+    direction = np.median(hyperparameters.prior_points(256, 0), axis=0) - theta
+    is_far = np.abs(direction) > options.distance * hyperparameters.prior_sd
+    direction[~is_far] = 0
+    for fraction in np.linspace(0, 1, 33):
+        point = theta + fraction * direction
+        spread = _likelihood_spread(evaluator, point, options)
+        is_at_edge = is_far & (spread < options.smallest_spread * spread.max())
+        support = evaluator.support(point[None])
+        effective = np.min([design["weight_ess"] for design in support.values()])
+        if not is_at_edge.any() and effective >= options.effective_responses:
+            return point
+    return theta
+
+
+def _likelihood_spread(
+    evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions
+) -> Floats:
+    """Return standard deviations of the derivatives of log weights, in units of the prior, (d,)."""
+    variance = np.zeros(len(theta))
+    for k in range(len(evaluator.nodes)):
+        variance += _weight_slopes(evaluator, k, theta, options).spread ** 2
+    return np.asarray(np.sqrt(variance) * evaluator.hyperparameters.prior_sd)
+
+
+def score_obstacle(evaluator: Evaluator) -> str | None:
+    """Return why the gradient of the objective is no mean over specimens, or None.
+
+    Examples are the area metric, observed responses of unequal weights or with gaps, and
+    simulators that share specimens in part.
+    """
+    for node in evaluator.nodes:
+        if not is_additive(node.target):
+            metric = type(node.metric).__name__
+            return f"{node.name} has a {metric}, whose gradient is no mean over specimens"
+        if np.ptp(node.target.weights) > 1e-12:
+            return f"{node.name} has observed responses of unequal weights"
+    numbers, _ = specimens(evaluator.nodes)
+    for members in groups(evaluator.nodes):
+        expected = np.unique(numbers[members[0]])
+        is_same = [np.array_equal(np.sort(numbers[k]), expected) for k in members]
+        nodes = [evaluator.nodes[k] for k in members]
+        if not all(is_same) or not aligned(nodes):
+            names = ", ".join(node.name for node in nodes)
+            return f"{names} share specimens in part, or have other inputs or designs"
+    return None
 
 
 @dataclass(frozen=True, eq=False)

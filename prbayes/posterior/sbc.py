@@ -20,7 +20,7 @@ from prbayes.model.description import labelled, versions
 from prbayes.model.evaluator import Evaluator, has_other_terms, specimen_params
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
-from prbayes.optimize.specimen_refits import (
+from prbayes.optimize.maximum_likelihood import (
     other_specimens,
     simulation_obstacle,
     specimen_pool,

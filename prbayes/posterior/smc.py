@@ -37,10 +37,9 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
 from prbayes.optimize.optimum import Optimum, require_sampling
-from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
 from prbayes.posterior.importance import LogDensity
-from prbayes.posterior.kernel import BatchedKernel, starting_thetas
+from prbayes.posterior.kernel import BatchedKernel, Checkpoint, starting_thetas, stored_settings
 from prbayes.posterior.results import (
     Draws,
     Stages,

@@ -1,20 +1,59 @@
-"""Posterior density: priors and a log-likelihood, by specimen or given the estimate."""
+r"""Posterior density: priors and a log-likelihood, by specimen or given the estimate.
+
+Without scores, the likelihood given the estimate comes from refits of synthetic data sets. These
+are drawn once from stored responses, at points :math:`\theta_r` around the estimate, and refitted
+once. The balance heuristic weights them under any theta (Veach and Guibas 1995,
+doi:10.1145/218380.218498):
+
+.. math:: W_r(\theta) \propto \frac{p(data_r | \theta)}{\sum_s p(data_r | \theta_s)}.
+
+The density of the observed estimate is a saddlepoint approximation over the weighted estimates. Its
+cumulant function is mixed with that of a normal distribution in the tail (Fasiolo et al. 2018,
+doi:10.1214/18-EJS1433).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, vstack
+from scipy.special import logsumexp, ndtri
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats
+from prbayes._validate import AT_ONCE, Floats
 from prbayes.inference.checks.prior import conflict_findings
-from prbayes.model.evaluator import Evaluator
-from prbayes.model.parameters import log_posterior
+from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
+from prbayes.inference.refits import BatchObjective, SamplingDistribution, refit
+from prbayes.inference.resampling import (
+    DataSets,
+    groups,
+    observable,
+    observed_set,
+    points_along,
+    sets_at,
+    specimens,
+    stored_populations,
+)
+from prbayes.metrics.score import prepared_on_population
+from prbayes.model.evaluator import TOLERABLE, Evaluator, coarse_where_sufficient, supports_each
+from prbayes.model.parameters import THETAS, log_posterior
+from prbayes.numerics.points import sobol
+from prbayes.numerics.threads import one_thread
 from prbayes.optimize.optimum import Optimum, optima_of
-from prbayes.posterior.estimate_likelihood import estimate_likelihood, score_obstacle
-from prbayes.posterior.importance import LogDensity
-from prbayes.posterior.refit_likelihood import refit_likelihood
+from prbayes.posterior.importance import LogDensity, importance_sample, laplace
+from prbayes.posterior.saddlepoint import (
+    Cumulants,
+    SaddlepointOptions,
+    Scores,
+    cumulants,
+    estimate_likelihood,
+    saddlepoint_density,
+    score_obstacle,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,3 +161,413 @@ def prior_conflicts(
         thetas.reshape(-1, evaluator.hyperparameters.size)[:, is_identified].mean(axis=0),
         prior + errors,
     )
+
+
+@dataclass(frozen=True)
+class RefitLikelihoodOptions:
+    """Options of the likelihood given an estimate, from refits."""
+
+    n_sets: int = 1024  # synthetic data sets
+    n_starts: int = 64  # points around the estimate as starts of refits, with local optima
+    # Rounds that share the data sets. The first ones are drawn in a ball of ``radius`` standard
+    # errors around the estimate, later ones from the previous posterior, ``inflation`` times wider.
+    rounds: int = 2
+    radius: float = 4.0
+    inflation: float = 1.5
+    weakest: float = 10.0  # standard error in prior sd up to which a direction is identified
+    # Squared distance of the observed estimate from its mean, in standard deviations, at which the
+    # normal distribution takes over.
+    tail: float = 40.0
+    # Number of data sets, for each element of the estimate and one more, that a standard error
+    # counts for in the moments.
+    prior_sets: float = 1.0
+    reach: float = 10.0  # largest distance of an estimate from the observed one, in standard errors
+    far: float = 0.1  # largest share of estimates beyond
+    converged: float = 0.9  # smallest share of refits that converge
+    # Times that metrics of several outputs are minimised again, whitened by the population at the
+    # previous estimate.
+    whitenings: int = 2
+    seed: int = 0
+    saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticSets:
+    """Synthetic data sets with their estimates, in coordinates of the sampling distribution."""
+
+    x: Floats  # (R, r): populations that they are drawn from
+    counts: tuple[csr_array, ...]  # (R, M_j): specimens at the stored responses, by group
+    estimates: Floats  # (R, r)
+
+
+@dataclass(frozen=True, eq=False)
+class RefitLikelihood:
+    """The likelihood given the estimate, for `importance_sample` and `laplace`."""
+
+    evaluator: Evaluator
+    # At the estimate and at optima that are as good; in coordinates of the continuation.
+    centers: tuple[SamplingDistribution, ...]
+    continuation: Continuation
+    starts: Floats  # (M, d): thetas of the centers, moved within the ends of the prior
+    scale: Floats  # (d,): unit of each element for `laplace`
+    sets: SyntheticSets
+    log_mixture: Floats  # (R,): log-density of each data set in the mixture of all populations
+    options: RefitLikelihoodOptions
+
+    @property
+    def point(self) -> Floats:
+        """Theta of the estimate, moved within the ends of the prior, (d,)."""
+        return np.asarray(self.starts[0])
+
+    @property
+    def sampling(self) -> SamplingDistribution:
+        """The sampling distribution of the estimate."""
+        return self.centers[0]
+
+    @one_thread()
+    def log_likelihood(self, thetas: Floats) -> Floats:
+        """Return the log-density of the observed estimate, (S, d) -> (S,)."""
+        if self.sets.estimates.shape[1] == 0:
+            return np.zeros(len(thetas))
+        x = self.sampling.coordinates(self.continuation.coordinates(thetas))
+        largest = max(count.shape[1] for count in self.sets.counts)
+        rows = max(16, AT_ONCE // max(largest, len(self.sets.estimates)))
+        blocks = [self._log_likelihood(x[first : first + rows]) for first in range(0, len(x), rows)]
+        return np.concatenate(blocks)
+
+    def _log_likelihood(self, x: Floats) -> Floats:
+        """Return the log-density at coordinates, (S, r) -> (S,)."""
+        result = np.full(len(x), -np.inf)
+        logs = self.log_weights(x)
+        is_supported = np.isfinite(logs).any(axis=1)
+        if is_supported.any():
+            shifts = nearest(self.centers, self.sampling.thetas(x[is_supported]))[1]
+            result[is_supported] = extended_log_density(
+                logs[is_supported], self.sets.estimates, shifts, self.options
+            )
+        return result
+
+    def log_weights(self, x: Floats) -> Floats:
+        """Return log weights of the data sets at coordinates, (S, r) -> (S, R); they sum to one."""
+        logs = _log_likelihoods(self.sampling, self.sets.counts, x) - self.log_mixture
+        with np.errstate(invalid="ignore"):
+            return np.asarray(logs - logsumexp(logs, axis=1, keepdims=True))
+
+    def with_sets(self, sets: SyntheticSets) -> RefitLikelihood:
+        """Return the likelihood from these data sets."""
+        logs = _log_likelihoods(self.sampling, sets.counts, sets.x)
+        return replace(self, sets=sets, log_mixture=logsumexp(logs, axis=0))
+
+
+def nearest(
+    centers: Sequence[SamplingDistribution], thetas: Floats
+) -> tuple[NDArray[np.intp], Floats]:
+    """Return the nearest center of each theta, (S,), and coordinates around it, (S, r)."""
+    x = np.stack([center.coordinates(thetas) for center in centers])
+    index = np.linalg.norm(x, axis=2).argmin(axis=0)
+    return index, x[index, np.arange(len(thetas))]
+
+
+def extended_log_density(
+    log_weights: Floats, estimates: Floats, shifts: Floats, options: RefitLikelihoodOptions
+) -> Floats:
+    """Return the log-density of an estimate of zero, (S,), given log weights (S, R) of estimates.
+
+    The cumulant function is that of the weighted estimates, (R, r), mixed with that of a normal
+    distribution with their moments. A few data sets with one standard error join the moments, which
+    matters if few of the synthetic ones have weights. ``shifts``, (S, r), are the populations
+    relative to the observed estimate.
+    """
+    r = estimates.shape[1]
+    scores = [Scores(estimates, 1)]
+    untilted = cumulants([log_weights], scores, np.zeros_like(shifts))
+    effective = 1 / np.exp(2 * log_weights).sum(axis=1)
+    part = effective / (effective + options.prior_sets * (r + 1))
+    # Beyond all data sets the mean is as far away as the population.
+    lengths = np.linalg.norm(untilted.gradients, axis=1)
+    ratios = np.linalg.norm(shifts, axis=1) / np.maximum(lengths, 1e-300)
+    factors = np.maximum(ratios, 1) ** (1 - part)
+    mean = factors[:, None] * untilted.gradients
+    covariance = part[:, None, None] * untilted.hessians
+    covariance += (1 - part)[:, None, None] * np.eye(r)
+    standardised = np.linalg.solve(covariance, mean[:, :, None])[:, :, 0]
+    distance = (mean * standardised).sum(axis=1)
+    share = part * np.exp(-distance / options.tail)
+
+    def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
+        empirical = cumulants([log_weights[rows]], scores, tilts)
+        linear = np.einsum("skl,sl->sk", covariance[rows], tilts)
+        normal = (mean[rows] * tilts).sum(axis=1) + (linear * tilts).sum(axis=1) / 2
+        weight = share[rows]
+        normal_weight = 1 - weight
+        gradients = normal_weight[:, None] * (mean[rows] + linear)
+        hessians = normal_weight[:, None, None] * covariance[rows]
+        return Cumulants(
+            weight * empirical.values + normal_weight * normal,
+            weight[:, None] * empirical.gradients + gradients,
+            weight[:, None, None] * empirical.hessians + hessians,
+        )
+
+    mixed = saddlepoint_density(function, shifts.shape, 1, options.saddlepoint)
+    normal = -(distance + np.linalg.slogdet(covariance)[1]) / 2
+    return np.where(np.isfinite(mixed), mixed, normal)
+
+
+def refit_likelihood(
+    evaluator: Evaluator,
+    optimum: Optimum,
+    options: RefitLikelihoodOptions = RefitLikelihoodOptions(),
+) -> RefitLikelihood:
+    """Return the likelihood of the hyperparameters given the minimiser of any metrics.
+
+    Responses are stored. Raises ValueError if the estimate is at an edge, stored responses do not
+    support populations around it, or refits do not converge.
+    """
+    if optimum.search.at_edge:
+        raise ValueError(_at_edge(", ".join(optimum.search.at_edge)))
+    thetas = optima_of(optimum, evaluator)
+    scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
+    continuation = continuation_of(evaluator, thetas[:1])
+    start, *rest = continuation.coordinates(thetas)
+    for _ in range(options.whitenings):
+        evaluator, start = _whitened(evaluator, continuation, start, scales, options)
+    continued = _continued(evaluator, continuation)
+    sampling = _at_minimiser(continued, start, scales, options)
+    _require_inside(sampling, options)
+    local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
+    centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
+    # Identified directions are known from all stored responses; an eighth is enough for the rest.
+    evaluator = coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
+    continued = _continued(evaluator, continuation)
+    centers = [replace(center, evaluator=continued) for center in centers]
+    sampling = centers[0] = _moved_to_minimiser(centers[0])
+    places = np.array([center.theta for center in centers])
+    r = sampling.stderr.size
+    likelihood = RefitLikelihood(
+        evaluator=evaluator,
+        centers=tuple(centers),
+        continuation=continuation,
+        starts=continuation.within(places, margin=0.05),
+        scale=_scale(evaluator, sampling, continuation),
+        sets=SyntheticSets(np.empty((0, r)), (), np.empty((0, r))),
+        log_mixture=np.empty(0),
+        options=options,
+    )
+    if not r:
+        return likelihood
+    number = options.n_sets // options.rounds
+    balls = [
+        sampling.coordinates(center.thetas(_ball(number // len(centers), r, options, i)))
+        for i, center in enumerate(centers)
+    ]
+    sets = _draw(centers, np.concatenate(balls), options, seed=0)
+    for i in range(1, options.rounds):
+        x = _posterior_points(likelihood.with_sets(sets), number)
+        new = _draw(centers, x, options, seed=i)
+        pairs = zip(sets.counts, new.counts, strict=True)
+        sets = SyntheticSets(
+            np.concatenate([sets.x, new.x]),
+            tuple(vstack(pair, format="csr") for pair in pairs),
+            np.concatenate([sets.estimates, new.estimates]),
+        )
+    return likelihood.with_sets(sets)
+
+
+def _ball(number: int, r: int, options: RefitLikelihoodOptions, shift: int = 0) -> Floats:
+    """Return evenly spread points of a ball around the estimate, (number, r)."""
+    u = sobol(number, r + 1, options.seed + shift)
+    directions = ndtri(u[:, :r])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(options.radius * u[:, r:] ** (1 / r) * directions)
+
+
+def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
+    """Return coordinates of draws from the posterior, spread out around each optimum, (n, r)."""
+    options, evaluator = likelihood.options, likelihood.evaluator
+
+    def log_likelihood(thetas: Floats) -> Floats:
+        return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
+
+    density = partial(log_posterior, evaluator.hyperparameters, log_likelihood=log_likelihood)
+    modes = laplace(density, likelihood.starts, likelihood.scale)
+    sample = importance_sample(density, modes, number, options.seed)
+    thetas = likelihood.continuation.coordinates(sample.draws)
+    x = likelihood.sampling.coordinates(thetas)
+    center_of, _ = nearest(likelihood.centers, thetas)
+    for i in np.unique(center_of):
+        members = center_of == i
+        median = np.median(x[members], axis=0)
+        x[members] = median + options.inflation * (x[members] - median)
+    return x
+
+
+def _draw(
+    centers: Sequence[SamplingDistribution],
+    x: Floats,
+    options: RefitLikelihoodOptions,
+    seed: int,
+) -> SyntheticSets:
+    """Draw a data set at each of some coordinates, (R, r), and refit it."""
+    sampling = centers[0]
+    evaluator = sampling.evaluator
+    thetas = sampling.thetas(x)
+    is_supported = np.ones(len(thetas), dtype=bool)
+    for name, support in evaluator.support(thetas).items():
+        bound = evaluator.reweighted[name]
+        is_supported &= supports_each(support, bound.required_ess, bound.max_lost, TOLERABLE)
+    if is_supported.mean() < 0.5:
+        raise ValueError(
+            f"got stored responses that support {is_supported.mean():.0%} of the populations "
+            "around the estimate, expected at least half; widen the prior, or use prb.sample_smc"
+        )
+    x, thetas = x[is_supported], thetas[is_supported]
+    rng = np.random.default_rng([options.seed, seed])
+    points = points_along(evaluator, thetas, rng)
+    data = sets_at(evaluator, stored_populations(evaluator, thetas), points)
+    starts = x if len(centers) == 1 else _best_starts(centers, data, options)
+    estimates, converged = refit(sampling, data, starts, is_rough=True)
+    if converged.mean() < options.converged:
+        raise ValueError(
+            f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
+            f"least {options.converged:.0%}; use another metric, or prb.sample_smc"
+        )
+    is_far = np.abs(estimates).max(axis=1) > options.reach
+    if is_far.mean() > options.far:
+        raise ValueError(_at_edge(f"{is_far.mean():.0%} of the estimates of synthetic data sets"))
+    estimates = np.clip(estimates, -options.reach, options.reach)
+    numbers, _ = specimens(evaluator.nodes)
+    counts = []
+    for members in groups(evaluator.nodes):
+        columns = np.unique(np.concatenate([numbers[k] for k in members]))
+        places = points[members[0]][np.ix_(converged, columns)]
+        # How often each stored response is a specimen of each data set.
+        n_sets, n = places.shape
+        shape = (n_sets, evaluator.nodes[members[0]].bound.n_points)
+        ends = n * np.arange(n_sets + 1)
+        count = csr_array((np.ones(places.size), places.ravel(), ends), shape=shape)
+        count.sum_duplicates()
+        counts.append(count)
+    return SyntheticSets(x[converged], tuple(counts), estimates[converged])
+
+
+def _log_likelihoods(
+    sampling: SamplingDistribution, counts: tuple[csr_array, ...], x: Floats
+) -> Floats:
+    """Return log p(data_r | theta) at coordinates, (S, R)."""
+    evaluator = sampling.evaluator
+    thetas = sampling.thetas(x)
+    total = np.zeros((len(x), counts[0].shape[0]))
+    for members, count in zip(groups(evaluator.nodes), counts, strict=True):
+        is_observable = np.ones(count.shape[1], dtype=bool)
+        for k in members:
+            responses, weights = evaluator.populations(thetas, k)
+            is_observable &= observable(responses[0], evaluator.nodes[k].target)
+        rows = np.where(is_observable, weights, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs = np.log(rows / rows.sum(axis=1, keepdims=True))
+        total += (count @ np.ascontiguousarray(logs.T)).T
+    return total
+
+
+def _best_starts(
+    centers: Sequence[SamplingDistribution], data: DataSets, options: RefitLikelihoodOptions
+) -> Floats:
+    """Return the best of some points around the estimate for each data set, (R, r).
+
+    Points nearer to another optimum are left out: all refits are minimisers near the estimate.
+    """
+    sampling = centers[0]
+    ball = _ball(options.n_starts, sampling.stderr.size, options)
+    thetas = sampling.thetas(ball)
+    is_nearest = nearest(centers, thetas)[0] == 0
+    ball, thetas = ball[is_nearest], thetas[is_nearest]
+    objective = BatchObjective.of(sampling.evaluator, sampling.scales, data)
+    best = [
+        objective(thetas[None], slice(first, first + 16)).argmin(axis=1)
+        for first in range(0, objective.n_sets, 16)
+    ]
+    return np.asarray(ball[np.concatenate(best)])
+
+
+def _continued(evaluator: Evaluator, continuation: Continuation) -> Evaluator:
+    if not continuation.is_continued.any():
+        return evaluator
+    return ContinuedEvaluator.continuing(evaluator, continuation)
+
+
+def _at_minimiser(
+    evaluator: Evaluator, start: Floats, scales: Floats, options: RefitLikelihoodOptions
+) -> SamplingDistribution:
+    """Return the sampling distribution at the minimiser for the observed responses near a start."""
+    for _ in range(5):
+        sampling = SamplingDistribution.of(evaluator, start, scales, options.weakest)
+        moved = _moved_to_minimiser(sampling)
+        start = moved.theta
+        if np.abs(sampling.coordinates(start)).max(initial=0.0) < 0.5:
+            return moved
+    raise ValueError(
+        "got an estimate that still moves by half a standard error when it is minimised again, "
+        "expected a minimum; use another metric, or prb.sample_smc"
+    )
+
+
+def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
+    """Return the sampling distribution with the minimiser for the observed responses as theta."""
+    (x,), _ = refit(sampling, observed_set(sampling.evaluator))
+    return replace(sampling, theta=sampling.thetas(x))
+
+
+def _whitened(
+    evaluator: Evaluator,
+    continuation: Continuation,
+    start: Floats,
+    scales: Floats,
+    options: RefitLikelihoodOptions,
+) -> tuple[Evaluator, Floats]:
+    """Return metrics of several outputs, whitened by the population, and their minimiser."""
+    targets = [node.target for node in evaluator.nodes]
+    if not any(target.event for target in targets):
+        return evaluator, start
+    continued = _continued(evaluator, continuation)
+    for k, target in enumerate(targets):
+        if target.event:
+            responses, weights = continued.populations(start[None], k)
+            targets[k] = prepared_on_population(target, responses[0], weights[0])
+    prepared = evaluator.with_targets(targets)
+    sampling = _at_minimiser(_continued(prepared, continuation), start, scales, options)
+    return prepared, sampling.theta
+
+
+def _require_inside(sampling: SamplingDistribution, options: RefitLikelihoodOptions) -> None:
+    """Raise if the data identify more at the middle of the prior than at the estimate."""
+    local = sampling.local
+    if not local.unidentified.size:
+        return
+    evaluator = sampling.evaluator
+    median = np.median(evaluator.hyperparameters.prior_points(THETAS, 0), axis=0)
+    shift = (median - sampling.theta) / local.prior_sd
+    along = local.identified @ (local.identified.T @ shift)
+    inside = sampling.theta + (shift - along) * local.prior_sd
+    at_median = SamplingDistribution.of(evaluator, inside, sampling.scales, options.weakest)
+    if at_median.stderr.size > sampling.stderr.size:
+        names = np.array(evaluator.hyperparameters.readable_names)
+        is_flat = (local.unidentified**2).sum(axis=1) > 0.5
+        raise ValueError(_at_edge(", ".join(names[is_flat])))
+
+
+def _at_edge(subject: str) -> str:
+    return (
+        f"got {subject} at an edge, as where a standard deviation is about zero, where estimates "
+        "pile up and have no density; use prb.LogLikelihood(), or prb.sample_smc"
+    )
+
+
+def _scale(
+    evaluator: Evaluator, sampling: SamplingDistribution, continuation: Continuation
+) -> Floats:
+    """Return prior standard deviations, or a hundred standard errors if these are less, (d,)."""
+    axes = sampling.axes * sampling.stderr
+    errors = np.sqrt((axes**2).sum(axis=1))
+    is_known = ~continuation.is_continued & (errors > 0)
+    units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
+    return np.asarray(units * evaluator.hyperparameters.prior_sd)

@@ -3,7 +3,7 @@
 from prbayes.response.budget import BudgetError, Cost
 from prbayes.response.discrepancy import Additive, Multiplicative
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
-from prbayes.response.groups import group
+from prbayes.response.inputs import group
 from prbayes.response.store import Store, StoreError
 
 __all__ = [

@@ -19,8 +19,7 @@ from pytensor.graph.basic import Variable
 from prbayes._finding import report
 from prbayes._validate import Floats, called, executes, folder_path
 from prbayes.response.budget import budget
-from prbayes.response.call import Points, checked, scalar, shapes
-from prbayes.response.chunks import CallSettings, Tally, respond
+from prbayes.response.call import CallSettings, Points, Tally, checked, respond, scalar, shapes
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError

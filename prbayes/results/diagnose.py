@@ -33,6 +33,7 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
 )
+from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.optimize.minimize import Minimisation, find_optimum
 from prbayes.optimize.optimum import (
     NO_RESPONSE,
@@ -41,7 +42,6 @@ from prbayes.optimize.optimum import (
     compared_in,
     require_of_model,
 )
-from prbayes.optimize.specimen_refits import simulation_obstacle
 from prbayes.response.inputs import model_on_context
 from prbayes.results.likelihood_checks import Checked, check_draws, check_optimum, separate_modes
 

@@ -33,11 +33,11 @@ from prbayes.model.parameters import roots_of
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.optimum import Optimum
-from prbayes.optimize.specimen_refits import (
+from prbayes.optimize.maximum_likelihood import (
     simulation_obstacle,
     specimen_refits,
 )
+from prbayes.optimize.optimum import Optimum
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import (
     PopulationSampler,

@@ -41,8 +41,7 @@ from prbayes.propagation.importance import new_specimens
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.failures import Abort, ResponseError
-from prbayes.response.groups import is_group
-from prbayes.response.inputs import Inputs, model_on_context, read_inputs
+from prbayes.response.inputs import Inputs, is_group, model_on_context, read_inputs
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
 

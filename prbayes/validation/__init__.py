@@ -1,8 +1,7 @@
 """Whether the calibrated model holds on data that it has not seen."""
 
 from prbayes.validation.area_test import ValidityTest, u_values
-from prbayes.validation.joint_null import JointNull
-from prbayes.validation.nulls import ExactModel, PosteriorNull
+from prbayes.validation.nulls import ExactModel, JointNull, PosteriorNull
 
 __all__ = [
     "ExactModel",

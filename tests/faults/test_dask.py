@@ -20,8 +20,7 @@ from um_server import Real
 
 import prbayes as prb
 from prbayes.model.random_variable import nodes
-from prbayes.response.call import Points
-from prbayes.response.chunks import CallSettings, Tally, respond
+from prbayes.response.call import CallSettings, Points, Tally, respond
 from prbayes.response.executors import Capacity, capacity
 from prbayes.response.outputs import Outputs
 from prbayes.response.store import Store

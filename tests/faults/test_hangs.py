@@ -14,8 +14,7 @@ from hostile import EXECUTORS
 from um_server import Real
 
 import prbayes as prb
-from prbayes.response.call import Points
-from prbayes.response.chunks import CallSettings, Tally, respond
+from prbayes.response.call import CallSettings, Points, Tally, respond
 
 LIMIT = 0.4
 

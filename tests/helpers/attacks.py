@@ -29,7 +29,7 @@ import xarray as xr
 import prbayes
 from prbayes.__main__ import main
 from prbayes.model.fingerprint import Identity
-from prbayes.posterior.checkpoint import Checkpoint
+from prbayes.posterior.kernel import Checkpoint
 from prbayes.response.store import Store, StoreError
 
 Attack = Callable[[Path, np.random.Generator, int], Iterator[str]]

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 import prbayes as prb
-from prbayes.response.call import Points
-from prbayes.response.chunks import CallSettings, Tally, respond
+from prbayes.response.call import CallSettings, Points, Tally, respond
 from prbayes.response.failures import OnFailure, ResponseError
 from prbayes.response.store import Store
 

@@ -25,8 +25,7 @@ from prbayes.optimize.convergence import (
     settle,
     smallest_overlap,
 )
-from prbayes.optimize.methods import Method
-from prbayes.optimize.objective import Objective
+from prbayes.optimize.objective import Method, Objective
 
 # -- budgets, tolerances, trace
 # --------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.validation.probability_transform import area
+from prbayes.validation.conditions import area
 
 
 @cache

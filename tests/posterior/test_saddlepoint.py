@@ -17,16 +17,14 @@ from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
 from prbayes.metrics.score import WeightSlopes, specimen_scores
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.estimate_likelihood import (
-    EstimateLikelihood,
-    EstimateLikelihoodOptions,
-    estimate_likelihood,
-)
 from prbayes.posterior.importance import ImportanceSample, importance_sample, laplace
 from prbayes.posterior.saddlepoint import (
+    EstimateLikelihood,
+    EstimateLikelihoodOptions,
     SaddlepointOptions,
     Scores,
     cumulants,
+    estimate_likelihood,
     log_density,
     minimum,
     varying_combinations,
@@ -241,7 +239,7 @@ def test_the_score_elsewhere_is_as_good_a_statistic(monkeypatch: pytest.MonkeyPa
         sign = -1 if len(specimens) == len(y) else 1
         return sign * specimen_scores(target, population, specimens, **options)
 
-    monkeypatch.setattr("prbayes.posterior.estimate_likelihood.specimen_scores", wrong)
+    monkeypatch.setattr("prbayes.posterior.saddlepoint.specimen_scores", wrong)
     with pytest.raises(AssertionError, match=r"\["):
         require_close(moments_of(at_another_point(optimum)), exact)
 

@@ -13,8 +13,7 @@ import pytest
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
-from prbayes.posterior.checkpoint import Checkpoint
-from prbayes.posterior.kernel import BatchedKernel, KernelOptions
+from prbayes.posterior.kernel import BatchedKernel, Checkpoint, KernelOptions
 from prbayes.posterior.results import Draws
 from prbayes.posterior.smc import Chains, SamplingSettings
 

@@ -20,8 +20,7 @@ from hostile import processes
 import prbayes as prb
 from prbayes.model.random_variable import nodes
 from prbayes.response import fmu
-from prbayes.response.call import Points
-from prbayes.response.chunks import CallSettings, Tally, respond
+from prbayes.response.call import CallSettings, Points, Tally, respond
 from prbayes.response.executors import Pool
 from prbayes.response.store import Store
 

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
-from prbayes.validation.probability_transform import area
+from prbayes.validation.conditions import area
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
