@@ -115,7 +115,7 @@ def test_groups_are_those_of_simulators_written_one_by_one() -> None:
         # Two designs, of 256 and 1024 points.
         assert abs(optimum.point["mu"][i] - known.point[f"mu_{name}"]) < 0.1 * error
         assert abs(optimum.stderr["mu"][i] / error - 1) < 0.1
-    assert not optimum.warnings
+    assert not optimum.findings
 
 
 def test_the_density_is_that_of_all_groups_also_in_a_clone() -> None:

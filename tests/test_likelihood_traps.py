@@ -112,11 +112,11 @@ def outcome(monkeypatch: pytest.MonkeyPatch) -> Callable[[pm.Model], list[str]]:
     """Return a function of a model: codes of all findings up to the optimum, or its error."""
     codes: list[str] = []
 
-    def recorded(findings: Any) -> tuple[Finding, ...]:
+    def recorded(*findings: Finding) -> tuple[Finding, ...]:
         codes.extend(finding.code for finding in findings)
-        return tuple(findings)
+        return findings
 
-    monkeypatch.setattr("prbayes.model.specimen_likelihood.report", recorded)
+    monkeypatch.setattr("prbayes.model.specimen_preparation.report", recorded)
     monkeypatch.setattr("prbayes.optimize.maximum_likelihood.report", recorded)
 
     def run(model: pm.Model, *, optimum: bool) -> list[str]:

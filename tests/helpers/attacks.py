@@ -188,7 +188,7 @@ sys.modules["prbayes"].__path__ = [sys.argv[4]]
 from prbayes.response.store import Store
 
 folder, number, chunks = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-store = Store(folder, "y", 2)
+store = Store(folder, "y", columns=2)
 print("ready", flush=True)
 sys.stdin.readline()
 

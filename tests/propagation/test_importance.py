@@ -10,7 +10,7 @@ import pytest
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference.design_error import DesignErrors, design_error
+from prbayes.inference.design_error import DesignErrors, _error_of_points, design_error
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.inference.resampling import aligned
 from prbayes.model.evaluator import Evaluator
@@ -198,9 +198,16 @@ def test_parts_of_a_cloud_without_a_minimum_leave_its_error_to_the_others(
     model = build(known=True)
     optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
     sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
-    found = iter([np.full(2, np.inf)] * lost + [np.array([k, -k]) for k in np.arange(8.0)])
-    monkeypatch.setattr(SamplingDistribution, "_only", lambda *_: next(found))
-    assert np.isfinite(sampling._error_of_points()).all() == known
+    minima = iter(
+        [
+            (np.array([[k, -k]]), np.array([converged]))
+            for k, converged in enumerate([False] * lost + [True] * (8 - lost))
+        ]
+    )
+    monkeypatch.setattr(
+        "prbayes.inference.design_error.minimise_sets", lambda *_, **__: next(minima)
+    )
+    assert np.isfinite(_error_of_points(sampling)).all() == known
 
 
 def test_another_response_is_computed_at_the_runs_and_emulated() -> None:

@@ -197,7 +197,7 @@ def test_a_stored_optimum_tells_what_the_optimum_does() -> None:
     memory, stored = prb.diagnose(lost), prb.diagnose(lost.to_datatree())
     assert memory.messages == stored.messages
     assert memory.messages[:2] == ("It is flat.", "So so.")
-    said = "did not converge (The minimiser failed. It stopped.); try another start or method; see docs/choose.md"
+    said = "did not converge (The minimiser failed. It stopped); try another start or method; see docs/choose.md"
     assert said in memory.messages[2]
     assert memory.support.sizes == {"simulator": 1, "sample": 1}
 
