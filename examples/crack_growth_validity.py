@@ -131,7 +131,8 @@ def check(result, model, inputs, wrap, who, conditions, null=None):
         n: prb.predict(result, f, *inputs, model=model, random_seed=1) for n, f in responses.items()
     }
     if null is not None:
-        null = null(result, {n: (f, *inputs) for n, f in responses.items()}, replicates=499)
+        calls = {n: (f, *inputs) for n, f in responses.items()}
+        null = null(result, responses=calls, replicates=499)
     specimens = dict.fromkeys(conditions, LABELS[who])
     return [
         prb.area_test(observed, predicted, specimens=specimens, null=null, folded=folded)

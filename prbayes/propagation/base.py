@@ -81,8 +81,8 @@ class Bound(ABC):
     inputs : Inputs
     target : Discrepancy
     responses : Responses
-    first_points : sequence of ndarray, shapes (n, *event)
-        Aleatory inputs at which responses were computed at the first use.
+    first_points : sequence of ndarray
+        Aleatory inputs, by input, at which responses were computed at the first use.
     first_responses : ndarray, shape (n,) or (n, m)
         The responses there.
     n_per_theta : int
