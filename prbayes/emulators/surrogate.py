@@ -291,7 +291,7 @@ class Surrogate:
         value = cast(Replace, self.outside).value
         # Once: a sampler calls thousands of times, and a simulator reports the mass it loses.
         level = logging.DEBUG if self._warned else logging.WARNING
-        once = f"{text}; they give {value}; this is told once."
+        once = f"{text}; they give {value}; this warning appears once."
         report(Finding("outside-ranges", once), level=level)
         self._warned[:] = [True]
         return value

@@ -49,10 +49,10 @@ class Level(IntEnum):
 
 
 _REMEDIES = {
-    Level.POPULATIONS: "pass the model that the result was made from, or make the result anew",
-    Level.PRIORS: "pass the model that the result was made from, or make the result anew",
+    Level.POPULATIONS: "pass the model that the result was made from, or make the result again",
+    Level.PRIORS: "pass the model that the result was made from, or make the result again",
     Level.OPTIMUM: "call prb.minimize on this model, and use that optimum",
-    Level.POSTERIOR: "sample this model anew",
+    Level.POSTERIOR: "sample this model again",
     Level.RUN: "start a new run",
 }
 
