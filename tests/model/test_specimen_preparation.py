@@ -123,7 +123,8 @@ def test_groups_have_populations_of_their_own() -> None:
 
 
 def test_seeds() -> None:
-    populations = populations_of(normal_model())
+    model = normal_model()
+    populations = populations_of(model)
     points = points_at(populations, X)
     first, same, second = (populations.posterior(*points, seed=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.thetas, same.thetas)
