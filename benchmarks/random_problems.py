@@ -137,13 +137,13 @@ def answered(seed: int) -> dict[str, Any]:
     known = np.isfinite(np.diag(optimum.covariance))
     stderr = np.sqrt(np.diag(optimum.covariance))[known]
     off = (optimum.theta - reference(problem, optimum))[known] / stderr
-    support = optimum.support["y"]["weight_ess"]
+    support = optimum.search.support["y"]["weight_ess"]
     return row | {
         "off": [round(float(x), 3) for x in off],
         "claimed": round(float(optimum.design_error), 3),
         "runs": optimum.n_responses,
         "effective": round(float(support)),
-        "others": sum(rival["comparable"] for rival in optimum.rivals),
+        "others": sum(other["comparable"] for other in optimum.local_optima),
     }
 
 

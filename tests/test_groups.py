@@ -136,7 +136,7 @@ def test_results_keep_the_names(tmp_path: Path) -> None:
     model, optimum = case()
     posterior = draws()
     elements = ["mu[Adler]", "mu[Busch]", "sigma"]
-    assert optimum.names == [*elements[:2], "sigma_log__"]
+    assert optimum.evaluator.hyperparameters.names == [*elements[:2], "sigma_log__"]
     assert list(optimum.discrepancies) == PARTS
     assert list(posterior["observed_data"].data_vars) == PARTS
     table = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)

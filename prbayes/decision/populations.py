@@ -60,7 +60,7 @@ class Populations:
         model = model_of(result, model, caller)
         if isinstance(result, Optimum):
             thetas = _sobol_thetas(result, n_draws, caller)
-            evaluator = result.evaluator if model is result.model else Evaluator.of(model)
+            evaluator = result.evaluator if model is result.evaluator.model else Evaluator.of(model)
             return cls(result, evaluator, thetas, result.theta, caller, are_draws=False)
         points, _ = populations_of(result, model, n_draws, caller)
         evaluator = Evaluator.of(model)
@@ -292,7 +292,11 @@ def _sobol_thetas(optimum: Optimum, n: int, caller: str) -> Floats:
     covariance = optimum.covariance
     if not np.isfinite(covariance).all():
         is_known = np.isfinite(np.diag(covariance))
-        unknown = [name for name, is_ok in zip(optimum.names, is_known, strict=True) if not is_ok]
+        unknown = [
+            name
+            for name, is_ok in zip(optimum.evaluator.hyperparameters.names, is_known, strict=True)
+            if not is_ok
+        ]
         raise ValueError(
             f"{caller}: got an optimum that says nothing of the uncertainty of {unknown}, expected "
             "a standard error of each; pass the posterior of prb.sample_smc"

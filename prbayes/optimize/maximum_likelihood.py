@@ -90,7 +90,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     weights = _posterior_weights(evaluator, modes, with_prior=settings.prior)
     findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
     findings += report(*_findings(evaluator, modes, weights, ends))
-    rivals = tuple(
+    local_optima = tuple(
         {
             "point": point_at(evaluator, mode.theta),
             "discrepancy": mode.value,
@@ -108,13 +108,11 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         stderr=stderr,
         theta=best.theta,
         covariance=best.covariance,
-        names=evaluator.hyperparameters.names,
         evaluator=evaluator,
         discrepancy=best.value,
         discrepancies={name: -float(v.sum()) for name, v in log_likelihoods.items()},
         scales=dict.fromkeys(log_likelihoods, 1.0),
         n_responses=evaluator.n_responses - n_previous,
-        identity=identity_of(evaluator, prior_minimised=settings.prior),
         search=SearchRecord(
             result=Result.CONVERGED if is_converged else Result.FAILED,
             prior=settings.prior,
@@ -124,8 +122,9 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
             n_computed=n_computed(evaluator),
             seconds=time.perf_counter() - clock,
             trace=objective.trace(best.steps),
+            identity=identity_of(evaluator, prior_minimised=settings.prior),
         ),
-        rivals=rivals,
+        local_optima=local_optima,
         findings=tuple(findings),
     )
 

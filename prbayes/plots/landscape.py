@@ -74,7 +74,7 @@ def plot_landscape(
     -------
     arviz.PlotCollection
         Its ``viz`` has the artists ``landscape`` (``landscape_lines``), ``path``, ``optimum`` and
-        ``rivals``.
+        ``local_optima``.
 
     Raises
     ------
@@ -130,16 +130,19 @@ def plot_landscape(
 
 def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
     """Return the optimum's evaluator, or that of another model with the same hyperparameters."""
-    if model is None or model is optimum.model:
+    if model is None or model is optimum.evaluator.model:
         return optimum.evaluator
     require_of_model(optimum, model, "plot_landscape", Level.POPULATIONS)
     evaluator = Evaluator.of(model)
     simulators = [node.name for node in evaluator.nodes or evaluator.measurements]
     expected = list(optimum.scales)
-    if evaluator.hyperparameters.names != optimum.names or simulators != expected:
+    if (
+        evaluator.hyperparameters.names != optimum.evaluator.hyperparameters.names
+        or simulators != expected
+    ):
         raise ValueError(
             f"model: got hyperparameters and simulators {evaluator.hyperparameters.names} and "
-            f"{simulators}, expected {optimum.names} and {expected}"
+            f"{simulators}, expected {optimum.evaluator.hyperparameters.names} and {expected}"
         )
     return evaluator
 
@@ -220,7 +223,7 @@ def _draw_marks(panel: Panel, path: Any, optimum: Floats, local_optima: Floats) 
     panel.points("optimum", x, y, VERMILION, marker=DIAMOND, size=90, legend="optimum")
     if local_optima.size:
         x, y = local_optima
-        panel.points("rivals", x, y, VERMILION, marker=CROSS, size=70, legend="other optima")
+        panel.points("local_optima", x, y, VERMILION, marker=CROSS, size=70, legend="other optima")
 
 
 # -- the objective and its values on a grid --------------------------------------------------
@@ -270,7 +273,7 @@ def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
 
 def free_names(optimum: Optimum) -> list[str]:
     """Return the names of these elements, without constants such as zeros of a factor."""
-    point = {str(rv.name): optimum.point[str(rv.name)] for rv in optimum.model.free_RVs}
+    point = {str(rv.name): optimum.point[str(rv.name)] for rv in optimum.evaluator.model.free_RVs}
     return optimum_elements(labelled(optimum.evaluator, point, {}).data_vars, optimum.stderr)
 
 
@@ -336,8 +339,8 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     """Evaluate the objective on a grid of ``points`` along each of one or two hyperparameters."""
     plane = _Plane.of(optimum, evaluator, names)
     path = free_elements(evaluator, optimum.search.trace["theta"])
-    local_optima = np.array([rival["theta"] for rival in optimum.rivals])
-    rivals = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
+    local_optima = np.array([other["theta"] for other in optimum.local_optima])
+    others = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
     prior = free_elements(evaluator, evaluator.hyperparameters.prior_thetas(1000, 0))
     errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
 
@@ -345,7 +348,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     for name in names:
         # The path beyond the prior's bulk, ten draws at each end, does not widen the axis.
         bulk = np.quantile(prior[name], (0.01, 0.99))
-        marked = np.append(np.clip(path[name], *bulk), rivals[name])
+        marked = np.append(np.clip(path[name], *bulk), others[name])
         error = errors[name]
         if not (np.isfinite(error) and error > 0):  # unknown: an axis as wide as the prior
             error = float((bulk[1] - bulk[0]) / (2 * _STANDARD_ERRORS))
@@ -364,7 +367,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
         axes,
         heights.reshape(coordinates[0].shape),
         path=_columns(path, names),
-        local_optima=_columns(rivals, names),
+        local_optima=_columns(others, names),
         optimum=_columns(plane.center, names),
     )
 

@@ -129,7 +129,9 @@ def _specimen_estimates(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return maximum-likelihood estimates, (draws, d), and whether they converged."""
     refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
-    unidentified = np.array(optimum.names)[np.isinf(np.diag(optimum.covariance))]
+    unidentified = np.array(optimum.evaluator.hyperparameters.names)[
+        np.isinf(np.diag(optimum.covariance))
+    ]
     if unidentified.size:
         raise ValueError(_unidentified(unidentified.tolist()))
     if not parametric:

@@ -99,7 +99,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
     refuse_without_epsilon(
-        optimum.model, "calibrate_epsilon", "sample it with prb.sample_smc or pm.sample"
+        optimum.evaluator.model, "calibrate_epsilon", "sample it with prb.sample_smc or pm.sample"
     )
     evaluator = require_sampling(optimum, "calibrate_epsilon").evaluator
     require_minimiser(optimum, "calibrate_epsilon")
@@ -111,7 +111,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         names = [evaluator.nodes[k].name for k in group]
         ratio = _variance_ratio(optimum, group, np.array([epsilons[name] for name in names]))
         epsilons |= {name: epsilons[name] * ratio for name in names}
-    return Epsilon(epsilons, optimum.identity)
+    return Epsilon(epsilons, optimum.search.identity)
 
 
 def _variance_ratio(optimum: Optimum, group: list[int], epsilon: Floats) -> float:

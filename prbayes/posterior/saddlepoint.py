@@ -219,7 +219,7 @@ def _scale(
         size = sum(len(node.observed) for node in evaluator.nodes)
         precision = _likelihood_spread(evaluator, point, options) * np.sqrt(size)
         return np.asarray(100 / np.maximum(precision, 100) * hyperparameters.prior_sd)
-    order = [optimum.names.index(name) for name in hyperparameters.names]
+    order = [optimum.evaluator.hyperparameters.names.index(name) for name in hyperparameters.names]
     errors = np.sqrt(np.diag(optimum.covariance))[order]
     return np.asarray(np.minimum(100 * errors, hyperparameters.prior_sd))
 

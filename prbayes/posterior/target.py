@@ -141,9 +141,12 @@ def prior_conflicts(
     The predictive distribution of an estimate is that of draws of the prior with the standard
     errors of the optimum.
     """
-    if optimum.search.prior or any(rival["comparable"] for rival in optimum.rivals):
+    if optimum.search.prior or any(other["comparable"] for other in optimum.local_optima):
         return ()
-    order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
+    order = [
+        optimum.evaluator.hyperparameters.names.index(name)
+        for name in evaluator.hyperparameters.names
+    ]
     covariance = optimum.covariance[np.ix_(order, order)]
     is_identified = np.isfinite(np.diag(covariance))
     if not is_identified.any():

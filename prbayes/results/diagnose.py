@@ -34,7 +34,8 @@ from prbayes.model.parameters import (
     table_elements,
 )
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
-from prbayes.optimize.minimize import Minimisation, find_optimum
+from prbayes.optimize.minimize import find_optimum
+from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import (
     NO_RESPONSE,
     SMALLEST_SHARE,
@@ -194,7 +195,7 @@ def _diagnose_optimum(optimum: Optimum) -> Diagnosis:
         findings.append(_not_converged(optimum.message))
     designs = _computed_coverage(evaluator, optimum.theta[None])
     lost, failed = (
-        {name: support[key] for name, support in optimum.support.items()}
+        {name: support[key] for name, support in optimum.search.support.items()}
         for key in ("lost_mass", "failed_mass")
     )
     failures, harmless = _failure_findings(optimum.failures, lost, failed)

@@ -369,7 +369,9 @@ class JointNull(Null):
 
     def _u_values(self, case: Case) -> Floats:
         """Return u-values of the replicates, (r, n)."""
-        require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
+        require_same(
+            case.identity, self.optimum.search.identity, "JointNull: predicted", Level.OPTIMUM
+        )
         evaluator = self.optimum.evaluator
         sampling = self.optimum.sampling()
         bounds = evaluator.reweighted.values()
@@ -454,7 +456,7 @@ class JointNull(Null):
             )
         response, *inputs = tested
         refuse_uncallable(condition.name, response)
-        roots = read_inputs(condition.name, inputs, self.optimum.model)
+        roots = read_inputs(condition.name, inputs, self.optimum.evaluator.model)
         responses = Responses(condition.name, response, roots, outputs=None)
         labels = set(condition.labels or ())
 

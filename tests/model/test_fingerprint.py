@@ -279,10 +279,10 @@ def test_nothing_is_asked_of_a_result_of_other_tools() -> None:
 
 
 def test_results_carry_it(tmp_path: Path) -> None:
-    assert optimum().identity is not None
-    assert optimum().identity.prior_minimised is False
+    assert optimum().search.identity is not None
+    assert optimum().search.identity.prior_minimised is False
     tree = optimum().to_datatree()
-    assert from_attributes(tree["optimum"].attrs) == optimum().identity
+    assert from_attributes(tree["optimum"].attrs) == optimum().search.identity
     posterior().to_netcdf(tmp_path / "draws.nc", engine="h5netcdf")
     with xr.open_datatree(tmp_path / "draws.nc", engine="h5netcdf") as saved:
         found = from_attributes(saved["posterior"].attrs)

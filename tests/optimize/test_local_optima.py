@@ -67,7 +67,7 @@ def posterior(name: str) -> xr.DataTree:
 @pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
 def test_both_optima_are_found(name: str) -> None:
     optimum = fit(name)
-    comparable = [r for r in optimum.rivals if r["comparable"]]
+    comparable = [r for r in optimum.local_optima if r["comparable"]]
     assert len(comparable) == 1
     (rival,) = comparable
     # The design is not quite symmetric: a tenth of a standard error.
@@ -75,7 +75,7 @@ def test_both_optima_are_found(name: str) -> None:
     assert abs(abs(optimum.point["mu"] - 1) - 1) < 4 * optimum.stderr["mu"]
     assert abs(np.log(optimum.point["sigma"] / rival["point"]["sigma"])) < 0.1
     np.testing.assert_allclose(rival["discrepancy"], optimum.discrepancy, rtol=0.05)
-    evaluator = Evaluator.of(optimum.model)
+    evaluator = Evaluator.of(optimum.evaluator.model)
     assert evaluator(rival["theta"][None]).discrepancies[0, 0] == pytest.approx(
         rival["discrepancy"]
     )
@@ -86,11 +86,11 @@ def test_both_optima_are_found(name: str) -> None:
 
 def test_rivals_are_minima() -> None:
     optimum = fit("pr")
-    evaluator = Evaluator.of(optimum.model)
-    for theta in (optimum.theta, *(r["theta"] for r in optimum.rivals if r["comparable"])):
+    evaluator = Evaluator.of(optimum.evaluator.model)
+    for theta in (optimum.theta, *(r["theta"] for r in optimum.local_optima if r["comparable"])):
         around = theta + 0.05 * np.vstack([np.eye(2), -np.eye(2)])
         assert (evaluator(around).discrepancies > evaluator(theta[None]).discrepancies).all()
-    values = [r["discrepancy"] for r in optimum.rivals]
+    values = [r["discrepancy"] for r in optimum.local_optima]
     assert values == sorted(values)
 
 
@@ -103,13 +103,13 @@ def test_warnings_are_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_starts() -> None:
     none = prb.minimize(mirrored(METRICS["pr"]), starts=0)
-    assert none.rivals == none.findings == ()
+    assert none.local_optima == none.findings == ()
     np.testing.assert_allclose(none.theta, fit("pr").theta)
     # Each theta costs responses: looked for only if asked.
     propagation = prb.Resimulated(128)
-    assert prb.minimize(mirrored(METRICS["pr"], propagation=propagation)).rivals == ()
+    assert prb.minimize(mirrored(METRICS["pr"], propagation=propagation)).local_optima == ()
     asked = prb.minimize(mirrored(METRICS["pr"], propagation=propagation), starts=8)
-    assert any(r["comparable"] for r in asked.rivals)
+    assert any(r["comparable"] for r in asked.local_optima)
     assert asked.n_responses > 8 * 128
 
 
@@ -118,7 +118,7 @@ def test_a_prior_that_excludes_one_leaves_one() -> None:
         x = pm.Normal.dist(pm.LogNormal("excess", 0, 0.5) + 1, pm.HalfNormal("sigma", 1))
         prb.Simulator("y", parabola, x, metric=METRICS["pr"], observed=DATA, propagation=R256)
     optimum = prb.minimize(model)
-    assert not [r for r in optimum.rivals if r["comparable"]]
+    assert not [r for r in optimum.local_optima if r["comparable"]]
     assert optimum.findings == ()
     assert abs(optimum.point["excess"] - 1) < 4 * optimum.stderr["excess"]
 
@@ -138,7 +138,7 @@ def test_a_worse_optimum_is_left_for_the_better_one() -> None:
     assert abs(found.point["mu"] - 4) < 0.2
     assert found.discrepancy < stuck.discrepancy - 0.1
     # What was the first one is now among the others, and said to be worse.
-    (other,) = found.rivals
+    (other,) = found.local_optima
     assert abs(other["point"]["mu"] + 2) < 0.2
     assert not other["comparable"]
     assert found.findings == ()
@@ -157,13 +157,13 @@ def test_a_linear_problem_has_no_rivals(name: str) -> None:
             propagation=R256,
         )
     optimum = prb.minimize(model)
-    assert optimum.rivals == ()
+    assert optimum.local_optima == ()
     assert optimum.findings == ()
 
 
 def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
     optimum = fit("pr")
-    evaluator = Evaluator.of(optimum.model)
+    evaluator = Evaluator.of(optimum.evaluator.model)
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
     best = Reference(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
     assert rivals_from_prior(best, starts=16, seed=0)
@@ -200,7 +200,7 @@ def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
         pm.Normal("idle", 3, 2)
         prb.Simulator("y", same, x, metric=METRICS["pr"], observed=OBSERVED, propagation=R256)
     optimum = prb.minimize(model)
-    assert optimum.rivals == ()
+    assert optimum.local_optima == ()
     (finding,) = optimum.findings
     line = str(finding)
     assert "about idle (" in line
@@ -214,7 +214,7 @@ def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> 
         pm.Normal("idle", 3, 2)
         prb.Simulator("y", parabola, x, metric=METRICS["pr"], observed=DATA, propagation=R256)
     optimum = prb.minimize(model)
-    comparable = [r for r in optimum.rivals if r["comparable"]]
+    comparable = [r for r in optimum.local_optima if r["comparable"]]
     assert len(comparable) == 1
     assert comparable[0]["point"]["idle"] == pytest.approx(optimum.point["idle"], abs=1e-6)
     assert len(optimum.findings) == 2
@@ -239,8 +239,8 @@ def test_one_output_of_many_excludes_a_mirror(slope: float, comparable: bool) ->
                 propagation=prb.Reweighted(128),
             )  # fmt: skip
     optimum = prb.minimize(model)
-    assert optimum.rivals
-    assert any(rival["comparable"] for rival in optimum.rivals) == comparable
+    assert optimum.local_optima
+    assert any(other["comparable"] for other in optimum.local_optima) == comparable
     assert ("second-mode" in {f.code for f in optimum.findings}) == comparable
 
 
@@ -274,7 +274,7 @@ def followed(starts: int) -> prb.Optimum:
 
 def test_a_mirror_far_from_the_points_is_found_and_both_are_supported() -> None:
     optimum = followed(16)
-    (rival,) = [r for r in optimum.rivals if r["comparable"]]
+    (rival,) = [r for r in optimum.local_optima if r["comparable"]]
     assert optimum.point["mu"] + rival["point"]["mu"] == pytest.approx(2, abs=0.1)
     thetas = np.stack([optimum.theta, rival["theta"]])
     for theta in thetas:

@@ -344,7 +344,7 @@ def test_vector_hyperparameters_of_a_multivariate_input() -> None:
             )  # fmt: skip
         pm.Deterministic("gap", mean[1] - mean[0])
     optimum = prb.minimize(model)
-    assert optimum.names == ["mean[a]", "mean[b]"]
+    assert optimum.evaluator.hyperparameters.names == ["mean[a]", "mean[b]"]
     assert optimum.point["mean"].shape == optimum.stderr["mean"].shape == (2,)
     expected = data.mean(
         axis=0

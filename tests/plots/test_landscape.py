@@ -77,7 +77,9 @@ def test_other_optima_are_marked(read: SimpleNamespace) -> None:
         found = prb.minimize()
     pc = prb.plot_landscape(found)
     assert (
-        abs(read.xy(pc, "rivals", "landscape")[0] + read.xy(pc, "optimum", "landscape")[0]).min()
+        abs(
+            read.xy(pc, "local_optima", "landscape")[0] + read.xy(pc, "optimum", "landscape")[0]
+        ).min()
         < 0.05
     )
     np.testing.assert_allclose(

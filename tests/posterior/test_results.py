@@ -205,9 +205,9 @@ def test_propagations_without_a_design_have_no_support_to_report() -> None:
 
 
 def test_the_support_of_an_optimum_is_part_of_it() -> None:
-    assert optimum().support
+    assert optimum().search.support
     tree = optimum().to_datatree()["calibration"]
-    for name, support in optimum().support.items():
+    for name, support in optimum().search.support.items():
         for key, value in support.items():
             assert float(tree[key].sel(simulator=name)) == value
         assert support["weight_ess"] > 30

@@ -422,7 +422,7 @@ def test_an_answer_that_rests_on_the_specimens_that_are_left_is_refused(propagat
 def test_more_may_be_lost_where_that_is_asked_for_and_is_reported() -> None:
     model = failing(prb.Resimulated(64, on_failure=REPLACED, max_lost=0.9))
     optimum = prb.minimize(model, method="Nelder-Mead", max_evaluations=30, progressbar=False)
-    assert 0.1 < optimum.support["y"]["lost_mass"] < 0.9
+    assert 0.1 < optimum.search.support["y"]["lost_mass"] < 0.9
     tree = prb.sample_smc(20, chains=1, model=model, adjustment=None, progressbar=False)
     assert 0.1 < tree["calibration"]["lost_mass_at_best"].item() < 0.9
 
@@ -436,7 +436,7 @@ def test_specimens_without_response_are_told_of(propagation: Any) -> None:
             metric=prb.AreaMetric(), observed=OBSERVED, propagation=propagation,
         )  # fmt: skip
     optimum = prb.minimize(model, progressbar=False)
-    share = optimum.support["y"]["lost_mass"]
+    share = optimum.search.support["y"]["lost_mass"]
     assert 0.001 < share < 0.05
     said = f"y: {share:.1%} of specimens have no response (NaN) and are left out"
     assert said in repr(optimum)
@@ -524,7 +524,7 @@ def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:
     assert (failures["inputs"].values > 2.0).all()
     assert set(failures["reason"].values) == {"it raised OSError: license server"}
     told = r"The response of y failed at \d+ point\(s\), the first at \(\d.*license server"
-    share = optimum.support["y"]["failed_mass"]
+    share = optimum.search.support["y"]["failed_mass"]
     assert 0 < share < 0.2
     assert f"y: {share:.1%} of specimens fail" in repr(optimum)
     tree = prb.sample_smc(20, chains=1, model=model, adjustment=None, progressbar=False)
