@@ -56,7 +56,7 @@ def sampled(optimum: Any, large: int, seed: int) -> tuple[float, Any]:
     try:
         tree = prb.sample_smc(
             optimum=optimum,
-            model=optimum.evaluator.model,
+            model=optimum.model,
             adjustment=None,
             random_seed=seed,
             progressbar=False,
@@ -64,7 +64,7 @@ def sampled(optimum: Any, large: int, seed: int) -> tuple[float, Any]:
     finally:
         evaluator._LARGE = before
     seconds = time.process_time() - clock
-    names = [rv.name for rv in optimum.evaluator.model.free_RVs]
+    names = [rv.name for rv in optimum.model.free_RVs]
     return seconds, np.array([tree.posterior[name].values.ravel() for name in names])
 
 

@@ -254,7 +254,7 @@ def minimised(build: Callable[[], pm.Model], **options: Any) -> prb.Optimum:
 def sampled(optimum: prb.Optimum, random_seed: int) -> dict[str, Any]:
     """Sample, and return all answers."""
     posterior = prb.sample_smc(
-        400, chains=1, model=optimum.evaluator.model, optimum=optimum, random_seed=random_seed, progressbar=False)  # fmt: skip
+        400, chains=1, model=optimum.model, optimum=optimum, random_seed=random_seed, progressbar=False)  # fmt: skip
     draws = posterior["calibration"].dataset["theta"].values[0]
     return {
         "theta": optimum.theta,
@@ -285,7 +285,7 @@ def on_surrogate(rng: np.random.Generator) -> tuple[Any, ...]:
 def validity(case: tuple[Any, ...], random_seed: int) -> dict[str, Any]:
     """Test a calibration on a surrogate, against fresh data and its own."""
     optimum, surface, x, rng = case
-    model = optimum.evaluator.model
+    model = optimum.model
     posterior = prb.sample_smc(
         200,
         chains=2,

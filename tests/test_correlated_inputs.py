@@ -113,7 +113,7 @@ def test_standard_deviations_and_correlation_are_found_with_their_standard_error
 
 
 def test_tables_have_the_correlation_once(optimum: prb.Optimum) -> None:
-    table = prb.compare({"optimum": optimum}, model=optimum.evaluator.model)
+    table = prb.compare({"optimum": optimum}, model=optimum.model)
     names = list(table["hyperparameter"].values)
     assert names == ["mean[0]", "mean[1]", "chol_corr[0,1]", "chol_stds[0]", "chol_stds[1]"]
     # What is read off the factor is known, and not all of its own elements.

@@ -36,12 +36,12 @@ def optimum() -> prb.Optimum:
 
 @cache
 def posterior() -> xr.DataTree:
-    return prb.sample_smc(20, chains=2, model=optimum().evaluator.model, optimum=optimum(), **QUIET)
+    return prb.sample_smc(20, chains=2, model=optimum().model, optimum=optimum(), **QUIET)
 
 
 @cache
 def predicted() -> xr.DataArray:
-    (x,) = next(iter(nodes(optimum().evaluator.model).values())).bound.inputs.aleatory
+    (x,) = next(iter(nodes(optimum().model).values())).bound.inputs.aleatory
     return prb.predict(optimum(), line, x, n_samples=50, **QUIET)
 
 
@@ -85,7 +85,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "response.Abort": prb.response.Abort,
     "response.Additive": lambda: prb.response.Additive([20.0, 1000.0]),
     "response.BudgetError": lambda: prb.response.BudgetError("max_seconds = 1 was reached"),
-    "response.Cost": lambda: prb.cost(optimum().evaluator.model),
+    "response.Cost": lambda: prb.cost(optimum().model),
     "response.Multiplicative": lambda: prb.response.Multiplicative([20.0, 1000.0]),
     "response.Replace": lambda: prb.response.Replace(1.0),
     "response.ResponseError": lambda: prb.response.ResponseError("y: it raised"),

@@ -328,7 +328,7 @@ def test_specimens_with_missing_outputs_make_the_estimate_better_than_without_th
 @pytest.mark.long
 def test_predictions_have_the_outputs_as_a_dimension():
     optimum = prb.minimize(model_of(as_mapping, NAMED))
-    a, b = node_of(optimum.evaluator.model).bound.inputs.aleatory
+    a, b = node_of(optimum.model).bound.inputs.aleatory
     found = prb.predict(optimum, as_mapping, a, b, random_seed=1)
     assert found.dims == ("chain", "draw", "sample", "output")
     assert found.output.values.tolist() == ["sum", "difference"]
@@ -396,7 +396,7 @@ def test_tested_outputs_are_taken_by_their_names():
 def test_own_specimens_of_several_outputs_are_tested_by_recalibration():
     data = observed(seed=3)
     optimum = prb.minimize(model_of(data=data))
-    a, b = node_of(optimum.evaluator.model).bound.inputs.aleatory
+    a, b = node_of(optimum.model).bound.inputs.aleatory
     predicted = prb.predict(optimum, two, a, b, random_seed=1)
     with pytest.raises(ValueError, match="very data of the calibration"):
         prb.area_test(data, predicted)

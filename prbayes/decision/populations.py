@@ -60,7 +60,7 @@ class Populations:
         model = model_of(result, model, caller)
         if isinstance(result, Optimum):
             thetas = _sobol_thetas(result, n_draws, caller)
-            evaluator = result.evaluator if model is result.evaluator.model else Evaluator.of(model)
+            evaluator = result.evaluator if model is result.model else Evaluator.of(model)
             return cls(result, evaluator, thetas, result.theta, caller, are_draws=False)
         points, _ = populations_of(result, model, n_draws, caller)
         evaluator = Evaluator.of(model)

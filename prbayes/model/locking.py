@@ -48,7 +48,6 @@ def _models(value: Any) -> Iterator[pm.Model]:
             yield from _models(element)
         return
     result = getattr(value, "optimum", value)
-    owner = getattr(result, "evaluator", result)
-    model = value if isinstance(value, pm.Model) else getattr(owner, "model", None)
+    model = value if isinstance(value, pm.Model) else getattr(result, "model", None)
     if isinstance(model, pm.Model):
         yield model.root

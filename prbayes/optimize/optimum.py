@@ -112,6 +112,72 @@ class SearchRecord:
     identity: Identity | None = None
 
 
+# -- display ---------------------------------------------------------------------------------------
+
+
+def _heading(optimum: Optimum) -> str:
+    """Return the discrepancy and its cost in words."""
+    kind = "Optimum with the prior" if optimum.search.prior else "Optimum"
+    label = "discrepancy" if optimum.evaluator.nodes else "minus log-likelihood"
+    state = "converged" if optimum.converged else "NOT converged"
+    return (
+        f"{kind}: {label} {optimum.discrepancy:.4g} after {optimum.search.n_evaluations} "
+        f"evaluations, {optimum.n_responses} responses, {state}"
+    )
+
+
+def _rows(optimum: Optimum) -> list[list[str]]:
+    """Return name, estimate and standard error in words.
+
+    Elements with labels, and those of matrices, have rows of their own, up to twenty of a variable.
+    """
+
+    def short(value: Any) -> str:
+        return np.array2string(
+            np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format}
+        )
+
+    point = labelled(optimum.evaluator, optimum.point, {}).data_vars
+    stderr = labelled(optimum.evaluator, optimum.stderr, {}).data_vars
+    names = [str(name) for name in point]
+    rows = []
+    for name in readable_variables(names, names):
+        value, error = point[name], stderr[name]
+        has_rows = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
+        if not has_rows or value.size > 20:
+            rows.append([name, short(value), short(error)])
+            continue
+        values, errors = single_elements({name: value}), single_elements({name: error})
+        for element in optimum_elements({name: value}, {name: error}):
+            rows.append([element, short(values[element]), short(errors[element])])
+    return rows
+
+
+def _sentences(optimum: Optimum) -> list[str]:
+    """Return the shares of specimens that fail or have no response, and the findings."""
+    sentences = []
+    for name, support in optimum.search.support.items():
+        for key, verb in (("failed_mass", "fail"), ("lost_mass", NO_RESPONSE)):
+            share = support.get(key, 0.0)
+            if share >= SMALLEST_SHARE:
+                sentences.append(f"{name}: {share:.1%} of specimens {verb}")
+    return [*sentences, *map(str, optimum.findings)]
+
+
+def _text(optimum: Optimum) -> str:
+    """Return the estimates, their cost, and the findings."""
+    rows = [f"{name} = {value} ± {error}" for name, value, error in _rows(optimum)]
+    return "\n  ".join([_heading(optimum), *rows, *_sentences(optimum)])
+
+
+def _html(optimum: Optimum) -> str:
+    """Return the same for a notebook, as a table."""
+    header = ["", "estimate", "standard error"]
+    return view(
+        _heading(optimum), header=header, rows=_rows(optimum), sentences=_sentences(optimum)
+    )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Optimum:
     """The result of `minimize`; numerical failure is a value in it, not an exception.
@@ -164,15 +230,8 @@ class Optimum:
     local_optima: tuple[dict[str, Any], ...] = ()
     findings: tuple[Finding, ...] = ()
 
-    def __repr__(self) -> str:
-        """Show the estimates, their cost, and the findings."""
-        rows = [f"{name} = {value} ± {error}" for name, value, error in _rows(self)]
-        return "\n  ".join([_heading(self), *rows, *_sentences(self)])
-
-    def _repr_html_(self) -> str:
-        """Show the same in a notebook, as a table."""
-        header = ["", "estimate", "standard error"]
-        return view(_heading(self), header=header, rows=_rows(self), sentences=_sentences(self))
+    __repr__ = _text
+    _repr_html_ = _html
 
     @property
     def converged(self) -> bool:
@@ -185,13 +244,18 @@ class Optimum:
         return f"{self.search.result.value} {self.search.details}".strip()
 
     @property
+    def model(self) -> pm.Model:
+        """The model."""
+        return self.evaluator.model
+
+    @property
     def initvals(self) -> dict[str, Any]:
         """The free variables at the optimum.
 
         For ``pm.sample(initvals=optimum.initvals, init="adapt_diag")``, which starts every chain
         there: PyMC's default jitter can move a chain into another mode.
         """
-        return {str(rv.name): self.point[str(rv.name)] for rv in self.evaluator.model.free_RVs}
+        return {str(rv.name): self.point[str(rv.name)] for rv in self.model.free_RVs}
 
     @property
     def failures(self) -> xr.Dataset:
@@ -247,7 +311,7 @@ class Optimum:
             "seconds": search.seconds,
             "findings": as_json(self.findings),
             **versions(),
-            **as_attribute(self.evaluator.model),
+            **as_attribute(self.model),
             **as_attributes(search.identity),
         }
         trace = {
@@ -267,55 +331,6 @@ class Optimum:
         if failures.sizes["failure"]:
             groups["failures"] = failures
         return xr.DataTree.from_dict(groups)
-
-
-def _heading(optimum: Optimum) -> str:
-    """Return the discrepancy and its cost in words."""
-    kind = "Optimum with the prior" if optimum.search.prior else "Optimum"
-    label = "discrepancy" if optimum.evaluator.nodes else "minus log-likelihood"
-    state = "converged" if optimum.converged else "NOT converged"
-    return (
-        f"{kind}: {label} {optimum.discrepancy:.4g} after {optimum.search.n_evaluations} "
-        f"evaluations, {optimum.n_responses} responses, {state}"
-    )
-
-
-def _rows(optimum: Optimum) -> list[list[str]]:
-    """Return name, estimate and standard error in words.
-
-    Elements with labels, and those of matrices, have rows of their own, up to twenty of a variable.
-    """
-
-    def short(value: Any) -> str:
-        return np.array2string(
-            np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format}
-        )
-
-    point = labelled(optimum.evaluator, optimum.point, {}).data_vars
-    stderr = labelled(optimum.evaluator, optimum.stderr, {}).data_vars
-    names = [str(name) for name in point]
-    rows = []
-    for name in readable_variables(names, names):
-        value, error = point[name], stderr[name]
-        has_rows = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
-        if not has_rows or value.size > 20:
-            rows.append([name, short(value), short(error)])
-            continue
-        values, errors = single_elements({name: value}), single_elements({name: error})
-        for element in optimum_elements({name: value}, {name: error}):
-            rows.append([element, short(values[element]), short(errors[element])])
-    return rows
-
-
-def _sentences(optimum: Optimum) -> list[str]:
-    """Return the shares of specimens that fail or have no response, and the findings."""
-    sentences = []
-    for name, support in optimum.search.support.items():
-        for key, verb in (("failed_mass", "fail"), ("lost_mass", NO_RESPONSE)):
-            share = support.get(key, 0.0)
-            if share >= SMALLEST_SHARE:
-                sentences.append(f"{name}: {share:.1%} of specimens {verb}")
-    return [*sentences, *map(str, optimum.findings)]
 
 
 # -- from the end of a minimisation ----------------------------------------------------------------
@@ -387,7 +402,7 @@ def n_computed(evaluator: Evaluator) -> int:
 def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:
     """Return variables and deterministics at theta in the user's units."""
     values = evaluator.hyperparameters.constrained(theta[None])
-    return {name: plain(value[0]) for name, value in values.items()}
+    return {name: _number(value[0]) for name, value in values.items()}
 
 
 def point_and_stderr(
@@ -402,7 +417,7 @@ def point_and_stderr(
     stderr = {}
     for name, value in values.items():
         gradients = slopes(value, step)
-        errors = _delta_method(gradients, covariance)
+        errors = delta_method(gradients, covariance)
         if functions is not None and name in deterministics:
             # Functions of unidentified elements may be identified: if better than by their prior.
             faint = np.sqrt(functions.variance(gradients))
@@ -411,11 +426,11 @@ def point_and_stderr(
         # Constants up to rounding, such as the diagonal of a correlation matrix.
         ranges = np.ptp(np.concatenate([value, prior[name]]), axis=0)
         is_constant = ranges <= 1e-12 * np.abs(value[0])
-        stderr[name] = plain(np.where(is_constant, 0.0, errors))
-    return {name: plain(value[0]) for name, value in values.items()}, stderr
+        stderr[name] = _number(np.where(is_constant, 0.0, errors))
+    return {name: _number(value[0]) for name, value in values.items()}, stderr
 
 
-def _delta_method(gradients: Floats, covariance: Floats) -> Floats:
+def delta_method(gradients: Floats, covariance: Floats) -> Floats:
     """Return standard errors of functions with gradients (..., d); inf, or NaN at a bound."""
     is_infinite = np.isinf(covariance)
     finite = np.where(is_infinite, 0.0, covariance)
@@ -428,7 +443,7 @@ def _delta_method(gradients: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.sqrt(np.where(is_at_bound, np.nan, variance)))
 
 
-def plain(value: Any) -> Any:
+def _number(value: Any) -> Any:
     """Return a float, or an array of several numbers."""
     return float(value) if np.ndim(value) == 0 else np.asarray(value)
 

@@ -61,7 +61,7 @@ def read_result(
     another kind of result or one without a free variable of the model, a `ValueError` if it is of
     other populations or data, a `DesignError` if stored responses do not support most populations.
     """
-    if isinstance(result, Optimum) and (model is None or model is result.evaluator.model):
+    if isinstance(result, Optimum) and (model is None or model is result.model):
         evaluator = result.evaluator
     else:
         model = model_on_context(model, caller)

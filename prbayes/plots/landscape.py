@@ -130,7 +130,7 @@ def plot_landscape(
 
 def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
     """Return the optimum's evaluator, or that of another model with the same hyperparameters."""
-    if model is None or model is optimum.evaluator.model:
+    if model is None or model is optimum.model:
         return optimum.evaluator
     require_of_model(optimum, model, "plot_landscape", Level.POPULATIONS)
     evaluator = Evaluator.of(model)
@@ -273,7 +273,7 @@ def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
 
 def free_names(optimum: Optimum) -> list[str]:
     """Return the names of these elements, without constants such as zeros of a factor."""
-    point = {str(rv.name): optimum.point[str(rv.name)] for rv in optimum.evaluator.model.free_RVs}
+    point = {str(rv.name): optimum.point[str(rv.name)] for rv in optimum.model.free_RVs}
     return optimum_elements(labelled(optimum.evaluator, point, {}).data_vars, optimum.stderr)
 
 

@@ -99,7 +99,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
     refuse_without_epsilon(
-        optimum.evaluator.model, "calibrate_epsilon", "sample it with prb.sample_smc or pm.sample"
+        optimum.model, "calibrate_epsilon", "sample it with prb.sample_smc or pm.sample"
     )
     evaluator = require_sampling(optimum, "calibrate_epsilon").evaluator
     require_minimiser(optimum, "calibrate_epsilon")
@@ -206,7 +206,7 @@ def _by_refits(information: Information) -> float:
 
 def _by_coverage(information: Information) -> float:
     """Solve for the epsilon whose posteriors cover, with features that are linear in theta."""
-    areas = information.areas(*information.data_set)
+    areas = information.areas(information.data_sets)
     # The strongest directions are last. The information of a sample of one response beyond two
     # directions, close to its location and spread, is of the order of the error of derivatives of
     # stored weights; m outputs have as many locations, spreads and correlations.

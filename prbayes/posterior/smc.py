@@ -276,7 +276,7 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
     """Return the evaluator of a model; raise if the optimum is of another problem."""
     if optimum is None:
         return Evaluator.of(model)
-    is_reusable = optimum.evaluator.model is model and is_current(optimum.evaluator)
+    is_reusable = optimum.model is model and is_current(optimum.evaluator)
     evaluator = optimum.evaluator if is_reusable else Evaluator.of(model)
     require_same(optimum.search.identity, identity_of(evaluator), f"{caller}: optimum")
     return evaluator

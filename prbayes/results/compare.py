@@ -126,7 +126,7 @@ def compare(
         raise ValueError(f"{error}; models of the same data are compared by prb.rank") from None
     optima = [result for result in results.values() if isinstance(result, Optimum)]
     # Draws without coordinates have those of the model.
-    naming = model or next((optimum.evaluator.model for optimum in optima), None)
+    naming = model or next((optimum.model for optimum in optima), None)
     columns = {label: _column(label, result, naming) for label, result in results.items()}
     shared = _shared_elements(list(columns.values()), model)
     in_table = set.intersection(*(column.in_table for column in columns.values()))
@@ -148,7 +148,7 @@ def compare(
         data[key] = ("result", [getattr(column, key) for column in columns.values()])
     if model is not None and (simulators(model) or specimen_likelihoods(model)):
         # The designs of a model cover its own optimum.
-        is_covered = any(optimum.evaluator.model is model for optimum in optima)
+        is_covered = any(optimum.model is model for optimum in optima)
         values = _table(columns, shared)[..., 0]
         for key, scores in _scores(model, shared, values, metrics, is_covered=is_covered).items():
             data[key] = ("result", scores)

@@ -229,9 +229,9 @@ def _labelled(
 def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
     """Return the model of a result, the one passed, or on the context; raise if it differs."""
     if model is None and isinstance(result, Optimum):
-        model = result.evaluator.model
+        model = result.model
     model = model_on_context(model, caller)
-    if not (isinstance(result, Optimum) and model is result.evaluator.model):
+    if not (isinstance(result, Optimum) and model is result.model):
         require_of_model(result, model, caller, Level.POPULATIONS)
         require_same_responses(identity_in(result), model, caller)
     return model

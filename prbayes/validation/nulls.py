@@ -456,7 +456,7 @@ class JointNull(Null):
             )
         response, *inputs = tested
         refuse_uncallable(condition.name, response)
-        roots = read_inputs(condition.name, inputs, self.optimum.evaluator.model)
+        roots = read_inputs(condition.name, inputs, self.optimum.model)
         responses = Responses(condition.name, response, roots, outputs=None)
         labels = set(condition.labels or ())
 

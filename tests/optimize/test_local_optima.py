@@ -75,7 +75,7 @@ def test_both_optima_are_found(name: str) -> None:
     assert abs(abs(optimum.point["mu"] - 1) - 1) < 4 * optimum.stderr["mu"]
     assert abs(np.log(optimum.point["sigma"] / rival["point"]["sigma"])) < 0.1
     np.testing.assert_allclose(rival["discrepancy"], optimum.discrepancy, rtol=0.05)
-    evaluator = Evaluator.of(optimum.evaluator.model)
+    evaluator = Evaluator.of(optimum.model)
     assert evaluator(rival["theta"][None]).discrepancies[0, 0] == pytest.approx(
         rival["discrepancy"]
     )
@@ -86,7 +86,7 @@ def test_both_optima_are_found(name: str) -> None:
 
 def test_rivals_are_minima() -> None:
     optimum = fit("pr")
-    evaluator = Evaluator.of(optimum.evaluator.model)
+    evaluator = Evaluator.of(optimum.model)
     for theta in (optimum.theta, *(r["theta"] for r in optimum.local_optima if r["comparable"])):
         around = theta + 0.05 * np.vstack([np.eye(2), -np.eye(2)])
         assert (evaluator(around).discrepancies > evaluator(theta[None]).discrepancies).all()
@@ -163,7 +163,7 @@ def test_a_linear_problem_has_no_rivals(name: str) -> None:
 
 def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
     optimum = fit("pr")
-    evaluator = Evaluator.of(optimum.evaluator.model)
+    evaluator = Evaluator.of(optimum.model)
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
     best = Reference(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
     assert rivals_from_prior(best, starts=16, seed=0)

@@ -49,8 +49,8 @@ import pickle, sys
 import prbayes as prb
 optimum = pickle.loads(open(sys.argv[1], "rb").read())
 print(repr(optimum.discrepancy), repr(optimum.point["mu"]), repr(optimum.stderr["mu"]))
-print(repr(prb.calibrate_epsilon(optimum)["y"]), optimum.evaluator.model is optimum.evaluator.model)
-tree = prb.sample_smc(50, chains=1, model=optimum.evaluator.model, optimum=optimum, progressbar=False)
+print(repr(prb.calibrate_epsilon(optimum)["y"]), optimum.model is optimum.model)
+tree = prb.sample_smc(50, chains=1, model=optimum.model, optimum=optimum, progressbar=False)
 print(repr(float(tree["posterior"]["mu"].mean())))
 """
 

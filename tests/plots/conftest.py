@@ -126,7 +126,7 @@ def pair() -> SimpleNamespace:
 
 @pytest.fixture(scope="session")
 def comparison(optimum: prb.Optimum, posterior: xr.DataTree) -> xr.Dataset:
-    return prb.compare({"optimum": optimum, "draws": posterior}, model=optimum.evaluator.model)
+    return prb.compare({"optimum": optimum, "draws": posterior}, model=optimum.model)
 
 
 @pytest.fixture(scope="session")
@@ -161,7 +161,7 @@ def pictures(
     optimum: prb.Optimum, posterior: xr.DataTree, comparison: xr.Dataset, pair: SimpleNamespace
 ) -> dict[str, Callable[..., Any]]:
     """Return every plot with a legend or a panel for each result, by name."""
-    model = optimum.evaluator.model
+    model = optimum.model
     return {
         "responses": lambda **k: prb.plot_responses(posterior, model=model, **k),
         "ecdf": lambda **k: prb.plot_responses(optimum, ecdf=True, **k),

@@ -33,12 +33,12 @@ def test_an_optimum_of_unknown_accuracy_stands_alone(optimum: prb.Optimum) -> No
 def test_a_posterior_stands_for_its_draws(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace
 ) -> None:
-    shown = read_result(posterior, optimum.evaluator.model, "test", 300)
+    shown = read_result(posterior, optimum.model, "test", 300)
     expected = np.column_stack([known.mu.ravel(), np.log(known.sigma.ravel())])
     np.testing.assert_allclose(shown.thetas, expected)
     assert shown.center.shape == (0, 2)
-    assert shown.evaluator.model is optimum.evaluator.model
-    assert len(read_result(posterior, optimum.evaluator.model, "test").thetas) == 200
+    assert shown.evaluator.model is optimum.model
+    assert len(read_result(posterior, optimum.model, "test").thetas) == 200
 
 
 def test_a_model_is_given_or_on_the_context(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
@@ -53,7 +53,7 @@ def test_before_is_what_it_says(optimum: prb.Optimum) -> None:
     theta, text = read_before(optimum, evaluator, None)
     np.testing.assert_array_equal(theta[0], evaluator.hyperparameters.initial)
     assert text == "prior's initial point"
-    started = prb.minimize(optimum.evaluator.model, start={"mu": -1.0, "sigma": 1.5})
+    started = prb.minimize(optimum.model, start={"mu": -1.0, "sigma": 1.5})
     theta, text = read_before(started, evaluator, None)
     np.testing.assert_allclose(theta[0], [-1, np.log(1.5)])
     assert text == "optimiser's first point"

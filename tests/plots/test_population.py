@@ -18,7 +18,7 @@ from prbayes.propagation.base import Propagation
 def test_the_population_is_the_closed_form(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_population(posterior, model=optimum.evaluator.model, n_draws=300, prob=0.8)
+    pc = prb.plot_population(posterior, model=optimum.model, n_draws=300, prob=0.8)
     x, y = read.xy(pc, "after", "x")
     each = stats.norm.pdf(x, known.mu.reshape(-1, 1), known.sigma.reshape(-1, 1))
     np.testing.assert_allclose(y, each.mean(axis=0), atol=1e-9)
@@ -35,7 +35,7 @@ def test_the_population_is_the_closed_form(
 
 def test_wrong_arguments_are_refused(optimum: prb.Optimum) -> None:
     with pytest.raises(TypeError, match="got int, expected an Optimum"):
-        prb.plot_population(3, model=optimum.evaluator.model)  # type: ignore[arg-type]
+        prb.plot_population(3, model=optimum.model)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"prob: got 1\.0"):
         prb.plot_population(optimum, prob=1.0)
 

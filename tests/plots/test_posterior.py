@@ -17,7 +17,7 @@ from prbayes.plots.canvas import BLUE, VERMILION
 def test_the_posterior_stands_against_the_optimum(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_posterior(posterior, optimum=optimum, model=optimum.evaluator.model, prob=0.8)
+    pc = prb.plot_posterior(posterior, optimum=optimum, model=optimum.model, prob=0.8)
     for name, draws in (("mu", known.mu), ("sigma", known.sigma)):
         x, y = read.xy(pc, "posterior", name)
         expected = stats.norm.pdf(x, draws.mean(), draws.std())

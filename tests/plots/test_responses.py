@@ -20,7 +20,7 @@ from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 def test_responses_are_the_closed_forms(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_responses(posterior, model=optimum.evaluator.model, n_draws=300)
+    pc = prb.plot_responses(posterior, model=optimum.model, n_draws=300)
     x, y = read.xy(pc, "after", "y")
     h = 0.9 * 0.5 * 700**-0.2  # about Silverman's for the weights' effective number
     each = stats.norm.pdf(x, known.mu.reshape(-1, 1), np.hypot(known.sigma.reshape(-1, 1), h))
@@ -32,7 +32,7 @@ def test_responses_are_the_closed_forms(
     assert (high - low).max() > 0.15
     truth = stats.norm.pdf(some, 1, 0.5)
     assert ((low - 0.02 <= truth) & (truth <= high + 0.02)).all()
-    narrow = prb.plot_responses(posterior, model=optimum.evaluator.model, n_draws=300, prob=0.5)
+    narrow = prb.plot_responses(posterior, model=optimum.model, n_draws=300, prob=0.5)
     inner = read.sides(narrow, "band", "y", some)
     assert np.ptp(inner, axis=0).max() < 0.6 * (high - low).max()
     x, y = read.xy(pc, "before", "y")
@@ -135,7 +135,7 @@ def test_what_the_stored_responses_do_not_reach(
     with pytest.raises(
         prb.propagation.DesignError, match="support 0 of 200 populations of the posterior"
     ):
-        prb.plot_responses(far, model=optimum.evaluator.model)
+        prb.plot_responses(far, model=optimum.model)
 
 
 def test_a_narrow_peak_before_does_not_flatten_the_data(
@@ -150,7 +150,7 @@ def test_a_narrow_peak_before_does_not_flatten_the_data(
 
 def test_wrong_arguments_are_refused(optimum: prb.Optimum) -> None:
     with pytest.raises(TypeError, match="got int, expected an Optimum"):
-        prb.plot_responses(3, model=optimum.evaluator.model)  # type: ignore[arg-type]
+        prb.plot_responses(3, model=optimum.model)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"prob: got 1\.5"):
         prb.plot_responses(optimum, prob=1.5)
 

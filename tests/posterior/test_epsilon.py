@@ -68,7 +68,7 @@ def area_fit(unit: float = 1.0) -> prb.Optimum:
 def known_sd(n: int | None = 256) -> tuple[prb.Optimum, Information]:
     propagation = prb.Resimulated(1024) if n is None else prb.Reweighted(n)
     optimum = prb.minimize(build(PR, sd=0.5, propagation=propagation))
-    evaluator = Evaluator.of(optimum.evaluator.model)
+    evaluator = Evaluator.of(optimum.model)
     return optimum, Information(evaluator, 0, optimum.theta)
 
 
@@ -118,7 +118,7 @@ def test_the_posterior_width_that_it_gives() -> None:
     optimum, information = known_sd()
     epsilon = prb.calibrate_epsilon(optimum)["y"]
     thetas = np.linspace(-0.4, 0.4, 161)[:, None] + optimum.theta
-    logs = -Evaluator.of(optimum.evaluator.model)(thetas).discrepancies[:, 0] / epsilon
+    logs = -Evaluator.of(optimum.model)(thetas).discrepancies[:, 0] / epsilon
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     mean = weights @ thetas[:, 0]
@@ -134,7 +134,7 @@ def test_the_posterior_width_that_it_gives() -> None:
 
 def test_area_epsilon_is_about_0_28_of_the_noise_floor() -> None:
     optimum = area_fit()
-    evaluator = Evaluator.of(optimum.evaluator.model)
+    evaluator = Evaluator.of(optimum.model)
     floor = Information(evaluator, 0, optimum.theta).noise_floor
     # The floor is a mean over 200 data sets whose distances vary by 40%; the bisected coverage has
     # a standard error of 1.6%, hence epsilon one of about 4%: 5% together. Bounds from the studies:
@@ -186,7 +186,7 @@ def test_residual_epsilon_scales_with_the_metric() -> None:
     other = prb.minimize(build(PR, Line(10.0), 10 * OBSERVED, sd=0.5))
     factor = (
         node(other.model).target.scale_factor
-        / node(optimum.evaluator.model).target.scale_factor
+        / node(optimum.model).target.scale_factor
         / 10
     )  # of int (p - q)^2
     np.testing.assert_allclose(other.discrepancy, factor * optimum.discrepancy, rtol=1e-6)
@@ -221,7 +221,7 @@ def test_no_response_is_called_under_reweighted(metric: prb.Metric) -> None:
     calls, responses = response.calls, optimum.n_responses
     assert prb.calibrate_epsilon(optimum)["y"] > 0
     assert response.calls == calls
-    assert node(optimum.evaluator.model).bound.responses.count == responses
+    assert node(optimum.model).bound.responses.count == responses
 
 
 def test_deterministic() -> None:

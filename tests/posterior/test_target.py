@@ -82,7 +82,7 @@ def fitted(metric: Metric) -> prb.Optimum:
 @pytest.mark.parametrize("metric", [PR, KLD, pytest.param(AREA, marks=pytest.mark.long)])
 def test_both_samplers_draw_the_posterior_given_the_estimate(metric: Metric) -> None:
     optimum = fitted(metric)
-    settings = {"model": optimum.evaluator.model, "optimum": optimum, **QUIET}
+    settings = {"model": optimum.model, "optimum": optimum, **QUIET}
     by_importance = prb.sample(500, chains=2, **settings)
     by_smc = prb.sample_smc(500, chains=2, **settings)
     samplers = [tree.posterior.attrs["sampler"] for tree in (by_importance, by_smc)]

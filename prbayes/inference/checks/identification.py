@@ -13,9 +13,8 @@ from prbayes._validate import Floats
 from prbayes.inference.asymptotics import (
     Local,
     named_direction,
-    one_dimensional,
+    number_parts,
     unidentified_directions,
-    without,
 )
 from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.parameters import THETAS
@@ -30,7 +29,12 @@ def unidentified_findings(
     evaluator: Evaluator, local: Local, excluded: Collection[str] = ()
 ) -> list[Finding]:
     """Report directions that the data identify less than the prior, without excluded names."""
-    hidden = without(local.unidentified, only_through_prior(evaluator))
+    hidden = local.unidentified
+    indirect = only_through_prior(evaluator)
+    if indirect.any():
+        # One, or zero up to rounding for elements on which nothing depends.
+        axes, strength, _ = np.linalg.svd(hidden * ~indirect[:, None], full_matrices=False)
+        hidden = np.asarray(axes[:, strength > 0.5])
     directions = unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
     return [
         Finding(
@@ -250,7 +254,8 @@ def _populations_differ(evaluator: Evaluator, a: Floats, b: Floats) -> bool:
     largest = 0.0
     for k, node in enumerate(evaluator.nodes):
         values, weights = evaluator.populations(np.array([a, b]), k)
-        for projection in one_dimensional(node.target, values):
+        for part in number_parts(node.target):
+            projection = part.of(values)
             occurring = np.unique(projection[np.isfinite(projection)])
             below = distribution_function(projection, weights, occurring)
             largest = max(largest, float(np.abs(below[0] - below[1]).max(initial=0.0)))

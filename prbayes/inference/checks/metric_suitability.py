@@ -12,7 +12,7 @@ import numpy as np
 from prbayes._finding import Finding
 from prbayes._stats import quantile
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local, number_parts, one_dimensional
+from prbayes.inference.asymptotics import Local, number_parts
 from prbayes.inference.resampling import dependent
 from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
@@ -27,8 +27,8 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
         if node.metric.minimum is not Minimum.ABSOLUTE or not node.bound.stored:
             continue
         values, weights = evaluator.populations(theta[None], k)
-        projections = one_dimensional(node.target, values[0])
-        index = min(_tail_index(projection, weights[0]) for projection in projections)
+        parts = number_parts(node.target)
+        index = min(_tail_index(part.of(values[0]), weights[0]) for part in parts)
         # At 1024 quantiles of a half-Cauchy population 1.0, of Student's t with 1.5 degrees of
         # freedom 1.5, of a lognormal one with a spread of 2.5 1.1.
         if index < 1.1:
