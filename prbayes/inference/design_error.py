@@ -73,56 +73,48 @@ def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
 def _error_of_points(sampling: SamplingDistribution) -> Floats:
     """Return the error of the optimum by the design's points, (r,); NaN if not known.
 
-    The spread of the minima of blocks of the design, each a coarser design of the same kind, as if
-    they were independent, bounds the error of the whole. Points of large emulated samples fill
-    space better together. Points on a line, which cut it into parts of equal mass, are far better
-    than their parts: they count as exact.
+    The spread of the minima of blocks of the design, as if they were independent, bounds the error
+    of the whole. Points on a line, which cut it into parts of equal mass, count as exact.
     """
-    evaluator = sampling.evaluator
-    blocks = [
-        np.zeros_like(node.bound.blocks) if node.bound.is_line else node.bound.blocks
-        for node in evaluator.nodes
-    ]
-    if not any(block.any() for block in blocks):
+    evaluator, scales = sampling.evaluator, sampling.scales
+    bounds = evaluator.reweighted
+    is_on_line = all(n.bound.is_line or not n.bound.blocks.any() for n in evaluator.nodes)
+    if is_on_line:
         return np.full(sampling.stderr.size, np.nan)
     observed = observed_set(evaluator)
-    bounds = [node.reweighted for node in evaluator.nodes]
-    if all(bound is not None and bound.design.is_emulated for bound in bounds):
+    if all(
+        node.name in bounds and bounds[node.name].design.is_emulated for node in evaluator.nodes
+    ):
+        minima = []
+        descent = None
+        for b in range(N_BLOCKS):
+            parts = {
+                k: bound.copied(bound.design.rows(bound.blocks == b)) for k, bound in bounds.items()
+            }
+            nodes = tuple(replace(node, bound=parts[node.name]) for node in evaluator.nodes)
+            part = replace(evaluator, nodes=nodes, has_graph=False)
+            objective = BatchObjective.of(part, scales, observed)
+            descent = descent or descent_of(sampling, objective, is_rough=True)
+            minima.append(_minimum(sampling, objective, descent))
+        x = np.array(minima)
+        is_usable = np.isfinite(x).all(axis=1)
         # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
         # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
         rate = 0.5 + 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)
-        return np.asarray(_spread_of_parts(sampling, observed) / N_BLOCKS**rate)
-    # The observed responses against each block.
-    first = np.zeros(N_BLOCKS, dtype=int)
-    sets = DataSets(observed.values, [w[first] for w in observed.weights])
-    objective = BatchObjective.of(evaluator, sampling.scales, sets, blocks=blocks)
-    x, converged = minimise_sets(sampling, objective, descent_of(sampling, objective))
-    if converged.sum() < N_BLOCKS / 2:
+    else:
+        # The observed responses against each block.
+        blocks = [
+            np.zeros_like(node.bound.blocks) if node.bound.is_line else node.bound.blocks
+            for node in evaluator.nodes
+        ]
+        first = np.zeros(N_BLOCKS, dtype=int)
+        sets = DataSets(observed.values, [w[first] for w in observed.weights])
+        objective = BatchObjective.of(evaluator, scales, sets, blocks=blocks)
+        x, is_usable = minimise_sets(sampling, objective, descent_of(sampling, objective))
+        rate = 0.5
+    if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
-    return np.asarray(x[converged].std(axis=0, ddof=1) / N_BLOCKS**0.5)
-
-
-def _spread_of_parts(sampling: SamplingDistribution, observed: DataSets) -> Floats:
-    """Return the spread of the minima of an eighth of the points each, (r,)."""
-    evaluator = sampling.evaluator
-    bounds = evaluator.reweighted
-    minima = []
-    descent = None
-    for b in range(N_BLOCKS):
-        parts = {
-            k: bound.copied(bound.design.rows(bound.blocks == b)) for k, bound in bounds.items()
-        }
-        nodes = tuple(replace(node, bound=parts[node.name]) for node in evaluator.nodes)
-        part = replace(evaluator, nodes=nodes, has_graph=False)
-        objective = BatchObjective.of(part, sampling.scales, observed)
-        descent = descent or descent_of(sampling, objective, is_rough=True)
-        (minimum,), (is_converged,) = minimise_sets(sampling, objective, descent)
-        if is_converged and np.isfinite(minimum).all():
-            minima.append(minimum)
-    finite = np.array(minima)
-    if len(finite) < N_BLOCKS / 2:
-        return np.full(sampling.stderr.size, np.inf)
-    return np.asarray(finite.std(axis=0, ddof=1))
+    return np.asarray(x[is_usable].std(axis=0, ddof=1) / N_BLOCKS**rate)
 
 
 def _minimum(sampling: SamplingDistribution, objective: BatchObjective, descent: Descent) -> Floats:

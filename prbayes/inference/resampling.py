@@ -130,15 +130,8 @@ def _require_aligned(nodes: Sequence[Node]) -> None:
 def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
     """Draw data sets of the observed sizes from the populations at theta (parametric bootstrap).
 
-    Specimens without a response (NaN) cannot be observed, and failed ones (+inf) only if the metric
-    counts them. Of populations of more than 2^15 points that many, the first of a Sobol sequence,
-    are used. Repeated observations of one specimen within a simulator are equal, as in the model.
-
-    Raises
-    ------
-    ValueError
-        If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or
-        whose designs differ, so that the model does not define the dependence of their responses.
+    Repeated observations of one specimen within a simulator are equal, as in the model. Raises
+    ValueError if simulators share specimens, but not their ``.dist()`` objects and designs.
     """
     populations = [
         thinned(*evaluator.populations(theta[None], k), node)
@@ -153,6 +146,18 @@ def stored_populations(evaluator: Evaluator, thetas: Floats) -> list[_Population
     return [(evaluator.populations(thetas[:1], k)[0], np.empty(0)) for k in nodes]
 
 
+def _observable_by_group(
+    nodes: Sequence[Node], populations: list[_Population]
+) -> list[tuple[list[int], NDArray[np.bool_]]]:
+    """Return groups that share specimens, with the points that all of a group can observe, (n,)."""
+    pairs = []
+    for group in groups(nodes):
+        _require_aligned([nodes[k] for k in group])
+        columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
+        pairs.append((group, np.asarray(np.all(columns, axis=0))))
+    return pairs
+
+
 def points_along(
     evaluator: Evaluator, thetas: Floats, rng: np.random.Generator
 ) -> list[NDArray[np.intp]]:
@@ -161,9 +166,7 @@ def points_along(
     size = (len(thetas), specimens(nodes)[1])
     populations = stored_populations(evaluator, thetas)
     points: dict[int, NDArray[np.intp]] = {}
-    for group in groups(nodes):
-        _require_aligned([nodes[k] for k in group])
-        is_observable = _observable_together(nodes, populations, group)
+    for group, is_observable in _observable_by_group(nodes, populations):
         uniform = rng.random(size)
         drawn = np.empty(size, dtype=np.intp)
         at_once = max(1, AT_ONCE // is_observable.size)
@@ -191,10 +194,8 @@ def simulated_points(
     rng = np.random.default_rng([seed, 1])
     size = (n_sets, specimens(nodes)[1] + more)
     points: dict[int, NDArray[np.intp]] = {}
-    for group in groups(nodes):
-        _require_aligned([nodes[k] for k in group])
+    for group, is_observable in _observable_by_group(nodes, populations):
         # Simulators that share specimens have the same points, with the same weights.
-        is_observable = _observable_together(nodes, populations, group)
         mass = np.where(is_observable, populations[group[0]][1][0], 0.0)
         probability = mass / mass.sum()
         points |= dict.fromkeys(group, rng.choice(probability.size, size=size, p=probability))
@@ -223,18 +224,13 @@ def sets_at(
                 pairs, places = np.unique(cells + size * row.ravel(), return_inverse=True)
                 cells = places.reshape(cells.shape)
                 occurring = np.where(patterns[pairs // size], occurring[pairs % size], np.nan)
+        # The observations' weights, added up by value; all data sets in one row.
+        n_sets, size = len(cells), len(occurring)
+        stacked = cells + (size * np.arange(n_sets))[:, None]
+        summed = np.bincount(stacked.ravel(), np.tile(node.target.weights, n_sets), n_sets * size)
         values.append(occurring)
-        weights.append(_summed_weights(cells, node.target.weights, len(occurring)))
+        weights.append(np.asarray(summed.reshape(n_sets, size)))
     return DataSets(values, weights)
-
-
-def _summed_weights(cells: NDArray[np.intp], weights: Floats, size: int) -> Floats:
-    """Add up the observations' weights at the cells drawn, (n_sets, n) -> (n_sets, size)."""
-    n_sets = len(cells)
-    # All data sets in one row, one after the other.
-    stacked = cells + (size * np.arange(n_sets))[:, None]
-    count = np.bincount(stacked.ravel(), np.tile(weights, n_sets), n_sets * size)
-    return np.asarray(count.reshape(n_sets, size))
 
 
 def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
@@ -244,14 +240,6 @@ def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
     """
     is_known = ~np.isnan(responses) if target.metric.counts_failures else np.isfinite(responses)
     return is_known if is_known.ndim == 1 else is_known.all(axis=1)
-
-
-def _observable_together(
-    nodes: Sequence[Node], populations: list[_Population], group: list[int]
-) -> NDArray[np.bool_]:
-    """Return which points can be observed by all simulators of a group, (n,)."""
-    columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
-    return np.asarray(np.all(columns, axis=0))
 
 
 def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:

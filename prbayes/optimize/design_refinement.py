@@ -29,6 +29,7 @@ from prbayes.optimize.convergence import (
 )
 from prbayes.optimize.objective import Ridge
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import designs_restored
 
 _log = logging.getLogger("prbayes")
@@ -390,13 +391,34 @@ def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[No
         yield
 
 
-# -- noise and refusals ---------------------------------------------------------------
+# -- noise, findings and refusals ---------------------------------------------------------------
 
 
 def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
     """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
     nodes = range(len(evaluator.nodes))
     return np.array([Information(evaluator, k, theta, n_sets=n_sets).noise_floor for k in nodes])
+
+
+def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
+    """Report a large error of the optimum by the design, in standard errors."""
+    # An estimate from eight blocks is itself uncertain by a quarter.
+    if not error > 1.5 * AGREE:
+        return []
+    designs = [bound.design for bound in evaluator.reweighted.values()]
+    runs = max(design.n_runs for design in designs)
+    advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
+    if min(len(design.emulated or ()) for design in designs) >= SIZES.largest:
+        advice = (
+            f"between its {runs} runs are {SIZES.largest} emulated points, the most there are: "
+            "more runs help as far as the emulator is off, which the message says, and the rest "
+            "counts as another error of the optimum"
+        )
+    text = (
+        f"The optimum of another design would differ by about {error:.2f} standard errors, "
+        f"expected at most {AGREE}; {advice}."
+    )
+    return [Finding("design-error", text, "choose.md#how-many-responses")]
 
 
 def refuse(

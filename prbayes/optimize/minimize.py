@@ -50,8 +50,8 @@ from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.convergence import Fit, Result, Search, Trace, approach, minimise, settle
 from prbayes.optimize.design_refinement import (
-    AGREE,
     MAX_ROUNDS,
+    design_error_findings,
     noise_floors,
     refine_at,
     refine_designs,
@@ -63,7 +63,6 @@ from prbayes.optimize.local_optima import LocalOptimum, find_local_optima
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
 from prbayes.optimize.objective import Method, Minimisation, Ridge, initial_scales
 from prbayes.optimize.optimum import Optimum, SearchRecord, n_computed, optimum_of
-from prbayes.propagation.importance import SIZES
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -141,11 +140,7 @@ def refine(
             )
         if not np.isfinite(thetas).all():
             raise ValueError("thetas: got NaN or infinite values, expected finite ones")
-    with (
-        shown(progressbar),
-        explained(model, "prb.refine"),
-        limited(max_seconds, max_runs),
-    ):
+    with shown(progressbar), explained(model, "prb.refine"), limited(max_seconds, max_runs):
         evaluator = Evaluator.of(model)
         if thetas is None:
             require_finished(find_optimum(evaluator, Minimisation()))
@@ -270,11 +265,7 @@ def minimize(
         starts=starts,
         random_seed=seed_number(random_seed),
     )
-    with (
-        shown(progressbar),
-        explained(model, "prb.minimize"),
-        limited(max_seconds, max_runs),
-    ):
+    with shown(progressbar), explained(model, "prb.minimize"), limited(max_seconds, max_runs):
         return find_optimum(Evaluator.of(model), settings)
 
 
@@ -325,9 +316,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
                 "At the start hardly any simulated response was near the data: the area metric "
                 f"led from there, in {trace.count} evaluations."
             )
-        record = SearchRecord(
-            Result.STOPPED, details, settings.prior, n_screened=n_screened
-        )  # until the minimisation has ended
+        record = SearchRecord(Result.STOPPED, details, settings.prior, n_screened=n_screened)
         problem = _Problem(search, settings, advance, n_previous, record)
         try:
             fit, optima = _optimise(problem, theta, scales, trace)
@@ -487,27 +476,19 @@ def _report(
         details += _details(search, fit, at_edge)
     record = replace(
         problem.record,
-        result=fit.result,
         details=" ".join(sentence for sentence in details if sentence),
-        n_evaluations=fit.trace.count,
-        trace={
-            "theta": np.array(fit.trace.thetas).reshape(-1, fit.theta.size),
-            "discrepancy": np.array(fit.trace.values),
-            "evaluations": np.array(fit.trace.counts, dtype=np.int64),
-        },
         stopped=stopped,
         at_edge=at_edge,
         at_jump=at_jump,
     )
     optimum = optimum_of(search, fit, record, problem.n_previous)
     if stopped:
-        finding = Finding(
-            "budget-spent",
+        text = (
             f"{stopped} before the minimisation was finished, so that this is no answer yet; "
             f"{kept(evaluator.model)}; call prb.minimize with a larger budget, on a model that is "
-            "built again, to go on.",
-            "expensive.md#a-night-is-not-enough",
+            "built again, to go on."
         )
+        finding = Finding("budget-spent", text, "expensive.md#a-night-is-not-enough")
         return replace(optimum, findings=report(finding))
     support = optimum.search.support
     refuse_lost(evaluator, {name: numbers["lost_mass"] for name, numbers in support.items()})
@@ -529,16 +510,12 @@ def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
     """Return sentences about edges, designs and directions that are not identified."""
     evaluator = search.evaluator
     sentences = [f"{', '.join(at_edge)} ran to the edge of the support."] if at_edge else []
-    designs = [
-        bound.design.summary(name)
-        for name, bound in evaluator.reweighted.items()
-        if bound.design.is_emulated
-    ]
-    sentences += designs
-    if designs and np.isfinite(fit.design_error):
-        sentences.append(
-            f"Another design's optimum would differ by {fit.design_error:.2g} standard errors."
-        )
+    designs = {name: bound.design for name, bound in evaluator.reweighted.items()}
+    emulated = [design.summary(name) for name, design in designs.items() if design.is_emulated]
+    if emulated and np.isfinite(fit.design_error):
+        error = f"{fit.design_error:.2g} standard errors"
+        emulated.append(f"Another design's optimum would differ by {error}.")
+    sentences += emulated
     if fit.ridge is not None:
         sentences.append(
             "Directions that the data do not identify were regularised; their values are arbitrary."
@@ -564,24 +541,7 @@ def optimum_findings(
     findings = [
         Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
     ]
-    # An estimate from eight blocks is itself uncertain by a quarter.
-    if design_error > 1.5 * AGREE:
-        designs = [bound.design for bound in evaluator.reweighted.values()]
-        runs = max(design.n_runs for design in designs)
-        advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
-        if min(len(design.emulated or ()) for design in designs) >= SIZES.largest:
-            advice = (
-                f"between its {runs} runs are {SIZES.largest} emulated points, the most there are: "
-                "more runs help as far as the emulator is off, which the message says, and the "
-                "rest counts as another error of the optimum"
-            )
-        finding = Finding(
-            "design-error",
-            f"The optimum of another design would differ by about {design_error:.2f} standard "
-            f"errors, expected at most {AGREE}; {advice}.",
-            "choose.md#how-many-responses",
-        )
-        findings.append(finding)
+    findings += design_error_findings(evaluator, design_error)
     findings += [other.finding(evaluator) for other in optima if other.comparable]
     if sampling is not None:
         ends = prior_ends(sampling)

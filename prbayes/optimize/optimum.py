@@ -389,7 +389,18 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         discrepancies=dict(zip(names, map(float, values), strict=True)),
         scales=dict(zip(names, map(float, scales), strict=True)),
         n_responses=n_responses,
-        search=replace(record, result=result, support=support, identity=identity),
+        search=replace(
+            record,
+            result=result,
+            n_evaluations=fit.trace.count,
+            trace={
+                "theta": np.array(fit.trace.thetas).reshape(-1, theta.size),
+                "discrepancy": np.array(fit.trace.values),
+                "evaluations": np.array(fit.trace.counts, dtype=np.int64),
+            },
+            support=support,
+            identity=identity,
+        ),
     )
 
 
