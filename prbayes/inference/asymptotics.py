@@ -31,21 +31,8 @@ from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
-
-@dataclass(frozen=True)
-class AsymptoticsOptions:
-    """Steps of differences in prior standard deviations, and limits."""
-
-    narrow_step: float = 1e-3  # for densities, which are twice differentiable
-    wide_step: float = 0.05  # for step functions: distribution functions, jumps, moving supports
-    # Largest distance between distribution functions that a step makes: .6 sd of a normal
-    # population, over which differences are right to a few per cent.
-    largest_move: float = 0.24
-    # Share of an element in unidentified directions above which it is not identified.
-    largest_loading: float = 0.02
-
-
-_OPTIONS = AsymptoticsOptions()
+# Share of an element in unidentified directions above which it is not identified.
+_LARGEST_LOADING = 0.02
 # Avoids division by zero.
 _TINY = np.finfo(float).tiny
 
@@ -90,15 +77,31 @@ def _stencil_around(
 
     ``share`` is the nominal step in prior standard deviations.
     """
-    node, largest = evaluator.nodes[k], _OPTIONS.largest_move
+    node, d = evaluator.nodes[k], theta.size
+    across = slice(1 + 2 * d)  # theta and its neighbours along each element
     step = share * evaluator.hyperparameters.prior_sd
+    # Largest distance between distribution functions that a step makes: .6 sd of a normal
+    # population, over which differences are right to a few per cent.
+    largest = 0.24
     stencils = []
     for _ in range(9):  # each up to ten times shorter: to 1e-11 of the prior's spread
-        values, weights = evaluator.populations(theta + stencil(step.size) * step, k)
+        values, weights = evaluator.populations(theta + stencil(d) * step, k)
         is_equal = np.array_equal(values[0], values[-1], equal_nan=True)
         around = Stencil(step, is_wide, values, weights, node.bound.blocks, is_equal)
         stencils.append(around)
-        moves = _largest_moves(around, node.target)
+        moves = np.zeros(d)  # of a distribution function over a step, by element
+        for part in number_parts(node.target):
+            projection = part.of(values[:1] if is_equal else values)
+            is_usable = np.isfinite(projection[0]) & (weights[0] > 0)
+            if not is_usable.any():
+                continue
+            mass = weights[0][is_usable]
+            mass = mass / mass.sum()
+            knots = quantile(projection[0][is_usable], mass, np.linspace(0.05, 0.95, 19))
+            simulated = projection[0] if is_equal else projection[across]
+            below = distribution_function(simulated, weights[across], knots)
+            gaps = np.nan_to_num(np.abs(below[1:] - below[0]).max(axis=-1))
+            moves = np.maximum(moves, gaps.reshape(2, d).max(axis=0))
         if moves.max(initial=0.0) <= largest:
             return around
         # Populations that do not overlap give no estimate of the factor.
@@ -106,27 +109,6 @@ def _stencil_around(
         step = np.where(moves > largest, factor, 1.0) * step
     # A population that is one number overlaps with no other.
     return stencils[0]
-
-
-def _largest_moves(around: Stencil, target: Discrepancy) -> Floats:
-    """Return the largest change of a distribution function over a step, by element, (d,)."""
-    d = around.step.size
-    across = slice(1 + 2 * d)  # theta and its neighbours along each element
-    values = around.values[:1] if around.has_equal_values else around.values
-    moves = [np.zeros(d)]
-    for part in number_parts(target):
-        projection = part.of(values)
-        is_usable = np.isfinite(projection[0]) & (around.weights[0] > 0)
-        if not is_usable.any():
-            continue
-        mass = around.weights[0][is_usable]
-        mass = mass / mass.sum()
-        knots = quantile(projection[0][is_usable], mass, np.linspace(0.05, 0.95, 19))
-        simulated = projection[0] if len(projection) == 1 else projection[across]
-        below = distribution_function(simulated, around.weights[across], knots)
-        gaps = np.abs(below[1:] - below[0]).max(axis=-1)
-        moves.append(np.nan_to_num(gaps).reshape(2, d).max(axis=0))
-    return np.asarray(np.max(moves, axis=0))
 
 
 # -- H and J ---------------------------------------------------------------------------------------
@@ -159,16 +141,15 @@ class Information:
         # A moving edge of a support passes several points within a wide step.
         is_smooth = not bound.support_moves if bound.stored else is_differentiable(target)
         if is_smooth:
-            narrow = _stencil_around(
-                self.evaluator, self.k, self.theta, _OPTIONS.narrow_step, is_wide=False
-            )
+            narrow = _stencil_around(self.evaluator, self.k, self.theta, 1e-3, is_wide=False)
             # Of several outputs a failed one is at the end of its scale, and does not jump.
             is_known = ~np.isnan(narrow.values) if target.event else np.isfinite(narrow.values)
             # Unless a point gains or loses its response within the step.
             if bound.stored or (is_known == is_known[0]).all():
                 return narrow
-        wide = self.widened * _OPTIONS.wide_step
-        return _stencil_around(self.evaluator, self.k, self.theta, wide, is_wide=True)
+        # For step functions: distribution functions, jumps, moving supports.
+        share = 0.05 * self.widened
+        return _stencil_around(self.evaluator, self.k, self.theta, share, is_wide=True)
 
     @cached_property
     def data_sets(self) -> DataSets:
@@ -176,31 +157,27 @@ class Information:
         return simulated_sets(self.evaluator, self.theta, self.n_sets)
 
     @cached_property
-    def center(self) -> tuple[Floats, Floats]:
-        """The population at theta that can be observed, with weights that sum to one."""
-        values = self.stencil.values[0]
-        is_observable = observable(values, self.node.target)
-        mass = self.stencil.weights[0][is_observable]
-        return values[is_observable], mass / mass.sum()
-
-    @cached_property
-    def _features(self) -> Any:
-        """Features at the stencil; they do not depend on the observed side."""
+    def _sides(self) -> tuple[Any, Floats, Floats]:
+        """Features at the stencil, and the values and weights at theta that can be observed."""
         around, target = self.stencil, self.node.target
         has_densities = [isinstance(part.target, DensityDiscrepancy) for part in target.parts]
         if around.has_equal_values and len(has_densities) > 1 and all(has_densities):
             # Cells are filled once for all points, and not for each.
-            return target.basis(around.values[0]).features(around.weights)
-        return target.features(around.values, around.weights, np)
+            features = target.basis(around.values[0]).features(around.weights)
+        else:
+            features = target.features(around.values, around.weights, np)
+        is_observable = observable(around.values[0], target)
+        mass = around.weights[0][is_observable]
+        return features, around.values[0][is_observable], mass / mass.sum()
 
     def discrepancies(
         self, observed: Floats, weights: Floats, points: slice = slice(None)
     ) -> Floats:
         """Return discrepancies at points of the stencil, (s,) or (n_sets, s)."""
-        features = [feature[points] for feature in self._features]
+        features = [feature[points] for feature in self._sides[0]]
         target = self.node.target.with_observed(observed, weights)
         n_sets = len(weights) if weights.ndim > 1 else 1
-        at_once = max(1, AT_ONCE // sum(feature.size for feature in features))
+        at_once = max(1, AT_ONCE // sum(map(np.size, features)))
         if n_sets <= at_once:
             return np.atleast_1d(target.outer(*features, xp=np))
         starts = range(0, n_sets, at_once)
@@ -245,7 +222,7 @@ class Information:
         # at equal steps of probability. Of several outputs half of them are drawn in proportion to
         # the fourth power of their distance from the middle, as most of the mean square of
         # gradients is theirs.
-        values, weights = self.center
+        _, values, weights = self._sides
         order = np.argsort(values.reshape(len(values), -1)[:, 0])
         n, mass = 1000, weights
         if values.ndim > 1:
@@ -266,7 +243,7 @@ class Information:
     def hessian(self) -> Floats:
         """H: the Hessian of the discrepancy against the population at theta, shape (d, d)."""
         step = self.stencil.step
-        differences = hessian_of(self.discrepancies(*self.center), step.size)
+        differences = hessian_of(self.discrepancies(*self._sides[1:]), step.size)
         return differences / np.outer(step, step)
 
     def areas(self, sets: DataSets, subset: NDArray[np.bool_] | None = None) -> list[LinearArea]:
@@ -417,7 +394,7 @@ class Local:
         """The covariance in theta, (d, d), infinite for elements with a share not identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
         covariance = self.identified @ self.covariance @ self.identified.T * unit
-        is_hidden = (self.unidentified**2).sum(axis=1) > _OPTIONS.largest_loading
+        is_hidden = (self.unidentified**2).sum(axis=1) > _LARGEST_LOADING
         covariance[is_hidden] = np.inf
         covariance[:, is_hidden] = np.inf
         return np.asarray(covariance)
@@ -432,7 +409,7 @@ class Local:
         along = unit @ self.identified
         across = unit @ self.unidentified
         variance = np.einsum("...i,ij,...j->...", along, self.covariance, along)
-        is_hidden = (across**2).sum(axis=-1) > _OPTIONS.largest_loading * (unit**2).sum(axis=-1)
+        is_hidden = (across**2).sum(axis=-1) > _LARGEST_LOADING * (unit**2).sum(axis=-1)
         return np.asarray(np.where(is_hidden, np.inf, np.maximum(variance, 0)))
 
 
@@ -446,18 +423,20 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
         return _area_covariance(information, scales, weakest)
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
-    pairs = list(zip(information, scales, strict=True))
-    hessian = unit * sum(item.hessian / scale for item, scale in pairs)
-    if dependent(information[0].evaluator.nodes):
+    is_dependent = dependent(information[0].evaluator.nodes)
+    hessian, noise, gradients = (np.zeros(()) for _ in range(3))
+    for item, scale in zip(information, scales, strict=True):
+        hessian = hessian + item.hessian / scale
+        if is_dependent:
+            sets = information[0].data_sets
+            observed, weights = sets.values[item.k], sets.weights[item.k]
+            gradients = gradients + item.gradients(observed, weights) / scale
+        else:
+            noise = noise + item.sampling_covariance / scale**2
+    if is_dependent:
         # Gradients of simulators that share specimens depend on each other.
-        sets = information[0].data_sets
-        gradients: Any = sum(
-            item.gradients(sets.values[item.k], sets.weights[item.k]) / scale
-            for item, scale in pairs
-        )
-        noise = unit * np.atleast_2d(np.cov(gradients, rowvar=False))
-    else:
-        noise = unit * sum(item.sampling_covariance / scale**2 for item, scale in pairs)
+        noise = np.atleast_2d(np.cov(gradients, rowvar=False))
+    hessian, noise = unit * hessian, unit * noise
     values, vectors, is_identified = identified_by_curvature(hessian, noise, weakest)
     identified = vectors[:, is_identified]
     inverse = identified / values[is_identified]

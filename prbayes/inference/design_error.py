@@ -35,12 +35,16 @@ class DesignErrors:
 
 def design_error(sampling: SamplingDistribution) -> DesignErrors:
     """Return the distance to the optimum of another design along the worst axis."""
-    if not is_stored(sampling.evaluator):
-        return DesignErrors(np.nan, np.nan)
-    # Two designs differ by the root of two of one's error.
-    points = np.sqrt(2) * _error_of_points(sampling).max(initial=0.0)
-    emulators = np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0)
-    return DesignErrors(float(points), float(emulators))
+    points = emulators = np.nan
+    if is_stored(sampling.evaluator):
+        bounds = [node.bound for node in sampling.evaluator.nodes]
+        # Two designs differ by the root of two of one's error. Points on a line, which cut it into
+        # parts of equal mass, count as exact.
+        if [bound for bound in bounds if bound.blocks.any() and not bound.is_line]:
+            points = float(np.sqrt(2) * _error_of_points(sampling).max(initial=0.0))
+        if [d for d in sampling.evaluator.reweighted.values() if d.design.is_emulated]:
+            emulators = float(np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0))
+    return DesignErrors(points, emulators)
 
 
 def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
@@ -71,16 +75,12 @@ def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
 
 
 def _error_of_points(sampling: SamplingDistribution) -> Floats:
-    """Return the error of the optimum by the design's points, (r,); NaN if not known.
+    """Return the error of the optimum by the design's points, (r,).
 
-    The spread of the minima of blocks of the design, as if they were independent, bounds the error
-    of the whole. Points on a line, which cut it into parts of equal mass, count as exact.
+    The spread of the minima of blocks of the design, as if they were independent, bounds it.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
     bounds = evaluator.reweighted
-    is_on_line = all(n.bound.is_line or not n.bound.blocks.any() for n in evaluator.nodes)
-    if is_on_line:
-        return np.full(sampling.stderr.size, np.nan)
     observed = observed_set(evaluator)
     if all(
         node.name in bounds and bounds[node.name].design.is_emulated for node in evaluator.nodes

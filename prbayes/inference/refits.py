@@ -518,4 +518,4 @@ def refit_obstacle(evaluator: Evaluator) -> str | None:
 
 def needs_refits(evaluator: Evaluator) -> bool:
     """Return whether a metric declares nothing of its minimum, so that refits measure it."""
-    return any(node.metric.minimum is Minimum.UNKNOWN for node in evaluator.nodes)
+    return Minimum.UNKNOWN in [node.metric.minimum for node in evaluator.nodes]

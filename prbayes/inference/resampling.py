@@ -63,7 +63,7 @@ def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[NDArray[np.int
 def dependent(nodes: Sequence[Node]) -> bool:
     """Return whether a specimen has several observations."""
     numbers, total = specimens(nodes)
-    return total < sum(n.size for n in numbers)
+    return total < np.concatenate(numbers).size
 
 
 def groups(nodes: Sequence[Node]) -> list[list[int]]:
@@ -79,7 +79,7 @@ def groups(nodes: Sequence[Node]) -> list[list[int]]:
             else:
                 members, shared = members + group, shared | group_labels
         joined = [*separate, (sorted(members), shared)]
-    return sorted(members for members, _ in joined)
+    return sorted([members for members, _ in joined])
 
 
 def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
@@ -114,14 +114,19 @@ def aligned(nodes: Sequence[Node]) -> bool:
     )
 
 
-def _require_aligned(nodes: Sequence[Node]) -> None:
-    if not aligned(nodes):
-        names = ", ".join(n.name for n in nodes)
-        raise ValueError(
-            f"specimens: got the same labels in {names} with different inputs or designs, "
-            "expected the same .dist() objects, n and seed in all; then the model says how "
-            "responses of one specimen depend on each other"
-        )
+def _aligned_groups(nodes: Sequence[Node]) -> list[list[int]]:
+    """Return groups that share specimens, or raise if the model does not define how they depend."""
+    result = groups(nodes)
+    for group in result:
+        members = [nodes[k] for k in group]
+        if not aligned(members):
+            names = ", ".join([node.name for node in members])
+            raise ValueError(
+                f"specimens: got the same labels in {names} with different inputs or designs, "
+                "expected the same .dist() objects, n and seed in all; then the model says how "
+                "responses of one specimen depend on each other"
+            )
+    return result
 
 
 # -- parametric bootstrap --------------------------------------------------------------------------
@@ -146,18 +151,6 @@ def stored_populations(evaluator: Evaluator, thetas: Floats) -> list[_Population
     return [(evaluator.populations(thetas[:1], k)[0], np.empty(0)) for k in nodes]
 
 
-def _observable_by_group(
-    nodes: Sequence[Node], populations: list[_Population]
-) -> list[tuple[list[int], NDArray[np.bool_]]]:
-    """Return groups that share specimens, with the points that all of a group can observe, (n,)."""
-    pairs = []
-    for group in groups(nodes):
-        _require_aligned([nodes[k] for k in group])
-        columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
-        pairs.append((group, np.asarray(np.all(columns, axis=0))))
-    return pairs
-
-
 def points_along(
     evaluator: Evaluator, thetas: Floats, rng: np.random.Generator
 ) -> list[NDArray[np.intp]]:
@@ -166,7 +159,9 @@ def points_along(
     size = (len(thetas), specimens(nodes)[1])
     populations = stored_populations(evaluator, thetas)
     points: dict[int, NDArray[np.intp]] = {}
-    for group, is_observable in _observable_by_group(nodes, populations):
+    for group in _aligned_groups(nodes):
+        columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
+        is_observable = np.asarray(np.all(columns, axis=0))
         uniform = rng.random(size)
         drawn = np.empty(size, dtype=np.intp)
         at_once = max(1, AT_ONCE // is_observable.size)
@@ -194,7 +189,9 @@ def simulated_points(
     rng = np.random.default_rng([seed, 1])
     size = (n_sets, specimens(nodes)[1] + more)
     points: dict[int, NDArray[np.intp]] = {}
-    for group, is_observable in _observable_by_group(nodes, populations):
+    for group in _aligned_groups(nodes):
+        columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
+        is_observable = np.asarray(np.all(columns, axis=0))
         # Simulators that share specimens have the same points, with the same weights.
         mass = np.where(is_observable, populations[group[0]][1][0], 0.0)
         probability = mass / mass.sum()
@@ -257,11 +254,10 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
     """
     nodes = evaluator.nodes
     numbers, total = specimens(nodes)
-    node_groups = groups(nodes)
+    node_groups = _aligned_groups(nodes)
     data = {}
     for group, generator in zip(node_groups, rng.spawn(len(node_groups)), strict=True):
         members = [nodes[k] for k in group]
-        _require_aligned(members)
         columns = []
         for k, node in zip(group, members, strict=True):
             sampler = PopulationSampler(node.bound.inputs)

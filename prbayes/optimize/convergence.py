@@ -16,7 +16,7 @@ from pytensor.gradient import NullTypeGradError
 
 from prbayes._progress import progress
 from prbayes._validate import Floats
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import overlap
@@ -75,7 +75,7 @@ class Trace:
         return Trace(
             thetas=self.thetas + tuple(objective.thetas),
             values=self.values + tuple(objective.values),
-            counts=self.counts + tuple(self.count + c for c in objective.counts),
+            counts=(*self.counts, *[self.count + c for c in objective.counts]),
             count=self.count + objective.count,
         )
 
@@ -129,14 +129,14 @@ class Search:
                 "which then needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
                 "propagation=prb.Reweighted() or prb.Resimulated()"
             )
-        has_kinks = any(node.metric.minimum is Minimum.ABSOLUTE for node in nodes)
+        has_kinks = Minimum.ABSOLUTE in [node.metric.minimum for node in nodes]
         object.__setattr__(self, "uses_gradient", self.method.gradient and not random)
         object.__setattr__(self, "has_kinks", has_kinks)
 
     def size(self, theta: Floats, scales: Floats) -> float:
         """Return a typical size of the objective; for a user's metric its value at theta."""
         nodes = self.evaluator.nodes
-        if not any(n.metric.minimum is Minimum.UNKNOWN for n in nodes):
+        if Minimum.UNKNOWN not in [node.metric.minimum for node in nodes]:
             sizes = [n.target.scale / scale for n, scale in zip(nodes, scales, strict=True)]
             return float(sum(sizes))
         (total,) = self.evaluator.total(theta[None], scales)
@@ -290,8 +290,9 @@ def _loses_responses(search: Search, theta: Floats) -> bool:
     nodes = search.evaluator.nodes
     if not all(n.metric.minimum is Minimum.QUADRATIC for n in nodes):
         return False
-    nearby = _populations(search.evaluator, cross(theta, _STEP * search.prior_sd))
-    for node, (values, _) in zip(nodes, nearby, strict=True):
+    nearby = cross(theta, _STEP * search.prior_sd)
+    for k, node in enumerate(nodes):
+        values, _ = search.evaluator.populations(nearby, k)
         is_lost = np.isnan(values) if node.target.event else ~np.isfinite(values)
         if (is_lost != is_lost[0]).any():
             return True
@@ -394,13 +395,13 @@ def approach(
     response. Returns theta itself where there is overlap.
     """
     evaluator = search.evaluator
-    if any(n.bound.random for n in evaluator.nodes):
+    if [node for node in evaluator.nodes if node.bound.random]:
         return theta, trace
     # A weight effective sample size below two: the design does not reach the population at all.
-    support = evaluator.support(theta[None]).values()
-    if not any(s["weight_ess"][0] < 2.0 for s in support):
-        (overlap_at_start,) = smallest_overlap(evaluator, _populations(evaluator, theta[None]))
-        if overlap_at_start > least:
+    ess = [s["weight_ess"][0] for s in evaluator.support(theta[None]).values()]
+    if not [n for n in ess if n < 2.0]:
+        _, overlaps = overlapping_populations(evaluator, theta[None])
+        if overlaps.min() > least:
             return theta, trace
     guide = AreaGuide(evaluator, scales)
     if not evaluator.responses_per_theta:
@@ -449,20 +450,19 @@ class AreaGuide:
 
     def __call__(self, thetas: Floats) -> Floats:
         """Return the sum of the areas; thetas (P, d) -> (P,)."""
-        populations = _populations(self.evaluator, thetas)
+        populations, overlaps = overlapping_populations(self.evaluator, thetas)
         areas = [
             area.of(*population) / area.scale
             for area, population in zip(self.areas, populations, strict=True)
         ]
         in_support = self.evaluator.hyperparameters.in_support(thetas)
         total = np.where(in_support, np.sum(areas, axis=0), np.inf)
-        overlaps = smallest_overlap(self.evaluator, populations)
         objective = np.zeros(len(thetas))
         for node, scale, population in zip(
             self.evaluator.nodes, self.scales, populations, strict=True
         ):
             objective = objective + node.target.of(*population) / scale
-        for theta, *numbers in zip(thetas, overlaps, objective, strict=True):
+        for theta, *numbers in zip(thetas, overlaps.min(axis=0), objective, strict=True):
             self.records[theta.tobytes()] = (numbers[0], numbers[1])
         return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
 
@@ -480,13 +480,13 @@ def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
     return np.asarray(thetas[np.argmin(values)])
 
 
-def smallest_overlap(evaluator: Evaluator, populations: list[tuple[Floats, Floats]]) -> Floats:
-    """Return the smallest overlap over simulators with densities, (P,); one where there is none."""
-    overlaps = [
-        overlap(node.target, *population)
-        for node, population in zip(evaluator.nodes, populations, strict=True)
-    ]
-    return np.min([np.ones(len(populations[0][1])), *overlaps], axis=0)
+def overlapping_populations(
+    evaluator: Evaluator, thetas: Floats
+) -> tuple[list[tuple[Floats, Floats]], Floats]:
+    """Return responses and weights by simulator, and their overlaps with the data, (K, P)."""
+    populations = [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]
+    pairs = zip(evaluator.nodes, populations, strict=True)
+    return populations, np.array([overlap(node.target, *population) for node, population in pairs])
 
 
 def apart_from_data(evaluator: Evaluator, theta: Floats, least: float = OVERLAP) -> bool:
@@ -495,12 +495,7 @@ def apart_from_data(evaluator: Evaluator, theta: Floats, least: float = OVERLAP)
     Their densities then overlap by less than ``least``. False if this would compute responses, or
     a metric compares no densities.
     """
-    if not all(node.bound.stored for node in evaluator.nodes):
+    if not is_stored(evaluator):
         return False
-    pairs = zip(evaluator.nodes, _populations(evaluator, theta[None]), strict=True)
-    return all(overlap(node.target, *population)[0] < least for node, population in pairs)
-
-
-def _populations(evaluator: Evaluator, thetas: Floats) -> list[tuple[Floats, Floats]]:
-    """Return responses and weights, (P, n) each, by simulator."""
-    return [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]
+    _, overlaps = overlapping_populations(evaluator, theta[None])
+    return bool((overlaps < least).all())

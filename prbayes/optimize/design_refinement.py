@@ -191,6 +191,8 @@ def refine_at(
     too many points have no response.
     """
     short = shortcomings(evaluator, thetas)
+    if not short:
+        return short
     for name, shortcoming in short.items():
         if shortcoming.lost is not None:
             raise DesignError(

@@ -126,9 +126,12 @@ class Reference:
         optima = [(self.theta, lowest)]
         for i in np.argsort(values):
             value = float(values[i])
-            if np.isfinite(value) and all(
-                has_barrier(self, ends[i], value, *optimum) for optimum in optima
-            ):
+            if not np.isfinite(value):
+                continue
+            for theta, better in optima:
+                if not has_barrier(self, ends[i], value, theta, better):
+                    break
+            else:
                 optima.append((ends[i], value))
         return [
             LocalOptimum(

@@ -476,7 +476,7 @@ def _report(
         details += _details(search, fit, at_edge)
     record = replace(
         problem.record,
-        details=" ".join(sentence for sentence in details if sentence),
+        details=" ".join(filter(None, details)),
         stopped=stopped,
         at_edge=at_edge,
         at_jump=at_jump,

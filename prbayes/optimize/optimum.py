@@ -406,8 +406,9 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
 
 def n_computed(evaluator: Evaluator) -> int:
     """Return the number of responses computed for a model, without those found in a store."""
-    by_metric = sum(node.bound.responses.computed for node in evaluator.nodes)
-    return by_metric + sum(m.responses.computed for m in evaluator.measurements)
+    responses = [node.bound.responses for node in evaluator.nodes]
+    responses += [measurement.responses for measurement in evaluator.measurements]
+    return sum([r.computed for r in responses])
 
 
 def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:
