@@ -16,10 +16,8 @@ from prbayes.inference.asymptotics import (
     identified_by_curvature,
     local_sampling,
     number_parts,
-    one_dimensional,
     oriented,
     unidentified_directions,
-    without,
 )
 from prbayes.inference.resampling import DataSets
 from prbayes.model.evaluator import Evaluator
@@ -54,12 +52,6 @@ def variance(information: list[Information], scales: Floats) -> float:
 
 def test_the_standard_error_of_the_mean_of_n_normals() -> None:
     assert variance(normal_means(KL), np.ones(1)) == pytest.approx(SPREAD**2 / N, rel=0.01)
-
-
-def test_a_scale_of_one_simulator_changes_nothing() -> None:
-    information = normal_means(KL)
-    one, other = (variance(information, np.array([scale])) for scale in (1.0, 7.0))
-    assert one == pytest.approx(other, rel=1e-10)
 
 
 def test_two_simulators_of_independent_specimens_halve_the_variance() -> None:
@@ -121,11 +113,6 @@ def test_a_covariance_has_the_axes_of_its_directions() -> None:
     np.testing.assert_allclose(local.in_theta, expected)
 
 
-def test_what_is_not_identified_has_no_finite_error() -> None:
-    local = Local(np.ones(2), np.eye(2)[:, :1], np.eye(2)[:, 1:], np.eye(1))
-    np.testing.assert_array_equal(local.in_theta, [[1.0, np.inf], [np.inf, np.inf]])
-
-
 @pytest.mark.parametrize("metric", [KL, AREA], ids=["kl", "area"])
 def test_of_a_sum_of_two_means_only_the_sum_is_identified(metric: prb.Metric) -> None:
     with pm.Model() as model:
@@ -172,20 +159,6 @@ def test_the_variance_of_a_function_across_what_is_identified_is_infinite() -> N
 RNG = np.random.default_rng(1)
 
 
-def test_a_metric_of_one_output_sees_the_responses_themselves() -> None:
-    target = prb.AreaMetric().against(RNG.normal(size=20))
-    values = RNG.normal(size=(3, 50))
-    (seen,) = one_dimensional(target, values)
-    assert seen is values
-
-
-def test_a_joint_metric_sees_a_number_in_each_direction() -> None:
-    target = prb.Joint(prb.AreaMetric(), directions=5).against(RNG.normal(size=(20, 2)))
-    values = RNG.normal(size=(3, 50, 2))
-    seen = one_dimensional(target, values)
-    assert [numbers.shape for numbers in seen] == [(3, 50)] * 5
-
-
 def test_a_residual_of_correlations_sees_no_single_number() -> None:
     target = prb.MarginalCorrelation(prb.AreaMetric()).against(RNG.normal(size=(20, 3)))
     assert len(number_parts(target)) == 3
@@ -228,10 +201,6 @@ def test_directions_have_names(unidentified: Any, lines: list[str]) -> None:
 def sorted_signs(line: str) -> str:
     # Where two are equally large, rounding decides which comes first.
     return {"b - a": "a - b", "b + a": "a + b"}.get(line, line)
-
-
-def test_where_all_is_identified_nothing_is_named() -> None:
-    assert unidentified_directions(np.zeros((2, 0)), ["a", "b"]) == []
 
 
 def test_rounding_errors_are_not_information() -> None:
@@ -321,35 +290,6 @@ def test_turned_matrices_have_turned_directions() -> None:
     assert list(seen) == [False, True]
 
 
-def test_a_maximum_identifies_nothing() -> None:
-    assert not identified_by_curvature(-np.eye(2), np.diag([0.01, 0.01]))[2].any()
-
-
-def test_of_a_sum_of_two_means_an_area_identifies_only_the_sum() -> None:
-    with pm.Model() as model:
-        a, b = pm.Normal("a", 0, 1), pm.Normal("b", 0, 1)
-        x = pm.Normal.dist(a + b, 0.5)
-        prb.Simulator(
-            "y", np.positive, x, metric=prb.AreaMetric(), observed=OF_FIFTY, propagation=R256
-        )
-    information = Information(Evaluator.of(model), 0, np.array([0.5, 0.5]), n_sets=50)
-    seen = identified_by_area(information)
-    assert seen.shape == (2, 1)
-    # In units of the priors' spreads, which are known from draws to some per cent.
-    assert abs(seen[:, 0] @ np.sqrt([0.5, 0.5])) > 0.99
-
-
-def test_directions_of_other_elements_are_left_out() -> None:
-    # The first two elements are not identified, and the sum of the others is not.
-    hidden = np.zeros((4, 3))
-    hidden[:2, :2] = [[0.6, 0.8], [-0.8, 0.6]]
-    hidden[2:, 2] = np.sqrt(0.5)
-    others = np.array([True, True, False, False])
-    left = without(hidden, others)
-    assert unidentified_directions(left, ["m", "tau", "a", "b"]) == ["a + b"]
-    assert without(hidden, np.zeros(4, dtype=bool)) is hidden
-
-
 def test_what_is_looked_at_stays_when_the_design_grows() -> None:
     """Populations around an optimum are those of the design as it was."""
     with pm.Model() as model:
@@ -368,9 +308,3 @@ def test_what_is_looked_at_stays_when_the_design_grows() -> None:
     assert bound.n_points == 1536
     np.testing.assert_array_equal(identified_by_area(information), before)
 
-
-def test_signs_of_axes_do_not_matter() -> None:
-    axes, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(5, 3)))
-    turned = oriented(axes * np.array([1.0, -1.0, -1.0]))
-    np.testing.assert_array_equal(turned, oriented(axes))
-    np.testing.assert_array_equal(np.abs(turned), np.abs(axes))

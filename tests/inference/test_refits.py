@@ -19,7 +19,6 @@ from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import (
     BatchObjective,
     SamplingDistribution,
-    _mean_hessian,
     is_prepared_by_data,
     refit,
     refit_obstacle,
@@ -142,7 +141,8 @@ def test_clouds_come_closer_at_the_rate_of_their_dimension(monkeypatch: pytest.M
     evaluator(np.zeros((1, 1)))
     sampling = SamplingDistribution.of(evaluator, np.zeros(1), np.ones(1))
     monkeypatch.setattr(Design, "is_emulated", True)
-    monkeypatch.setattr(design_errors, "_spread_of_parts", lambda *_: np.array([8.0]))
+    ends = iter(8.0 * np.array([-1, 1, -1, 1, -1, 1, -1, 1]) * np.sqrt(7 / 8))
+    monkeypatch.setattr(design_errors, "_minimum", lambda *_: np.array([next(ends)]))
     # Eight parts, two inputs: 1/2 + 1/4 as the power of the size.
     np.testing.assert_allclose(design_errors._error_of_points(sampling), 8 / 8**0.75)
 
@@ -193,16 +193,6 @@ def test_two_simulators_are_weighed_by_their_scales() -> None:
     by_itself = SamplingDistribution.of(alone, TRUTH, np.array([1 / N]))
     expected, _ = refit(by_itself, DataSets(sets.values[:1], sets.weights[:1]))
     np.testing.assert_allclose(sampling.thetas(only_a), by_itself.thetas(expected), atol=0.003)
-
-
-def test_mean_hessian_of_a_parabola() -> None:
-    exact = np.array([[3.0, 1.0, 0.5], [1.0, 2.0, 0.0], [0.5, 0.0, 1.0]])
-    found = _mean_hessian(
-        lambda x: 0.5 * np.einsum("bsi,ij,bsj->s", x, exact, x) + x.sum(axis=(0, 2)), 3
-    )
-    np.testing.assert_allclose(found, exact, atol=1e-10)
-    lifted = _mean_hessian(lambda x: 0.5 * (x[0, :, 0] ** 2 - x[0, :, 1] ** 2), 2)
-    np.testing.assert_allclose(lifted, np.diag([1.0, 0.05]), atol=1e-10)
 
 
 def test_the_standard_error_of_a_mean() -> None:

@@ -40,6 +40,11 @@ def mean_and_sd(metric: prb.Metric) -> Information:
     return Information(Evaluator.of(model), 0, np.array([MEAN, np.log(SPREAD)]))
 
 
+def drawn(information: Information) -> tuple[Any, Any]:
+    """Return the values and weights of the simulated data sets."""
+    return information.data_sets.values[0], information.data_sets.weights[0]
+
+
 def closed_form(h: float, s: float, factor: float) -> tuple[float, float]:
     """H and J of the residual of a normal mean with known sd s, from Gaussian integrals.
 
@@ -74,7 +79,7 @@ def test_sandwich_of_a_normal_mean(propagation: Any) -> None:
     np.testing.assert_allclose(information.sampling_covariance, [[noise]], rtol=5e-3)
     # Simulated data sets say the same: 200 of them give a variance with a relative standard error
     # of 10%, and a mean gradient of zero.
-    gradients = information.gradients(*information.data_set)
+    gradients = information.gradients(*drawn(information))
     np.testing.assert_allclose(np.var(gradients, ddof=1), noise, rtol=0.4)
     assert abs(gradients.mean()) < 4 * (noise / 200) ** 0.5
 
@@ -100,7 +105,7 @@ def test_the_gradient_points_away_from_the_data() -> None:
 def test_data_sets_are_drawn_at_theta() -> None:
     # Neither from the prior, whose spread is 2, nor from the observed responses.
     for information in (known_sd(KL), known_sd(AREA, prb.Resimulated(1024))):
-        values, weights = information.data_set
+        values, weights = drawn(information)
         means = weights @ values
         assert abs(means.mean() - MEAN) < 4 * SPREAD / (N * 200) ** 0.5
         np.testing.assert_allclose(means.std(), SPREAD / N**0.5, rtol=0.2)
@@ -120,7 +125,7 @@ def test_mean_and_spread_of_a_normal_population_are_orthogonal() -> None:
 
 def test_the_area_is_linear_in_a_shift_of_the_population() -> None:
     # dF / dmu = -f: the slopes add up to minus the shift of the mean.
-    (area,) = mean_and_sd(AREA).areas(*mean_and_sd(AREA).data_set)
+    (area,) = mean_and_sd(AREA).areas(mean_and_sd(AREA).data_sets)
     np.testing.assert_allclose(area.slopes[0] @ area.lengths, -1, rtol=0.02)
     # And of one interval's gap, the distance between data set and population is the sum.
     floor = mean_and_sd(AREA).noise_floor
@@ -177,7 +182,7 @@ def test_one_prior_however_wide_leaves_the_other_s_error_as_it_is() -> None:
 def test_points_that_no_population_reaches_tell_nothing_of_it() -> None:
     information = known_sd(AREA)
     nowhere = np.zeros(256, dtype=bool)
-    (found,) = information.areas(*information.data_set, nowhere)
+    (found,) = information.areas(information.data_sets, nowhere)
     assert (found.slopes == 0).all()
     assert (found.gaps <= 0).all()
 
@@ -235,7 +240,7 @@ def test_noise_of_gradients_with_tails_is_that_of_the_whole_population() -> None
         )
     evaluator = Evaluator.of(model)
     information = Information(evaluator, 0, np.array([0.3, -0.5]))
-    values, weights = information._center
+    values, weights = information._sides[1:]
     batches = [slice(i, i + 64) for i in range(0, len(values), 64)]
     each = [information.gradients(values[b], np.eye(len(values[b]))) for b in batches]
     noise = np.cov(np.concatenate(each), rowvar=False, aweights=weights)

@@ -16,14 +16,14 @@ from prbayes.metrics.density import overlap as density_overlap
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import differences
 from prbayes.optimize.convergence import (
+    Fit,
     Result,
-    Run,
     Search,
     Trace,
     _newton_step,
     approach,
+    overlapping_populations,
     settle,
-    smallest_overlap,
 )
 from prbayes.optimize.objective import Method, Objective
 
@@ -159,24 +159,29 @@ def test_gradients_a_step_apart_see_along_a_kink() -> None:
     assert _newton_step(nowhere, at, 0.01)[1] == np.inf
 
 
-def settled(function: Any, at: list[float], most: int = 1000, count: int = 10) -> Run:
+def settled(function: Any, at: list[float], most: int = 1000, count: int = 10) -> Fit:
     """Settle a line search that gave up at a place of some function."""
 
     class Known(Search):
-        def _function(self, scales: Any, *, gradient: bool) -> Any:
-            return function if gradient else lambda theta: (function(theta)[0], None, 1)
+        def objective(self, center: Any, scales: Any, size: float, spent: int, *, gradient: bool) -> Any:
+            return Objective(
+                function if gradient else lambda theta: (function(theta)[0], None, 1),
+                *(center, self.prior_sd, size),
+                gradient=gradient,
+                max_evaluations=self.max_evaluations - spent,
+            )
 
     search = Known(Evaluator.of(model()), np.ones(2), Method(), False, 1e-5, most)
     end = np.array(at)
     value = float(function(end)[0])
     trace = Trace((end,), (value,), (count,), count)
-    return settle(search, Run(end, Result.STALLED, "", trace, np.zeros(2), np.ones(1), value, 1.0))
+    return settle(search, Fit(end, Result.STALLED, "", trace, np.zeros(2), np.ones(1), value, 1.0))
 
 
 def test_a_line_search_at_a_kink_goes_on_along_it() -> None:
     run = settled(valley, [0.99, -0.99])
     assert run.result.converged
-    np.testing.assert_allclose(run.best, [1.0, -1.0], atol=1e-6)
+    np.testing.assert_allclose(run.theta, [1.0, -1.0], atol=1e-6)
     assert run.lowest == pytest.approx(1)
     assert run.trace.count == 10 + 2 * 5 + 2
     assert run.details.startswith("Gradients around it promise a gain of ")
@@ -286,8 +291,7 @@ def test_where_there_is_overlap_the_start_is_left_alone(propagation: Any) -> Non
     assert near is theta
     assert trace.count == 0
     far, trace = approach(search, np.array([9.0, -1.0]), np.ones(1), 0, Trace())
-    values, weights = evaluator.populations(far[None], 0)
-    assert smallest_overlap(evaluator, [values], [weights])[0] > 0.5
+    assert overlapping_populations(evaluator, far[None])[1].min() > 0.5
     assert trace.count > 0
 
 

@@ -23,9 +23,9 @@ from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
 from prbayes.optimize import minimize as minimization
-from prbayes.optimize.convergence import Run, Search, Trace
+from prbayes.optimize.convergence import Fit, Search, Trace
 from prbayes.optimize.design_refinement import Restart
-from prbayes.optimize.local_optima import Rival
+from prbayes.optimize.local_optima import LocalOptimum
 from prbayes.optimize.minimize import optimum_findings
 from prbayes.optimize.objective import Ridge
 from prbayes.propagation.importance import SIZES
@@ -967,9 +967,9 @@ def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.Mo
     expected = prb.minimize(model, starts=0)
     begun = []
 
-    def astray(search: Search, run: Run) -> Run:
-        begun.append(run.best)
-        return replace(run, best=run.best + np.array([0.0, -8.0]), lowest=0.0)
+    def astray(search: Search, fit: Fit) -> Fit:
+        begun.append(fit.theta)
+        return replace(fit, theta=fit.theta + np.array([0.0, -8.0]), lowest=0.0)
 
     monkeypatch.setattr(minimization, "settle", astray)
     found = prb.minimize(model, starts=0)
@@ -1010,10 +1010,10 @@ def test_a_mirror_is_told_by_standard_deviations_and_correlations() -> None:
         prb.Simulator("y", np.positive, x, metric=prb.Joint(prb.AreaMetric()), observed=response)
     evaluator = Evaluator.of(model)
     point = {"mean": [1.0, 2.0], "cov": [0.5, -0.3, 0.4]}
-    rival = Rival(
+    other = LocalOptimum(
         evaluator.hyperparameters.unconstrained(point), 0.1, comparable=True, better=False
     )
-    (finding,) = optimum_findings(evaluator, None, (rival,), 0.0)
+    (finding,) = optimum_findings(evaluator, None, (other,), 0.0)
     assert (
         "come from mean[rod] = 1, mean[pin] = 2, cov_stds[0] = 0.5, cov_stds[1] = 0.5, "
         "cov_corr[0,1] = -0.6: another optimum"
