@@ -497,7 +497,7 @@ def _add_term(
         observed=_pymc_data(observed, target.observed),
         dims=dims,
     )
-    rv.owner.op.own_simulator(rv.owner)
+    rv.owner.op.owner = weakref.ref(rv.owner)  # a clone of the model is another one
     return rv
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pymc.pytensorf import join_nonshared_inputs
 
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
@@ -578,10 +579,10 @@ class SpecimenRefits:
     @property
     def _function(self) -> Any:
         """The compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
-        return self.evaluator.cached("weighted log-likelihood", self._compile)
-
-    def _compile(self) -> Any:
         evaluator = self.evaluator
+        key = "weighted log-likelihood"
+        if key in evaluator.functions:
+            return evaluator.functions[key]
         with untraced():
             graphs = specimen_graphs(evaluator)
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
@@ -589,9 +590,13 @@ class SpecimenRefits:
                 pt.switch(pt.gt(w, 0), w * g, 0.0).sum()
                 for w, g in zip(weights, graphs, strict=True)
             ]
-            (value,), theta = evaluator.hyperparameters.joined([-sum(terms)])
+            point = evaluator.hyperparameters.point
+            values = evaluator.model.value_vars
+            (value,), theta = join_nonshared_inputs(point, [-sum(terms)], values)
             gradient = pt.grad(value, theta)
-            return compiled([theta, *weights], ninf_for_invalid([value, gradient]))
+            outputs = ninf_for_invalid([value, gradient])
+            evaluator.functions[key] = compiled([theta, *weights], outputs)
+        return evaluator.functions[key]
 
     @cached_property
     def _root(self) -> Floats:
