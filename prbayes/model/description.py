@@ -32,10 +32,6 @@ _SIMULATOR = ("name", "response", "inputs", "metric", "propagation", "n_points",
 
 _CONSTANT = "<constant>"  # PyMC's text for an array
 
-# Largest length of a JSON text in an attribute of an HDF5 file, which has less than 64 KiB. JSON
-# writes letters beyond ASCII as six characters of a byte each: its characters are bytes.
-LONGEST_ATTRIBUTE = 60_000
-
 
 def describe(model: pm.Model) -> dict[str, Any]:
     """Return the model as texts that JSON takes.
@@ -113,8 +109,14 @@ def without_addresses(configuration: object) -> str:
 
 def as_attribute(model: pm.Model) -> dict[str, str]:
     """Return the description as an attribute of a file; none where it is too long for one."""
-    text = json.dumps(describe(model))
-    return {"model": text} if len(text) <= LONGEST_ATTRIBUTE else {}
+    return json_attribute("model", describe(model))
+
+
+def json_attribute(name: str, content: Mapping[str, Any]) -> dict[str, str]:
+    """Return JSON as an attribute of an HDF5 file; none where it is too long, near 64 KiB."""
+    # JSON writes letters beyond ASCII as six characters of a byte each: its characters are bytes.
+    text = json.dumps(content)
+    return {name: text} if len(text) <= 60_000 else {}
 
 
 def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:

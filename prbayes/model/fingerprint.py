@@ -19,7 +19,7 @@ import numpy as np
 import pymc as pm
 from pymc.printing import str_for_dist
 
-from prbayes.model.description import LONGEST_ATTRIBUTE, as_pymc_writes, without_addresses
+from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement
 from prbayes.model.parameters import fixed_points
@@ -231,8 +231,7 @@ def from_text(text: str) -> Identity:
 
 def as_attributes(identity: Identity | None) -> dict[str, str]:
     """Return an identity as an attribute of a file; none where it is unknown or too long."""
-    text = "" if identity is None else as_text(identity)
-    return {"identity": text} if 0 < len(text) <= LONGEST_ATTRIBUTE else {}
+    return {} if identity is None else json_attribute("identity", asdict(identity))
 
 
 def from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
