@@ -39,7 +39,7 @@ from prbayes.propagation.base import Bound
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
-from prbayes.response.compile import compiled, ninf_for_invalid, untraced
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 from prbayes.response.inputs import is_group
 
 # Points of a design from which on samplers start with an eighth of them.
@@ -207,7 +207,7 @@ class Evaluator:
             return lambda theta, scales: (self.total(theta[None], scales)[0],)
         key = ("objective", prior, gradient)
         if key not in self.functions:
-            with untraced():
+            with interpreted():
                 graphs = [
                     pt.as_tensor(node.bound.discrepancy(params))
                     for node, params in zip(self.nodes, _simulator_params(self), strict=True)

@@ -27,7 +27,6 @@ from prbayes.response.compile import (
     compiled,
     interpreted,
     ninf_for_invalid,
-    untraced,
     with_leading_axis,
 )
 from prbayes.response.distributions import PriorPoints, PriorSampler
@@ -90,7 +89,7 @@ class Hyperparameters:
 
         Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
         """
-        with untraced():
+        with interpreted():
             values = self.model.value_vars
             outputs, theta = join_nonshared_inputs(self.point, list(graphs), values)
             batch = pt.dmatrix("thetas")
@@ -98,7 +97,7 @@ class Hyperparameters:
             return compiled([batch], batched)
 
     @cached_property
-    @untraced()
+    @interpreted()
     def _log_prior(self) -> Any:
         """The log-density of each free variable, in its own units, and the Jacobian of all."""
         model = self.model
@@ -137,7 +136,7 @@ class Hyperparameters:
             return {name: v[:0] for name, v in self.constrained(self.initial[None]).items()}
         variables = self.model.unobserved_RVs
         if "constrained" not in self.cache:
-            with untraced():
+            with interpreted():
                 graphs = self.model.replace_rvs_by_values(variables)
                 self.cache["constrained"] = self.compile(graphs)
         values = self.cache["constrained"](np.ascontiguousarray(thetas))
@@ -181,7 +180,7 @@ class Hyperparameters:
         """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
         free = self.model.free_RVs
         if "thetas" not in self.cache:
-            with untraced():
+            with interpreted():
                 columns = []
                 for value_variable in self.model.value_vars:
                     rv = self.model.values_to_rvs[value_variable]

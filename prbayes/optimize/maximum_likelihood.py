@@ -50,7 +50,7 @@ from prbayes.optimize.optimum import (
 )
 from prbayes.propagation.specimen_emulation import specimen_roots
 from prbayes.propagation.specimen_points import draw_points
-from prbayes.response.compile import compiled, ninf_for_invalid, untraced
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 
 
 @dataclass(frozen=True, eq=False)
@@ -583,7 +583,7 @@ class SpecimenRefits:
         key = "weighted log-likelihood"
         if key in evaluator.functions:
             return evaluator.functions[key]
-        with untraced():
+        with interpreted():
             graphs = specimen_graphs(evaluator)
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
             terms = [
