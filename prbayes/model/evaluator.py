@@ -13,7 +13,6 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats
@@ -221,8 +220,7 @@ class Evaluator:
                 value = pt.switch(
                     log_prior > -np.inf, total - log_prior if prior else total, np.inf
                 )
-                point = self.hyperparameters.point
-                (value,), theta = join_nonshared_inputs(point, [value], model.value_vars)
+                (value,), theta = self.hyperparameters.joined([value])
                 outputs = [value, pt.grad(value, theta)] if gradient else [value]
                 self.functions[key] = compiled([theta, scales], ninf_for_invalid(outputs))
         function = self.functions[key]

@@ -84,14 +84,18 @@ class Hyperparameters:
         with interpreted():
             return cls(model, model.initial_point(random_seed=0))
 
+    def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
+        """Return graphs of the value variables as graphs of one vector theta, and that vector."""
+        outputs, theta = join_nonshared_inputs(self.point, list(graphs), self.model.value_vars)
+        return list(outputs), theta
+
     def compile(self, graphs: Sequence[Any]) -> Any:
         """Compile graphs of the value variables into a function of thetas, shape (P, d).
 
         Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
         """
         with interpreted():
-            values = self.model.value_vars
-            outputs, theta = join_nonshared_inputs(self.point, list(graphs), values)
+            outputs, theta = self.joined(graphs)
             batch = pt.dmatrix("thetas")
             batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
             return compiled([batch], batched)

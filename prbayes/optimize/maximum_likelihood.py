@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pymc.pytensorf import join_nonshared_inputs
 
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
@@ -590,9 +589,7 @@ class SpecimenRefits:
                 pt.switch(pt.gt(w, 0), w * g, 0.0).sum()
                 for w, g in zip(weights, graphs, strict=True)
             ]
-            point = evaluator.hyperparameters.point
-            values = evaluator.model.value_vars
-            (value,), theta = join_nonshared_inputs(point, [-sum(terms)], values)
+            (value,), theta = evaluator.hyperparameters.joined([-sum(terms)])
             gradient = pt.grad(value, theta)
             outputs = ninf_for_invalid([value, gradient])
             evaluator.functions[key] = compiled([theta, *weights], outputs)
