@@ -22,7 +22,7 @@ from prbayes.optimize.objective import Ridge
 from prbayes.optimize.optimum import point_at
 
 # Share of the noise floor that is about the difference of the discrepancy between the fit of the
-# data and the truth; half or twice changes no optimum (docs/constants.md).
+# data and the truth; half or twice changes no optimum (docs/appendix/constants.md).
 _NOISE_SHARE = 0.3
 # Difference, in multiples of the noise, up to which data could come from either optimum: three make
 # about the noise floor.
