@@ -497,8 +497,7 @@ class Requirement:
 
 # Of the optimiser and the samplers, whose designs grow until they meet it. A mean weight of 0.8 to
 # 1.25 is a fifth of the population's mass either way. Half the effective sample size moves an
-# optimum by .05 standard errors; twice is more than 1024 points give with two inputs
-# (docs/constants.md).
+# optimum by .05 standard errors; twice is more than 1024 points give with two inputs.
 ENOUGH = Requirement(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
 # Of predictions, whose designs do not grow. Laxer: draws at the edge of a posterior are less well
 # supported than its centre, and resampling needs no derivative.
