@@ -63,7 +63,9 @@ def scikit_learn(smoothness: float, x: Any, y: Any) -> tuple[Predict, Any]:
     from sklearn.gaussian_process import GaussianProcessRegressor, kernels
 
     shape = kernels.Matern(np.ones(x.shape[1]), (1e-2, 1e4), nu=smoothness)
-    noisy = kernels.ConstantKernel(10.0, (1e-2, 1e4)) * shape + kernels.WhiteKernel(1e-4, (1e-8, 1.0))
+    noisy = kernels.ConstantKernel(10.0, (1e-2, 1e4)) * shape + kernels.WhiteKernel(
+        1e-4, (1e-8, 1.0)
+    )
     process = GaussianProcessRegressor(noisy, normalize_y=True, random_state=0)
     with warnings.catch_warnings():
         # Hyperparameters at their bounds: irrelevant inputs, no noise.

@@ -123,7 +123,6 @@ def guard_sizes() -> Iterator[Row]:
             yield [problem, check, str(cell["data sets"]), share]
 
 
-
 def partial_pooling() -> Iterator[Row]:
     """Return the rows of groups beside the exact posterior."""
     table = found("partial_pooling")

@@ -30,9 +30,7 @@ def test_tables_are_what_the_benchmarks_found(path: Path) -> None:
     assert pages.written(page) == page, "run python -m benchmarks.pages"
 
 
-@pytest.mark.parametrize(
-    "path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem)
 def test_files_that_a_page_names_are_there(path: Path) -> None:
     page = path.read_text(encoding="utf-8")
     named = re.findall(r"\b(?:tests|benchmarks|examples|prbayes)/[\w/]+\.(?:py|json|csv)\b", page)
@@ -52,9 +50,7 @@ def wide_lines(page: str) -> list[str]:
     return [line for block in seen for line in block.splitlines() if len(line) > CODE_WIDTH]
 
 
-@pytest.mark.parametrize(
-    "path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem)
 def test_code_fits_on_the_page(path: Path) -> None:
     assert not wide_lines(path.read_text(encoding="utf-8"))
 
