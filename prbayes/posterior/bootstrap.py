@@ -14,10 +14,11 @@ from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.inference.asymptotics import unidentified_directions
 from prbayes.inference.refits import is_prepared_by_data, refit, refit_prepared
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
+from prbayes.model.description import observed_dataset, versions
 from prbayes.model.locking import locked
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_refits
-from prbayes.posterior.results import bootstrap_tree
+from prbayes.posterior.results import posterior_group
 
 
 @locked
@@ -94,15 +95,19 @@ def bootstrap(
     refitted = _specimen_estimates if by_specimen else _minimisers
     with shown(progressbar):
         thetas, converged = refitted(optimum, draws, seed, parametric=parametric)
-    return bootstrap_tree(
-        optimum.evaluator,
-        thetas[None],
-        sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
-        converged=float(converged.mean()),
-        seed=seed,
-        n_responses=optimum.n_responses,
-        seconds=time.perf_counter() - clock,
-    )
+    attrs = {
+        "sampler": "parametric bootstrap" if parametric else "loss-likelihood bootstrap",
+        "converged": float(converged.mean()),
+        "n_responses": optimum.n_responses,
+        "seconds": time.perf_counter() - clock,
+        "random_seed": str(seed),
+        **versions(),
+    }
+    groups = {
+        "posterior": posterior_group(optimum.evaluator, thetas[None], attrs),
+        "observed_data": observed_dataset(optimum.evaluator),
+    }
+    return xr.DataTree.from_dict(groups)
 
 
 def _minimisers(

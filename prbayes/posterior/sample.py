@@ -27,12 +27,11 @@ from prbayes.posterior.importance import (
     importance_sample,
     laplace,
 )
-from prbayes.posterior.results import Draws, require_idata_kwargs, require_names, selected
+from prbayes.posterior.results import Chains, require_selection, selected
 from prbayes.posterior.smc import (
     SamplingSettings,
     estimate_of,
     evaluator_of,
-    require_optimum,
     result_of,
 )
 from prbayes.posterior.target import Target, estimate_target, specimen_target
@@ -124,9 +123,7 @@ def sample(
     positive_integer(draws, "draws", minimum=10)
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample")
-    require_optimum(optimum)
-    names = require_names(var_names, model)
-    keywords = require_idata_kwargs(idata_kwargs)
+    names, keywords = require_selection(var_names, idata_kwargs, model)
     settings = SamplingSettings(
         draws=draws,
         chains=chains,
@@ -211,7 +208,7 @@ def _distinct(modes: list[Laplace]) -> list[Laplace]:
 
 def _importance_draws(
     target: Target, modes: list[Laplace], settings: SamplingSettings
-) -> Draws | None:
+) -> Chains | None:
     """Return draws by importance sampling, None if they are not reliable."""
     evaluator, (chains, draws) = target.evaluator, (settings.chains, settings.draws)
     hyperparameters = evaluator.hyperparameters
@@ -227,7 +224,7 @@ def _importance_draws(
         log_likelihood = log_likelihood.reshape(chains, draws)
     lp = sample.log_density.reshape(chains, draws)
     coords = {"chain": np.arange(chains), "draw": np.arange(draws)}
-    return Draws(
+    return Chains(
         sample.draws.reshape(chains, draws, -1),
         sampler={
             "sampler": "importance sampling",
@@ -240,7 +237,7 @@ def _importance_draws(
     )
 
 
-def _nuts_draws(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings) -> Draws:
+def _nuts_draws(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings) -> Chains:
     """Return draws by NUTS from the mode of the posterior."""
     hyperparameters = evaluator.hyperparameters
     values = hyperparameters.constrained(mode.mode[None])
@@ -260,7 +257,7 @@ def _nuts_draws(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings)
     posterior = idata["posterior"].to_dataset()
     columns = [posterior[name].transpose("chain", "draw", ...).values for name in names]
     thetas = hyperparameters.thetas_of([x.reshape(-1, *x.shape[2:]) for x in columns])
-    return Draws(
+    return Chains(
         thetas.reshape(settings.chains, settings.draws, -1),
         sampler={"sampler": "NUTS"},
         sample_stats=idata["sample_stats"].to_dataset(),
