@@ -15,7 +15,7 @@ import prbayes as prb
 from prbayes.model.description import versions
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior import results
-from prbayes.posterior.results import Draws, posterior_tree
+from prbayes.posterior.smc import _stage_statistics
 
 DATA = np.random.default_rng(1).normal([1.0, 3.0], 0.5, (40, 2))
 
@@ -140,33 +140,13 @@ def test_metrics_are_described_the_same_in_every_session() -> None:
 
 
 def test_chains_with_different_numbers_of_stages() -> None:
-    evaluator = Evaluator.of(model())
-    thetas = np.zeros((2, 3, 3))
-    stats: list[dict[str, list[float]]] = [
-        {"beta": [0.2, 1.0], "n_steps": [2, 4]},
-        {"beta": [1.0], "n_steps": [6]},
-    ]
-    tree = posterior_tree(
-        evaluator,
-        Draws(
-            thetas,
-            {"sampler": "SMC"},
-            discrepancies=np.ones((2, 3, 2)),
-            lost=np.full((2, 3, 2), np.nan),
-            stages=stats,
-        ),
-        adjustment="none",
-        findings=(),
-        groups={},
-        seed=None,
-        n_responses=7,
-        seconds=1.5,
-    )
-    np.testing.assert_array_equal(tree["sample_stats"]["beta"], [[0.2, 1.0], [1.0, np.nan]])
-    np.testing.assert_array_equal(tree["sample_stats"]["n_steps"], [[2, 4], [6, np.nan]])
-    assert tree["posterior"].attrs["random_seed"] == "None"
-    assert tree["posterior"].attrs["n_responses"] == 7
-    np.testing.assert_array_equal(tree["posterior"]["sigma"], 1.0)
+    first = {"beta": [0.2, 1.0], "log_marginal_likelihood": [np.nan, 4.0]}
+    second = {"beta": [1.0], "log_marginal_likelihood": [2.0]}
+    stats, evidence = _stage_statistics([first, second])
+    np.testing.assert_array_equal(stats["beta"], [[0.2, 1.0], [1.0, np.nan]])
+    mean = np.log((np.exp(4) + np.exp(2)) / 2)
+    assert evidence["log_marginal_likelihood"] == pytest.approx(mean)
+    assert evidence["log_marginal_likelihood_sd"] == pytest.approx(np.sqrt(2))
 
 
 @pytest.mark.parametrize("make", [idata, lambda: optimum().to_datatree()])

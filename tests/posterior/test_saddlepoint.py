@@ -183,7 +183,9 @@ def likelihood_of(model: pm.Model) -> EstimateLikelihood:
 
 def target_of(likelihood: EstimateLikelihood) -> Target:
     log_likelihood = likelihood.log_likelihood
-    return Target(likelihood.evaluator, log_likelihood, likelihood.starts[0][None], likelihood.scale)
+    return Target(
+        likelihood.evaluator, log_likelihood, likelihood.starts[0][None], likelihood.scale
+    )
 
 
 def sample_of(likelihood: EstimateLikelihood) -> ImportanceSample:

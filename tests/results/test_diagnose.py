@@ -20,7 +20,7 @@ import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.model.evaluator import Evaluator
 from prbayes.optimize.convergence import Result
-from prbayes.posterior.smc import _refuse_lost
+from prbayes.posterior.smc import _lost_findings
 from prbayes.propagation.base import DesignError, discrepancy_error
 from prbayes.results.diagnose import _NOISE
 
@@ -479,7 +479,7 @@ def test_an_answer_is_refused_where_most_draws_lose_too_much(
     evaluator = Evaluator.of(failing(prb.Resimulated(16, on_failure=REPLACED)))
     lost = np.where(np.arange(50) < 50 * of_draws, 0.3, 0.0).reshape(1, 50, 1)
     with nullcontext() if not refused else pytest.raises(DesignError, match=r"got 30\.0% of the"):
-        _refuse_lost(evaluator, lost, {"y": {"lost_mass": 0.0}})
+        _lost_findings(evaluator, lost, {})
 
 
 @pytest.mark.parametrize("sampler", [prb.sample, prb.sample_smc])
