@@ -302,13 +302,7 @@ def correlation(start: Floats, end: Floats) -> float:
 
 
 def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) -> Floats:
-    """Return thetas, (draws, d), of the particles that a user passes, as for `pymc.sample_smc`.
-
-    ``start`` has for each free variable values of shape (draws, *shape): by its own name in its own
-    units, as draws of `pymc.sample_prior_predictive` are, or transformed by the name that PyMC
-    gives its value, such as ``sigma_log__``. Raises KeyError, TypeError or ValueError if it is no
-    such mapping, or a value is outside the priors' support.
-    """
+    """Return thetas, (draws, d), of particles by names of variables or of transformed values."""
     if not isinstance(start, Mapping):
         raise TypeError(
             f"start: got {called(start)}, expected a dict of arrays by the names of variables, or "

@@ -168,10 +168,7 @@ def _columns(values: Mapping[str, Any], size: int) -> dict[str, Any]:
 
 
 def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) -> xr.Dataset:
-    """Return the same variables of the simulators with a log-likelihood by specimen.
-
-    Minus the log-likelihood is the discrepancy, with an epsilon of one.
-    """
+    """Return the same variables of log-likelihoods by specimen, as minus discrepancies."""
     chains, draws, d = thetas.shape
     measurements = evaluator.measurements
     values = specimen_log_likelihoods(evaluator, thetas.reshape(-1, d))
@@ -208,12 +205,7 @@ def share_of_lossy(lost: Floats, max_lost: float) -> float:
 
 
 def arviz_groups(evaluator: Evaluator, chains: Chains, seed: int | None) -> dict[str, xr.Dataset]:
-    """Return groups for ArviZ, which cost no response.
-
-    ``prior``, ``log_prior`` and ``log_likelihood``, by specimen or for all together, and
-    ``posterior_predictive`` and ``prior_predictive`` of simulators whose responses are stored or
-    emulated.
-    """
+    """Return priors, log-likelihoods and predictive draws for ArviZ, which cost no response."""
     thetas = chains.thetas
     n_chains, n_draws, d = thetas.shape
     rng = np.random.default_rng(seed)
@@ -309,11 +301,7 @@ def _emulated_responses(
 
 
 def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -> xr.Dataset:
-    """Draw as many stored responses as were observed at each theta, (chains, draws, d).
-
-    They are drawn by weight and with replacement; NaN at thetas without a population. If all draws
-    would take too much memory, they are thinned.
-    """
+    """Draw stored responses by weight, as many as were observed, at thetas (chains, draws, d)."""
     chains, draws, d = thetas.shape
     stored = [k for k, node in enumerate(evaluator.nodes) if node.bound.n_per_theta == 0]
     size = chains * draws * sum(evaluator.nodes[k].target.observed.size for k in stored)

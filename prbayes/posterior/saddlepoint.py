@@ -163,12 +163,7 @@ def estimate_likelihood(
     optimum: Optimum,
     options: EstimateLikelihoodOptions = EstimateLikelihoodOptions(),
 ) -> EstimateLikelihood:
-    """Return the likelihood of the hyperparameters given the minimiser of their metrics.
-
-    Responses are stored, or computed at each theta from common random numbers. Simulators that
-    share specimens add the scores of a specimen; independent simulators add their cumulant
-    functions. Raises ValueError if the gradient of the objective is no mean over specimens.
-    """
+    """Return the likelihood of the hyperparameters given the minimiser of their metrics."""
     obstacle = score_obstacle(evaluator)
     if obstacle is not None:
         raise ValueError(f"metric: {obstacle}; expected a refit_likelihood")
@@ -217,10 +212,7 @@ def estimate_likelihood(
 def _minimised_on_population(
     evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
 ) -> tuple[Evaluator, Floats, Floats]:
-    """Return metrics with whitening and bandwidths of the population, scales and minimiser.
-
-    A minimiser that stored responses do not support is not taken.
-    """
+    """Return metrics with whitening and bandwidths of the population, scales and minimiser."""
     from scipy.optimize import minimize as scipy_minimize
 
     targets = []
@@ -261,8 +253,7 @@ def _group_scores(
     populations: list[WeightSlopes | ShiftedResponses] = []
     functions = []
     for k, node in zip(members, nodes, strict=True):
-        differences = _weight_slopes if node.bound.stored else _shifted_responses
-        population = differences(evaluator, k, point, options)
+        population = _derivatives(evaluator, k, point, options)
         score = partial(
             specimen_scores, node.target, population, options=options.score, total=total
         )
@@ -292,24 +283,21 @@ def _group_scores(
     return StoredScores(members[0], is_observable, stored, n, identity, rows)
 
 
-def _shifted_responses(
+def _derivatives(
     evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
-) -> ShiftedResponses:
-    """Return the k-th simulator's responses at theta and a step away along each element."""
-    steps = options.resimulated_step * evaluator.hyperparameters.prior_sd
-    responses, _ = evaluator.populations(cross(theta, steps), k)
-    center, upper, lower = np.split(responses, [1, 1 + len(theta)])
-    return ShiftedResponses(center[0], upper, lower, steps)
-
-
-def _weight_slopes(
-    evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
-) -> WeightSlopes:
-    """Return the k-th simulator's stored responses with weights, and their derivatives."""
-    moves = evaluator.nodes[k].bound.support_moves
-    steps = (options.wide_step if moves else options.step) * evaluator.hyperparameters.prior_sd
+) -> WeightSlopes | ShiftedResponses:
+    """Return the k-th simulator's stored responses with slopes of weights, or shifted responses."""
+    bound = evaluator.nodes[k].bound
+    step = options.wide_step if bound.support_moves else options.step
+    steps = (
+        step if bound.stored else options.resimulated_step
+    ) * evaluator.hyperparameters.prior_sd
     responses, weights = evaluator.populations(cross(theta, steps), k)
-    center, up, down = np.split(weights, [1, 1 + len(theta)])
+    ends = [1, 1 + len(theta)]
+    if not bound.stored:
+        center, upper, lower = np.split(responses, ends)
+        return ShiftedResponses(center[0], upper, lower, steps)
+    center, up, down = np.split(weights, ends)
     # Log weights are nearly parabolas, whose differences are right at any step. A weight that
     # vanishes within the step has none.
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -319,12 +307,7 @@ def _weight_slopes(
 
 
 def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
-    """Return the estimate, (d,), or a point inside if it is at an edge.
-
-    At an edge the scores of an element vanish, or stored responses are too few for them. The score
-    at a point inside is as good a statistic. Elements at an edge are moved towards the middle of
-    their prior.
-    """
+    """Return the estimate, (d,), or a point towards the middle of the prior if it is at an edge."""
     if not all(node.bound.stored for node in evaluator.nodes):
         return theta
     hyperparameters = evaluator.hyperparameters
@@ -348,16 +331,14 @@ def _likelihood_spread(
     """Return standard deviations of the derivatives of log weights, in units of the prior, (d,)."""
     variance = np.zeros(len(theta))
     for k in range(len(evaluator.nodes)):
-        variance += _weight_slopes(evaluator, k, theta, options).spread ** 2
+        population = _derivatives(evaluator, k, theta, options)
+        assert isinstance(population, WeightSlopes)
+        variance += population.spread**2
     return np.asarray(np.sqrt(variance) * evaluator.hyperparameters.prior_sd)
 
 
 def score_obstacle(evaluator: Evaluator) -> str | None:
-    """Return why the gradient of the objective is no mean over specimens, or None.
-
-    Examples are the area metric, observed responses of unequal weights or with gaps, and
-    simulators that share specimens in part.
-    """
+    """Return why the gradient of the objective is no mean over specimens, or None."""
     for node in evaluator.nodes:
         if not is_additive(node.target):
             metric = type(node.metric).__name__
@@ -405,10 +386,7 @@ CumulantFunction = Callable[[Floats, NDArray[np.intp]], Cumulants]
 
 
 def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Floats) -> Cumulants:
-    """Return the sum of N_j K_j(a) over simulators at tilts, (S, r).
-
-    Log weights of the stored responses have shapes (S, M_j); the weights of a row sum to one.
-    """
+    """Return the sum of N_j K_j(a) over simulators at tilts, (S, r), given log weights (S, M_j)."""
     count, r = tilts.shape
     values = np.zeros(count)
     gradients = np.zeros((count, r))
@@ -471,11 +449,7 @@ def log_density(
     scores: Sequence[Scores],
     options: SaddlepointOptions = SaddlepointOptions(),
 ) -> Floats:
-    """Return the log-density of a mean score of zero, up to a constant, (S,).
-
-    Log weights have shapes (S, M_j); -inf or NaN throughout a row if no stored response supports
-    its population. Scores are in units in which their covariance is about one.
-    """
+    """Return the log-density of a mean score of zero, (S,), given log weights (S, M_j)."""
     result = np.full(len(log_weights[0]), -np.inf)
     is_supported = np.all([np.isfinite(logs.max(axis=1)) for logs in log_weights], axis=0)
     if not is_supported.any():

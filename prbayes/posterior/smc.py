@@ -303,11 +303,7 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
 
 
 def estimate_of(evaluator: Evaluator, settings: SamplingSettings, caller: str) -> Optimum | None:
-    """Return the estimate that the posterior is given, by a search if needed.
-
-    With a log-likelihood by specimen it is the optimum that was passed, if any. Raises ValueError
-    if the density of the estimate is not known, or the optimum is at an edge or a jump.
-    """
+    """Return the estimate that the posterior is given, by a search if needed, or raise."""
     optimum = settings.optimum
     if not evaluator.nodes:
         return optimum
@@ -326,12 +322,7 @@ def result_of(
     n_before: int,
     clock: float,
 ) -> xr.DataTree:
-    """Return the DataTree of chains.
-
-    Discrepancies are computed if that costs no response. ``n_before`` and ``clock`` are the number
-    of responses and the time at the start. Raises DesignError if too much of the populations of
-    most draws has no response.
-    """
+    """Return the DataTree of chains, with discrepancies if these cost no response."""
     is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
     findings: list[Finding] = []
     if chains.stopped:
@@ -379,11 +370,7 @@ def result_of(
 
 
 def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floats:
-    """Return shares of populations without response, (chains, draws, k).
-
-    Responses that are not stored are computed at a sample of draws, within the budget. The shares
-    of other draws, and of stored responses, are NaN.
-    """
+    """Return the share without response, (chains, draws, k), at some draws; NaN at others."""
     chains, draws, _ = thetas.shape
     lost = np.full((chains, draws, len(evaluator.nodes)), np.nan)
     rows = np.linspace(0, chains * draws - 1, count).astype(np.intp)
@@ -402,11 +389,7 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floa
 def _lost_findings(
     evaluator: Evaluator, lost: Floats, missing: Mapping[str, Mapping[str, float]]
 ) -> tuple[Finding, ...]:
-    """Report that the populations of many draws lack responses; raise if those of most draws do.
-
-    ``lost``, (chains, draws, k), is NaN if not known; `diagnose` reports it for designs.
-    ``missing`` is that of the best draw, by simulator.
-    """
+    """Report draws whose populations lack responses; raise if most draws, or the best, do."""
     shares = {}
     findings = []
     for k, node in enumerate(evaluator.nodes):
@@ -485,11 +468,7 @@ def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
 def _chains_on_designs(
     evaluator: Evaluator, settings: SamplingSettings, optimum: Optimum | None
 ) -> Chains:
-    """Return chains that the designs support, after refinements.
-
-    Raises DesignError if the refined designs do not support the draws, and BudgetError if a budget
-    is spent before.
-    """
+    """Return chains that the designs support, after refinements, or raise."""
     starts = _starts(evaluator, settings)
     checkpoint = None
     entropy: int | None = settings.random_seed
@@ -676,10 +655,7 @@ def _save(
 
 
 def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, float]]:
-    """Return statistics by chain and stage, NaN after the last one of a chain, and the evidence.
-
-    The evidence is the log of the chains' mean marginal likelihood, and the spread of their logs.
-    """
+    """Return statistics by chain and stage, NaN after the last one, and the mean evidence."""
     n_stages = max(len(stages["beta"]) for stages in chains)
     variables = {}
     for name in chains[0]:

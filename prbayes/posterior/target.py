@@ -71,11 +71,7 @@ class Target:
 
 
 def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
-    """Return the posterior of a model whose simulators have a log-likelihood by specimen.
-
-    Without an optimum it starts at the best of 1024 prior points, and seven of the best quarter far
-    from each other.
-    """
+    """Return the posterior of a model whose simulators have a log-likelihood by specimen."""
     prior_sd = evaluator.hyperparameters.prior_sd
     if optimum is not None:
         return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
@@ -93,12 +89,7 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
-    """Return the posterior given the metrics' own estimate; raise as `require_density`.
-
-    The estimate of metrics whose gradient is a mean over specimens is an M-estimator, and its
-    density follows from the scores of stored responses. The density of other estimates follows from
-    refits.
-    """
+    """Return the posterior given the metrics' own estimate, by scores or refits, or raise."""
     require_density(evaluator)
     is_mean = score_obstacle(evaluator) is None
     likelihood = (estimate_likelihood if is_mean else refit_likelihood)(evaluator, optimum)
@@ -110,10 +101,7 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
 
 
 def require_density(evaluator: Evaluator) -> None:
-    """Raise if the density of the metrics' estimate is not known.
-
-    Responses are random, or not stored although the density requires refits.
-    """
+    """Raise if the density of the metrics' estimate is not known."""
     obstacle = score_obstacle(evaluator)
     for node in evaluator.nodes:
         if node.bound.random:
@@ -134,11 +122,7 @@ def require_density(evaluator: Evaluator) -> None:
 def prior_conflicts(
     optimum: Optimum, evaluator: Evaluator, thetas: Floats, size: int = 4096
 ) -> tuple[Finding, ...]:
-    """Report hyperparameters whose prior pulls the posterior, thetas (..., d), from the estimate.
-
-    The predictive distribution of an estimate is that of draws of the prior with the standard
-    errors of the optimum.
-    """
+    """Report hyperparameters whose prior pulls the posterior thetas from the estimate."""
     if optimum.search.prior or any(rival["comparable"] for rival in optimum.rivals):
         return ()
     order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
@@ -293,20 +277,25 @@ def refit_likelihood(
     optimum: Optimum,
     options: RefitLikelihoodOptions = RefitLikelihoodOptions(),
 ) -> RefitLikelihood:
-    """Return the likelihood of the hyperparameters given the minimiser of any metrics.
-
-    Responses are stored. Raises ValueError if the estimate is at an edge, stored responses do not
-    support populations around it, or refits do not converge.
-    """
+    """Return the likelihood given the minimiser of any metrics, from refits, or raise."""
     if optimum.search.at_edge:
         raise ValueError(_at_edge(", ".join(optimum.search.at_edge)))
     thetas = optima_of(optimum, evaluator)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     continuation = continuation_of(evaluator, thetas[:1])
     start, *rest = continuation.coordinates(thetas)
-    for _ in range(options.whitenings):
-        evaluator, start = _whitened(evaluator, continuation, start, scales, options)
     continued = _continued(evaluator, continuation)
+    has_several_outputs = any(node.target.event for node in evaluator.nodes)
+    for _ in range(options.whitenings if has_several_outputs else 0):
+        # Metrics of several outputs are whitened by the population at the last minimiser.
+        targets = [node.target for node in evaluator.nodes]
+        for k, target in enumerate(targets):
+            if target.event:
+                responses, weights = continued.populations(start[None], k)
+                targets[k] = prepared_on_population(target, responses[0], weights[0])
+        evaluator = evaluator.with_targets(targets)
+        continued = _continued(evaluator, continuation)
+        start = _at_minimiser(continued, start, scales, options).theta
     sampling = _at_minimiser(continued, start, scales, options)
     _require_inside(sampling, options)
     local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
@@ -389,11 +378,7 @@ def _draw(
     options: RefitLikelihoodOptions,
     seed: int,
 ) -> tuple[Floats, list[csr_array], Floats]:
-    """Draw a data set at each of some coordinates, (R, r), and refit it.
-
-    Return coordinates, specimens at the stored responses by group, and estimates, of data sets
-    whose refit converged.
-    """
+    """Draw and refit data sets at coordinates, (R, r); return these, counts and estimates."""
     sampling = centers[0]
     evaluator = sampling.evaluator
     thetas = sampling.thetas(x)
@@ -458,10 +443,7 @@ def _log_likelihoods(
 def _best_starts(
     centers: Sequence[SamplingDistribution], data: DataSets, options: RefitLikelihoodOptions
 ) -> Floats:
-    """Return the best of some points around the estimate for each data set, (R, r).
-
-    Points nearer to another optimum are left out: all refits are minimisers near the estimate.
-    """
+    """Return the best of some points near the estimate for each data set, (R, r)."""
     sampling = centers[0]
     ball = _ball(options.n_starts, sampling.stderr.size, options)
     thetas = sampling.thetas(ball)
@@ -501,27 +483,6 @@ def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
     """Return the sampling distribution with the minimiser for the observed responses as theta."""
     (x,), _ = refit(sampling, observed_set(sampling.evaluator))
     return replace(sampling, theta=sampling.thetas(x))
-
-
-def _whitened(
-    evaluator: Evaluator,
-    continuation: Continuation,
-    start: Floats,
-    scales: Floats,
-    options: RefitLikelihoodOptions,
-) -> tuple[Evaluator, Floats]:
-    """Return metrics of several outputs, whitened by the population, and their minimiser."""
-    targets = [node.target for node in evaluator.nodes]
-    if not any(target.event for target in targets):
-        return evaluator, start
-    continued = _continued(evaluator, continuation)
-    for k, target in enumerate(targets):
-        if target.event:
-            responses, weights = continued.populations(start[None], k)
-            targets[k] = prepared_on_population(target, responses[0], weights[0])
-    prepared = evaluator.with_targets(targets)
-    sampling = _at_minimiser(_continued(prepared, continuation), start, scales, options)
-    return prepared, sampling.theta
 
 
 def _require_inside(sampling: SamplingDistribution, options: RefitLikelihoodOptions) -> None:

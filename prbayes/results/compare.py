@@ -237,10 +237,7 @@ def _scores(
     *,
     is_covered: bool,
 ) -> dict[str, Floats]:
-    """Return discrepancies of estimates, shape (results, elements), by simulator and metric.
-
-    Designs that do not cover the estimates grow temporarily, unless ``is_covered``.
-    """
+    """Return discrepancies of estimates, shape (results, elements), by simulator and metric."""
     evaluator = Evaluator.of(model)
     if metrics is None and evaluator.responses_per_theta:
         return {}  # scores that were not requested compute no response

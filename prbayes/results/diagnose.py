@@ -288,11 +288,7 @@ def _stored_shares(calibration: xr.Dataset, key: str) -> dict[str, float]:
 def _failure_findings(
     tree: xr.DataTree, lost: Mapping[str, float], failed: Mapping[str, float]
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return findings about failed responses by simulator: those that matter, and harmless ones.
-
-    Failures are harmless if they have next to no weight in the populations of the answer, by the
-    shares without response, ``lost``, and of specimens that fail, ``failed``.
-    """
+    """Return findings about failed responses that matter to the answer, and harmless ones."""
     findings: list[Finding] = []
     harmless: list[Finding] = []
     if "failures" not in tree.children:

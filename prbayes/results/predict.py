@@ -323,10 +323,7 @@ def _predicted(
 
 
 def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
-    """Return and report the number of responses that are NaN, and report a rough emulator.
-
-    Raises if too many responses are NaN.
-    """
+    """Report a rough emulator; return and report the number of NaN, or raise if it is large."""
     values, error = drawn.values, drawn.error
     is_nan = is_missing(values.reshape(-1, *values.shape[2:]))
     missing = int(is_nan.sum())
@@ -392,10 +389,7 @@ def _resampled_responses(
     n: int,
     rng: np.random.Generator,
 ) -> _Predicted:
-    """Return responses of n design points for each population, in random order.
-
-    Systematic resampling: the number of copies of a point is its weight times n, to one.
-    """
+    """Return responses of n design points for each population, by systematic resampling."""
     bound = node.reweighted
     assert bound is not None
     roots = [points[str(rv.name)] for rv in bound.inputs.roots]
