@@ -34,7 +34,6 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
     variable_of,
-    with_coordinates,
 )
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
@@ -198,9 +197,7 @@ def _estimates(
     estimates: dict[str, tuple[float, ...]] = {}
     if "posterior" in groups:
         attrs = result["posterior"].attrs
-        draws = stacked_draws(result["posterior"])
-        if naming is not None:
-            draws = with_coordinates(draws, naming)
+        draws = stacked_draws(result["posterior"], model=naming)
         tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
         for element, x in split_elements(draws).items():
             estimates[element] = (x.mean(), x.std(ddof=1), *np.quantile(x, tails))
