@@ -510,12 +510,6 @@ def between_runs() -> Iterator[Row]:
         yield [name, str(response.d), str(response.outputs), *columns]
 
 
-def placement() -> Iterator[Row]:
-    """Return the rows of errors by where runs are added."""
-    for name, cell in found("placement").items():
-        yield [name, *(f"{error:.3f}".lstrip("0") for error in cell.values())]
-
-
 def emulator_speed() -> Iterator[Row]:
     """Return the rows of what it costs to emulate."""
     for n, cell in found("emulator_speed").items():
@@ -562,26 +556,6 @@ def at_a_fold() -> Iterator[Row]:
             )
             cells.append(f"{short(row['mu'])} / {short(row['sigma'])}")
         yield [metric, *cells]
-
-
-def random_problems() -> Iterator[Row]:
-    """Return the row of problems that nobody chose."""
-    from benchmarks.random_problems import summary
-
-    of = summary(found("random_problems")["rows"])
-    errors = [short(of[key], 3) for key in ("median off", "farthest off")]
-    counts = [str(of[key]) for key in ("problems", "refused")]
-    runs = [f"{of[key]:,.0f}" for key in ("median runs", "most runs")]
-    yield [*counts, *errors, str(of["claimed more than 0.1"]), *runs, f"{of['median seconds']:.0f}"]
-
-
-def three_masses() -> Iterator[Row]:
-    """Return the rows of the benchmark of three masses."""
-    for case, rows in found("three_masses").items():
-        for row in rows:
-            errors = [abs(error) for pair in row["errors %"] for error in pair]
-            ends = (f"[{low:.3f}, {high:.3f}]" for low, high in row["ends"])
-            yield [case, str(row["runs"]), *ends, short(max(errors)), str(row["seconds"])]
 
 
 def two_fidelities() -> Iterator[Row]:
@@ -760,13 +734,10 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "scale": scale,
     "busy workers": busy_workers,
     "between runs": between_runs,
-    "placement": placement,
     "emulators, time": emulator_speed,
     "few runs": few_runs,
     "many inputs": many_inputs,
     "at a fold": at_a_fold,
-    "random problems": random_problems,
-    "three masses": three_masses,
     "two fidelities": two_fidelities,
     "libraries": libraries,
     "planning": plans,
