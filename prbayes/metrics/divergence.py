@@ -15,7 +15,6 @@ from prbayes.metrics.density import (
     DensityEstimator,
     GaussianKDE,
     density_estimator,
-    floored,
 )
 from prbayes.metrics.grid import Cells
 
@@ -95,27 +94,20 @@ class ResidualDiscrepancy(CellwiseDiscrepancy):
         return cls(metric, observed, weights, cells, density, scale_factor)
 
     @property
-    def _measure(self) -> Any:
-        """The measure of a cell: its width in the integral form, one in the sum form."""
-        return self.cells.widths if self.cells.smooth else 1.0
-
-    @property
-    def _root(self) -> Any:
-        """The root of S, which times a density is of the order of one.
-
-        np.float64, because PyTensor casts Python floats to float32.
-        """
-        return np.sqrt(np.float64(self.scale_factor))
-
-    @property
     def scale(self) -> float:
         """The residual of a population without any density: S times the integral of q squared."""
-        return float(((self._root * self.density) ** 2 * self._measure).sum())
+        root, observed, measure = self.constants
+        return float(((root * observed) ** 2 * measure).sum())
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """The root of S, the observed density, and the measure of a cell."""
-        return self._root, self.density, self._measure
+        """The root of S, which gives densities of the order of one, q, and the measure of a cell.
+
+        The measure is the width in the integral form, one in the sum form.
+        """
+        # np.float64, because PyTensor casts Python floats to float32.
+        root = np.sqrt(np.float64(self.scale_factor))
+        return root, self.density, self.cells.widths if self.cells.smooth else 1.0
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return S times (p - q)^2, times the width of the cell: eq. 6, 8, 9."""
@@ -188,6 +180,6 @@ class DivergenceDiscrepancy(CellwiseDiscrepancy):
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return the integral of a log(a / b), (a, b) = (q, p) forward, (p, q) in reverse."""
         q, floor, widths = constants
-        p = floored(density, floor)
+        p = self.floored(density, floor)
         a, b = (p, q) if self.metric.reverse else (q, p)
         return a * xp.log(a / b) * widths

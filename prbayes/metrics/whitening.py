@@ -90,20 +90,19 @@ def principal_components(
         equal = np.full(len(design), 1 / len(design))
         scatters.append(_robust_moments(design, equal, middle, typical)[1])
     scaled = [s / max(float(np.trace(s)), np.finfo(float).tiny) for s in scatters]
-    _, vectors = np.linalg.eigh(np.mean(scaled, axis=0))
-    axes = vectors[:, ::-1]
-    # The variance that the first components explain of each.
-    shares = [np.einsum("ij,ik,kj->j", axes, s, axes) for s in scaled]
-    explained = np.array([np.cumsum(share) for share in shares])
+    axes = np.linalg.eigh(np.mean(scaled, axis=0))[1][:, ::-1]
+    # The variance of each scatter that the first components explain.
+    variances = [np.einsum("ij,ik,kj->j", axes, s, axes) for s in scaled]
+    explained = np.cumsum(variances, axis=1)
     if number is None:
         is_sufficient = (explained >= 1 - LEFT_OUT).all(axis=0)
         sufficient = int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m
         number = min(sufficient, max(1, min(m, MOST_OUTPUTS, n // 5)))
     # Signs that do not depend on the algorithm.
     largest = np.abs(axes).argmax(axis=0)
-    signs = np.sign(axes[largest, np.arange(m)])
-    axes = (axes * signs)[:, :number]
+    axes = (axes * np.sign(axes[largest, np.arange(m)]))[:, :number]
     left_out = 1 - explained[:, number - 1].clip(0, 1)
+    # The correlation of neighbours in the remainder.
     centered = sample - center
     rest = centered - centered @ axes @ axes.T
     rest = rest - rest.mean(axis=0)
@@ -264,4 +263,5 @@ def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
 
 
 def _listed(outputs: NDArray[np.intp]) -> str:
+    """Return the numbers of outputs for a message."""
     return ", ".join(map(str, outputs.tolist()))

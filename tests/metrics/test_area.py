@@ -88,17 +88,6 @@ def test_failed_specimens_count_below_and_their_infinite_interval_is_left_out() 
     assert AreaMetric()([INF, INF], [1.0, 3.0, 8.0]) == pytest.approx(8 - 4)
 
 
-def test_its_features_are_the_simulated_less_the_observed_distribution_function() -> None:
-    d = AreaMetric().against([1.0, 3.0])
-    basis = d.basis(np.array([2.0, 0.0]))
-    for gap, lengths in (
-        d.features(np.array([2.0, 0.0]), np.array([0.25, 0.75]), np),
-        basis.features(np.array([0.25, 0.75])),
-    ):
-        np.testing.assert_allclose(gap, [0.75, 0.25, 0.5])
-        np.testing.assert_allclose(lengths, [1, 1, 1])
-
-
 def test_many_weights_are_summed_to_the_same_digits(draw: Draw) -> None:
     x, _, z, u = draw(0)
     basis = AreaMetric().against(z, u).basis(np.round(x))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -149,7 +150,10 @@ def test_pullback_equals_finite_differences(estimator: Any, batch: tuple[int, ..
     # Beyond the ends, where a kernel reaches back.
     x[..., 4:6] = cells.centers[0] - 0.7 * H, cells.centers[-1] + 1.3 * H
     cotangent = rng.normal(size=(*batch, cells.widths.size))
-    for_sample, for_weights = w * cells.slope(x, cotangent), cells.value(x, cotangent)
+    for_sample, for_weights = (
+        w * cells.adjoint(x, cotangent, for_sample=True),
+        cells.adjoint(x, cotangent),
+    )
     assert for_sample.shape == for_weights.shape == x.shape
 
     def objective(sample: Floats, weights: Floats) -> float:
@@ -335,10 +339,11 @@ def test_results_do_not_depend_on_layout_or_permission_to_write() -> None:
     cells = GaussianKDE().cells(rng.normal(size=30), np.full(30, 1 / 30))
     x, w = rng.normal(size=(4, 50)), rng.random((4, 50))
     expected, cotangent = cells.density(x, w), rng.normal(size=(4, cells.widths.size))
-    slopes = cells.slope(x, cotangent)
+    adjoint = partial(cells.adjoint, for_sample=True)
+    slopes = adjoint(x, cotangent)
     wide = np.asfortranarray(x)
     wide.flags.writeable = False
     np.testing.assert_array_equal(cells.density(wide, np.asfortranarray(w)), expected)
-    np.testing.assert_array_equal(cells.slope(wide, np.asfortranarray(cotangent)), slopes)
+    np.testing.assert_array_equal(adjoint(wide, np.asfortranarray(cotangent)), slopes)
     np.testing.assert_array_equal(cells.density(np.repeat(x, 2, axis=1)[:, ::2], w), expected)
-    np.testing.assert_array_equal(cells.slope(x[0], cotangent)[2], cells.slope(x[0], cotangent[2]))
+    np.testing.assert_array_equal(adjoint(x[0], cotangent)[2], adjoint(x[0], cotangent[2]))

@@ -166,7 +166,7 @@ def test_other_observed_values_keep_the_slices(metric: Metric, draw: Any) -> Non
     other = d.with_observed(x)
     assert other.observed is x
     for part, before in zip(other.parts, d.parts, strict=True):
-        assert (part.view, part.share) == (before.view, before.share)
+        assert (part.projection, part.share) == (before.projection, before.share)
         np.testing.assert_array_equal(part.target.observed, before.of(x))
     if d.metric.distance and not isinstance(d.metric.metric, MeanMetric):  # type: ignore[attr-defined]
         assert other(x) < d(x)
