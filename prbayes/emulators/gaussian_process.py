@@ -138,27 +138,21 @@ class GaussianProcess(Surface):
         """Return the means of processes that lack some of the points each, from one inverse."""
         if self.lengths is None or self.nugget is None:
             return self.tuned(x, y).without_each(x, y, lacking)
-        kernel = KERNELS[self.kernel]
-        lengths = np.array(self.lengths)
+        kernel, lengths = KERNELS[self.kernel], np.array(self.lengths)
         scaled = x / lengths
-        correlation, _ = kernel(_squares(scaled, scaled))
-        inverse = _inverse(_root(correlation, self.nugget))
+        inverse = _inverse(_root(kernel(_squares(scaled, scaled))[0], self.nugget))
         mean = y.mean()
         of_ones = inverse.sum(axis=1)
         of_y = inverse @ (y - mean)
-        coefficients = []
-        centers = []
-        for row in lacking:
-            center = float(y[~row].mean())
-            all_points = of_y - (center - mean) * of_ones
+        centers = np.array([float(y[~row].mean()) for row in lacking])
+        coefficients = np.zeros((len(x), len(lacking)))
+        for b, row in enumerate(lacking):
+            all_points = of_y - (centers[b] - mean) * of_ones
             # The coefficients given the remaining points, by a block inverse.
             columns = inverse[:, row]
             reduced = all_points - columns @ np.linalg.solve(columns[row], all_points[row])
-            reduced[row] = 0.0
-            coefficients.append(reduced)
-            centers.append(center)
-        columns = np.stack(coefficients, axis=1)
-        return partial(_mean, kernel, scaled, lengths, np.array(centers), columns)
+            coefficients[~row, b] = reduced[~row]
+        return partial(_mean, kernel, scaled, lengths, centers, coefficients)
 
     def slope(self, x: Floats, y: Floats, along: Floats) -> float:
         """Return the likeliest slope with these lengths, that of generalised least squares."""
