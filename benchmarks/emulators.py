@@ -46,9 +46,9 @@ from benchmarks.responses import RESPONSES, Response
 from prbayes.emulators.gaussian_process import (
     MOST_TUNED,
     Kernel,
-    Likelihood,
     matern,
     mean_through,
+    negative_log_likelihood,
     squared_exponential,
 )
 
@@ -342,10 +342,11 @@ def _by_hand(kernel: Kernel, starts: tuple[tuple[float, float], ...], x: Any, y:
 
     few, value = x[:MOST_TUNED], y[:MOST_TUNED] - y[:MOST_TUNED].mean()
     d = x.shape[1]
-    negative = Likelihood(kernel, few, value)
+    runs = kernel, few, value
     bounds = [(np.log(0.05), np.log(1e3))] * d + [(np.log(1e-10), 0.0)]
     first = [np.log([*[length * d**0.5] * d, nugget]) for length, nugget in starts]
-    found = [minimize(negative, s, jac=True, bounds=bounds, method="L-BFGS-B") for s in first]
+    options = {"args": runs, "jac": True, "bounds": bounds, "method": "L-BFGS-B"}
+    found = [minimize(negative_log_likelihood, s, **options) for s in first]
     best = min(found, key=lambda result: result.fun).x
 
     def again(x: Any, y: Any) -> Fitted:

@@ -101,7 +101,7 @@ class GaussianProcess(Surface):
         from scipy.optimize import minimize as scipy_minimize
 
         rows = np.linspace(0, len(x) - 1, min(MOST_TUNED, len(x))).astype(int)
-        likelihood = Likelihood(KERNELS[self.kernel], x[rows], y[rows] - y[rows].mean())
+        runs = KERNELS[self.kernel], x[rows], y[rows] - y[rows].mean()
         d = x.shape[1]
         # Far shorter, a process is noise; far longer, a plane.
         bounds = [(np.log(0.05), np.log(1e3))] * d + [(np.log(1e-10), 0.0)]
@@ -110,8 +110,9 @@ class GaussianProcess(Surface):
         starts = [(0.7, 1e-2), (2.0, 1e-6)] if len(rows) <= 128 else [(0.7, 1e-2)]
         fits = [
             scipy_minimize(
-                likelihood,
+                negative_log_likelihood,
                 np.log([*[length * np.sqrt(d)] * d, nugget]),
+                args=runs,
                 jac=True,
                 bounds=bounds,
                 method="L-BFGS-B",
@@ -197,39 +198,32 @@ def _mean(
     return np.asarray(center + deviations)
 
 
-@dataclass(frozen=True, eq=False)
-class Likelihood:
-    """Minus the log-likelihood of log lengths and log nugget, with its gradient."""
+def negative_log_likelihood(
+    parameters: Floats, kernel: Kernel, x: Floats, y: Floats
+) -> tuple[float, Floats]:
+    """Return minus the log-likelihood of log lengths and log nugget, and its gradient."""
+    from scipy.linalg import cholesky
 
-    correlation: Kernel
-    x: Floats
-    y: Floats
-
-    def __call__(self, parameters: Floats) -> tuple[float, Floats]:
-        """Return the value and the gradient."""
-        from scipy.linalg import cholesky
-
-        n = len(self.x)
-        lengths = np.exp(parameters[:-1])
-        nugget = np.exp(parameters[-1])
-        scaled = self.x / lengths
-        square = _squares(scaled, scaled)
-        np.fill_diagonal(square, 0)
-        correlation, slope = self.correlation(square)
-        try:
-            root = cholesky(correlation + nugget * np.eye(n), lower=True)
-        except np.linalg.LinAlgError:
-            return 1e10, np.zeros(parameters.size)
-        inverse = _inverse(root)
-        weights = inverse @ self.y
-        variance = max(float(self.y @ weights) / n, 1e-300)
-        outer = np.outer(weights, weights) / variance - inverse
-        inner = outer * slope
-        of_lengths = inner.sum(axis=1) @ scaled**2 - ((inner @ scaled) * scaled).sum(axis=0)
-        of_nugget = 0.5 * nugget * np.trace(outer)
-        log_determinant = np.log(np.diag(root)).sum()
-        value = 0.5 * n * np.log(variance) + log_determinant
-        return float(value), -np.append(of_lengths, of_nugget)
+    n = len(x)
+    nugget = np.exp(parameters[-1])
+    scaled = x / np.exp(parameters[:-1])
+    square = _squares(scaled, scaled)
+    np.fill_diagonal(square, 0)
+    correlation, slope = kernel(square)
+    try:
+        root = cholesky(correlation + nugget * np.eye(n), lower=True)
+    except np.linalg.LinAlgError:
+        return 1e10, np.zeros(parameters.size)
+    inverse = _inverse(root)
+    weights = inverse @ y
+    variance = max(float(y @ weights) / n, 1e-300)
+    outer = np.outer(weights, weights) / variance - inverse
+    inner = outer * slope
+    of_lengths = inner.sum(axis=1) @ scaled**2 - ((inner @ scaled) * scaled).sum(axis=0)
+    of_nugget = 0.5 * nugget * np.trace(outer)
+    log_determinant = np.log(np.diag(root)).sum()
+    value = 0.5 * n * np.log(variance) + log_determinant
+    return float(value), -np.append(of_lengths, of_nugget)
 
 
 def _root(correlation: Floats, nugget: float) -> Any:

@@ -19,7 +19,7 @@ from prbayes.response.failures import Abort, Replace
 from prbayes.response.outputs import outputs_of_keys
 from prbayes.response.store import StoreError
 
-_SHIPPED = (RadialBasis, Polynomial, GaussianProcess)
+_SHIPPED: tuple[Any, ...] = (RadialBasis, Polynomial, GaussianProcess)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +75,8 @@ def read(path: str | PathLike[str]) -> SavedSurrogate:
             data.load()
         config = json.loads(data.attrs["configuration"])
         # JSON has lists for tuples.
+        kind = config["model"].pop("kind")
         settings = {k: tuple(x) if isinstance(x, list) else x for k, x in config["model"].items()}
-        kind = settings.pop("kind")
         model = next((cls(**settings) for cls in _SHIPPED if cls.__name__ == kind), None)
         sd = data["population_sd"].values
         outside = config["outside"]

@@ -85,7 +85,12 @@ class AreaDiscrepancy(Discrepancy):
 
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
         """Return the ranks of the values among all finite values, the knots."""
-        return _ranked_basis([(self, simulated)])
+        pooled = np.concatenate([simulated, self.observed])
+        knots = np.unique(pooled[np.isfinite(pooled)])
+        order, below = ranked(simulated, knots[:-1], kind="quicksort")
+        observed_order, observed_below = ranked(self.observed, knots[:-1], kind="quicksort")
+        arrays = [order, below, observed_order, observed_below, np.diff(knots)]
+        return RankedBasis(tuple([array[None] for array in arrays]), (self.weights,))
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the area."""
@@ -106,7 +111,10 @@ class AreaSum(PartSum):
 
     def basis(self, simulated: Floats, most: float) -> Basis:
         """Return the ranks of all projections."""
-        return _ranked_basis(list(projected(self.parts, simulated)))
+        bases = [target.basis(values) for target, values in projected(self.parts, simulated)]
+        columns = zip(*[basis.arrays for basis in bases], strict=True)
+        arrays = [_padded([row for (row,) in column]) for column in columns]
+        return RankedBasis(tuple(arrays), tuple([part.target.weights for part in self.parts]))
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the areas times their shares."""
@@ -153,19 +161,6 @@ class RankedBasis(Basis):
     def rows(self, index: Any) -> Self:
         """Return the ranks for some of several data sets."""
         return replace(self, observed_weights=tuple(w[index] for w in self.observed_weights))
-
-
-def _ranked_basis(targets: Sequence[tuple[Discrepancy, Floats]]) -> RankedBasis:
-    """Return the ranks for areas of observed and stored values, (n,) each."""
-    ranks = []
-    for target, simulated in targets:
-        pooled = np.concatenate([simulated, target.observed])
-        knots = np.unique(pooled[np.isfinite(pooled)])
-        order, below = ranked(simulated, knots[:-1], kind="quicksort")
-        observed = ranked(target.observed, knots[:-1], kind="quicksort")
-        ranks.append((order, below, *observed, np.diff(knots)))
-    arrays = tuple(_padded(rows) for rows in zip(*ranks, strict=True))
-    return RankedBasis(arrays, tuple(target.weights for target, _ in targets))
 
 
 def _padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -124,8 +124,7 @@ def repeated(values: Floats, weights: Floats, size: int) -> Floats:
     """Return a sample in which each value, (n,), is repeated in proportion to its weight.
 
     It has ``size`` values if the weights are multiples of its inverse; else the value of smallest
-    weight occurs once, as in a subset. Raises ValueError if the weights are not counts, as those of
-    the loss-likelihood bootstrap.
+    weight occurs once, as in a subset. Weights that are no counts raise a ValueError.
     """
     for counts in (weights * size, weights / weights[weights > 0].min()):
         whole = np.round(counts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from prbayes.metrics.density import (
     GaussianKDE,
     density_estimator,
 )
-from prbayes.metrics.grid import Cells
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,9 @@ class ProbabilityResidual(Metric):
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         cells = self.density.cells(observed, weights)
-        return ResidualDiscrepancy.on_cells(self, observed, weights, cells)
+        density = cells.density(observed, weights)
+        scale_factor = float(self.scale_base ** -np.floor(np.log10(density.max())))  # eq. 10
+        return ResidualDiscrepancy(self, observed, weights, cells, density, scale_factor)
 
     def on_one_scale(self, slices: Sequence[Any]) -> Sequence[Any]:
         """Return the residuals with one factor S, the smallest: that of the highest peak."""
@@ -78,20 +79,13 @@ class ProbabilityResidual(Metric):
 
 @dataclass(frozen=True, eq=False)
 class ResidualDiscrepancy(CellwiseDiscrepancy):
-    """The probability residual against fixed observed values; ``scale_factor`` is S of eq. 10."""
+    """The probability residual against fixed observed values.
+
+    Against other values, by `with_observed`, it keeps its scale factor S.
+    """
 
     metric: ProbabilityResidual
     scale_factor: float
-
-    @classmethod
-    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
-        """Return the residual from observed values, S from the peak of their density (eq. 10).
-
-        Against other values, by `with_observed`, it keeps this S.
-        """
-        density = cells.density(observed, weights)
-        scale_factor = float(metric.scale_base ** -np.floor(np.log10(density.max())))
-        return cls(metric, observed, weights, cells, density, scale_factor)
 
     @property
     def scale(self) -> float:
@@ -164,7 +158,8 @@ class KullbackLeibler(Metric):
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         cells = self.density.cells(observed, weights)
-        return DivergenceDiscrepancy.on_cells(self, observed, weights, cells)
+        density = cells.density(observed, weights)
+        return DivergenceDiscrepancy(self, observed, weights, cells, density)
 
 
 class DivergenceDiscrepancy(CellwiseDiscrepancy):

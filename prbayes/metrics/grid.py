@@ -10,8 +10,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, update_wrapper
-from typing import cast
+from functools import update_wrapper
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,15 +91,7 @@ class KernelCells(Cells):
     # Additional nodes on either side on which values are binned: from farther out a kernel reaches
     # no node, whichever of four its spline brings it to.
     margin: int
-
-    @cached_property
-    def _mass_outside(self) -> Floats:
-        """The part of a kernel at each binning node below and above the grid, (2, g + 2 margin)."""
-        nodes = np.arange(self.centers.size + 2 * self.margin) - self.margin
-        # The mass of a kernel up to each of its nodes.
-        mass = np.concatenate([[0.0], np.cumsum(self.kernel * self.step)])
-        below = mass[np.clip(self.kernel.size // 2 - nodes, 0, mass.size - 1)]
-        return np.stack([below, below[::-1]])
+    mass_outside: Floats  # (2, g + 2 margin): of a kernel at each of these nodes, below and above
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return densities at the nodes, then mass below and above divided by a cluster's width."""
@@ -121,7 +113,7 @@ class KernelCells(Cells):
         # Smooth the counts, within the grid and beyond its ends.
         inner = np.zeros((rows, nodes))
         smooth(counts, self.kernel, -self.margin, inner)
-        for side, mass in enumerate(self._mass_outside):
+        for side, mass in enumerate(self.mass_outside):
             reached = np.flatnonzero(mass)
             block = slice(reached[0], reached[-1] + 1)
             outside[:, side] += (counts[:, block] * mass[block]).sum(axis=-1)
@@ -170,7 +162,7 @@ class KernelCells(Cells):
         smooth(flat, self.kernel, self.margin, smoothed)
         ends = cotangent[..., -2:] / self.widths[-1]
         smoothed = smoothed.reshape(*cotangent.shape[:-1], nodes)
-        for side, mass in enumerate(self._mass_outside):
+        for side, mass in enumerate(self.mass_outside):
             smoothed = smoothed + ends[..., side, None] * mass
         # The cubic beyond each node, from the splines around: (rows, g, 4).
         spline = _SPLINE
@@ -232,11 +224,11 @@ class BinCells(Cells):
         return np.take_along_axis(padded / self.widths[0], self._cell(sample), axis=-1)
 
 
-def compiled[**P](loop: Callable[P, None]) -> Callable[P, None]:
+def compiled(loop: Callable[..., None]) -> Callable[..., None]:
     """Compile with Numba at the first call, as it takes long to import, with a cache on disk."""
-    function: Callable[P, None] | None = None
+    function: Callable[..., None] | None = None
 
-    def call(*args: P.args, **kwargs: P.kwargs) -> None:
+    def call(*args: Any) -> None:
         nonlocal function
         if function is None:
             from numba import njit
@@ -245,7 +237,7 @@ def compiled[**P](loop: Callable[P, None]) -> Callable[P, None]:
                 function = njit(cache=True, nogil=True)(loop)
             except RuntimeError:  # no folder for the cache
                 function = njit(nogil=True)(loop)
-        function(*args, **kwargs)
+        function(*args)
 
     return update_wrapper(call, loop)
 

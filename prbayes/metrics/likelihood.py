@@ -16,7 +16,6 @@ from prbayes.metrics.density import (
     density_estimator,
     likelihood_bandwidth,
 )
-from prbayes.metrics.grid import Cells
 from prbayes.metrics.readings import Readings
 
 
@@ -189,7 +188,8 @@ class LogLikelihood(Metric):
                 "prb.LogLikelihood(density=prb.GaussianKDE())"
             )
         cells = self.density.cells(observed, weights)
-        return LikelihoodDiscrepancy.on_cells(self, observed, weights, cells)
+        density, reading = cells.density(observed, weights), cells.reading(observed, weights)
+        return LikelihoodDiscrepancy(self, observed, weights, cells, density, reading)
 
 
 def _hashable(value: Any, name: str) -> Any:
@@ -214,13 +214,6 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     # (m,) or (..., m): ``reading @ g`` is the mean at the observed values of g, given on the cells.
     reading: Floats
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
-
-    @classmethod
-    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
-        """Return the likelihood of observed values, to be read from densities on given cells."""
-        density = cells.density(observed, weights)
-        reading = cells.reading(observed, weights)
-        return cls(metric, observed, weights, cells, density, reading)
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
         """Return the same metric, on the same cells, against other values; for resampling."""

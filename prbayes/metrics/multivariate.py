@@ -27,11 +27,12 @@ from prbayes.metrics.whitening import (
     LEFT_OUT,
     MOST_OUTPUTS,
     Components,
-    Whitening,
     principal_components,
     units,
     whitening,
 )
+
+type _Coordinates = tuple[Floats, Floats]  # center and axes, see `whitening`
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +133,10 @@ def components_summary(target: Discrepancy, *, missed: bool = False) -> str:
     return "; ".join(filter(None, texts))
 
 
+# What a metric of several outputs declares as its metric of one output does.
+_DECLARED = "minimum", "additive", "symbolic", "takes_weights", "tail_responses", "distance"
+
+
 @dataclass(frozen=True)
 class LiftedMetric(Metric):
     """A metric of several outputs, made of a metric of one, whose properties it has."""
@@ -142,18 +147,12 @@ class LiftedMetric(Metric):
     additive = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.metric, Metric):
+        if not isinstance(self.metric, Metric) or self.metric.takes_outputs:
             raise TypeError(
                 f"metric: got {called(self.metric)}, expected a metric of one output, such as "
                 "prb.ProbabilityResidual()"
             )
-        if self.metric.takes_outputs:
-            raise TypeError(
-                f"metric: got {called(self.metric)}, which compares several outputs already, "
-                "expected a metric of one output, such as prb.ProbabilityResidual()"
-            )
-        names = "minimum", "additive", "symbolic", "takes_weights", "tail_responses", "distance"
-        for name in names:
+        for name in _DECLARED:
             object.__setattr__(self, name, getattr(self.metric, name))
 
     def like(self, metric: Metric) -> Metric:
@@ -357,15 +356,17 @@ class Joint(LiftedMetric):
                 runs = design[:, outputs]
                 runs = _capped(runs[~np.isnan(runs).any(axis=1)], caps[outputs])
             sample = observed[:, outputs]
-            white, principal = self._white(sample, weights, outputs, caps[outputs], runs, n_inputs)
+            (center, axes), principal = self._white(
+                sample, weights, outputs, caps[outputs], runs, n_inputs
+            )
             components += principal
-            m = white.axes.shape[1]
+            m = axes.shape[1]
             number = 1 if m == 1 else self.directions or sufficient_directions(m)
             which = ""
             if outputs.size < observed.shape[1]:
                 which = f" of outputs {', '.join(map(str, outputs.tolist()))}"
             for k, direction in enumerate(directions(m, number, self.random_seed)):
-                view = Projection(outputs, caps[outputs], white.center, white.axes @ direction)
+                view = Projection(outputs, caps[outputs], center, axes @ direction)
                 values, index = view.observed_of(observed)
                 target = self.metric.against(values, weights[index])
                 parts.append(Part(target, share / number, f"direction {k + 1}{which}", view))
@@ -384,7 +385,7 @@ class Joint(LiftedMetric):
         caps: Floats,
         design: Floats | None,
         n_inputs: int | None,
-    ) -> tuple[Whitening, list[Components]]:
+    ) -> tuple[_Coordinates, list[Components]]:
         """Return white coordinates of some outputs, or of their principal components."""
         if outputs.size > 1 and (outputs.size > MOST_OUTPUTS or self.components is not None):
             is_complete = ~np.isnan(sample).any(axis=-1)
@@ -400,17 +401,16 @@ class Joint(LiftedMetric):
         return white, []
 
 
-def _whitened_scores(principal: Components, sample: Floats, weights: Floats) -> Whitening:
+def _whitened_scores(principal: Components, sample: Floats, weights: Floats) -> _Coordinates:
     """Return white coordinates of the scores on principal components."""
     scores = (sample - principal.center) @ principal.axes
-    white = whitening(scores, weights, np.arange(principal.number))
-    center = principal.center + principal.axes @ white.center
-    return Whitening(center, principal.axes @ white.axes)
+    center, axes = whitening(scores, weights, np.arange(principal.number))
+    return principal.center + principal.axes @ center, principal.axes @ axes
 
 
 def _flat(
     sample: Floats, weights: Floats, outputs: NDArray[np.intp], n_inputs: int
-) -> Whitening | None:
+) -> _Coordinates | None:
     """Return white coordinates of a surface that outputs of fewer inputs lie on; None if too bent.
 
     Whitening weights the bend of a surface as much as the places of specimens on it, which say more
@@ -422,8 +422,8 @@ def _flat(
     for number in range(max(1, n_inputs), outputs.size):
         principal = principal_components(standard, weights, number)
         if principal.left_out <= LEFT_OUT:
-            white = _whitened_scores(principal, standard, weights)
-            return Whitening(center + unit * white.center, white.axes / unit[:, None])
+            inner, axes = _whitened_scores(principal, standard, weights)
+            return center + unit * inner, axes / unit[:, None]
     return None
 
 

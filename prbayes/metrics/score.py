@@ -21,29 +21,16 @@ from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """Options of scores.
+    """Options of scores."""
 
-    Attributes
-    ----------
-    reach : float
-        Default bandwidths beyond the ends of the data, farther than which the score of a
-        log-density is constant. It would grow without bound, and the tail of the population would
-        decide on the posterior. The extremes expected of all specimens of the model count as data.
-    step : float
-        Relative step of central differences.
-    block : int
-        Number of specimens that are evaluated at once.
-    nodes : int
-        Nodes of the tables of scores as functions of a response.
-    margin : float
-        Default bandwidths beyond all responses at the estimate where the tables end.
-    """
-
+    # Default bandwidths beyond the ends of the data, farther than which the score of a log-density
+    # is constant. It would grow without bound, and the tail of the population would decide on the
+    # posterior. The extremes expected of all specimens of the model count as data.
     reach: float = 2.0
-    step: float = 1e-4
-    block: int = 128
-    nodes: int = 1024
-    margin: float = 10.0
+    step: float = 1e-4  # relative step of central differences
+    block: int = 128  # specimens that are evaluated at once
+    nodes: int = 1024  # of the tables of scores as functions of a response
+    margin: float = 10.0  # default bandwidths beyond all responses where the tables end
 
 
 @dataclass(frozen=True, eq=False)

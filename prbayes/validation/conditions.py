@@ -210,10 +210,10 @@ def projections(pool: Floats) -> list[Projection]:
     # 4096 specimens determine correlations to .02; any directions give a test of the right size.
     sample = finite[:: -(-len(finite) // 4096)]
     outputs = np.arange(m)
-    white = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
+    center, axes = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
     caps = failure_caps(rows)
     return [
-        Projection(outputs, caps, white.center, white.axes @ u)
+        Projection(outputs, caps, center, axes @ u)
         for u in directions(m, max(1, sufficient_directions(m)), 0)
     ]
 

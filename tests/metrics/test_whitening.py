@@ -108,8 +108,8 @@ def test_what_is_left_out_is_told_and_said_if_it_is_no_noise() -> None:
 
 def coordinates(y: Floats, weights: Floats | None = None) -> Floats:
     u = np.full(len(y), 1 / len(y)) if weights is None else weights
-    white = whitening(y, u, np.arange(y.shape[1]))
-    return (y - white.center) @ white.axes
+    center, axes = whitening(y, u, np.arange(y.shape[1]))
+    return (y - center) @ axes
 
 
 def correlated(rho: float, n: int = 50, m: int = 2, seed: int = 0) -> Floats:
@@ -153,13 +153,13 @@ def test_weights_are_repetitions_and_weight_zero_is_not_there() -> None:
 @pytest.mark.parametrize("distance", [8.0, 1e3])
 def test_gross_outliers_move_it_little(distance: float) -> None:
     y = correlated(0.9, 400)
-    white = whitening(y, np.full(400, 1 / 400), np.arange(2))
+    center, axes = whitening(y, np.full(400, 1 / 400), np.arange(2))
     y[:20] = distance
-    other = whitening(y, np.full(400, 1 / 400), np.arange(2))
+    other_center, other_axes = whitening(y, np.full(400, 1 / 400), np.arange(2))
     # Scatter of the one in coordinates of the other; mean and covariance would be 8 or 1e5 off.
-    back = np.linalg.inv(other.axes) @ white.axes
+    back = np.linalg.inv(other_axes) @ axes
     np.testing.assert_allclose(np.linalg.svd(back)[1], 1, atol=0.2)
-    assert np.abs((other.center - white.center) @ white.axes).max() < 0.15
+    assert np.abs((other_center - center) @ axes).max() < 0.15
 
 
 def test_equal_specimens_that_have_no_robust_scatter_are_whitened_all_the_same() -> None:
