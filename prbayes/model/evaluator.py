@@ -40,7 +40,7 @@ from prbayes.propagation.base import Bound
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
-from prbayes.response.compile import compiled, ninf_for_invalid, untraced
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 from prbayes.response.inputs import is_group
 
 # Points of a design from which on samplers start with an eighth of them.
@@ -318,7 +318,7 @@ def _compile_roots(evaluator: Evaluator) -> tuple[Any, Any]:
     return evaluator.hyperparameters.compile(graphs), np.cumsum([0, *map(len, params)])
 
 
-@untraced()
+@interpreted()
 def _compile_objective(evaluator: Evaluator, *, prior: bool, gradient: bool) -> Any:
     """Compile the objective of `Evaluator.objective`."""
     model = evaluator.model
@@ -497,8 +497,7 @@ class Requirement:
 
 # Of the optimiser and the samplers, whose designs grow until they meet it. A mean weight of 0.8 to
 # 1.25 is a fifth of the population's mass either way. Half the effective sample size moves an
-# optimum by .05 standard errors; twice is more than 1024 points give with two inputs
-# (docs/constants.md).
+# optimum by .05 standard errors; twice is more than 1024 points give with two inputs.
 ENOUGH = Requirement(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
 # Of predictions, whose designs do not grow. Laxer: draws at the edge of a posterior are less well
 # supported than its centre, and resampling needs no derivative.

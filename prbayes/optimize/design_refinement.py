@@ -32,7 +32,7 @@ from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 
 _log = logging.getLogger("prbayes")
-# Batches after which a design is refused; half or twice changes no answer (docs/constants.md).
+# Batches after which a design is refused; half or twice changes no answer.
 MAX_ROUNDS = 8
 # Share of it for points and for emulators: together they then have it all.
 _SHARE = np.sqrt(0.5)
