@@ -244,7 +244,8 @@ class Surrogate:
             coarse=coarse,
             _joined=bool(joined),
             _named=tally.named,
-        )._with_surface()
+            _surface=_fitted_surface(model, domain, design, responses, coarse, joined=bool(joined)),
+        )
         if predictive is not None:
             values = surrogate._at(predictive)
             error = CrossValidation(residuals, _spread(values[_usable(values)]))
@@ -348,7 +349,7 @@ class Surrogate:
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        write(path, self, self._probes())
+        write(path, self, _probes(self))
 
     @classmethod
     def load(
@@ -392,10 +393,13 @@ class Surrogate:
                 "follows: a file does not keep it; pass coarse="
             )
         coarse = coarse if saved.follows_coarse else None
-        surrogate = cls(**saved.fields, model=model, coarse=coarse)._with_surface()
-        spread = np.asarray(_spread(surrogate.responses[surrogate._is_usable]))
+        fields = saved.fields
+        runs = fields["domain"], fields["points"], fields["responses"]
+        surface = _fitted_surface(model, *runs, coarse, joined=fields["_joined"])
+        surrogate = cls(**fields, model=model, coarse=coarse, _surface=surface)
+        spread = np.asarray(_spread(surrogate.responses[_usable(surrogate.responses)]))
         size = np.where(spread > 0, spread, 1.0)
-        probes, expected = surrogate._probes() / size, saved.probes / size
+        probes, expected = _probes(surrogate) / size, saved.probes / size
         # The tolerance is above rounding on another processor, below the effect of a setting.
         if not np.allclose(probes, expected, rtol=0, atol=1e-6, equal_nan=True):
             and_coarse = ", and the same coarse response" if saved.follows_coarse else ""
@@ -407,32 +411,12 @@ class Surrogate:
         return surrogate
 
     @cached_property
-    def _is_usable(self) -> NDArray[np.bool_]:
-        """Which runs have only finite outputs, (n,)."""
-        return _usable(self.responses)
-
-    @cached_property
     def _trees(self) -> tuple[Any, Any]:
         """Search trees of all runs and of the usable ones, in the unit cube."""
         from scipy.spatial import cKDTree
 
         unit = self.domain.scaled(self.points)
-        return cKDTree(unit), cKDTree(unit[self._is_usable])
-
-    def _with_surface(self) -> Surrogate:
-        """Return the surrogate with its surface, or one for each output."""
-        x = self.domain.scaled(self.points)[self._is_usable]
-        y = self.responses[self._is_usable]
-        surface: Any
-        if y.ndim > 1:
-            surface = partial(_outputs, [fitted(self.model, x, output) for output in y.T])
-        elif self.coarse is None:
-            surface = fitted(self.model, x, y)
-        else:
-            coarse = _coarse_at("surrogate", self.coarse, self.domain, self.points)
-            model = MultifidelityModel(self.model, self.model, self._joined)
-            surface = fit_multifidelity(model, x, y, coarse[self._is_usable])
-        return replace(self, _surface=surface)
+        return cKDTree(unit), cKDTree(unit[_usable(self.responses)])
 
     def _surface_at(self, columns: Floats, unit: Floats) -> Floats:
         """Return values of the surface at rows, and at the same rows in the unit cube."""
@@ -450,11 +434,6 @@ class Surrogate:
             )
         return np.asarray(self._surface(unit, coarse))
 
-    def _probes(self) -> Floats:
-        """Return values of the surface at 64 fixed points, which identify it."""
-        unit = sobol(64, self.domain.dimensions, 0)
-        return self._surface_at(self.domain.at(unit), unit)
-
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
         if not len(columns):
@@ -470,15 +449,16 @@ class Surrogate:
             place = (number % np.uint64(k)).astype(np.intp)
             signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
             values = values + residuals[np.arange(n), place] * signs
-        if not self._is_usable.all():
+        failed = ~_usable(self.responses)
+        if failed.any():
             _, nearest = self._trees[0].query(unit)
-            is_failed = ~self._is_usable[nearest]
+            is_failed = failed[nearest]
             values[is_failed] = self.responses[nearest[is_failed]]
         return values
 
     def _nearby(self, unit: Floats) -> Floats:
         """Return the residuals at the nearest design points that did not fail, (n, k, ...)."""
-        residuals = self.error.residuals[self._is_usable]
+        residuals = self.error.residuals[_usable(self.responses)]
         # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
         k = min(len(residuals), 4 * (unit.shape[1] + 1))
         # Points that are not finite are outside: any neighbours will do.
@@ -500,6 +480,32 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
         h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         h = h ^ (h >> np.uint64(31))
     return h
+
+
+def _fitted_surface(
+    model: Any,
+    domain: Ranges,
+    points: Floats,
+    responses: Floats,
+    coarse: Callable[..., Any] | None,
+    *,
+    joined: bool,
+) -> Any:
+    """Return a surface through the usable runs, or one for each output, in the unit cube."""
+    usable = _usable(responses)
+    x, y = domain.scaled(points)[usable], responses[usable]
+    if y.ndim > 1:
+        return partial(_outputs, [fitted(model, x, output) for output in y.T])
+    if coarse is None:
+        return fitted(model, x, y)
+    coarse_values = _coarse_at("surrogate", coarse, domain, points)[usable]
+    return fit_multifidelity(MultifidelityModel(model, model, joined), x, y, coarse_values)
+
+
+def _probes(surrogate: Surrogate) -> Floats:
+    """Return values of the surface at 64 fixed points, which identify it."""
+    unit = sobol(64, surrogate.domain.dimensions, 0)
+    return surrogate._surface_at(surrogate.domain.at(unit), unit)
 
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:
