@@ -176,7 +176,7 @@ def refine_at(
     """
     short = shortcomings(evaluator, thetas)
     for name, shortcoming in short.items():
-        if shortcoming.lost is not None:
+        if shortcoming.is_lost:
             raise DesignError(
                 f"{name}: {shortcoming}; repair the response there, return +inf for specimens "
                 "that fail, narrow the priors, or raise max_lost"
