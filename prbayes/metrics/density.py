@@ -458,7 +458,7 @@ def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
     outside the inner cells does not count.
     """
     batch = np.shape(simulated)[: np.ndim(simulated) - 1 - len(target.event)]
-    smallest = np.ones(batch)
+    cosines = [np.ones(batch)]
     for inner, values in projected(target.parts, simulated):
         if not isinstance(inner, DensityDiscrepancy):
             continue
@@ -467,5 +467,5 @@ def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
         dz = inner.cells.widths[:-2]
         size = np.sqrt(((p**2) * dz).sum(axis=-1) * ((q**2) * dz).sum(axis=-1))
         cosine = (p * q * dz).sum(axis=-1) / np.where(size > 0, size, 1.0)
-        smallest = np.minimum(smallest, np.nan_to_num(cosine))
-    return smallest
+        cosines.append(np.nan_to_num(cosine))
+    return np.asarray(np.min(cosines, axis=0))
