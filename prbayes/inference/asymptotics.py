@@ -31,8 +31,6 @@ from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
-# Share of an element in unidentified directions above which it is not identified.
-_LARGEST_LOADING = 0.02
 # Avoids division by zero.
 _TINY = np.finfo(float).tiny
 
@@ -330,7 +328,7 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
             product = product + (even_change * odd_change * lengths).sum(axis=-1)
             even_square = even_square + (even_change**2 * lengths).sum(axis=-1)
             odd_square = odd_square + (odd_change**2 * lengths).sum(axis=-1)
-        # Correlation of the changes. Half or twice of .35 changes no answer (docs/constants.md).
+        # Correlation of the changes. Half or twice of .35 changes no answer.
         is_identified &= product > 0.35 * np.sqrt(even_square * odd_square)
     return np.asarray(vectors[:, is_identified])
 
@@ -382,7 +380,10 @@ def first_order_shifts(
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Covariance of the minimiser at one theta, in units of the prior's spread."""
+    """Covariance of the minimiser at one theta, in units of the prior's spread.
+
+    Elements and functions with a share above .02 in unidentified directions are not identified.
+    """
 
     prior_sd: Floats  # (d,): the prior's spread
     identified: Floats  # (d, r): orthonormal directions that the data identify
@@ -394,7 +395,7 @@ class Local:
         """The covariance in theta, (d, d), infinite for elements with a share not identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
         covariance = self.identified @ self.covariance @ self.identified.T * unit
-        is_hidden = (self.unidentified**2).sum(axis=1) > _LARGEST_LOADING
+        is_hidden = (self.unidentified**2).sum(axis=1) > 0.02
         covariance[is_hidden] = np.inf
         covariance[:, is_hidden] = np.inf
         return np.asarray(covariance)
@@ -409,7 +410,7 @@ class Local:
         along = unit @ self.identified
         across = unit @ self.unidentified
         variance = np.einsum("...i,ij,...j->...", along, self.covariance, along)
-        is_hidden = (across**2).sum(axis=-1) > _LARGEST_LOADING * (unit**2).sum(axis=-1)
+        is_hidden = (across**2).sum(axis=-1) > 0.02 * (unit**2).sum(axis=-1)
         return np.asarray(np.where(is_hidden, np.inf, np.maximum(variance, 0)))
 
 

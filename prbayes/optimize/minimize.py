@@ -41,7 +41,7 @@ from prbayes.inference.checks.prior import prior_end_findings, prior_ends
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import SamplingDistribution, jumping_simulators
 from prbayes.inference.resampling import SETS
-from prbayes.metrics.multivariate import components_missed
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.cost import explained, kept
 from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
 from prbayes.model.locking import locked
@@ -500,7 +500,7 @@ def _report(
         *smoothing_bias(evaluator, fit.theta, fit.scales, local),
         *optimum_findings(evaluator, fit.sampling, optima, fit.design_error),
     )
-    local_optima = tuple(other.as_dict(evaluator) for other in optima)
+    local_optima = tuple(mode.as_dict(evaluator) for mode in optima)
     return replace(
         optimum, design_error=fit.design_error, local_optima=local_optima, findings=findings
     )
@@ -537,12 +537,12 @@ def optimum_findings(
     design_error: float,
 ) -> tuple[Finding, ...]:
     """Report what the metric leaves out, the design's error, other optima, and identification."""
-    missed = {node.name: components_missed(node.target) for node in evaluator.nodes}
+    missed = {n.name: components_summary(n.target, missed=True) for n in evaluator.nodes}
     findings = [
         Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
     ]
     findings += design_error_findings(evaluator, design_error)
-    findings += [other.finding(evaluator) for other in optima if other.comparable]
+    findings += [mode.finding(evaluator) for mode in optima if mode.comparable]
     if sampling is not None:
         ends = prior_ends(sampling)
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"

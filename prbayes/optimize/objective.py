@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator, has_other_terms
+from prbayes.model.evaluator import Evaluator
 
 # Theta (d,) -> value, gradient (d,) or None, number of evaluations.
 type Function = Callable[[Floats], tuple[float, Floats | None, int]]
@@ -119,7 +119,7 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
     terms = ""
     if prior:
         terms = "minus the log prior (prior=True)"
-    elif has_other_terms(evaluator):
+    elif evaluator.has_other_terms:
         # Terms that only exclude hyperparameters do not count.
         values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))
         finite = values[np.isfinite(values)]

@@ -31,7 +31,6 @@ from prbayes.model.description import (
 )
 from prbayes.model.evaluator import (
     Evaluator,
-    has_other_terms,
     likelihood_of,
     missing_mass,
     specimen_log_likelihoods,
@@ -365,7 +364,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
-    elif len(scales) > 1 or search.prior or has_other_terms(evaluator):
+    elif len(scales) > 1 or search.prior or evaluator.has_other_terms:
         values = np.full(len(scales), np.nan)
     else:
         values = fit.lowest * scales
@@ -517,8 +516,8 @@ def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
     """
     names = optimum.evaluator.hyperparameters.names
     order = [names.index(name) for name in evaluator.hyperparameters.names]
-    others = [other["theta"] for other in optimum.local_optima if other["comparable"]]
-    return np.array([optimum.theta, *others])[:, order]
+    modes = [mode["theta"] for mode in optimum.local_optima if mode["comparable"]]
+    return np.array([optimum.theta, *modes])[:, order]
 
 
 # -- storage ---------------------------------------------------------------------------------------

@@ -339,8 +339,8 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     """Evaluate the objective on a grid of ``points`` along each of one or two hyperparameters."""
     plane = _Plane.of(optimum, evaluator, names)
     path = free_elements(evaluator, optimum.search.trace["theta"])
-    local_optima = np.array([other["theta"] for other in optimum.local_optima])
-    others = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
+    local_optima = np.array([mode["theta"] for mode in optimum.local_optima])
+    modes = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
     prior = free_elements(evaluator, evaluator.hyperparameters.prior_thetas(1000, 0))
     errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
 
@@ -348,7 +348,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     for name in names:
         # The path beyond the prior's bulk, ten draws at each end, does not widen the axis.
         bulk = np.quantile(prior[name], (0.01, 0.99))
-        marked = np.append(np.clip(path[name], *bulk), others[name])
+        marked = np.append(np.clip(path[name], *bulk), modes[name])
         error = errors[name]
         if not (np.isfinite(error) and error > 0):  # unknown: an axis as wide as the prior
             error = float((bulk[1] - bulk[0]) / (2 * _STANDARD_ERRORS))
@@ -367,7 +367,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
         axes,
         heights.reshape(coordinates[0].shape),
         path=_columns(path, names),
-        local_optima=_columns(others, names),
+        local_optima=_columns(modes, names),
         optimum=_columns(plane.center, names),
     )
 

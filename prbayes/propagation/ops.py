@@ -16,7 +16,7 @@ from pytensor.graph.replace import _vectorize_node
 from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy, DensitySum
 from prbayes.metrics.grid import Cells
-from prbayes.response.inputs import batch_shape, broadcast_batch
+from prbayes.response.inputs import broadcast_batch
 from prbayes.response.response import Responses
 
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every
@@ -74,8 +74,7 @@ class ResponseOp(OwnOp):
         self.event_shape: tuple[int, ...] = ()
         if responses.outputs is not None:
             self.event_shape = responses.outputs.event
-        inputs = responses.inputs
-        self.event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
+        self.event_ndims = responses.inputs.event_ndims
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Call the response for populations that are valid.
@@ -83,8 +82,7 @@ class ResponseOp(OwnOp):
         Others have an input that is finite at none of their specimens.
         """
         k = len(self.responses.inputs.aleatory)
-        batch = batch_shape(inputs, self.event_ndims)
-        full = broadcast_batch(inputs, self.event_ndims, batch)
+        batch, full = broadcast_batch(inputs, self.event_ndims)
         valid = np.ones(batch[:-1], dtype=bool)
         for x in full[:k]:
             event_axes = tuple(range(len(batch), x.ndim))
@@ -130,8 +128,8 @@ class DensityOp(OwnOp):
                 "use GaussianKDE, or prb.Reweighted"
             )
         sample, weights = inputs
-        slope = CotangentOp(self.cells, 1)(sample, *cotangents)
-        value = CotangentOp(self.cells, 0)(sample, *cotangents)
+        slope = CotangentOp(self.cells, True)(sample, *cotangents)
+        value = CotangentOp(self.cells, False)(sample, *cotangents)
         return [weights * slope, value]
 
 
@@ -141,18 +139,17 @@ class CotangentOp(OwnOp):
     (..., n), (..., m) -> (..., n).
     """
 
-    __props__ = ("cells", "order")
+    __props__ = ("cells", "for_sample")
     __str__ = OwnOp.__str__
     event_shape = (None,)
 
-    def __init__(self, cells: Cells, order: int) -> None:
+    def __init__(self, cells: Cells, for_sample: bool) -> None:
         self.cells = cells
-        self.order = order
+        self.for_sample = for_sample
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
-        gather = self.cells.slope if self.order else self.cells.value
-        outputs[0][0] = gather(*inputs)
+        outputs[0][0] = self.cells.adjoint(*inputs, for_sample=self.for_sample)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse second derivatives."""

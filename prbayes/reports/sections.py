@@ -312,9 +312,9 @@ def optima(m: Material) -> list[Section]:
         text = [_how_it_ended(tree["optimum"].attrs)]
         if label in m.live_optima:
             evaluator = m.live_optima[label].evaluator
-            for other in m.live_optima[label].local_optima:
-                place = labelled(evaluator, other["point"], {}).data_vars
-                text.append(_other_optimum(other, place, names))
+            for mode in m.live_optima[label].local_optima:
+                place = labelled(evaluator, mode["point"], {}).data_vars
+                text.append(_other_optimum(mode, place, names))
         text.append(
             "Standard errors are those of the curvature of the log-likelihood."
             if m.is_by_specimen
@@ -348,15 +348,15 @@ def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
     return text
 
 
-def _other_optimum(other: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
+def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
     """Return a sentence on another optimum, by scalars alone if its elements are many."""
     elements = single_elements(point)
     shown = [name for name in names if name in elements]
     if len(shown) > 8:
         shown = [name for name in shown if name in point] or shown
     at = ", ".join(f"{name} = {number(elements[name])}" for name in shown)
-    discrepancy = number(float(other["discrepancy"]))
-    if other["comparable"]:
+    discrepancy = number(float(mode["discrepancy"]))
+    if mode["comparable"]:
         judged = "the data could as well come from there"
     else:
         judged = "the data fit it less well; a posterior gives its weight"

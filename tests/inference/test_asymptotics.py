@@ -16,7 +16,6 @@ from prbayes.inference.asymptotics import (
     identified_by_curvature,
     local_sampling,
     number_parts,
-    oriented,
     unidentified_directions,
 )
 from prbayes.inference.resampling import DataSets
@@ -307,4 +306,3 @@ def test_what_is_looked_at_stays_when_the_design_grows() -> None:
     bound.add([np.atleast_1d(values) for values in evaluator.roots(theta[None], 0)], 512)
     assert bound.n_points == 1536
     np.testing.assert_array_equal(identified_by_area(information), before)
-

@@ -163,7 +163,9 @@ def settled(function: Any, at: list[float], most: int = 1000, count: int = 10) -
     """Settle a line search that gave up at a place of some function."""
 
     class Known(Search):
-        def objective(self, center: Any, scales: Any, size: float, spent: int, *, gradient: bool) -> Any:
+        def objective(
+            self, center: Any, scales: Any, size: float, spent: int, *, gradient: bool
+        ) -> Any:
             return Objective(
                 function if gradient else lambda theta: (function(theta)[0], None, 1),
                 *(center, self.prior_sd, size),

@@ -29,7 +29,11 @@ def nearby(local: Local | None, covariance: Any, ridge: Any = None) -> Any:
     evaluator: Any = SimpleNamespace(hyperparameters=hyperparameters, reweighted={})
     sampling = None if local is None else SimpleNamespace(local=local)
     fit: Any = SimpleNamespace(
-        theta=np.array([1.0, -1.0]), sampling=sampling, covariance=covariance, ridge=ridge, pilot=None
+        theta=np.array([1.0, -1.0]),
+        sampling=sampling,
+        covariance=covariance,
+        ridge=ridge,
+        pilot=None,
     )
     return neighbourhood(evaluator, fit, 0)
 

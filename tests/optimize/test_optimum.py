@@ -115,9 +115,7 @@ COVARIANCE = np.array([[4.0, 1.0], [1.0, 9.0]])
 
 def test_standard_errors_of_sums_and_differences_know_the_correlation() -> None:
     gradients = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, -1.0], [0.0, 0.0]])
-    np.testing.assert_allclose(
-        delta_method(gradients, COVARIANCE), np.sqrt([4.0, 15.0, 11.0, 0.0])
-    )
+    np.testing.assert_allclose(delta_method(gradients, COVARIANCE), np.sqrt([4.0, 15.0, 11.0, 0.0]))
 
 
 def test_what_depends_on_an_element_that_is_not_identified_is_infinite() -> None:

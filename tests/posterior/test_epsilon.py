@@ -185,9 +185,7 @@ def test_residual_epsilon_scales_with_the_metric() -> None:
     optimum, _ = known_sd()
     other = prb.minimize(build(PR, Line(10.0), 10 * OBSERVED, sd=0.5))
     factor = (
-        node(other.model).target.scale_factor
-        / node(optimum.model).target.scale_factor
-        / 10
+        node(other.model).target.scale_factor / node(optimum.model).target.scale_factor / 10
     )  # of int (p - q)^2
     np.testing.assert_allclose(other.discrepancy, factor * optimum.discrepancy, rtol=1e-6)
     one, ten = (prb.calibrate_epsilon(o)["y"] for o in (optimum, other))

@@ -57,9 +57,7 @@ def test_metric_and_epsilon(
 def test_results_under_different_metrics(calibrated: Any) -> None:
     first = calibrated.optimum.to_datatree()
     other = first.copy(deep=True)
-    other["calibration"] = (
-        other["calibration"].to_dataset().assign(metric=("simulator", ["Other()"]))
-    )
+    other["calibration"] = other["calibration"].to_dataset().assign(metric=("simulator", ["Other()"]))
     given = dict.fromkeys(("model", "posterior", "validity", "comparison"))
     (same,) = metric(gather(optimum={"a": first, "b": first}, **given))
     assert [p.split(": ")[0] for p in same.text[1:]] == ["y"]
@@ -283,8 +281,8 @@ def test_a_place_of_many_elements_is_told_by_scalars_alone() -> None:
     for size, told in ((7, "mu = 2.000, w[0]"), (8, "mu = 2.000, with")):
         point = {"mu": 2.0, "w": np.ones(size)}
         names = ["mu", *(f"w[{i}]" for i in range(size))]
-        other = {"discrepancy": 0.1, "comparable": False}
-        assert f"is at {told}" in _other_optimum(other, point, names)
+        mode = {"discrepancy": 0.1, "comparable": False}
+        assert f"is at {told}" in _other_optimum(mode, point, names)
 
 
 def test_of_a_covariance_standard_deviations_and_correlations_are_read(
@@ -299,9 +297,9 @@ def test_of_a_covariance_standard_deviations_and_correlations_are_read(
     }
     stderr = {name: 0.1 * np.ones(np.shape(value)) for name, value in point.items()}
     stderr["chol_corr"] = np.array([[0.0, 0.1], [0.1, 0.0]])
-    other = {"point": {**point, "mu": 7.0}, "discrepancy": 0.25, "comparable": True}
+    mode = {"point": {**point, "mu": 7.0}, "discrepancy": 0.25, "comparable": True}
     optimum = dataclasses.replace(
-        calibrated.optimum, point=point, stderr=stderr, local_optima=(other,)
+        calibrated.optimum, point=point, stderr=stderr, local_optima=(mode,)
     )
     found = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum")
     assert [row[0] for row in cells(found.table).rows] == read

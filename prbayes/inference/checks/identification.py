@@ -69,7 +69,7 @@ def confounding_findings(evaluator: Evaluator, local: Local) -> list[Finding]:
                 f"{reason}; measure under more conditions, state narrower priors, or leave one of "
                 "them out."
             )
-            page = "inadequacy.md#can-it-be-told-from-the-scatter-of-the-inputs"
+            page = "inadequacy.md#can-it-be-separated-from-the-scatter-of-the-inputs"
             findings.append(Finding("discrepancy-confounded", text, page))
     return findings
 
