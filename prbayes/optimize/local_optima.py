@@ -156,11 +156,11 @@ def find_local_optima(
         optima = verified_optima(reference, optima_from_prior(reference, starts, seed))
     else:
         for remaining in (2, 1, 0):  # most need one search
-            found = optima_from_prior(reference, starts, seed)
-            optima = [optimum for optimum in found if _is_supported(evaluator, optimum)]
+            candidates = optima_from_prior(reference, starts, seed)
+            optima = [optimum for optimum in candidates if _is_supported(evaluator, optimum)]
             undersampled = [
                 optimum
-                for optimum in found
+                for optimum in candidates
                 if (optimum.better or optimum.comparable) and optimum not in optima
             ]
             if not undersampled or not refine or not remaining:

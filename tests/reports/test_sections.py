@@ -57,7 +57,9 @@ def test_metric_and_epsilon(
 def test_results_under_different_metrics(calibrated: Any) -> None:
     first = calibrated.optimum.to_datatree()
     other = first.copy(deep=True)
-    other["calibration"] = other["calibration"].to_dataset().assign(metric=("simulator", ["Other()"]))
+    other["calibration"] = (
+        other["calibration"].to_dataset().assign(metric=("simulator", ["Other()"]))
+    )
     given = dict.fromkeys(("model", "posterior", "validity", "comparison"))
     (same,) = metric(gather(optimum={"a": first, "b": first}, **given))
     assert [p.split(": ")[0] for p in same.text[1:]] == ["y"]
