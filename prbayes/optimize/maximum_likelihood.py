@@ -578,10 +578,10 @@ class SpecimenRefits:
     @property
     def _function(self) -> Any:
         """The compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
-        return self.evaluator.cached("weighted log-likelihood", self._compile)
-
-    def _compile(self) -> Any:
         evaluator = self.evaluator
+        key = "weighted log-likelihood"
+        if key in evaluator.functions:
+            return evaluator.functions[key]
         with interpreted():
             graphs = specimen_graphs(evaluator)
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
@@ -591,7 +591,9 @@ class SpecimenRefits:
             ]
             (value,), theta = evaluator.hyperparameters.joined([-sum(terms)])
             gradient = pt.grad(value, theta)
-            return compiled([theta, *weights], ninf_for_invalid([value, gradient]))
+            outputs = ninf_for_invalid([value, gradient])
+            evaluator.functions[key] = compiled([theta, *weights], outputs)
+        return evaluator.functions[key]
 
     @cached_property
     def _root(self) -> Floats:
