@@ -102,7 +102,7 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
                 texts.append(column)
         if texts:
             raise TypeError(
-                f"{label}: got a DataFrame whose columns {texts} hold no numbers, expected a "
+                f"{label}: got a DataFrame whose columns {texts} are no numbers, expected a "
                 "column of measured responses for each output; leave others out, as in "
                 "df['life'], and where one names groups, such as suppliers, index hyperparameters "
                 f"by prb.response.group({str(texts[0])!r})"
