@@ -8,6 +8,7 @@ write at once. A checksum of every run reveals damage.
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 import threading
 import uuid
@@ -507,33 +508,23 @@ def _damaged(reason: str) -> _FileError:
     )
 
 
-_FULL = (
-    "which cannot grow",
-    "space on the disk, and within its quota and the largest size of a file",
-    "all that was written before is kept: free some space and run again",
-)
-_LOCKED = (
-    f"which another process has locked for {_PATIENCE:.0f} s",
-    "to wait for milliseconds",
-    "end that process, if it hangs, and run again",
-)
-_CLOSED = (
-    "which cannot be opened",
-    "a file that may be read and written",
-    "nothing was changed: look at the rights of folder and file, or pass another folder",
-)
+# Names of errors of SQLite (https://www.sqlite.org/rescode.html), with got, expected, what to do.
 _EXPLANATIONS = {
-    sqlite3.SQLITE_FULL: _FULL,
-    sqlite3.SQLITE_IOERR_WRITE: _FULL,
-    sqlite3.SQLITE_IOERR_FSYNC: _FULL,
-    sqlite3.SQLITE_IOERR_TRUNCATE: _FULL,
-    sqlite3.SQLITE_IOERR_SHMSIZE: _FULL,
-    sqlite3.SQLITE_BUSY: _LOCKED,
-    sqlite3.SQLITE_LOCKED: _LOCKED,
-    sqlite3.SQLITE_CANTOPEN: _CLOSED,
-    sqlite3.SQLITE_READONLY: _CLOSED,
-    sqlite3.SQLITE_PERM: _CLOSED,
-    sqlite3.SQLITE_IOERR: _CLOSED,
+    "FULL|IOERR_(WRITE|FSYNC|TRUNCATE|SHMSIZE)": (
+        "which cannot grow",
+        "space on the disk, and within its quota and the largest size of a file",
+        "all that was written before is kept: free some space and run again",
+    ),
+    "BUSY|LOCKED": (
+        f"which another process has locked for {_PATIENCE:.0f} s",
+        "to wait for milliseconds",
+        "end that process, if it hangs, and run again",
+    ),
+    "CANTOPEN|READONLY|PERM|IOERR": (
+        "which cannot be opened",
+        "a file that may be read and written",
+        "nothing was changed: look at the rights of folder and file, or pass another folder",
+    ),
 }
 
 
@@ -541,11 +532,8 @@ def explanation(error: sqlite3.Error | _FileError) -> tuple[str, str, str]:
     """Return got, expected and what to do; an unknown error of SQLite is damage."""
     if isinstance(error, _FileError):
         return error.args
-    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
-    # The kind of an extended result code (https://www.sqlite.org/rescode.html).
-    if code not in _EXPLANATIONS:
-        code &= 0xFF
-    if code not in _EXPLANATIONS:
-        return _damaged(f"{error!s:.200}").args  # it may quote what is damaged
-    got, expected, action = _EXPLANATIONS[code]
-    return f"{got} ({error})", expected, action
+    name = getattr(error, "sqlite_errorname", "")
+    for pattern, (got, expected, action) in _EXPLANATIONS.items():
+        if re.match(f"SQLITE_({pattern})", name):
+            return f"{got} ({error})", expected, action
+    return _damaged(f"{error!s:.200}").args  # it may quote what is damaged
