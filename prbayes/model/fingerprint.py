@@ -144,6 +144,10 @@ def _node_identity(node: Node, discrepancies: Floats) -> SimulatorIdentity:
     observed, weights, bound = node.observed, node.weights, node.bound
     order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
     labels = [] if node.specimens is None else node.specimens[order].tolist()
+    batches = 1
+    if node.reweighted is not None:
+        design = node.reweighted.design
+        batches = len(design.batch_sizes) + design.n_emulated_samples
     return SimulatorIdentity(
         name=node.name,
         data=_digest(observed[order].tobytes()),
@@ -153,7 +157,7 @@ def _node_identity(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         metric=without_addresses(node.metric),
         propagation=without_addresses(node.propagation),
         n_points=bound.n_runs,
-        batches=1 if node.reweighted is None else node.reweighted.design.n_drawn,
+        batches=batches,
         epsilon=node.epsilon_value,
         # Stored responses are appended to, so that the first stay the first.
         responses=_tuples(bound.first_responses[:8].ravel()),

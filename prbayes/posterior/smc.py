@@ -677,7 +677,7 @@ class Chains:
         """
         (stream,) = seed.generate_state(1)
         for node in self.evaluator.nodes:
-            node.bound.restart(int(stream))
+            node.bound.stream, node.bound.draws = int(stream), 0
         is_resumed = chain == saved.get("chain")
         is_coarse = saved["state"]["is_coarse"] if is_resumed else coarse is not None
         kernel = BatchedKernel(
