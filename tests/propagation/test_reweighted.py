@@ -9,7 +9,6 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
-import xarray as xr
 from first_use import first_use
 from scipy.special import logsumexp
 from scipy.stats import norm
@@ -567,47 +566,6 @@ def test_a_design_that_can_never_do_is_refused() -> None:
     words = r"y: the design does not support the answer.*now 144 runs in all"
     with pytest.raises(prb.propagation.DesignError, match=words):
         prb.refine(model, thetas=thetas)
-
-
-def posterior(**values: Floats) -> xr.DataTree:
-    data = {
-        name: (["chain", "draw", *(f"{name}_{i}" for i in range(np.ndim(v) - 2))], v)
-        for name, v in values.items()
-    }
-    return xr.DataTree.from_dict({"posterior": xr.Dataset(data)})
-
-
-def test_diagnose_of_a_design_that_is_good() -> None:
-    rng = np.random.default_rng(6)
-    result = posterior(mu=rng.normal(1.0, 0.1, (2, 50)), sigma=rng.uniform(0.4, 0.6, (2, 50)))
-    found = prb.diagnose(result, model=once())
-    assert found.ok
-    assert str(found).startswith("No problem was found.")
-    assert found.support["weight_ess"].sizes == {"simulator": 1, "sample": 100}
-    roots = [result["posterior"][n].values.ravel() for n in ("mu", "sigma")]
-    for key, values in bound_of(once()).support(roots).items():
-        if key in found.support:
-            np.testing.assert_allclose(found.support[key].sel(simulator="y"), values, rtol=1e-9)
-    with once():
-        assert prb.diagnose(result).ok
-    with pytest.raises(KeyError, match="sigma"):
-        prb.diagnose(posterior(mu=np.zeros((1, 5))), model=once())
-    with pytest.raises(TypeError, match="no model on the context"):
-        prb.diagnose(posterior(mu=np.zeros((1, 5))))
-
-
-def test_diagnose_says_what_to_do() -> None:
-    model, _ = hard(PR, 256)
-    shape = (2, 20)
-    scattered = 0.01 * np.random.default_rng(0).standard_normal((*shape, 2))
-    mean = np.array([8.0, -8.0]) + scattered
-    result = posterior(mean=mean, sd=np.full(shape, 0.1), rho=np.full(shape, 0.9))
-    found = prb.diagnose(result, model=model)
-    assert len(found.messages) == 2
-    for name, message in zip(("sum", "difference"), found.messages, strict=True):
-        assert message.startswith(f"{name}: the design does not support the answer: weight effec")
-        assert "Call prb.refine(model) and sample again, or use prb.Resimulated; see" in message
-    assert float(found.support["weight_ess"].max()) < 5
 
 
 @pytest.mark.long
