@@ -12,7 +12,7 @@ for each problem whose answers change at all, the largest change over hyperparam
 - the number of responses, as a factor; p-values, as a difference; and whether the verdict (converged,
   warnings by their number) changes, or an error ends it.
 
-The first row says how much another seed of the sampler changes. docs/constants.md shows the table.
+The first row says how much another seed of the sampler changes. docs/appendix/constants.md shows the table.
 
 One process imports and compiles what can be kept; each variation is a fork of it, so that none sees
 another's: in one thread, as forks of a process with several may hang. The file is written after
@@ -62,7 +62,7 @@ ROOMS = (
 )
 COLUMNS = ("optimum", "stderr", "epsilon", "mean", "sd", "responses", "p")
 RESULTS = record.RESULTS / "constants.json"
-# The problem that docs/constants.md leaves out of its table.
+# The problem that docs/appendix/constants.md leaves out of its table.
 LEFT_OUT = "two inputs, PR, N = 30"
 # Seconds for all problems of one variation: many times what they take.
 PATIENCE = 300

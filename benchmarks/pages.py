@@ -18,7 +18,8 @@ from benchmarks import record
 from benchmarks.scoreboard import table as scoreboard
 from benchmarks.scoreboard.problems import PROBLEMS
 
-PAGES = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("appendix/*.md")])
 METRICS = {
     "PR": "ProbabilityResidual",
     "KLD": "KullbackLeibler",
@@ -848,7 +849,7 @@ def written(page: str) -> str:
 
 def main() -> None:
     """Write all pages."""
-    for path in sorted(PAGES.glob("*.md")):
+    for path in PAGES:
         page = path.read_text(encoding="utf-8")
         path.write_text(written(page), encoding="utf-8")
 

@@ -25,14 +25,14 @@ UNSEEN = re.compile(r"\A:tags: \[.*remove-(?:cell|input)")
 FEATURES = re.sub(r"\s+", " ", (ROOT / "docs" / "features.md").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("path", sorted(pages.PAGES.glob("*.md")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", pages.PAGES, ids=lambda path: path.stem)
 def test_tables_are_what_the_benchmarks_found(path: Path) -> None:
     page = path.read_text(encoding="utf-8")
     assert pages.written(page) == page, "run python -m benchmarks.pages"
 
 
 @pytest.mark.parametrize(
-    "path", [ROOT / "README.md", *sorted(pages.PAGES.glob("*.md"))], ids=lambda path: path.stem
+    "path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem
 )
 def test_files_that_a_page_names_are_there(path: Path) -> None:
     page = path.read_text(encoding="utf-8")
@@ -40,7 +40,7 @@ def test_files_that_a_page_names_are_there(path: Path) -> None:
     assert not [name for name in named if not (ROOT / name).exists()]
 
 
-@pytest.mark.parametrize("path", sorted(pages.PAGES.glob("*.md")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", pages.PAGES, ids=lambda path: path.stem)
 def test_tests_that_a_page_names_are_there(path: Path) -> None:
     named = re.findall(r"(tests/[\w/]+\.py)::(test_\w+)", path.read_text(encoding="utf-8"))
     for file, test in named:
@@ -54,7 +54,7 @@ def wide_lines(page: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "path", [ROOT / "README.md", *sorted(pages.PAGES.glob("*.md"))], ids=lambda path: path.stem
+    "path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem
 )
 def test_code_fits_on_the_page(path: Path) -> None:
     assert not wide_lines(path.read_text(encoding="utf-8"))
@@ -71,7 +71,7 @@ def test_a_wide_line_of_code_is_found() -> None:
 def test_executed_pages_are_notebooks() -> None:
     """Without a name to show, the format of notebooks has no kernel, and jupytext refuses a page."""
     kernel = "kernelspec:\n  name: python3\n  display_name: Python 3\n"
-    written = [path.read_text(encoding="utf-8") for path in pages.PAGES.glob("*.md")]
+    written = [path.read_text(encoding="utf-8") for path in pages.PAGES]
     executed = [page.split("---\n")[1] for page in written if "{code-cell}" in page]
     assert len(executed) > 20
     for header in executed:
@@ -81,14 +81,14 @@ def test_executed_pages_are_notebooks() -> None:
 
 def test_fractions_in_formulas_have_braces() -> None:
     """The writer of MathML takes 13 for one number in TeX's short form of a third."""
-    written = [*pages.PAGES.glob("*.md"), *(ROOT / "prbayes").rglob("*.py")]
+    written = [*pages.PAGES, *(ROOT / "prbayes").rglob("*.py")]
     bare = re.compile(r"\\[dt]?frac(?!\{)")
     assert bare.search(r"\frac13 - \frac{x}{L}")
     assert not [path.name for path in written if bare.search(path.read_text(encoding="utf-8"))]
 
 
 def test_every_table_is_on_a_page() -> None:
-    told = "".join(path.read_text(encoding="utf-8") for path in pages.PAGES.glob("*.md"))
+    told = "".join(path.read_text(encoding="utf-8") for path in pages.PAGES)
     assert set(re.findall(r"<!-- table: (.+) -->", told)) == set(pages.TABLES)
 
 
@@ -168,7 +168,7 @@ def pages_of_messages() -> list[str]:
 @pytest.mark.parametrize("named", pages_of_messages())
 def test_what_a_message_names_is_there(named: str) -> None:
     name, _, anchor = named.partition("#")
-    page = (pages.PAGES / name).read_text(encoding="utf-8")
+    page = (pages.DOCS / name).read_text(encoding="utf-8")
     headings = re.findall(r"^##+ (.+)$", page, re.MULTILINE)
     # As GitHub and the site make them of headings
     anchors = [re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings]

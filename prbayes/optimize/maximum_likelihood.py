@@ -49,7 +49,7 @@ from prbayes.optimize.optimum import (
 )
 from prbayes.propagation.specimen_emulation import specimen_roots
 from prbayes.propagation.specimen_points import draw_points
-from prbayes.response.compile import compiled, ninf_for_invalid, untraced
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 
 
 @dataclass(frozen=True, eq=False)
@@ -578,11 +578,11 @@ class SpecimenRefits:
     @property
     def _function(self) -> Any:
         """The compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
-        return self.evaluator.cached("weighted log-likelihood", self._compile)
-
-    def _compile(self) -> Any:
         evaluator = self.evaluator
-        with untraced():
+        key = "weighted log-likelihood"
+        if key in evaluator.functions:
+            return evaluator.functions[key]
+        with interpreted():
             graphs = specimen_graphs(evaluator)
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
             terms = [
@@ -591,7 +591,9 @@ class SpecimenRefits:
             ]
             (value,), theta = evaluator.hyperparameters.joined([-sum(terms)])
             gradient = pt.grad(value, theta)
-            return compiled([theta, *weights], ninf_for_invalid([value, gradient]))
+            outputs = ninf_for_invalid([value, gradient])
+            evaluator.functions[key] = compiled([theta, *weights], outputs)
+        return evaluator.functions[key]
 
     @cached_property
     def _root(self) -> Floats:

@@ -220,7 +220,7 @@ def _by_coverage(information: Information) -> float:
     directions = axes * information.prior_sd[:, None]  # (d, r), a standard error long
     # Thetas around the optimum, three times as wide as the sampling distribution, to reach all
     # posteriors. Half or twice their number changes epsilon by 3%, half of the width by 2%, and
-    # twice the width by 11% (docs/constants.md).
+    # twice the width by 11%.
     z = np.random.default_rng(0).standard_normal((500, directions.shape[1]))
     distances = _distances(areas, 3.0 * (z @ directions.T))
     # Coverage grows with epsilon.

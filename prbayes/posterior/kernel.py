@@ -33,7 +33,7 @@ from prbayes.response.store import StoreError
 
 @dataclass(frozen=True)
 class KernelOptions:
-    """Limits of the mutation, which a study chose (docs/constants.md)."""
+    """Limits of the mutation, which a study chose."""
 
     # Mean absolute correlation with the previous particles, below which draws are new: .036 among
     # 500 independent ones. Half or twice moves a mean no more than another seed does.

@@ -32,7 +32,7 @@ from prbayes.propagation.population_density import normalise
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import KnownPoints, Responses, deduplicated_responses
+from prbayes.response.response import Responses, deduplicated_responses
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +146,7 @@ class DesignSampler:
         if values is not None:
             responses.count_reused(len(values))
         else:
-            earlier = (
-                None if design is None else KnownPoints(design.runs.points, design.runs.values)
-            )
+            earlier = (None if design is None else design.runs.points, design.runs.values)
             values = deduplicated_responses(responses, points, earlier)
             responses.runs.stored.append((list(points), values))
         batch_sizes: tuple[int, ...] = (n,)

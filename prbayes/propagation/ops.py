@@ -17,7 +17,7 @@ from prbayes._validate import Floats
 from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy, DensitySum
 from prbayes.metrics.grid import Cells
-from prbayes.response.inputs import batch_shape, broadcast_batch
+from prbayes.response.inputs import broadcast_batch
 from prbayes.response.response import Responses
 
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every
@@ -83,8 +83,7 @@ class ResponseOp(OwnOp):
         self.responses = responses
         if responses.outputs is not None:
             self.event_shape = responses.outputs.event
-        inputs = responses.inputs
-        self.event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
+        self.event_ndims = responses.inputs.event_ndims
         self.no_gradient = (
             f"{responses.name}: the response does not accept PyTensor variables, so it has no "
             "gradient under prb.Resimulated; use propagation=prb.Reweighted(), or prb.sample_smc, "
@@ -97,8 +96,7 @@ class ResponseOp(OwnOp):
         Others have an input that is finite at none of their specimens.
         """
         k = len(self.responses.inputs.aleatory)
-        batch = batch_shape(inputs, self.event_ndims)
-        full = broadcast_batch(inputs, self.event_ndims, batch)
+        batch, full = broadcast_batch(inputs, self.event_ndims)
         valid = np.ones(batch[:-1], dtype=bool)
         for x in full[:k]:
             event_axes = tuple(range(len(batch), x.ndim))

@@ -36,7 +36,6 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
     variable_of,
-    with_coordinates,
 )
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
@@ -220,9 +219,7 @@ def _column(label: str, result: Any, naming: pm.Model | None) -> _Column:
         return _optimum_column(point, stderr, (float(result.n_responses), result.search.seconds))
     groups = result.children if isinstance(result, xr.DataTree) else {}
     if "posterior" in groups:
-        draws = stacked_draws(result["posterior"])
-        if naming is not None:
-            draws = with_coordinates(draws, naming)
+        draws = stacked_draws(result["posterior"], model=naming)
         tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
         estimates = {}
         for element, x in split_elements(draws).items():

@@ -622,7 +622,7 @@ def _unsupported(designs: _Coverage) -> list[Finding]:
         if not lacking:
             continue
         text = f"{name}: the design does not support the answer: {lacking}. "
-        if lacking.lost is not None:
+        if lacking.is_lost:
             # More points would have no more responses.
             text += (
                 "Repair the response there, return +inf for specimens that fail, narrow the "
