@@ -146,7 +146,7 @@ class DesignSampler:
         if values is not None:
             responses.count_reused(len(values))
         else:
-            earlier = (None if design is None else design.runs.points, design.runs.values)
+            earlier = None if design is None else (design.runs.points, design.runs.values)
             values = deduplicated_responses(responses, points, earlier)
             responses.runs.stored.append((list(points), values))
         batch_sizes: tuple[int, ...] = (n,)
