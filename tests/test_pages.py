@@ -22,7 +22,6 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 CODE_WIDTH = 79
 BLOCK = re.compile(r"^```(?:python|bash|text|\{code-cell\} ipython3)\n(.*?)^```$", re.S | re.M)
 UNSEEN = re.compile(r"\A:tags: \[.*remove-(?:cell|input)")
-FEATURES = re.sub(r"\s+", " ", (ROOT / "docs" / "features.md").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("path", pages.PAGES, ids=lambda path: path.stem)
@@ -31,9 +30,7 @@ def test_tables_are_what_the_benchmarks_found(path: Path) -> None:
     assert pages.written(page) == page, "run python -m benchmarks.pages"
 
 
-@pytest.mark.parametrize(
-    "path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem)
 def test_files_that_a_page_names_are_there(path: Path) -> None:
     page = path.read_text(encoding="utf-8")
     named = re.findall(r"\b(?:tests|benchmarks|examples|prbayes)/[\w/]+\.(?:py|json|csv)\b", page)
@@ -53,9 +50,7 @@ def wide_lines(page: str) -> list[str]:
     return [line for block in seen for line in block.splitlines() if len(line) > CODE_WIDTH]
 
 
-@pytest.mark.parametrize(
-    "path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem)
 def test_code_fits_on_the_page(path: Path) -> None:
     assert not wide_lines(path.read_text(encoding="utf-8"))
 
@@ -90,17 +85,6 @@ def test_fractions_in_formulas_have_braces() -> None:
 def test_every_table_is_on_a_page() -> None:
     told = "".join(path.read_text(encoding="utf-8") for path in pages.PAGES)
     assert set(re.findall(r"<!-- table: (.+) -->", told)) == set(pages.TABLES)
-
-
-def test_the_features_tell_the_cost_of_sampling_that_was_found() -> None:
-    found = pages.found("smc")
-    own, stock, other = (found[f"linear {name}"] for name in ("reweighted", "pymc", "pyabc"))
-    for told in (
-        f"draws from {own['responses']} responses in {own['cpu']:.1f} s",
-        f"{stock['responses']:,} responses and {stock['cpu']:.1f} s".replace(",", " "),
-        f"pyABC {other['responses']:,} and".replace(",", " "),
-    ):
-        assert told in FEATURES
 
 
 def test_the_thermal_page_tells_the_correlation_of_the_coupons() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +13,6 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
 
-from prbayes._validate import Floats
 from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy, DensitySum
 from prbayes.metrics.grid import Cells
@@ -25,7 +24,7 @@ from prbayes.response.response import Responses
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
-    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|AdjointOp|BinnedOp|OpaqueOp|abc_d)",
+    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|AdjointOp|Binned|OpaqueOp|abc_d)",
 )
 
 
@@ -133,25 +132,25 @@ class DensityOp(OwnOp):
                 "use GaussianKDE, or prb.Reweighted"
             )
         sample, weights = inputs
-        slope = AdjointOp(self.cells.slope)(sample, *cotangents)
-        value = AdjointOp(self.cells.value)(sample, *cotangents)
+        slope = AdjointOp(self.cells, for_sample=True)(sample, *cotangents)
+        value = AdjointOp(self.cells, for_sample=False)(sample, *cotangents)
         return [weights * slope, value]
 
 
 class AdjointOp(OwnOp):
     """A cotangent of a density at its sample, or its derivative: (..., n), (..., m) -> (..., n)."""
 
-    __props__ = ("function",)
+    __props__ = ("cells", "for_sample")
     event_shape = (None,)
     no_gradient = "second derivatives of densities of simulated values are not implemented"
 
-    def __init__(self, function: Callable[[Floats, Floats], Floats], sample_ndim: int = 1) -> None:
-        self.function = function
-        self.event_ndims = (sample_ndim, 1)
+    def __init__(self, cells: Cells, for_sample: bool) -> None:
+        self.cells = cells
+        self.for_sample = for_sample
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
-        outputs[0][0] = self.function(*inputs)
+        outputs[0][0] = self.cells.adjoint(*inputs, for_sample=self.for_sample)
 
 
 class BinnedOp(OwnOp):
@@ -173,7 +172,24 @@ class BinnedOp(OwnOp):
         """Return the derivatives for the weights by another operation; values are stored."""
         projections, _ = inputs
         constant = grad_undefined(self, 0, projections, "stored values do not change")
-        return [constant, AdjointOp(self.densities.adjoint, 2)(projections, *cotangents)]
+        return [constant, BinnedAdjointOp(self.densities)(projections, *cotangents)]
+
+
+class BinnedAdjointOp(OwnOp):
+    """The adjoint of such densities, (n, K), (..., cells) -> (..., n)."""
+
+    __props__ = ("densities",)
+    event_ndims = (2, 1)
+    event_shape = (None,)
+    supported = BinnedOp.supported
+    no_gradient = AdjointOp.no_gradient
+
+    def __init__(self, densities: DensitySum) -> None:
+        self.densities = densities
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Gather."""
+        outputs[0][0] = self.densities.adjoint(*inputs)
 
 
 class OpaqueOp(OwnOp):
