@@ -50,10 +50,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv, ndtri, stdtrit
 
 from prbayes._validate import Floats
@@ -112,18 +111,13 @@ def fibre_points(
     seed: int = 0,
     name: str = "response",
 ) -> tuple[Emulation, SpecimenPoints]:
-    """Emulate a response and draw points on the fibres of all specimens.
+    """Emulate a response with n first runs, and draw points on the fibres of all specimens.
 
     ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. ``bounds``,
     (2, d), and ``prior_specimens``, (n, d), are those of the prior predictive population, whose
     middle 99 % lies within [-1, 1]. ``posterior`` maps points (N, K, d), their numbers (N, K), and
     None or a covariance (d, d) by which populations are smoothed, to draws of the hyperparameters.
-    ``n`` is the number of first runs.
-
-    Raises
-    ------
-    DesignError
-        If the response cannot be emulated well enough, or `most_points` are not enough.
+    Raise DesignError if the emulator is too inaccurate, or `most_points` are not enough.
     """
     d = bounds.shape[1]
     n = first_runs(d) if n is None else n
@@ -157,7 +151,7 @@ def fibre_points(
         is_last = 4 * count > options.most_points
         largest = 3 * unit if is_last else 2 * unit
         if difference <= largest:
-            break
+            return emulation, replace(joined(*halves), difference=difference)
         if is_last:
             raise _monte_carlo_error(name, 2 * count, difference, largest)
         halves = [
@@ -165,7 +159,6 @@ def fibre_points(
             for half, proposal in zip(halves, proposals, strict=True)
         ]
         count *= 2
-    return emulation, replace(joined(*halves), difference=difference)
 
 
 def _reliable_draws(
@@ -203,10 +196,10 @@ def _reliable_draws(
                 raise _monte_carlo_error(name, count, difference, limit)
         smoothing = count ** (-2 / (free + 4)) * population.root @ population.root.T
         specimens = posterior(points.z, points.log_a, smoothing).specimens()
-        smoothed = ReferencePopulation.from_sample(specimens).wider(smoothing)
-        volumes = [np.diag(p.root).prod() for p in (smoothed, population)]
-        narrows = bool(volumes[0] < volumes[1] / 2)
-        population = smoothed
+        narrow = ReferencePopulation.from_sample(specimens)
+        root = np.linalg.cholesky(narrow.root @ narrow.root.T + smoothing)
+        narrows = bool(np.diag(root).prod() < np.diag(population.root).prod() / 2)
+        population = ReferencePopulation(narrow.mean, root)
         count = count if narrows else 2 * count
 
 
@@ -231,6 +224,15 @@ def _difference(first: Floats, second: Floats) -> float:
     """Return the half difference of log-likelihoods (S, N) over the draws where both are finite."""
     finite = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
     return half_difference(first[finite], second[finite]) if finite.any() else np.inf
+
+
+class _Pattern(NamedTuple):
+    """Specimens with the same outputs measured, and the proposal on their fibres."""
+
+    rows: Indices
+    columns: Indices
+    proposal: FibreProposal | None  # None: nothing is measured
+    error: Floats | None  # (columns,): of the readings; None if they are exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,16 +261,15 @@ class FibreProposals:
             rows = np.flatnonzero(number.ravel() == k)
             columns = np.flatnonzero(pattern[:m])
             if not len(columns):
-                proposals.append(_Pattern(rows, columns))
+                proposals.append(_Pattern(rows, columns, None, None))
                 continue
             response = _columns(emulation, columns)
-            y = readings.values[np.ix_(rows, columns)]
             error, reference = None, population
             if pattern[m:].any() or len(columns) >= len(population.mean):
                 # A reading error per pattern; the density of each reading replaces it in `draw`.
                 error = typical_sd(sd[np.ix_(rows, columns)])
-                response = with_error(response, error)
-                reference = population.with_errors(len(columns))
+                response, reference = with_errors(response, population, error)
+            y = readings.values[np.ix_(rows, columns)]
             proposal = fit_fibres(response, y, reference, seed=seed, numbers=rows)
             proposals.append(_Pattern(rows, columns, proposal, error))
         return cls(emulation, readings, population, seed, proposals)
@@ -281,48 +282,36 @@ class FibreProposals:
         z = np.empty((n, count, d))
         log_proposal = np.full((n, count), np.inf)
         exact = np.full((n, count), np.nan)
-        for pattern in self.patterns:
-            rows, columns = pattern.rows, pattern.columns
-            if pattern.proposal is None:
+        for rows, columns, proposal, error in self.patterns:
+            if proposal is None:
                 z[rows], log_proposal[rows] = _population_points(
                     self.population, rows, count, self.seed, after
                 )
                 continue
-            points = pattern.proposal.draw(count, self.seed, after)
-            if pattern.error is None:
-                z[rows], exact[rows] = points.x, points.log_a
+            x, log_a = proposal.draw(count, self.seed, after)
+            if error is None:
+                z[rows], exact[rows] = x, log_a
                 log_proposal[rows] = 0.0
                 continue
-            points = points.without_errors(len(columns))
-            z[rows] = points.x
-            values, _ = _columns(self.emulation, columns)(points.x.reshape(-1, d))
+            z[rows], log_a = without_errors(x, log_a, len(columns))
+            values, _ = _columns(self.emulation, columns)(z[rows].reshape(-1, d))
             y = self.readings.values[np.ix_(rows, columns)]
-            residual = (y[:, None] - values.reshape(len(rows), count, -1)) / pattern.error
-            log_normal = -0.5 * residual**2 - np.log(pattern.error) - 0.5 * np.log(2 * np.pi)
-            log_proposal[rows] = log_normal.sum(axis=-1) - points.log_a
+            residual = (y[:, None] - values.reshape(len(rows), count, -1)) / error
+            log_normal = -0.5 * residual**2 - np.log(error) - 0.5 * np.log(2 * np.pi)
+            log_proposal[rows] = log_normal.sum(axis=-1) - log_a
         outputs = self.emulation.values(z.reshape(-1, d)).reshape(n, count, m)
-        readings, error = self.readings, self.emulation.error
+        readings, of_emulator = self.readings, self.emulation.error
         censored = replace(readings, values=np.full_like(readings.values, np.nan))
         log_a = np.where(
             np.isnan(exact),
-            readings.log_density(outputs, error) - log_proposal,
-            exact + censored.log_density(outputs, error),
+            readings.log_density(outputs, of_emulator) - log_proposal,
+            exact + censored.log_density(outputs, of_emulator),
         )
         log_a = np.where(np.isnan(log_a), -np.inf, log_a)
         return SpecimenPoints(z, outputs, log_a, log_proposal, np.zeros(n, dtype=np.intp))
 
 
-@dataclass(frozen=True, eq=False)
-class _Pattern:
-    """Specimens with the same outputs measured, and the proposal on their fibres."""
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    proposal: FibreProposal | None = None  # None: nothing is measured
-    error: Floats | None = None  # (columns,): of the readings; None if they are exact
-
-
-def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
+def _columns(emulation: Emulation, columns: Indices) -> Response:
     """Return the response of some outputs."""
 
     def response(z: Floats) -> tuple[Floats, Floats]:
@@ -338,30 +327,21 @@ def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
 
 
 def _population_points(
-    population: ReferencePopulation, rows: NDArray[np.intp], count: int, seed: int, after: int
+    population: ReferencePopulation, rows: Indices, count: int, seed: int, after: int
 ) -> tuple[Floats, Floats]:
     """Return points of a wide population, and the log of count times their density."""
-    d = len(population.mean)
+    d, wide = len(population.mean), 1.5
     base = sobol(after + count, d, seed)[after:]
-    rng = np.random.default_rng([seed, 2])
-    size = int(rows.max()) + 1
-    shift = rng.random((size, 1, d))[rows]
-    u = np.clip((base + shift) % 1.0, 1e-12, 1 - 1e-12)
-    standard = ndtri(u)
-    wide = 1.5
+    shift = np.random.default_rng([seed, 2]).random((int(rows.max()) + 1, 1, d))[rows]
+    standard = ndtri(np.clip((base + shift) % 1.0, 1e-12, 1 - 1e-12))
     z = population.mean + wide * standard @ population.root.T
     log_det = np.log(np.diag(population.root)).sum() + d * np.log(wide)
-    square = (standard**2).sum(axis=-1)
-    density = -0.5 * square - d / 2 * np.log(2 * np.pi) - log_det
+    density = -0.5 * (standard**2).sum(axis=-1) - d / 2 * np.log(2 * np.pi) - log_det
     return z, density + np.log(count)
 
 
 def _fresh(
-    points: SpecimenPoints,
-    draws: Draws,
-    count: int,
-    bounds: Floats,
-    rng: np.random.Generator,
+    points: SpecimenPoints, draws: Draws, count: int, bounds: Floats, rng: np.random.Generator
 ) -> Floats:
     """Return points for new runs: half a sample of the specimens' inputs, half spread out."""
     specimens = draws.specimens()
@@ -385,28 +365,6 @@ def _fresh(
 
 
 @dataclass(frozen=True, eq=False)
-class FibrePoints:
-    """K importance points on the fibre of each of N specimens.
-
-    log L_i(theta) = logsumexp_k(log p(x_ik | theta) + log_a_ik).
-    """
-
-    x: Floats  # (N, K, d): inputs; the mean of the reference population for points of weight zero
-    # (N, K): logarithms of the importance numbers, minus log K; -inf for points of weight zero
-    log_a: Floats
-
-    def without_errors(self, outputs: int) -> FibrePoints:
-        """Return points over the inputs alone, with log N(e; 0, 1) added to `log_a`.
-
-        For points over inputs and reading errors e, from a response with `with_error`: the last
-        ``outputs`` inputs.
-        """
-        e = self.x[..., -outputs:]
-        log_normal = -(e**2).sum(axis=-1) / 2 - outputs / 2 * np.log(2 * np.pi)
-        return FibrePoints(self.x[..., :-outputs], self.log_a + log_normal)
-
-
-@dataclass(frozen=True, eq=False)
 class FibreProposal:
     """Proposal distribution on the fibres of N specimens: a mixture over charts for each."""
 
@@ -414,20 +372,22 @@ class FibreProposal:
     charts: Charts
     numbers: Indices  # (N,): numbers of the specimens, from which their random numbers follow
 
-    def draw(self, points: int, seed: int, after: int = 0) -> FibrePoints:
-        """Draw points on all fibres.
+    def draw(self, points: int, seed: int, after: int = 0) -> tuple[Floats, Floats]:
+        """Return inputs x, (N, K, d), on all fibres, and numbers A, (N, K).
 
-        K = ``points`` for each specimen: a power of two fills the fibre most evenly. The first
-        ``after`` points of the same seed are left out, as they were drawn before.
+        log L_i(theta) = logsumexp_k(log p(x_ik | theta) + A_ik). Points of weight zero have A of
+        -inf and the mean of the reference population. K = ``points``: a power of two fills the
+        fibre most evenly. The first ``after`` points of the seed are left out.
         """
         n, d = len(self.fibres.y), len(self.fibres.population.mean)
         x = np.empty((n, points, d))
         log_a = np.empty((n, points))
         for block in _blocks(n, points):
-            fibres, charts = self.fibres.subset(block), self.charts.subset(block)
+            fibres = replace(self.fibres, y=self.fibres.y[block])
+            charts = Charts(*(array[block] for array in vars(self.charts).values()))
             sample = _draw(fibres, charts, points, (1, seed), self.numbers[block], after)
-            x[block], log_a[block] = self.fibres.population.inputs(sample.z), sample.log_a
-        return FibrePoints(x, log_a)
+            x[block], log_a[block] = fibres.population.inputs(sample.z), sample.log_a
+        return x, log_a
 
 
 def fit_fibres(
@@ -435,7 +395,6 @@ def fit_fibres(
     y: Floats,
     population: ReferencePopulation,
     *,
-    starts: int = 8,
     tries: int = 64,
     most_charts: int = 8,
     rounds: int = 2,
@@ -450,11 +409,10 @@ def fit_fibres(
     outputs lacked up to .35 in log L. Numbers of a specimen depend on the other specimens only by
     rounding.
 
-    The response is called with many inputs (n, d), and is NaN where it has no value; y are the
-    measured outputs, (N, m) with m < d. The proposals are fitted to ``population``, which should
-    cover the plausible populations. Modes are searched from ``starts`` points, and ``tries`` random
-    points of the fibre show whether charts are missing. A specimen has the same points alone as in
-    a batch if its number is the same.
+    The response is NaN where it has no value; y are the measured outputs, (N, m) with m < d.
+    ``population`` should cover the plausible populations. ``tries`` random points of the fibre show
+    whether charts are missing. A specimen has the same points alone as in a batch if its number is
+    the same.
 
     Examples
     --------
@@ -466,9 +424,9 @@ def fit_fibres(
     ...     r = np.sqrt((x**2).sum(axis=1, keepdims=True))
     ...     return r, (x / r)[:, None, :]
     >>> population = ReferencePopulation(np.array([0.1, 0.0]), np.eye(2))
-    >>> points = fit_fibres(radius, np.array([[0.5], [2.0]]), population).draw(1024, seed=1)
-    >>> log_density = -(points.x**2).sum(axis=2) / 2 - np.log(2 * np.pi)
-    >>> likelihood = np.exp(logsumexp(log_density + points.log_a, axis=1))
+    >>> x, log_a = fit_fibres(radius, np.array([[0.5], [2.0]]), population).draw(1024, seed=1)
+    >>> log_density = -(x**2).sum(axis=2) / 2 - np.log(2 * np.pi)
+    >>> likelihood = np.exp(logsumexp(log_density + log_a, axis=1))
     >>> np.allclose(likelihood, [0.5 * np.exp(-0.125), 2 * np.exp(-2)], rtol=0.02)
     True
     """
@@ -477,8 +435,8 @@ def fit_fibres(
     fibres = Fibres.of(response, y, population)
     parts = [Charts.empty(0, most_charts, d, y.shape[1])]
     for block in _blocks(len(y), 256):
-        part, label = fibres.subset(block), numbers[block]
-        charts = charts_at_modes(part, starts, most_charts)
+        part, label = replace(fibres, y=fibres.y[block]), numbers[block]
+        charts = charts_at_modes(part, 8, most_charts)
         normal = ndtri(_shifted_sobol(tries, d, (0, seed), label))
         charts = cover(part, charts, normal)
         for r in range(rounds):
@@ -489,18 +447,19 @@ def fit_fibres(
             sample = _draw(part, charts, 256, (2 + r, seed), label)
             charts = _adapted(charts, sample, turn=not last)
         parts.append(charts)
-    return FibreProposal(fibres, Charts.concatenated(parts), numbers)
+    arrays = zip(*(vars(part).values() for part in parts), strict=True)
+    return FibreProposal(fibres, Charts(*map(np.concatenate, arrays)), numbers)
 
 
-def with_error(response: Response, error: Floats) -> Response:
-    """Return the response with the reading's error, f(x) + error e, of d + m inputs (x, e).
+def with_errors(
+    response: Response, population: ReferencePopulation, error: Floats
+) -> tuple[Response, ReferencePopulation]:
+    """Return response and population of inputs x and standard normal errors e, f(x) + error e.
 
-    Use it with `ReferencePopulation.with_errors` and `FibrePoints.without_errors`. The number of
-    outputs may then be that of the inputs or more.
-
-    The errors, (m,), are positive standard deviations of the reading, in units of the outputs.
+    The number of outputs may then be that of the inputs or more. The error, (m,), is the standard
+    deviation of the readings, in units of the outputs.
     """
-    m = len(error)
+    d, m = len(population.mean), len(error)
 
     def response_with_error(x: Floats) -> tuple[Floats, Floats]:
         values, jacobian = response(x[:, :-m])
@@ -508,12 +467,21 @@ def with_error(response: Response, error: Floats) -> Response:
         values = values + x[:, -m:] * error
         return values, np.concatenate([jacobian, by_error], axis=2)
 
-    return response_with_error
+    root = np.eye(d + m)
+    root[:d, :d] = population.root
+    mean = np.concatenate([population.mean, np.zeros(m)])
+    return response_with_error, ReferencePopulation(mean, root)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sample:
-    """Points of a block of specimens, with what the adaptation of charts needs."""
+def without_errors(x: Floats, log_a: Floats, m: int) -> tuple[Floats, Floats]:
+    """Return points over the inputs alone, with log N(e; 0, 1) of m errors added to A."""
+    e = x[..., -m:]
+    log_normal = -(e**2).sum(axis=-1) / 2 - m / 2 * np.log(2 * np.pi)
+    return x[..., :-m], log_a + log_normal
+
+
+class _Sample(NamedTuple):
+    """Points of n specimens, with their charts and Jacobians."""
 
     z: Floats  # (n, K, d): whitened inputs
     log_a: Floats  # (n, K)
