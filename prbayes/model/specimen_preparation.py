@@ -205,7 +205,7 @@ def _emulate(
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
     points = draw_points(
-        emulation,
+        emulation.values,
         emulation.error,
         readings,
         roots,
