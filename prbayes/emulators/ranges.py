@@ -14,7 +14,7 @@ from pytensor.graph.basic import Variable
 from prbayes._validate import Floats, real_array
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import compile_batched
-from prbayes.response.distributions import PopulationSampler, prior_draws, valid
+from prbayes.response.distributions import PopulationSampler, PriorSampler, valid
 from prbayes.response.inputs import model_on_context, read_inputs
 
 # Ranges are quantiles of these 2^15 draws: with a coverage of .999 some 16 draws are beyond either
@@ -255,7 +255,7 @@ def predictive_inputs(name: str, variables: list[Any], random_seed: int) -> list
     """
     model = model_on_context(None, f"{name}: inputs that are distributions")
     inputs = read_inputs(name, variables, model)
-    roots = prior_draws(inputs.roots, POPULATIONS, random_seed)
+    roots = PriorSampler(inputs.roots)(POPULATIONS, random_seed)
     symbols = inputs.placeholders()
     (is_valid,) = compile_batched(symbols, [valid(inputs, inputs.rebuilt(symbols)[0])])(*roots)
     usable = np.flatnonzero(np.broadcast_to(is_valid, POPULATIONS))

@@ -41,7 +41,7 @@ from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, is_missing
-from prbayes.response.response import check_call_settings, refuse_coarse, refuse_misfit
+from prbayes.response.response import check_call_settings, refuse_misfit, refuse_uncallable
 from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
@@ -203,7 +203,7 @@ class Surrogate:
         share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
         domain, predictive = read_ranges(name, inputs, prob, seed)
-        refuse_misfit(name, response, lambda: [r.size for r in domain.inputs], None)
+        refuse_misfit(name, response, [r.size for r in domain.inputs])
         n_needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=n_needed)
         design = _design(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
@@ -579,10 +579,11 @@ def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
     keys, values = store.known()
     if values.ndim == 1:
         return
-    usable = np.flatnonzero(_usable(values) & points.have_same_constants(keys))[:1]
+    stored_points, have_same_constants = points.read_keys(keys)
+    usable = np.flatnonzero(_usable(values) & have_same_constants)[:1]
     if not usable.size:
         return
-    (again,) = respond(replace(settings, store=None), points.from_keys(keys[usable]), tally)
+    (again,) = respond(replace(settings, store=None), stored_points.at(usable), tally)
     (stored,) = values[usable]
     moved = np.allclose(np.sort(again), np.sort(stored)) and not np.allclose(again, stored)
     if tally.named is not None and moved:
@@ -625,7 +626,7 @@ def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: F
 
 def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
     """Return a coarse response at the design, or raise if it is no response of the inputs."""
-    refuse_coarse(f"{name}: coarse", coarse)
+    refuse_uncallable(name, coarse, "coarse")
     values = _coarse_at(name, coarse, domain, columns)
     if not np.isfinite(values).any():
         raise ResponseError(

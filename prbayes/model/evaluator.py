@@ -40,7 +40,7 @@ from prbayes.propagation.base import Bound
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
-from prbayes.response.compile import compiled, ninf_for_invalid, untraced
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 from prbayes.response.inputs import is_group
 
 # Points of a design from which on samplers start with an eighth of them.
@@ -318,7 +318,7 @@ def _compile_roots(evaluator: Evaluator) -> tuple[Any, Any]:
     return evaluator.hyperparameters.compile(graphs), np.cumsum([0, *map(len, params)])
 
 
-@untraced()
+@interpreted()
 def _compile_objective(evaluator: Evaluator, *, prior: bool, gradient: bool) -> Any:
     """Compile the objective of `Evaluator.objective`."""
     model = evaluator.model

@@ -23,7 +23,7 @@ from prbayes.model.parameters import Hyperparameters
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions
-from prbayes.response.distributions import prior_draws
+from prbayes.response.distributions import PriorSampler
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
@@ -66,7 +66,7 @@ class Measurement:
         """Observed values and their errors; an unknown error has its prior's 84 % quantile."""
         error = None
         if "error" in self.extras:
-            (draws,) = prior_draws([self.extras["error"]], 512, seed=0)
+            (draws,) = PriorSampler([self.extras["error"]])(512, seed=0)
             error = np.asarray(np.quantile(draws, 0.84, axis=0))
         return self.metric.readings(self.rows, error, self.event)
 

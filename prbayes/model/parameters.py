@@ -22,7 +22,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 from prbayes._validate import Floats, called, real_array, refuse_single_precision
 from prbayes.model.random_variable import priors_alone
 from prbayes.numerics.points import sobol
-from prbayes.response.compile import compiled, interpreted, ninf_for_invalid, untraced
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import Inputs, event_shape, is_group
 
@@ -103,14 +103,14 @@ class Hyperparameters:
 
         Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
         """
-        with untraced():
+        with interpreted():
             outputs, theta = self.joined(graphs)
             batch = pt.dmatrix("thetas")
             batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
             return compiled([batch], batched)
 
     @cached_property
-    @untraced()
+    @interpreted()
     def _log_prior(self) -> Any:
         """The log-density of each free variable, in its own units, and the Jacobian of all."""
         model = self.model
@@ -144,7 +144,7 @@ class Hyperparameters:
         return np.isfinite(self.log_prior(thetas))
 
     @cached_property
-    @untraced()
+    @interpreted()
     def _constrain(self) -> Any:
         return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
 
@@ -193,7 +193,7 @@ class Hyperparameters:
         return theta
 
     @cached_property
-    @untraced()
+    @interpreted()
     def _transform(self) -> Any:
         """The compiled function of values of the free variables that returns thetas."""
         free = self.model.free_RVs

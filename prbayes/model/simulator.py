@@ -56,7 +56,6 @@ from prbayes.response.inputs import (
     Inputs,
     group_indices,
     is_group,
-    is_labelled,
     model_on_context,
     read_inputs,
 )
@@ -582,7 +581,7 @@ def _numbers(name: str, observed: Any) -> Any:
     """Return observed responses as they were passed; of `pymc.Data` the present numbers."""
     if not isinstance(observed, Variable):
         return observed
-    values = None if is_labelled(observed) else known_value(observed)
+    values = None if hasattr(observed.type, "dims") else known_value(observed)
     if values is None:
         raise TypeError(
             f"{name}: observed: got {observed} of type {observed.type}, expected numbers or pm.Data"

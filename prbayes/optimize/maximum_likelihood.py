@@ -49,7 +49,7 @@ from prbayes.optimize.optimum import (
 )
 from prbayes.propagation.specimen_emulation import specimen_roots
 from prbayes.propagation.specimen_points import draw_points
-from prbayes.response.compile import compiled, ninf_for_invalid, untraced
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 
 
 @dataclass(frozen=True, eq=False)
@@ -582,7 +582,7 @@ class SpecimenRefits:
 
     def _compile(self) -> Any:
         evaluator = self.evaluator
-        with untraced():
+        with interpreted():
             graphs = specimen_graphs(evaluator)
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
             terms = [

@@ -31,7 +31,7 @@ from prbayes.plots.canvas import (
 from prbayes.plots.curves import GRID_POINTS, central_range, outlines, smooth_densities
 from prbayes.plots.ensemble import Calibrated, Ensemble, read_result
 from prbayes.response.compile import compile_batched
-from prbayes.response.distributions import PopulationSampler, is_mvnormal
+from prbayes.response.distributions import MVNORMAL, PopulationSampler
 from prbayes.response.inputs import Inputs, aleatory_names
 
 
@@ -292,7 +292,7 @@ def _exact(inputs: Inputs, margin: Margin, roots: list[Floats], grid: Floats) ->
 
 def _log_density(dist: Any, index: tuple[int, ...], x: Any) -> Any:
     """Return the log-density of an element at x, shape (g,), or None where there is none."""
-    if is_mvnormal(dist):
+    if isinstance(dist.owner.op, MVNORMAL):
         mean, covariance = dist.owner.op.dist_params(dist.owner)
         (i,) = index
         return pm.logp(pm.Normal.dist(mean[i], pt.sqrt(covariance[i, i])), x)

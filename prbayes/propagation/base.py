@@ -28,7 +28,7 @@ from prbayes.response.budget import RunCost
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import (
     PopulationSampler,
-    prior_draws,
+    PriorSampler,
     refuse_lopsided,
     valid,
 )
@@ -338,7 +338,7 @@ def cost_by_evaluation(n: int) -> RunCost:
 
 def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:
     """Return a trial of the response at points of the prior, (2, 8), and their inputs."""
-    draws = prior_draws(bound.inputs.roots, 64, seed)  # a few of them at least are valid
+    draws = PriorSampler(bound.inputs.roots)(64, seed)  # a few of them at least are valid
     two = [draw[:2] for draw in valid_roots(bound, draws)]
     aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)

@@ -31,7 +31,7 @@ from prbayes.propagation.population_density import PopulationDensity, normalise
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import KnownPoints, Responses, deduplicated_responses
+from prbayes.response.response import Responses, deduplicated_responses
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,8 +255,8 @@ def _responses_at(points: Sequence[Floats], responses: Responses, design: Design
     if values is not None:
         responses.count_reused(len(values))
         return values
-    runs = None if design is None else KnownPoints(design.runs.points, design.runs.values)
-    values = deduplicated_responses(responses, points, runs)
+    known = None if design is None else (design.runs.points, design.runs.values)
+    values = deduplicated_responses(responses, points, known)
     responses.runs.stored.append((list(points), values))
     return values
 

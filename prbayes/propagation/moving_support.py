@@ -20,7 +20,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.response.compile import compile_batched, with_leading_axis
-from prbayes.response.distributions import is_elliptical
+from prbayes.response.distributions import ELLIPTICAL
 from prbayes.response.inputs import Inputs
 
 
@@ -49,7 +49,7 @@ def moving_inputs(
     values = with_leading_axis(inputs.aleatory)
     moving = []
     for i, (dist, x) in enumerate(zip(dists, values, strict=True)):
-        if is_elliptical(dist):  # positive everywhere
+        if isinstance(dist.owner.op, ELLIPTICAL):  # positive everywhere
             continue
         outside = pt.isneginf(pm.logp(dist, x, warn_rvs=False))
         compiled = compile_batched(symbols, [outside], [x])

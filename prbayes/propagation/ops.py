@@ -16,7 +16,7 @@ from pytensor.graph.replace import _vectorize_node
 from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy, DensitySum
 from prbayes.metrics.grid import Cells
-from prbayes.response.inputs import batch_shape, broadcast_batch
+from prbayes.response.inputs import broadcast_batch
 from prbayes.response.response import Responses
 
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every
@@ -74,8 +74,7 @@ class ResponseOp(OwnOp):
         self.event_shape: tuple[int, ...] = ()
         if responses.outputs is not None:
             self.event_shape = responses.outputs.event
-        inputs = responses.inputs
-        self.event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
+        self.event_ndims = responses.inputs.event_ndims
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Call the response for populations that are valid.
@@ -83,8 +82,7 @@ class ResponseOp(OwnOp):
         Others have an input that is finite at none of their specimens.
         """
         k = len(self.responses.inputs.aleatory)
-        batch = batch_shape(inputs, self.event_ndims)
-        full = broadcast_batch(inputs, self.event_ndims, batch)
+        batch, full = broadcast_batch(inputs, self.event_ndims)
         valid = np.ones(batch[:-1], dtype=bool)
         for x in full[:k]:
             event_axes = tuple(range(len(batch), x.ndim))

@@ -30,7 +30,7 @@ from scipy.linalg import qr
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.numerics.threads import one_thread
-from prbayes.response.distributions import PopulationSampler, compiled_log_density, is_mvnormal
+from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs
 
 
@@ -62,7 +62,7 @@ def _coordinates(dist: pt.TensorVariable, values: Floats) -> list[tuple[Floats, 
 
     None if the distribution is no exponential family with a fixed support.
     """
-    if is_mvnormal(dist):
+    if isinstance(dist.owner.op, MVNORMAL):
         return [(values.T, True)]
     op = dist.owner.op
     if type(op) not in _FAMILIES:

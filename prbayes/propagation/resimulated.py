@@ -34,7 +34,7 @@ from prbayes.propagation.ops import OwnOp, ResponseOp, symbolic_discrepancy
 from prbayes.response.budget import RunCost
 from prbayes.response.compile import PLAIN, compile_batched, ninf_for_invalid
 from prbayes.response.distributions import PopulationSampler, quantiles, valid
-from prbayes.response.inputs import Inputs, batch_shape, broadcast_batch
+from prbayes.response.inputs import Inputs, broadcast_batch
 from prbayes.response.response import Responses
 
 
@@ -300,8 +300,7 @@ class FreshOp(OwnOp):
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Draw, call the response, compare."""
-        batch = batch_shape(inputs, self.event_ndims)
-        full = broadcast_batch(inputs, self.event_ndims, batch)
+        batch, full = broadcast_batch(inputs, self.event_ndims)
         params = [values.reshape(-1, *values.shape[len(batch) :]) for values in full]
         discrepancies = self.bound.discrepancies(params, self.bound.target)
         outputs[0][0] = discrepancies.reshape(batch)

@@ -45,15 +45,14 @@ from prbayes.propagation.importance import (
 from prbayes.propagation.ops import stored_discrepancy
 from prbayes.propagation.population_density import normalise
 from prbayes.response.budget import RunCost
-from prbayes.response.distributions import prior_draws, refuse_without_density
+from prbayes.response.distributions import PriorSampler, refuse_without_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import is_missing
 from prbayes.response.response import (
-    KnownPoints,
     Responses,
     deduplicated_responses,
-    refuse_coarse,
-    refuse_wrong_arity,
+    refuse_misfit,
+    refuse_uncallable,
 )
 
 # Largest basis in a compiled graph, 1 GiB, for the largest design. Graphs without a basis are as
@@ -143,7 +142,7 @@ class Reweighted(Propagation):
         refuse_max_lost(self.max_lost, "Reweighted")
         _refuse_emulator(self.emulator)
         if self.coarse is not None:
-            refuse_coarse("Reweighted: coarse", self.coarse)
+            refuse_uncallable("Reweighted", self.coarse, "coarse")
             if self.emulator is None:
                 raise ValueError(
                     "Reweighted: coarse: got a coarse response and no emulator to follow it, "
@@ -216,7 +215,7 @@ class Reweighted(Propagation):
                     f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
                     "leave coarse= out"
                 )
-            refuse_wrong_arity(f"{name}: coarse", self.coarse, inputs)
+            refuse_misfit(f"{name}: coarse", self.coarse, inputs.sizes)
 
     def check_likelihood(self, name: str) -> None:
         """Refuse options that the log-likelihood by specimen, with its own emulator, lacks."""
@@ -315,7 +314,7 @@ class ReweightedBound(Bound):
         # Other responses at runs: more conditions than a study has, fewer than fill the memory.
         self._other_responses: deque[tuple[Responses, Sample]] = deque(maxlen=32)
         # As many components as points would be as good, and cost their square.
-        components = prior_draws(inputs.roots, min(config.n, 512), config.random_seed)
+        components = PriorSampler(inputs.roots)(min(config.n, 512), config.random_seed)
         components = valid_roots(self, components)
         self._design = self._sampler.with_runs(None, components, config.n, responses)
         self.support_moves = bool(self._design.moving)
@@ -479,7 +478,7 @@ class ReweightedBound(Bound):
         if len(values) < len(runs):
             points = self.points_of(responses.inputs, runs.points)
             missing = [x[len(values) :] for x in points]
-            more = deduplicated_responses(responses, missing, KnownPoints(points, values))
+            more = deduplicated_responses(responses, missing, (points, values))
             values = np.concatenate([values.reshape(-1, *more.shape[1:]), more])
             if pairs:
                 self._other_responses.remove(pairs[0])

@@ -34,7 +34,7 @@ from prbayes.propagation.roots import (
     nearest_starts,
     rows_by_specimen,
 )
-from prbayes.response.distributions import PopulationSampler, prior_draws
+from prbayes.response.distributions import PopulationSampler, PriorSampler
 from prbayes.response.inputs import Inputs
 
 
@@ -489,7 +489,7 @@ class Coordinates:
         sampler: PopulationSampler | None = None,
     ) -> Coordinates:
         """Return the coordinates of populations of the prior, and bounds of n specimens of each."""
-        roots = prior_draws(inputs.roots, populations, 0)
+        roots = PriorSampler(inputs.roots)(populations, 0)
         sampler = PopulationSampler(inputs) if sampler is None else sampler
         rng = np.random.default_rng([0, 11])
 

@@ -40,9 +40,9 @@ from prbayes.optimize.maximum_likelihood import (
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import (
+    MVNORMAL,
     PopulationSampler,
     compiled_log_density,
-    is_mvnormal,
 )
 from prbayes.response.inputs import Inputs, aleatory_names
 
@@ -207,7 +207,7 @@ class NormalScores:
             return cls(None, log_density)
         graphs = []
         for dist, x in zip(dists, points, strict=True):
-            if is_mvnormal(dist):
+            if isinstance(dist.owner.op, MVNORMAL):
                 mean, covariance = dist.owner.op.dist_params(dist.owner)
                 root = pt.linalg.cholesky(covariance)
                 graphs.append(pt.linalg.solve_triangular(root, (x - mean).T, lower=True).T)
@@ -227,7 +227,9 @@ class NormalScores:
         columns = []
         for dist, value, x in zip(inputs.aleatory, self.function(*roots, *flat), flat, strict=True):
             value = np.broadcast_to(value, (1, *x.shape))[0].reshape(n * count, -1)
-            columns.append(value if is_mvnormal(dist) else normal_scores(np.exp(value)))
+            columns.append(
+                value if isinstance(dist.owner.op, MVNORMAL) else normal_scores(np.exp(value))
+            )
         (log_p,) = self.log_density(*roots, *flat)
         terms = np.broadcast_to(log_p, (1, n * count))[0].reshape(n, count) + log_a
         terms = np.where(np.isfinite(terms), terms, -np.inf)

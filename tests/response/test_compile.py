@@ -24,8 +24,8 @@ from prbayes.response import compile as compilation
 from prbayes.response.compile import (
     compile_batched,
     compiled,
+    interpreted,
     ninf_for_invalid,
-    untraced,
     with_leading_axis,
 )
 from prbayes.response.distributions import PriorSampler
@@ -34,10 +34,10 @@ from prbayes.response.distributions import PriorSampler
 def test_our_own_graphs_have_no_notes_of_lines_and_others_have() -> None:
     x = pt.dscalar("x")
     with pytensor.config.change_flags(traceback__limit=8):
-        with untraced():
+        with interpreted():
             ours = x + 1.0
         theirs = x + 2.0
-        with pytest.raises(ZeroDivisionError), untraced():
+        with pytest.raises(ZeroDivisionError), interpreted():
             raise ZeroDivisionError
         assert pytensor.config.traceback__limit == 8
     assert not any(getattr(ours.tag, "trace", ()))

@@ -18,7 +18,6 @@ from prbayes.response.compile import PLAIN
 from prbayes.response.inputs import (
     Groups,
     Inputs,
-    batch_shape,
     broadcast_batch,
     event_shape,
     group_indices,
@@ -52,7 +51,7 @@ def test_inputs_are_sorted_in_the_order_of_the_arguments() -> None:
     assert set(inputs.roots) == set(roots)
     assert not inputs.nested
     assert inputs.event_shapes == ((2,), ())
-    assert inputs.event_ndims == (1, 0)
+    assert inputs.event_ndims == [1, 0, 0]
     # Constants are floats, positions of aleatory inputs are integers.
     constant, *positions, vector, again = inputs.arguments
     assert (constant, type(constant)) == (3.0, float)
@@ -196,20 +195,14 @@ X, PAIRS = np.arange(3.0), np.arange(8.0).reshape(4, 1, 2)
 
 
 def test_leading_axes_broadcast_and_events_do_not() -> None:
-    assert batch_shape([X, PAIRS], [0, 1]) == (4, 3)
-    assert batch_shape([X, PAIRS], [1, 2]) == (4,)
-    assert batch_shape([np.float64(1.0)], [0]) == ()
-    x, pairs = broadcast_batch([X, PAIRS], [0, 1], (4, 3))
-    assert (x.shape, pairs.shape) == ((4, 3), (4, 3, 2))
+    assert broadcast_batch([X, PAIRS], [1, 2])[0] == (4,)
+    assert broadcast_batch([np.float64(1.0)], [0])[0] == ()
+    batch, (x, pairs) = broadcast_batch([X, PAIRS], [0, 1])
+    assert (batch, x.shape, pairs.shape) == ((4, 3), (4, 3), (4, 3, 2))
     np.testing.assert_array_equal(x[2], X)
     np.testing.assert_array_equal(pairs[2, 1], PAIRS[2, 0])
-
-
-def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="shape mismatch"):
-        batch_shape([X, np.zeros(2)], [0, 0])
-    with pytest.raises(ValueError, match="zip"):
-        batch_shape([X], [0, 0])
+        broadcast_batch([X, np.zeros(2)], [0, 0])
 
 
 GROUPS = Groups("supplier", ("Adler", "Busch"))

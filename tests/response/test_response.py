@@ -19,7 +19,6 @@ from prbayes.response.call import scalar
 from prbayes.response.failures import Abort, Replace, ResponseError
 from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.response import (
-    KnownPoints,
     Responses,
     deduplicated_responses,
     refuse_uncallable,
@@ -115,7 +114,7 @@ def test_mistakes_are_named() -> None:
     ):
         call(lambda x: x[:2], on_failure=Replace())
     with pytest.raises(
-        TypeError, match=r"y: response: got float, expected a function .*the order is"
+        TypeError, match=r"y: response: got float 3.0, expected a function .*the order is"
     ):
         call(3.0)
     refuse_uncallable("y", np.square)
@@ -339,12 +338,12 @@ def test_each_different_point_is_computed_once_and_four_of_them_twice_at_first()
     assert response.asked == [12 + 4]
     # Known ones are not computed, and none is again.
     more = [rng.integers(0, 4, 300), rng.integers(0, 4, 300)]
-    found = deduplicated_responses(responses, more, KnownPoints(points, found))
+    found = deduplicated_responses(responses, more, (points, found))
     np.testing.assert_array_equal(found, 10 * more[0] + more[1])
     assert response.asked == [16, 4]
     assert responses.count == 800
     assert responses.computed == 20
-    assert deduplicated_responses(responses, more, KnownPoints(more, found)) == pytest.approx(found)
+    assert deduplicated_responses(responses, more, (more, found)) == pytest.approx(found)
     assert response.asked == [16, 4]
 
 
@@ -366,7 +365,7 @@ def test_a_response_with_scatter_of_its_own_is_computed_everywhere() -> None:
     assert sum(response.asked) == 400
     assert np.unique(found).size == 400
     assert np.std(found - x) == pytest.approx(1, abs=0.2)
-    deduplicated_responses(responses, [x], KnownPoints([x], found))
+    deduplicated_responses(responses, [x], ([x], found))
     assert response.asked[-1] == 400
 
 
