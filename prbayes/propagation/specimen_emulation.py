@@ -20,7 +20,7 @@ from scipy.special import ndtri
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
 from prbayes.metrics.readings import Readings
-from prbayes.numerics.points import sobol
+from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import (
     fit_normal,
@@ -457,13 +457,10 @@ def spread_out(
     around = z[rng.integers(0, len(z), 8 * count)]
     jittered = around + 0.4 * scale * rng.standard_normal(around.shape)
     candidates = np.clip(np.concatenate([z, jittered]), box[0], box[1]) / scale
-    points = list(sample / scale)
-    distance = np.min([((candidates - p) ** 2).sum(axis=1) for p in points], axis=0)
-    while len(points) < count:
-        best = int(np.argmax(distance))
-        points.append(candidates[best])
-        distance = np.minimum(distance, ((candidates - candidates[best]) ** 2).sum(axis=1))
-    return np.asarray(np.array(points) * scale)
+    points = sample / scale
+    squares = np.min([((candidates - p) ** 2).sum(axis=1) for p in points], axis=0)
+    rows = farthest_rows(candidates, count - len(points), squares)
+    return np.concatenate([points, candidates[rows]]) * scale
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ material models, Data-Centric Engineering 2, e20, doi:10.1017/dce.2021.20.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
 from typing import Any
@@ -310,12 +310,12 @@ def _moment_matched(
         components = replace(components, center=new_center, root=new_root)
         changed = np.unique(components.specimen[uneven])
         subset = replace(sampler, readings=sampler.readings.rows(changed))
-        is_changed = np.isin(components.specimen, changed)
+        rows = np.isin(components.specimen, changed)
+        ranks = np.searchsorted(changed, components.specimen[rows])
         of_changed = _Components(
-            *(getattr(components, f.name)[is_changed] for f in fields(components))
+            ranks, components.center[rows], components.root[rows], components.log_mass[rows]
         )
-        ranks = np.searchsorted(changed, of_changed.specimen)
-        fresh = subset.draw(replace(of_changed, specimen=ranks), 256, (seed, 4 + attempt))
+        fresh = subset.draw(of_changed, 256, (seed, 4 + attempt))
         for name in ("z", "outputs", "log_a", "log_proposal"):
             values = getattr(fresh, name)
             getattr(sample, name)[changed, : values.shape[1]] = values
