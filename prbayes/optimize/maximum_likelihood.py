@@ -528,19 +528,16 @@ def other_specimens(
 ) -> Iterator[None]:
     """Give compiled likelihoods the points and numbers A of other specimens within the context."""
     shared = [arrays(likelihood) for likelihood in likelihoods]
-    before = [([x.get_value() for x in points], log_a.get_value()) for points, log_a in shared]
+    variables = [v for points, log_a in shared for v in (*points, log_a)]
+    values = [value for points, log_a in data for value in (*points, log_a)]
+    before = [variable.get_value() for variable in variables]
     try:
-        _set(shared, data)
+        for variable, value in zip(variables, values, strict=True):
+            variable.set_value(np.ascontiguousarray(value), borrow=True)
         yield
     finally:
-        _set(shared, before)
-
-
-def _set(shared: Sequence[Any], data: Sequence[tuple[list[Floats], Floats]]) -> None:
-    for (points, log_a), (new_points, new_log_a) in zip(shared, data, strict=True):
-        for variable, value in zip(points, new_points, strict=True):
-            variable.set_value(np.ascontiguousarray(value), borrow=True)
-        log_a.set_value(np.ascontiguousarray(new_log_a), borrow=True)
+        for variable, value in zip(variables, before, strict=True):
+            variable.set_value(value, borrow=True)
 
 
 @dataclass(frozen=True, eq=False)
