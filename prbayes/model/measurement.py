@@ -1,7 +1,6 @@
 """Measured specimens: readings of one simulator, readings of all, and the record of a likelihood.
 
 A specimen has one row: the outputs of all simulators side by side, NaN where one was not measured.
-Repeated readings of an output are one reading, their weighted mean.
 """
 
 from __future__ import annotations

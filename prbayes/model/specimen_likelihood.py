@@ -1,17 +1,11 @@
 """The log-likelihood by specimen, from importance points, as PyMC evaluates and draws it.
 
-The log-likelihood of specimen i is
-
     log p(y_i | theta) = logsumexp_k(log p(x_ik | theta) + A_ik),
 
 with PyMC's own log-densities of the inputs at points x_ik. Points and numbers A_ik contain no
-hyperparameter (`prbayes.model.specimen_preparation`), so that NUTS, SMC and optimisers evaluate
-the graph without a run.
-
-The log-density of the observed variable is a vector with an element for each specimen. Simulators
-that measured the same specimens have one likelihood: the log-density of the last one has an element
-for each specimen, those of the first ones have none; their observed variables are parameters of the
-last one's.
+hyperparameter, so that samplers evaluate the graph without a run. Simulators that measured the same
+specimens have one likelihood: the log-density of the last one has an element for each specimen,
+those of the first ones have none; their observed variables are parameters of the last one's.
 """
 
 from __future__ import annotations
@@ -103,10 +97,9 @@ def _roots(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats], group: 
 
 
 def log_likelihoods(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats]) -> Floats:
-    """Return the log-likelihoods of the specimens in batches of populations, (P, S).
+    """Return the log-likelihoods of the specimens in populations, (P, S), without a graph.
 
-    The numbers of `log_likelihood_graph`, for likelihoods that need no graph. Values are by the
-    likelihood's variables, shapes (P, *shape), without the group of a specimen.
+    Values are by the likelihood's variables, shapes (P, *shape), without the group of a specimen.
     """
     share = prepared(likelihood).share
     result = np.empty((len(next(iter(params.values()))), len(likelihood.readings)))
@@ -236,9 +229,8 @@ def draw_readings(
 
     Values are by the likelihood's variables, shapes (P, *shape), without the group of a specimen:
     specimens are of the groups of the observed ones. Readings are those of one simulator, or the
-    outputs of all, with repeated readings as their mean. They have errors, and gross errors where
-    the metric has them. If n is the number of a simulator's rows, repeated readings have common
-    inputs. NaN in a population of which next to nothing has a response.
+    outputs of all. If n is the number of a simulator's rows, repeated readings have common inputs.
+    NaN in a population of which next to nothing has a response.
     """
     emulation, size = prepared(likelihood).emulation, len(next(iter(params.values())))
     groups = likelihood.stacked.groups if measurement is None else measurement.groups
@@ -311,8 +303,8 @@ def _with_errors(
 class SpecimenRV(RandomVariable):  # type: ignore[misc]
     """The operation of the observed variable: draws data sets, and carries the likelihood.
 
-    PyTensor's rewriters keep every operation that they have met. The likelihood with its arrays is
-    therefore referenced by applications of the operation, and weakly by the operation itself.
+    PyTensor's rewriters keep every operation that they have met: the operation refers weakly to the
+    likelihood, its applications refer to it.
     """
 
     __props__ = ("name", "signature", "dtype", "inplace", "reference", "simulators")

@@ -1,10 +1,7 @@
 """Importance points of measured specimens, from runs and an emulator.
 
-The log-likelihood by specimen is computed at these points. They contain no hyperparameter.
-
-Posterior draws of the hyperparameters, given such points, give the population in which the fibres
-of specimens are covered, and the unit of Monte Carlo errors. Adaptive importance sampling with a
-multivariate t proposal needs no gradient.
+Posterior draws of the hyperparameters, given such points, give the population in which fibres are
+covered, and the unit of Monte Carlo errors.
 """
 
 from __future__ import annotations
@@ -241,8 +238,7 @@ class Populations:
         """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
 
         With `smoothing`, a covariance (d, d), populations are normal with the moments of the
-        coordinates z, and wider by it: the log-likelihood is then smooth where points lie farther
-        apart than a population is wide.
+        coordinates z, and wider by it: the log-likelihood is then smooth.
         """
         n, count, d = z.shape
         likelihood = self.likelihood
@@ -310,9 +306,8 @@ class Populations:
     ) -> PopulationDraws:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
 
-        Weights are tempered until their effective sample size is ten times the number of
-        hyperparameters, so that a few draws do not decide the next proposal. Points and smoothing
-        are those of `log_likelihoods`; the share is that of a population with a response.
+        Adaptive importance sampling. Weights are tempered until their effective sample size is ten
+        times the number of hyperparameters, so that a few draws do not decide the next proposal.
         """
         names = self.hyperparameters
         d = names.size

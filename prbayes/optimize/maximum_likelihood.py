@@ -1,11 +1,8 @@
 """Maximum likelihood for models whose observed variables have exact log-densities.
 
 BFGS with exact gradients from the most likely points of the prior. Every local optimum is kept with
-its weight, the share of the posterior mass by Laplace's approximation.
-
-The estimates of other data sets are by the log-likelihood by specimen. Such a data set is either
-the observed specimens with other weights, or specimens of a pool: simulated specimens whose points
-are computed once. Both cost no run.
+its weight, the share of the posterior mass by Laplace's approximation. Estimates of other data sets
+cost no run: these are the observed specimens with other weights, or simulated specimens of a pool.
 """
 
 from __future__ import annotations
@@ -142,8 +139,7 @@ def mode_weights(
 ) -> Floats:
     """Return the share of each mode in the posterior's mass, by Laplace's approximation.
 
-    ``log_prior``, (M,), is added to optima of the likelihood. ``prior_sd``, (d,), bounds the mass
-    along directions that the data do not identify.
+    ``log_prior``, (M,), is added to optima of the likelihood. ``prior_sd``, (d,), bounds the mass.
     """
     logs = np.array([-mode.value for mode in modes])
     if log_prior is not None:
@@ -331,8 +327,7 @@ def share_mode(
 ) -> bool:
     """Return whether two optima are of one mode: no barrier in nats lies between them.
 
-    The profile along the straight line between the optima has the smallest value across the line,
-    in units of the prior. So a ridge, straight or curved, is one mode.
+    The profile along the straight line has the smallest value across it: a ridge is one mode.
     """
     from scipy.linalg import null_space
     from scipy.optimize import minimize as scipy_minimize
@@ -361,9 +356,7 @@ def _prior_ends(
 ) -> list[PriorEnd]:
     """Return the hyperparameters that the data push to a finite end of their prior.
 
-    In unconstrained space the end is at infinity, and nothing changes on the way there. Back at the
-    median of the prior the log-likelihood is lower by more than three nats, whatever the values of
-    the other hyperparameters.
+    At the median of the prior the log-likelihood is lower by more than three nats.
     """
     from scipy.optimize import minimize as scipy_minimize
 
@@ -470,19 +463,8 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class SpecimenPool:
-    """Simulated specimens of one likelihood with the points of each."""
-
-    copies: int  # simulated specimens for each observed one, with its group and missing outputs
-    points: list[Floats]  # (copies * N, K, *event): inputs
-    log_a: Floats  # (copies * N, K): the numbers A
-
-    def data_set(self, rng: np.random.Generator) -> tuple[list[Floats], Floats]:
-        """Return points and numbers A of one data set of N specimens."""
-        n = len(self.log_a) // self.copies
-        rows = rng.integers(0, self.copies, n) * n + np.arange(n)
-        return [x[rows] for x in self.points], self.log_a[rows]
+type SpecimenData = tuple[list[Floats], Floats]
+"""Points, (N, K, *event) by input, and numbers A, (N, K), of the specimens of a likelihood."""
 
 
 def specimen_pool(
@@ -490,11 +472,11 @@ def specimen_pool(
     params: Mapping[Any, Floats],
     rng: np.random.Generator,
     size: int = 2000,
-) -> SpecimenPool:
-    """Simulate specimens of one population, and draw their points.
+) -> Callable[[np.random.Generator], SpecimenData]:
+    """Simulate at least ``size`` specimens of one population, with their points.
 
-    ``params`` has the values of the variables without the group, (1, *shape). ``size`` is rounded
-    up to a multiple of the number of observed specimens.
+    ``params`` has the values of the variables without the group, (1, *shape). Return a function
+    that draws a data set: for each observed specimen one with its group and missing outputs.
     """
     n = len(likelihood.readings)
     copies = max(1, -(-size // n))
@@ -518,13 +500,18 @@ def specimen_pool(
         emulation.values, emulation.error, readings, roots, emulation.box, options, seed=1
     )
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
-    return SpecimenPool(copies, likelihood.coordinates.inputs(points.z), log_a)
+    inputs = likelihood.coordinates.inputs(points.z)
+
+    def data_set(rng: np.random.Generator) -> SpecimenData:
+        rows = rng.integers(0, copies, n) * n + np.arange(n)
+        return [x[rows] for x in inputs], log_a[rows]
+
+    return data_set
 
 
 @contextmanager
 def other_specimens(
-    likelihoods: Sequence[SpecimenLikelihood],
-    data: Sequence[tuple[list[Floats], Floats]],
+    likelihoods: Sequence[SpecimenLikelihood], data: Sequence[SpecimenData]
 ) -> Iterator[None]:
     """Give compiled likelihoods the points and numbers A of other specimens within the context."""
     shared = [arrays(likelihood) for likelihood in likelihoods]
@@ -538,15 +525,6 @@ def other_specimens(
     finally:
         for variable, value in zip(variables, before, strict=True):
             variable.set_value(value, borrow=True)
-
-
-@dataclass(frozen=True, eq=False)
-class Refit:
-    """The estimate of one simulated data set."""
-
-    theta: Floats  # (d,)
-    converged: bool
-    data: list[tuple[list[Floats], Floats]]  # points and numbers A, by likelihood
 
 
 @dataclass(frozen=True, eq=False)
@@ -608,8 +586,8 @@ class SpecimenRefits:
         slope = np.abs(objective(result.x)[1]).max()
         return self.theta + root @ result.x, bool(np.isfinite(result.fun) and slope < 0.05)
 
-    def simulated(self, draws: int, seed: int) -> Iterator[Refit]:
-        """Yield estimates of data sets simulated at the optimum."""
+    def simulated(self, draws: int, seed: int) -> Iterator[tuple[Floats, bool, list[SpecimenData]]]:
+        """Yield estimates of simulated data sets, whether they converged, and the data."""
         evaluator = self.evaluator
         rng = np.random.default_rng([seed, 21])
         pools = [
@@ -618,10 +596,10 @@ class SpecimenRefits:
         ]
         rng = np.random.default_rng([seed, 22])
         for _ in range(draws):
-            data = [pool.data_set(rng) for pool in pools]
+            data = [pool(rng) for pool in pools]
             with other_specimens(evaluator.likelihoods, data):
                 theta, converged = self.fit()
-            yield Refit(theta, converged, data)
+            yield theta, converged, data
 
     def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """Return estimates of weighted data sets, (S, d), and which converged.

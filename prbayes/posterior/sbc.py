@@ -257,7 +257,7 @@ def _ranks(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[st
         draws=job.draws, adjustment=job.adjustment, random_seed=int(rng.integers(2**31))
     )
     draw = sample if job.adjustment is None else draw_posterior
-    with other_specimens(evaluator.likelihoods, [pool.data_set(rng) for pool in pools]):
+    with other_specimens(evaluator.likelihoods, [pool(rng) for pool in pools]):
         posterior = draw(evaluator.observing(data), settings)["posterior"]
     row = {}
     for name, (truth,) in hyperparameters.constrained(theta).items():

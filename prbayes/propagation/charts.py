@@ -52,10 +52,9 @@ class ReferencePopulation:
 
 @dataclass(frozen=True, eq=False)
 class Fibres:
-    """Fibres {z : g(z) = y_i} of N specimens in whitened inputs.
+    """Fibres {z : g(z) = y_i} of N specimens in whitened inputs; g is the response over `unit`.
 
-    g is the response divided by `unit`, as a function of z. No number of this class depends on
-    more than one specimen, and all of them are free of the units of inputs and outputs.
+    All numbers are free of the units of inputs and outputs.
     """
 
     response: Response
@@ -99,14 +98,10 @@ class Fibres:
         """Move z onto fibres by at most 15 Newton steps, at most one unit long.
 
         ``directions``, (n, d, m), are the span of the steps, by default that of the Jacobian's rows
-        (steps of least norm). The determinant of the Jacobian along directions keeps its sign:
-        beyond a fold of the fibre another chart finds the points. ``solution`` has points of the
-        fibres, (n, d), and Jacobians there: steps that come within .01 of them have converged.
-
-        Convergence is judged by the length of the step, in units of the population: a tolerance
-        relative to the range of y depends on the batch, and counted points of two charts twice.
-        Steps of 1e-6 leave an error of their square. Returns points, Jacobians there, (n, m, d),
-        and which of them converged.
+        (steps of least norm). Along them the determinant of the Jacobian keeps its sign: beyond a
+        fold another chart finds the points. ``solution`` has points of the fibres and Jacobians
+        there: steps that come within .01 of them have converged. Returns points, Jacobians there,
+        (n, m, d), and which of them converged.
         """
         z = z.copy()
         jacobian = np.zeros((len(z), self.y.shape[1], z.shape[1]))
@@ -147,12 +142,8 @@ class Fibres:
 class Charts:
     """Charts of the fibres of N specimens, at most C for each.
 
-    Chart c of specimen i maps free coordinates u to
-
-        z = centre + free u + solved w(u),    w(u) such that g(z) = y_i,
-
-    and u has a t distribution as proposal. The proposal of a specimen is the mixture of its charts.
-    Arrays of some charts have the shape (n, ...) in place of (N, C, ...).
+    Chart c maps u to z = centre + free u + solved w(u) with w(u) such that g(z) = y_i; u has a t
+    distribution as proposal. Arrays of some charts have the shape (n, ...) in place of (N, C, ...).
     """
 
     # Degrees of freedom of the t distributions; 5 and 20 gave the same effective sample sizes.
@@ -215,11 +206,11 @@ class Charts:
     def log_mixture(
         self, fibres: Fibres, specimen: Indices, slot: Indices, z: Floats, jacobian: Floats
     ) -> Floats:
-        """Return the log-density of the proposal at its points, by the balance heuristic.
+        """Return the log-density of the proposal, by the balance heuristic.
 
-        The density is with respect to the fibre's volume over sqrt(det J J'), the same measure in
-        every chart: the sum of share t(u) |det(J solved)| over the charts that reach the point.
-        ``specimen`` and ``slot``, (n,), are the chart that the point was drawn from.
+        The sum of share t(u) |det(J solved)| over the charts that reach the point: a density with
+        respect to the fibre's volume over sqrt(det J J'), the same measure in every chart. Chart
+        ``slot`` of ``specimen``, (n,) both, drew the point.
         """
         k, nu = self.location.shape[-1], Charts.degrees
         exponent = (nu + k) / 2
@@ -267,8 +258,7 @@ def solve_each(matrices: Floats, right: Floats) -> Floats:
 def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
     """Return charts at the modes of the reference population on the fibres.
 
-    Levenberg-Marquardt from z = 0 and Sobol points finds the modes. Modes within 8 nats of the
-    best, and .7 apart from better ones, get a chart: at most four of ``charts`` for a specimen.
+    At most four for a specimen: modes within 8 nats of the best, and .7 apart from better ones.
     """
     n, m = fibres.y.shape
     d = len(fibres.population.mean)
@@ -334,13 +324,9 @@ def _levenberg_marquardt(fibres: Fibres, specimen: Indices, z: Floats) -> Floats
 def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
     """Add charts until random points of the fibres are covered, at most three for a specimen.
 
-    A chart covers a point if it reaches the point, and if the Jacobian there is not steep to the
-    chart: |det(J solved)| >= .3 sqrt(det J J'). The most probable point that no chart covers gets
-    a chart. Other sheets are detected thus, and turns, where the weights of a chart diverge.
-
-    ``normal``, (N, tries, d), are standard normal numbers. The first half of the tries start from
-    them, the others within .5 of the first mode: random points miss the far side of a small closed
-    fibre beside an extremum.
+    A chart covers a point if it reaches the point, and |det(J solved)| >= .3 sqrt(det J J') there.
+    The most probable point that no chart covers gets a chart: other sheets and turns are detected
+    thus. ``normal``, (N, tries, d), are standard normal numbers.
     """
     n, tries, d = normal.shape
     specimen = np.repeat(np.arange(n), tries)
@@ -388,9 +374,8 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
 def _charts_at(fibres: Fibres, z: Floats, jacobian: Floats) -> Charts:
     """Return charts at points of the fibres, (n, d), with the Laplace approximation of u.
 
-    log p(u) = -|z(u)|^2 / 2 - log |det J solved| has a Hessian and a slope that follow from
-    Jacobians beside the centre. The second derivative of the determinant is left out, and
-    eigenvalues of the covariance are clipped: weighted points correct both later.
+    Hessian and slope of log p(u) = -|z(u)|^2 / 2 - log |det J solved| follow from Jacobians beside
+    the centre; the second derivative of the determinant is left out.
     """
     n, m, d = jacobian.shape
     right = np.linalg.svd(jacobian)[2].transpose(0, 2, 1)

@@ -21,20 +21,12 @@ the balance heuristic [2]_,
 
 .. math:: A_{ik} = \log |L| - \log K - \log \sum_j s_j t_j(u_j) |\det J R_j|. \qquad (3)
 
-The sum is over the charts that map u_j = F_j'(z - z*_j) to the point.
+**Accuracy.** Errors of specimens add up: two sets of points are compared until they agree. A small
+closed fibre beside an extremum of the response can be missed, and no number shows it.
 
-**Accuracy.** Errors of specimens add up, so effective sample sizes do not show the error of the
-log-likelihood. Use K = 256 first, then compare two sets of points with different seeds, and join
-more of them until they agree. Theta far outside the reference population needs a new one: fit it to
-inputs of posterior draws (`ReferencePopulation.from_sample`), twice.
-A small closed fibre beside an extremum of the response can be missed, and no number shows it.
-
-Papadimas and Dodwell [3]_ integrate over the inputs of specimens by an emulator and quadrature.
-
-**Specimens.** The readings of such a specimen do not determine its inputs: its points have to cover
-every plausible population. The reference population in which they are drawn is the prior predictive
-one at first, then that of draws of the posterior, twice. Posteriors of smoothed populations come
-before these where points lie farther apart than populations are wide.
+**Reference population.** The prior predictive one at first, then that of posterior draws, twice.
+Posteriors of smoothed populations come before these where points lie farther apart than
+populations are wide. Papadimas and Dodwell [3]_ integrate over the inputs by quadrature.
 
 References
 ----------
@@ -113,11 +105,10 @@ def fibre_points(
 ) -> tuple[Emulation, SpecimenPoints]:
     """Emulate a response with n first runs, and draw points on the fibres of all specimens.
 
-    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. ``bounds``,
-    (2, d), and ``prior_specimens``, (n, d), are those of the prior predictive population, whose
-    middle 99 % lies within [-1, 1]. ``posterior`` maps points (N, K, d), their numbers (N, K), and
-    None or a covariance (d, d) by which populations are smoothed, to draws of the hyperparameters.
-    Raise DesignError if the emulator is too inaccurate, or `most_points` are not enough.
+    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response; the middle
+    99 % of the prior predictive population lies within [-1, 1]. ``posterior`` maps points
+    (N, K, d), their numbers (N, K), and None or a covariance by which populations are smoothed, to
+    draws. Raise DesignError if the emulator is too inaccurate, or `most_points` are not enough.
     """
     d = bounds.shape[1]
     n = first_runs(d) if n is None else n
@@ -175,9 +166,7 @@ def _reliable_draws(
 
     Where points lie farther apart than populations are wide, the likely populations are those
     where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
-    have a smooth log-likelihood. They narrow the reference population, in which points are drawn
-    again, until it narrows no more; then points are doubled. A half difference of one nat shifts
-    the posterior of four hyperparameters by about half of their standard deviations.
+    narrow the reference population, until it narrows no more; then points are doubled.
     """
     free = population.root.shape[0] - int(readings.is_measured.sum(axis=1).min())
     narrows = False
@@ -206,8 +195,8 @@ def _reliable_draws(
 def _per_hyperparameter(draws: Draws) -> float:
     """Return the error of a log-likelihood that shifts hyperparameters as 1 shifts each of four.
 
-    A random function of p hyperparameters with a standard deviation of s nats over the posterior
-    has slopes of about s / sqrt(p) nats a posterior standard deviation, and shifts means by that.
+    A random function of p hyperparameters with a standard deviation of s nats shifts means by about
+    s / sqrt(p) posterior standard deviations.
     """
     return float(np.sqrt(max(draws.thetas.shape[1], 4) / 4))
 
@@ -373,11 +362,9 @@ class FibreProposal:
     numbers: Indices  # (N,): numbers of the specimens, from which their random numbers follow
 
     def draw(self, points: int, seed: int, after: int = 0) -> tuple[Floats, Floats]:
-        """Return inputs x, (N, K, d), on all fibres, and numbers A, (N, K).
+        """Return inputs x, (N, K, d), on all fibres, and numbers A, (N, K); -inf for no point.
 
-        log L_i(theta) = logsumexp_k(log p(x_ik | theta) + A_ik). Points of weight zero have A of
-        -inf and the mean of the reference population. K = ``points``: a power of two fills the
-        fibre most evenly. The first ``after`` points of the seed are left out.
+        The first ``after`` points of the seed are left out.
         """
         n, d = len(self.fibres.y), len(self.fibres.population.mean)
         x = np.empty((n, points, d))
@@ -401,18 +388,13 @@ def fit_fibres(
     seed: int = 0,
     numbers: Indices | None = None,
 ) -> FibreProposal:
-    """Fit proposals to the fibres of measured specimens.
+    """Fit proposals to the fibres of measured outputs y, (N, m) with m < d.
 
-    Charts at the modes, more charts until random points of the fibres are covered, then rounds of
-    adaptation to 256 weighted points each. Charts turn in all rounds but the last, before which
-    the cover is repeated: without that, single specimens of a study with three inputs and two
-    outputs lacked up to .35 in log L. Numbers of a specimen depend on the other specimens only by
-    rounding.
-
-    The response is NaN where it has no value; y are the measured outputs, (N, m) with m < d.
-    ``population`` should cover the plausible populations. ``tries`` random points of the fibre show
-    whether charts are missing. A specimen has the same points alone as in a batch if its number is
-    the same.
+    Charts at the modes, more charts until ``tries`` random points of the fibres are covered, then
+    rounds of adaptation to 256 weighted points each. Charts turn in all rounds but the last, before
+    which the cover is repeated: without that, single specimens lacked up to .35 in log L.
+    ``population`` should cover the plausible populations. A specimen has the same points alone as
+    in a batch if its number is the same.
 
     Examples
     --------
@@ -454,10 +436,9 @@ def fit_fibres(
 def with_errors(
     response: Response, population: ReferencePopulation, error: Floats
 ) -> tuple[Response, ReferencePopulation]:
-    """Return response and population of inputs x and standard normal errors e, f(x) + error e.
+    """Return response f(x) + error e and population of inputs x and standard normal errors e, (m,).
 
-    The number of outputs may then be that of the inputs or more. The error, (m,), is the standard
-    deviation of the readings, in units of the outputs.
+    The number of outputs may then be that of the inputs or more.
     """
     d, m = len(population.mean), len(error)
 
@@ -533,9 +514,8 @@ def _draw(
 def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
     """Return charts with location, scale and share of their weighted points.
 
-    The weights are those of the reference population. With `turn` the solved directions become
-    the row space of the mean Jacobian, which keeps det(J solved) off zero over more of the fibre
-    than the row space at one point. The present values count as 4 (d - m) points.
+    With `turn` the solved directions become the row space of the mean Jacobian, which keeps
+    det(J solved) off zero over more of the fibre. The present values count as 4 (d - m) points.
     """
     d, k = charts.free.shape[2:]
     m = d - k

@@ -1,7 +1,6 @@
 """Emulation of a response near the measured specimens: runs over the prior and at the roots.
 
-`Coordinates` are the aleatory inputs as one vector, scaled to a box. Guards of the log-likelihood
-by specimen (missing roots, emulator error, Monte Carlo error) return numbers, with which loops add
+Guards (missing roots, emulator error, Monte Carlo error) return numbers, with which loops add
 starts, runs or points. No guard detects a root outside the box of the search, or an emulator error
 that is smooth between the fresh runs.
 """
@@ -199,9 +198,8 @@ def emulate(
     """Fit the emulator: runs over a box, then batches at the roots until the bias is small.
 
     ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. The first n
-    runs are in ``box``, and roots are searched in ``search_box``, both (2, d). ``known`` is the
-    emulation of the same response for other data: runs are added where the roots leave its range.
-    Raise DesignError if the response cannot be emulated well enough.
+    runs are in ``box``. ``known`` is the emulation of the same response for other data. Raise
+    DesignError if the response cannot be emulated well enough.
     """
     d = box.shape[1]
     n = first_runs(d) if n is None else n
@@ -257,12 +255,11 @@ def require_accurate(
 def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
     """Return by how much the error of the emulator could narrow the population of an input.
 
-    In posterior standard deviations of its standard deviation sigma. The comparison allows an error
-    covariance C of a root; the part of it that the runs have overestimated is missing in sigma^2:
+    The comparison allows an error covariance C of a root; the part of it that the runs have
+    overestimated is missing in sigma^2. In posterior standard deviations of sigma, with weights
+    w_ir of the roots under a fitted normal population:
 
         sqrt(2 N) / 2 max_j mean_i sum_r w_ir C_jj / (C_jj + sigma_j^2)
-
-    with weights w_ir of the roots under a normal population that is fitted to them.
     """
     sd = np.where(readings.is_measured, readings.comparison_sd(emulation.error), 1.0)
     factor = (sd / emulation.error)[roots.specimen][:, :, None]
@@ -300,8 +297,7 @@ def extended(
 ) -> Emulation:
     """Return the emulation with runs at fresh points, whose misfit gives its error and bias.
 
-    The misfit is that of the emulator before at the first points. With `sampled` it is the left-out
-    error of the new emulator at so many first points, which are a sample of the specimens' inputs.
+    With `sampled` the misfit is the left-out error of the new emulator at so many first points.
     """
     values, jacobian = emulation.surface(fresh)
     outputs = run(fresh)
@@ -338,8 +334,7 @@ def surface_near(
 ) -> tuple[Interpolant, Floats, NDArray[np.bool_]]:
     """Return the interpolant, left-out errors, (n, m), and which runs are near the data, (n,).
 
-    Runs that are equal to nine digits count once: copies add nothing but rounding errors.
-    Left-out errors are NaN where there is no response.
+    Runs that are equal to nine digits count once. Left-out errors are NaN without a response.
     """
     good = np.isfinite(y).all(axis=1)
     if good.sum() < 8:
@@ -374,11 +369,9 @@ def surface_near(
 
 
 def _widened(box: Floats, roots: Roots) -> Floats:
-    """Return the box with more room where roots or their population reach beyond its sides.
+    """Return the box with room for roots that end at its sides, and for their population.
 
-    A quarter where the search for a root ends at the side with a misfit of 50 nats. And room for a
-    normal population that is fitted to the roots: all specimens of a data set are within the box,
-    with the probability 1 - 1 / 4097 of `Coordinates.bounds`.
+    All specimens of a data set are then within it with a probability of 1 - 1 / 4097.
     """
     poor = roots.z[roots.misfit > 50.0]
     width = box[1] - box[0]
@@ -447,11 +440,7 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
 def spread_out(
     z: Floats, box: Floats, count: int, sampled: int, rng: np.random.Generator
 ) -> Floats:
-    """Return points for new runs, (count, d): a sample of the given ones, then others spread out.
-
-    The spread ones are selected one by one, each farthest from all others, among the given points
-    and points around them.
-    """
+    """Return points for new runs, (count, d): a sample of the given ones, then points far apart."""
     scale = np.maximum(z.std(axis=0), 1e-9 * (box[1] - box[0]))
     sample = z[rng.permutation(len(z))[: min(sampled, len(z))]]
     around = z[rng.integers(0, len(z), 8 * count)]
@@ -558,10 +547,9 @@ def missing_share(
 ) -> float:
     """Return the share of n simulated specimens whose own inputs are not among their roots.
 
-    Inputs x* are uniform in the box of the runs. Only responses near the data y, (N, m), count. As
-    x* is a draw from its own posterior under a flat population, the share estimates the missing
-    posterior mass. 0 of 128 means less than 2.3 % (95 %). NaN if no response in the box is near the
-    data. A root may differ from x* by ``tolerance`` of the box.
+    Inputs x* are uniform in the box of the runs, with responses near the data y, (N, m); NaN if
+    there are none. As x* is a draw from its own posterior under a flat population, the share
+    estimates the missing posterior mass. A root may differ from x* by ``tolerance`` of the box.
     """
     low, high = box
     y = y[np.isfinite(y).all(axis=1)]
@@ -587,15 +575,10 @@ def missing_share(
 def half_difference(log_likelihoods_a: Floats, log_likelihoods_b: Floats) -> float:
     """Return the Monte Carlo error of the log-likelihood over the posterior, in nats.
 
-    sd_s sum_i (log L_i^a(theta_s) - log L_i^b(theta_s)) / 2
-
-    over posterior draws theta_s, with points of two independent halves a and b, both (S, N); 32
-    draws suffice. A tilt of the log-likelihood by one nat for each posterior standard deviation
-    moves the posterior mean by one standard deviation. At .15: size .00 to .06 with 256 Sobol
-    points, power .80 to 1.00 with up to 16 (one to four free inputs, 20 and 50 specimens, 200 data
-    sets). With data that inform little it flags .45 to .58 of the good sets, at the price of free
-    points. Single data sets with a large error are missed in up to .71 where these are rare
-    (<= .07). A specimen without a point in one of the halves is left out.
+    sd_s sum_i (log L_i^a(theta_s) - log L_i^b(theta_s)) / 2 over posterior draws theta_s, with
+    points of two independent halves a and b, both (S, N). A tilt of one nat for each posterior
+    standard deviation moves the posterior mean by one standard deviation. A specimen without a
+    point in one of the halves is left out. Size and power: docs/likelihood.md.
     """
     is_finite = np.isfinite(log_likelihoods_a) & np.isfinite(log_likelihoods_b)
     with np.errstate(invalid="ignore"):
@@ -608,14 +591,10 @@ def predicted_bias(misfit: Floats, jacobian: Floats, x: Floats, size: int) -> Fl
     """Return the bias that the emulator's error causes, (2, d), in posterior standard deviations.
 
     The true root lies at x + shift, where shift = -J^+ (run - emulator). From the shifts follow the
-    biases of mean (first row) and standard deviation (second row) of each input's population. At
-    .15 for the largest absolute value, 16 fresh runs: flagged .91 of the data sets with a true bias
-    > .25 and .055 of the others (kinks, poles, crossing modes, jump, frame; 7000 data sets). At a
-    jump the prediction has .10 to .45 of the true size. Infinite if all runs have the same value of
-    an input.
-
-    ``misfit`` is run minus emulator at n fresh runs, (n, m), whose inputs ``x``, (n, d), are a
-    sample of the roots of ``size`` specimens; the emulator's Jacobian there has shape (n, m, d).
+    biases of mean (first row) and standard deviation (second row) of each input's population.
+    ``misfit`` is run minus emulator, (n, m), at a sample x, (n, d), of the roots of ``size``
+    specimens. Infinite if all runs have the same value of an input. At a jump the prediction has
+    .10 to .45 of the true size.
     """
     shift = -np.einsum("ndm,nm->nd", np.linalg.pinv(jacobian), misfit)
     sd = x.std(axis=0)

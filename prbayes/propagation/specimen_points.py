@@ -1,18 +1,10 @@
 """Importance points around the roots of each measured specimen.
 
-The likelihood of specimen i under a population p(x | theta) is
-
     p(y_i | theta) = integral p(y_i | f(x)) p(x | theta) dx  ~=  sum_k exp(A_ik) p(x_ik | theta).
 
-Points x_ik and numbers A_ik do not contain theta. An emulator of the response is fitted to runs
-over the prior's range and at the roots of the specimens (`specimen_emulation`). Points are drawn
-around every root from a multivariate t distribution, whose mixture over the roots of a specimen is
-the proposal density.
-
-References
-----------
-Papadimas, N. and T. Dodwell (2021), A hierarchical Bayesian approach for calibration of stochastic
-material models, Data-Centric Engineering 2, e20, doi:10.1017/dce.2021.20.
+Points x_ik and numbers A_ik do not contain theta. Points are drawn around every root from a
+multivariate t distribution; the mixture over the roots of a specimen is the proposal density.
+Papadimas and Dodwell (2021), doi:10.1017/dce.2021.20, integrate over the inputs by quadrature.
 """
 
 from __future__ import annotations
@@ -104,12 +96,10 @@ def draw_points(
 ) -> SpecimenPoints:
     """Draw points around all roots until two independent halves of them agree.
 
-    ``emulation`` maps coordinates (k, d) to outputs (k, m); ``error``, (m,), is the standard
-    deviation of its error. A specimen without a root,
-    whose readings are censored, gets points of the population. If ``error_is_known``, the error of
-    the readings is the one given, and the weights around the root of certain readings are scaled to
-    its mass, which 256 points measure; otherwise the error is approximate. Raise DesignError if
-    `most_points` are not enough.
+    ``emulation`` maps coordinates (k, d) to outputs (k, m), with the standard deviation ``error``.
+    If ``error_is_known``, the weights around the root of certain readings are scaled to its mass,
+    which 256 points measure; otherwise the error of the readings is approximate. Raise DesignError
+    if `most_points` are not enough.
     """
     sampler = _PointSampler(emulation, error, readings, options.degrees)
     components = _fit_components(sampler, roots, box, seed)
@@ -184,11 +174,9 @@ def _fit_components(
     """Return a t component for each root, fitted to the readings' density around it.
 
     The first scale matrix is that of the Gauss-Newton approximation, within the box. Where the
-    weights of 256 points are uneven, as at a turning point of the response, location and scale
-    become their weighted moments, twice. The points of the last components give the population and
-    the masses. Where the readings leave an input about as uncertain as the population does, the
-    component is that of the specimen given a population twice as wide. A component or a reading
-    that is uncertain by this share of the scatter has no mass: see `_normalised`.
+    readings leave an input about as uncertain as the population does, the component is that of the
+    specimen given a population twice as wide. A component or a reading that is uncertain by this
+    share of the scatter has no mass: see `_normalised`.
     """
     d = roots.z.shape[1] if len(roots.z) else box.shape[1]
     precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
@@ -258,11 +246,7 @@ def _with_population(
     box: Floats,
     seed: int,
 ) -> _Components:
-    """Add 24 components for each specimen without a root.
-
-    Eight are of the population. The specimens with a root may be few, and far from these: sixteen
-    are spread over the box.
-    """
+    """Add components of specimens without a root: 8 of the population, and 16 over the box."""
     d = len(mean)
     width = box[1] - box[0]
     centers = np.concatenate([np.tile(mean, (8, 1)), box[0] + width * sobol(16, d, seed)])
@@ -379,8 +363,7 @@ class _PointSampler:
 def _t_radius(u: Floats, degrees: float) -> Floats:
     """Return the factors that turn normal vectors into vectors of a t distribution.
 
-    Their log is smooth in the logit of u. A spline of it, to nine digits, takes a tenth of the time
-    of the quantiles.
+    A spline in the logit of u, to nine digits, takes a tenth of the time of the quantiles.
     """
     from scipy.interpolate import CubicSpline  # takes long to import
 
@@ -408,8 +391,7 @@ def _component_weights(sample: SpecimenPoints, components: _Components) -> tuple
 def _normalised(sample: SpecimenPoints, components: _Components) -> SpecimenPoints:
     """Scale the weights of the points around each root to the root's mass, if there is one.
 
-    Few points with scaled weights have too small a variance: a negligible bias if the readings are
-    certain. Both halves have that bias, and their difference does not show it.
+    Few points have too small a variance, in both halves: a negligible bias of certain readings.
     """
     table = components.table
     n, slots = table.shape
