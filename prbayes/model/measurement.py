@@ -133,9 +133,7 @@ class StackedReadings:
         )
 
 
-def _specimen_numbers(
-    measurements: Sequence[Measurement],
-) -> tuple[list[NDArray[np.intp]], int]:
+def _specimen_numbers(measurements: Sequence[Measurement]) -> tuple[list[NDArray[np.intp]], int]:
     """Return the specimen of each row, by simulator, and the number of specimens."""
     first: dict[object, int] = {}
     numbers = []

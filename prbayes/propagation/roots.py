@@ -31,13 +31,7 @@ class Roots:
 
 
 def find_roots(
-    response: Response,
-    y: Floats,
-    sd: Floats,
-    starts: Floats,
-    box: Floats,
-    *,
-    gap: float = 20.0,
+    response: Response, y: Floats, sd: Floats, starts: Floats, box: Floats, *, gap: float = 20.0
 ) -> Roots:
     """Find the roots of each specimen by Levenberg-Marquardt [1]_ from several starts, (N, S, d).
 

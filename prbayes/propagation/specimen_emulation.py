@@ -449,7 +449,7 @@ def spread_out(
     points = sample / scale
     squares = np.min([((candidates - p) ** 2).sum(axis=1) for p in points], axis=0)
     rows = farthest_rows(candidates, count - len(points), squares)
-    return np.concatenate([points, candidates[rows]]) * scale
+    return np.asarray(np.concatenate([points, candidates[rows]]) * scale)
 
 
 @dataclass(frozen=True, eq=False)

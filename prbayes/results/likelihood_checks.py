@@ -33,17 +33,10 @@ from prbayes.model.parameters import roots_of
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.maximum_likelihood import (
-    simulation_obstacle,
-    specimen_refits,
-)
+from prbayes.optimize.maximum_likelihood import simulation_obstacle, specimen_refits
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.compile import compile_batched
-from prbayes.response.distributions import (
-    MVNORMAL,
-    PopulationSampler,
-    compiled_log_density,
-)
+from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs, aleatory_names
 
 
@@ -260,10 +253,7 @@ def _normalised(log_weights: Floats) -> Floats:
 
 
 def check_draws(
-    evaluator: Evaluator | None,
-    result: xr.DataTree,
-    thetas: Floats | None,
-    optimum: Optimum | None,
+    evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None, optimum: Optimum | None
 ) -> Checked:
     """Return the reports of the checks of draws.
 
