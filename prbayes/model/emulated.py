@@ -8,7 +8,7 @@ reports use.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
@@ -143,81 +143,47 @@ class EmulatedSimulator:
     likelihood: SpecimenLikelihood
     measurement: Measurement
     place: int | None = None  # index of the group; None without groups
+    name: str = field(init=False)  # such as 'y', or 'y[Adler]' of a group
+    group: str = field(init=False)  # name of the group, empty without groups
+    rows: NDArray[np.intp] = field(init=False)  # (N,): which of the measurement's rows these are
+    observed: Floats = field(init=False)  # measured responses, (N,) or (N, m)
+    weights: Floats = field(init=False)  # of the specimens, (N,); they sum to one
+    specimens: NDArray[Any] | None = field(init=False)  # (N,): labels
+    n_specimens: float = field(init=False)  # effective number
+    metric: Metric = field(init=False)
+    inputs: Inputs = field(init=False)
+    responses: Responses = field(init=False)
+    outputs: Outputs = field(init=False)
+    has_specimens: bool = field(init=False)  # whether a population has specimens without a run
 
     is_emulated: ClassVar[Literal[True]] = True
     # As of a Node: no response is weighted.
     reweighted: ClassVar[None] = None
     max_lost: ClassVar[float] = MAX_LOST
 
-    @property
-    def has_specimens(self) -> bool:
-        """Whether a population has specimens without a run."""
-        return not self.likelihood.calls_response
-
-    @property
-    def name(self) -> str:
-        """Name of the simulator, such as 'y', or 'y[Adler]' of a group."""
-        groups = self.inputs.groups
-        if groups is None or self.place is None:
-            return self.measurement.name
-        return groups.name(self.measurement.name, self.place)
-
-    @property
-    def group(self) -> str:
-        """Name of the group, empty without groups."""
-        groups = self.inputs.groups
-        return "" if groups is None or self.place is None else groups.names[self.place]
-
-    @cached_property
-    def rows(self) -> NDArray[np.intp]:
-        """Which of the simulator's rows these are, (N,)."""
-        groups = self.measurement.groups
-        if groups is None:
-            return np.arange(len(self.measurement.observed))
-        return np.flatnonzero(groups == self.place)
-
-    @property
-    def observed(self) -> Floats:
-        """Measured responses, (N,) or (N, m)."""
-        return self.measurement.observed[self.rows]
-
-    @property
-    def weights(self) -> Floats:
-        """Weights of the specimens, (N,), which sum to one."""
-        weights = self.measurement.weights
-        factors = np.ones(len(self.rows)) if weights is None else weights[self.rows]
-        return np.asarray(factors / factors.sum())
-
-    @property
-    def specimens(self) -> NDArray[Any] | None:
-        """Labels, (N,), or None."""
-        labels = self.measurement.specimens
-        return None if labels is None else labels[self.rows]
-
-    @property
-    def n_specimens(self) -> float:
-        """Effective number of specimens."""
-        return float(1 / (self.weights**2).sum())
-
-    @property
-    def metric(self) -> Metric:
-        """The log-likelihood by specimen."""
-        return self.measurement.metric
-
-    @property
-    def inputs(self) -> Inputs:
-        """The inputs of the response."""
-        return self.measurement.inputs
-
-    @property
-    def responses(self) -> Responses:
-        """The response, and how it is called."""
-        return self.measurement.responses
-
-    @property
-    def outputs(self) -> Outputs:
-        """The outputs of a run."""
-        return self.measurement.outputs
+    def __post_init__(self) -> None:
+        """Set the attributes of the measurement, or of one of its groups."""
+        m, groups = self.measurement, self.measurement.inputs.groups
+        name, group, rows = m.name, "", np.arange(len(m.observed))
+        if groups is not None and self.place is not None:
+            name, group = groups.name(m.name, self.place), groups.names[self.place]
+            rows = np.flatnonzero(m.groups == self.place)
+        weights = np.ones(len(rows)) if m.weights is None else m.weights[rows]
+        weights = weights / weights.sum()
+        vars(self).update(
+            name=name,
+            group=group,
+            rows=rows,
+            observed=m.observed[rows],
+            weights=weights,
+            specimens=None if m.specimens is None else m.specimens[rows],
+            n_specimens=float(1 / (weights**2).sum()),
+            metric=m.metric,
+            inputs=m.inputs,
+            responses=m.responses,
+            outputs=m.outputs,
+            has_specimens=not self.likelihood.calls_response,
+        )
 
     @cached_property
     def _emulated(self) -> EmulatedResponse:
@@ -289,7 +255,10 @@ class EmulatedSample:
     points: list[Floats]  # (n, *event) by input
     log_mixture: Floats  # (n,): log-density of the specimens in the mixture
     blocks: NDArray[np.intp]  # (n,): eight parts, each of which represents the mixture
+    inputs: Inputs  # of the specimens
+    n_points: int  # number of specimens
 
+    max_lost: ClassVar[float] = MAX_LOST  # largest share of a population without response
     has_runs: ClassVar[Literal[False]] = False  # a design has runs as points
 
     @classmethod
@@ -307,22 +276,7 @@ class EmulatedSample:
         log_p = _log_density(simulator.inputs, roots, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
         blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
-        return cls(simulator, flat, log_mixture, blocks)
-
-    @property
-    def inputs(self) -> Inputs:
-        """The inputs of the specimens."""
-        return self.simulator.inputs
-
-    @property
-    def n_points(self) -> int:
-        """Number of specimens."""
-        return len(self.log_mixture)
-
-    @property
-    def max_lost(self) -> float:
-        """Largest share of a population that may have no response."""
-        return MAX_LOST
+        return cls(simulator, flat, log_mixture, blocks, simulator.inputs, len(log_mixture))
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""

@@ -34,7 +34,7 @@ from prbayes.model.measurement import (
     specimen_numbers,
 )
 from prbayes.model.random_variable import (
-    builds_priors_alone,
+    TERMS,
     equal_data,
     known_value,
     printed_names,
@@ -441,7 +441,7 @@ def _log_density_of_vector(
 ) -> TensorVariable:
     """Return the log-likelihoods of the specimens, (S,); none where a later simulator has them."""
     (value,) = values
-    if builds_priors_alone() or op.measurement is not op.likelihood.measurements[-1]:
+    if TERMS.get() == "priors" or op.measurement is not op.likelihood.measurements[-1]:
         return pt.zeros(0)
     variables = op.variables
     roots = {

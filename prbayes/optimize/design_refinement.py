@@ -32,7 +32,7 @@ from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 
 _log = logging.getLogger("prbayes")
-# Batches after which a design is refused; half or twice changes no answer (docs/constants.md).
+# Batches after which a design is refused; half or twice changes no answer.
 MAX_ROUNDS = 8
 # Share of it for points and for emulators: together they then have it all.
 _SHARE = np.sqrt(0.5)
@@ -176,7 +176,7 @@ def refine_at(
     """
     short = shortcomings(evaluator, thetas)
     for name, shortcoming in short.items():
-        if shortcoming.lost is not None:
+        if shortcoming.is_lost:
             raise DesignError(
                 f"{name}: {shortcoming}; repair the response there, return +inf for specimens "
                 "that fail, narrow the priors, or raise max_lost"

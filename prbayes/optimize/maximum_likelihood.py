@@ -535,9 +535,12 @@ class SpecimenRefits:
     theta: Floats  # (d,): start of all estimates
     covariance: Floats  # (d, d): unit of the parameters, or the prior's spread if not finite
 
-    def _compile(self) -> Any:
-        """Compile (theta, *weights) -> minus the weighted log-likelihood, gradient."""
+    def _function(self) -> Any:
+        """Return the compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
         evaluator = self.evaluator
+        key = "weighted log-likelihood"
+        if key in evaluator.functions:
+            return evaluator.functions[key]
         with interpreted():
             graphs = specimen_graphs(evaluator)
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
@@ -547,7 +550,9 @@ class SpecimenRefits:
             ]
             (value,), theta = evaluator.hyperparameters.joined([-sum(terms)])
             gradient = pt.grad(value, theta)
-            return compiled([theta, *weights], ninf_for_invalid([value, gradient]))
+            outputs = ninf_for_invalid([value, gradient])
+            evaluator.functions[key] = compiled([theta, *weights], outputs)
+        return evaluator.functions[key]
 
     @cached_property
     def _root(self) -> Floats:
@@ -568,7 +573,7 @@ class SpecimenRefits:
         if weights is None:
             weights = [np.ones(len(each.readings)) for each in self.evaluator.likelihoods]
         root = self._root
-        function = self.evaluator.cached("weighted log-likelihood", self._compile)
+        function = self._function()
 
         def objective(u: Floats) -> tuple[float, Floats]:
             value, gradient = function(self.theta + root @ u, *weights)

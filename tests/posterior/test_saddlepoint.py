@@ -26,7 +26,6 @@ from prbayes.posterior.saddlepoint import (
     cumulants,
     estimate_likelihood,
     log_density,
-    minimum,
     varying_combinations,
 )
 from prbayes.posterior.target import Target
@@ -61,14 +60,8 @@ def test_derivatives_of_the_cumulant_function() -> None:
         np.testing.assert_allclose(slope, at.hessians[:, j], rtol=1e-7)
 
 
-def test_tilts_have_no_gradient_and_simulators_add() -> None:
+def test_simulators_add() -> None:
     logs, values = atoms()
-    scores = [Scores(values, 7)]
-    state, converged = minimum(
-        lambda tilts, rows: cumulants([logs[rows]], scores, tilts), (3, 2), 7, SaddlepointOptions()
-    )
-    assert converged.all()
-    np.testing.assert_allclose(state.gradients, 0, atol=7e-5)
     halves = [Scores(values, 3), Scores(values, 4)]
     np.testing.assert_allclose(
         log_density([logs, logs], halves), log_density([logs], [Scores(values, 7)])
@@ -190,7 +183,9 @@ def likelihood_of(model: pm.Model) -> EstimateLikelihood:
 
 def target_of(likelihood: EstimateLikelihood) -> Target:
     log_likelihood = likelihood.log_likelihood
-    return Target(likelihood.evaluator, log_likelihood, likelihood.point[None], likelihood.scale)
+    return Target(
+        likelihood.evaluator, log_likelihood, likelihood.starts[0][None], likelihood.scale
+    )
 
 
 def sample_of(likelihood: EstimateLikelihood) -> ImportanceSample:
@@ -224,7 +219,7 @@ def at_another_point(optimum: prb.Optimum) -> EstimateLikelihood:
     """Return the likelihood by the score a standard deviation of the prior away."""
     shifted = replace(optimum, theta=optimum.theta + optimum.evaluator.hyperparameters.prior_sd)
     likelihood = estimate_likelihood(optimum.evaluator, shifted)
-    np.testing.assert_allclose(likelihood.point, shifted.theta)
+    np.testing.assert_allclose(likelihood.starts[0], shifted.theta)
     return likelihood
 
 
@@ -411,5 +406,5 @@ def test_the_options_reach_the_density() -> None:
     options = EstimateLikelihoodOptions(saddlepoint=SaddlepointOptions(iterations=0))
     evaluator: Evaluator = optimum.evaluator
     likelihood = estimate_likelihood(evaluator, optimum, options)
-    away = likelihood.point + 0.1
+    away = likelihood.starts[0] + 0.1
     assert np.isneginf(likelihood.log_likelihood(away[None])).all()
