@@ -41,7 +41,7 @@ from prbayes.inference.checks.prior import prior_end_findings, prior_ends
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import SamplingDistribution, jumping_simulators
 from prbayes.inference.resampling import SETS
-from prbayes.metrics.multivariate import components_missed
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.cost import explained, kept
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
@@ -604,7 +604,7 @@ def optimum_findings(
     design_error: float,
 ) -> tuple[Finding, ...]:
     """Report what the metric leaves out, the design's error, other optima, and identification."""
-    missed = {node.name: components_missed(node.target) for node in evaluator.nodes}
+    missed = {n.name: components_summary(n.target, missed=True) for n in evaluator.nodes}
     findings = [
         Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
     ]

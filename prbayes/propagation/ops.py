@@ -128,8 +128,8 @@ class DensityOp(OwnOp):
                 "use GaussianKDE, or prb.Reweighted"
             )
         sample, weights = inputs
-        slope = CotangentOp(self.cells, 1)(sample, *cotangents)
-        value = CotangentOp(self.cells, 0)(sample, *cotangents)
+        slope = CotangentOp(self.cells, True)(sample, *cotangents)
+        value = CotangentOp(self.cells, False)(sample, *cotangents)
         return [weights * slope, value]
 
 
@@ -139,18 +139,17 @@ class CotangentOp(OwnOp):
     (..., n), (..., m) -> (..., n).
     """
 
-    __props__ = ("cells", "order")
+    __props__ = ("cells", "for_sample")
     __str__ = OwnOp.__str__
     event_shape = (None,)
 
-    def __init__(self, cells: Cells, order: int) -> None:
+    def __init__(self, cells: Cells, for_sample: bool) -> None:
         self.cells = cells
-        self.order = order
+        self.for_sample = for_sample
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
-        gather = self.cells.slope if self.order else self.cells.value
-        outputs[0][0] = gather(*inputs)
+        outputs[0][0] = self.cells.adjoint(*inputs, for_sample=self.for_sample)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse second derivatives."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from prbayes._stats import cumulated
 from prbayes._validate import Floats, Seed, called, flag, real_array, sample_labels, seed_number
-from prbayes.metrics.base import Centered, Projection, View
+from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
 from prbayes.metrics.whitening import whitening
 from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
@@ -42,8 +42,12 @@ class Condition:
     labels: tuple[str, ...] | None  # of the specimens
     numbers: NDArray[np.intp]  # (n,): the specimens, counted over all conditions
     attributes: Mapping[Any, Any] = field(default_factory=dict)  # of the prediction
-    projection: View = field(default_factory=View)
+    projection: Projection | None = None
     group: int = 0  # values of a group have one ECDF; the number of a projection, else 0
+
+    def projected(self, responses: Any) -> Any:
+        """Return the projection of responses, (..., n) or (..., n, m) -> (..., n)."""
+        return responses if self.projection is None else self.projection.of(responses)
 
     @property
     def base_name(self) -> str:
@@ -206,10 +210,10 @@ def projections(pool: Floats) -> list[Projection]:
     # 4096 specimens determine correlations to .02; any directions give a test of the right size.
     sample = finite[:: -(-len(finite) // 4096)]
     outputs = np.arange(m)
-    white = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
-    centered = Centered(outputs, failure_caps(rows), white.center)
+    center, axes = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
+    caps = failure_caps(rows)
     return [
-        Projection(centered, white.axes @ u)
+        Projection(outputs, caps, center, axes @ u)
         for u in directions(m, max(1, sufficient_directions(m)), 0)
     ]
 

@@ -417,7 +417,7 @@ class JointNull(Null):
         u = []
         for t, number in zip(tested, numbers, strict=True):
             drawn = points[t.simulator][converged][:, number]
-            project = t.condition.projection.of
+            project = t.condition.projected
             measured = project(t.values_or(populations[t.simulator][0][0])[drawn])
             refitted, weights = evaluator.populations(thetas, t.simulator)
             values = np.broadcast_to(project(t.values_or(refitted)), weights.shape)
@@ -503,7 +503,7 @@ class _Tested:
         predicted = condition.predicted[~np.isnan(condition.predicted)]
         # Between these a distribution function moves by .05, half of the smallest difference.
         at = np.quantile(predicted, np.linspace(0.05, 0.95, 19), method="nearest")
-        values = condition.projection.of(self.values_or(responses))
+        values = condition.projected(self.values_or(responses))
         expected = Predictive(values, weights).transform(at, None)
         got = Predictive(condition.predicted).transform(at, None)
         largest = np.abs(expected - got).max()

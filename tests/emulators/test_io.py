@@ -1,6 +1,5 @@
 """Files of surrogates: the same comes back, and nothing else is taken for it."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import pytest
 from sklearn.linear_model import Ridge
 
 import prbayes as prb
-from prbayes.emulators.io import settings_of, shipped
 from prbayes.response.failures import Abort, Replace
 from prbayes.response.store import StoreError
 
@@ -27,7 +25,12 @@ def fresh_points(n: int = 500) -> tuple[Any, Any]:
 
 
 @pytest.mark.parametrize(
-    "model", [prb.surrogate.RadialBasis("quintic", smoothing=1e-6), prb.surrogate.Polynomial(3)]
+    "model",
+    [
+        prb.surrogate.RadialBasis("quintic", degree=2, smoothing=1e-6),
+        prb.surrogate.Polynomial(3),
+        prb.surrogate.GaussianProcess("matern", lengths=(0.5, 1.5), nugget=1e-6),
+    ],
 )
 def test_saved_and_loaded_it_is_the_same(tmp_path: Path, model: Any) -> None:
     found = prb.Surrogate.fit(
@@ -99,20 +102,6 @@ def test_what_is_no_surrogate_is_refused(tmp_path: Path) -> None:
     (tmp_path / "s.nc").write_bytes(b"not a file of this kind")
     with pytest.raises(StoreError, match=r"path: got .*expected a file of Surrogate.save"):
         prb.Surrogate.load(tmp_path / "s.nc")
-
-
-def test_settings_make_the_same_surface_again() -> None:
-    surfaces = (
-        prb.surrogate.RadialBasis("quintic", degree=2, smoothing=0.1),
-        prb.surrogate.Polynomial(4),
-        prb.surrogate.GaussianProcess("matern", lengths=(0.5, 1.5), nugget=1e-6),
-    )
-    for model in surfaces:
-        # As JSON has them.
-        settings = json.loads(json.dumps(settings_of(model)))
-        assert shipped(type(model).__name__, settings) == model
-    assert settings_of(Ridge()) == {}
-    assert shipped("Ridge", {}) is None
 
 
 def test_several_outputs_survive_a_file(tmp_path: Path) -> None:

@@ -186,7 +186,7 @@ def error(known: Runs, function: Any = fine, coarse: Any = rough) -> float:
 @pytest.mark.parametrize("joined", [False, True])
 @pytest.mark.parametrize("model", [RadialBasis(), Polynomial(2), GaussianProcess("matern")])
 def test_a_coarse_response_is_followed_with_its_sign(model: Any, joined: bool) -> None:
-    surface = fit_multifidelity(model, X, fine(X), rough(X), joined=joined)
+    surface = fit_multifidelity(MultifidelityModel(model, model, joined), X, fine(X), rough(X))
     if not joined:
         assert surface.rho == pytest.approx(-3, abs=0.2)
     off = surface(AT, rough(AT)) - fine(AT)
@@ -205,7 +205,8 @@ def test_what_varies_over_short_distances_tells_rho() -> None:
 
     tuned = GaussianProcess("matern", lengths=(1.0, 1.0), nugget=1e-6)
     for model in (tuned, RadialBasis()):
-        rho = fit_multifidelity(model, X, trend(X), coarse(X), joined=False).rho
+        following = MultifidelityModel(model, model, joined=False)
+        rho = fit_multifidelity(following, X, trend(X), coarse(X)).rho
         assert rho == pytest.approx(1, abs=0.2)
     assert np.polyfit(coarse(X), trend(X), 1)[0] > 2
 
@@ -289,7 +290,8 @@ def test_too_few_coarse_responses_are_none() -> None:
 
 
 def test_a_constant_coarse_response_tells_nothing() -> None:
-    surface = fit_multifidelity(GaussianProcess(), X, fine(X), np.full(64, 3.0), joined=False)
+    process = MultifidelityModel(GaussianProcess(), GaussianProcess(), joined=False)
+    surface = fit_multifidelity(process, X, fine(X), np.full(64, 3.0))
     assert surface.rho == pytest.approx(0, abs=1e-12)
     model = GaussianProcess("matern", lengths=(1.0, 1.0, 1.0), nugget=1e-6)
     constant = np.full(64, 3.0)
