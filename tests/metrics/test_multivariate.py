@@ -51,6 +51,7 @@ def test_two_outputs_have_equal_angles() -> None:
     angles = np.sort(np.arctan2(u[:, 1], u[:, 0]) % np.pi)
     np.testing.assert_allclose(np.diff(angles), np.pi / 5)
     np.testing.assert_array_equal(u, directions(2, 5, 7))
+    assert directions(3, 1, 0).shape == (1, 3)
 
 
 # The best arrangements of lines: of an icosahedron, of the 24-cell, and of the roots of E6.
@@ -128,6 +129,7 @@ def test_a_joint_metric_declares_what_its_inner_one_does(metric: Metric) -> None
     assert (is_likelihood(d), is_additive(d)) == (False, metric.additive)
     assert (joint.takes_outputs, joint.likelihood) == (True, False)
     assert joint.like(KullbackLeibler()) == Joint(KullbackLeibler(), directions=5)
+    assert metric.like(AreaMetric()) == AreaMetric()
     assert pickle.loads(pickle.dumps(joint)).additive == metric.additive
 
 
