@@ -35,24 +35,16 @@ from prbayes.response.response import Responses
 
 @dataclass(frozen=True)
 class EmulatedSizes:
-    """Sizes of emulated samples.
+    """Sizes of emulated samples."""
 
-    Attributes
-    ----------
-    specimens : int
-        Specimens of a population in plots and scores: the error of a quantile is far below the
-        width of a posterior band.
-    populations, of_each : int
-        Populations of the result, and specimens of each, in the weighted sample of a decision.
-        Twice as many change probabilities by less than their reported error.
-    blocks : int
-        Parts of the sample whose differences give its error.
-    """
-
+    # Specimens of a population in plots and scores: the error of a quantile is far below the width
+    # of a posterior band.
     specimens: int = 1024
+    # Populations of the result, and specimens of each, in the weighted sample of a decision. Twice
+    # as many change probabilities by less than their reported error.
     populations: int = 64
     of_each: int = 64
-    blocks: int = 8
+    blocks: int = 8  # parts of the sample whose differences give its error
 
 
 _SIZES = EmulatedSizes()
@@ -94,7 +86,9 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
 
     Raises a DesignError if fewer than eight runs have a finite response.
     """
-    runs = likelihood.coordinates.inputs(prepared(likelihood).emulation.z)
+    preparation = prepared(likelihood)
+    run_z = preparation.emulation.z
+    runs = likelihood.coordinates.inputs(run_z)
     points = values_of(runs, likelihood.inputs, responses.inputs)
     values = responses(points, [])
     coordinates = Coordinates.of_prior(responses.inputs)
@@ -107,7 +101,12 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
             f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
             "prb.predict, which computes responses at new specimens"
         )
-    is_near = _near_specimens(likelihood)
+    # Runs within the range of the specimens' roots; all if few are.
+    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
+    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
+    is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
+    if is_near.sum() < 16:
+        is_near = np.ones(len(run_z), dtype=bool)
     distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
     rows = np.flatnonzero(is_finite)[distinct]
     has_near = is_near[rows].any()
@@ -115,16 +114,6 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
     left_out = surface.left_out[is_near[rows]] if has_near else surface.left_out
     error = np.sqrt((left_out**2).mean(axis=0))
     return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
-
-
-def _near_specimens(likelihood: SpecimenLikelihood) -> NDArray[np.bool_]:
-    """Return which runs are within the range of the specimens' roots, (n,); all if few are."""
-    preparation = prepared(likelihood)
-    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
-    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
-    z = preparation.emulation.z
-    is_near = ((z >= low) & (z <= high)).all(axis=1)
-    return is_near if is_near.sum() >= 16 else np.ones(len(z), dtype=bool)
 
 
 def values_of(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:

@@ -80,13 +80,20 @@ class Evaluator:
     simulators: list[PopulationSimulator] = field(init=False, repr=False)
     reweighted: dict[str, ReweightedBound] = field(init=False, repr=False)  # designs by simulator
     responses_per_theta: int = field(init=False)  # number of scalar responses of one theta
+    # Observed variables without a metric of distributions.
+    ordinary: list[Any] = field(init=False, repr=False)
+    has_other_terms: bool = field(init=False)  # whether there are such variables, or potentials
 
     def __post_init__(self) -> None:
-        """Set the attributes of all simulators."""
+        """Set the attributes of all simulators, and of the other terms."""
+        rvs = self.model.observed_RVs
+        ordinary = [rv for rv in rvs if not isinstance(rv.owner.op, SimulatorRV)]
         vars(self).update(
             simulators=[*self.nodes, *self.emulated],
             reweighted={n.name: n.reweighted for n in self.nodes if n.reweighted is not None},
-            responses_per_theta=sum(node.bound.n_per_theta for node in self.nodes),
+            responses_per_theta=sum([node.bound.n_per_theta for node in self.nodes]),
+            ordinary=ordinary,
+            has_other_terms=bool(ordinary or self.model.potentials),
         )
 
     @classmethod
@@ -126,7 +133,7 @@ class Evaluator:
         for node in self.nodes:
             runs = id(node.responses.runs)
             counts[runs] = max(node.responses.count, counts.get(runs, 0))
-        return sum(counts.values()) + sum(m.responses.count for m in self.measurements)
+        return sum(counts.values()) + sum([m.responses.count for m in self.measurements])
 
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
@@ -137,7 +144,7 @@ class Evaluator:
                 values = log_likelihoods(likelihood, specimen_params(self, thetas, k))
                 total += values.sum(axis=1)
                 evaluated |= {m.name for m in likelihood.measurements}
-        variables = [rv for rv in _other_variables(self.model) if rv.name not in evaluated]
+        variables = [rv for rv in self.ordinary if rv.name not in evaluated]
         if variables or self.model.potentials:
             if "log_other" not in self.functions:
                 graph = _log_other(self.model, variables)
@@ -173,7 +180,7 @@ class Evaluator:
             log_other[rows] = self.log_other(block)
             for i, node in enumerate(self.nodes):
                 discrepancies[rows, i] = self.discrepancies(block, i)
-                lost[rows, i] = node.bound.lost
+                lost[rows, i] = node.bound.last_missing.lost
         log_prior[np.isnan(log_prior)] = -np.inf
         log_other[np.isnan(log_other)] = -np.inf
         discrepancies[np.isnan(discrepancies)] = np.inf
@@ -214,7 +221,7 @@ class Evaluator:
                 graphs = model.replace_rvs_by_values(graphs)
                 scales = pt.dvector("scales")
                 scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
-                total = scaled - _log_other(model, _other_variables(model))
+                total = scaled - _log_other(model, self.ordinary)
                 with building("priors"):
                     log_prior = model.logp(vars=model.free_RVs, jacobian=False)
                 value = pt.switch(
@@ -325,21 +332,11 @@ def _simulator_params(evaluator: Evaluator) -> list[list[Any]]:
 # Terms beside the discrepancies.
 
 
-def _other_variables(model: pm.Model) -> list[Any]:
-    """Return the observed variables without a metric of distributions."""
-    return [rv for rv in model.observed_RVs if not isinstance(rv.owner.op, SimulatorRV)]
-
-
 def _log_other(model: pm.Model, variables: list[Any]) -> Any:
     """Return the graph of the log-likelihood of observed variables, plus potentials."""
     with building("ordinary"):
         likelihood = model.logp(vars=variables) if variables else pt.constant(0.0)
     return likelihood + model.potentiallogp
-
-
-def has_other_terms(evaluator: Evaluator) -> bool:
-    """Return whether there are observed variables without a metric, or potentials."""
-    return bool(_other_variables(evaluator.model) or evaluator.model.potentials)
 
 
 def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
@@ -433,8 +430,11 @@ def missing_mass(evaluator: Evaluator, theta: Floats, k: int) -> dict[str, float
     return {"lost_mass": float(missing.lost[0]), "failed_mass": float(missing.failed[0])}
 
 
-def coarser_evaluator(evaluator: Evaluator) -> Evaluator | None:
-    """Return an evaluator with an eighth of the points of large designs; None if none is large."""
+def coarser_evaluator(evaluator: Evaluator, theta: Floats | None = None) -> Evaluator | None:
+    """Return an evaluator with an eighth of the points of large designs.
+
+    None if no design is large, or if the smaller designs do not support theta, (d,).
+    """
     bounds: list[Bound] = []
     for node in evaluator.nodes:
         bound = node.reweighted
@@ -442,24 +442,16 @@ def coarser_evaluator(evaluator: Evaluator) -> Evaluator | None:
             bounds.append(bound.copied(bound.design.rows(bound.blocks == 0)))
         else:
             bounds.append(node.bound)
-    pairs = list(zip(evaluator.nodes, bounds, strict=True))
-    if all(node.bound is bound for node, bound in pairs):
+    if bounds == [node.bound for node in evaluator.nodes]:
         return None
-    coarse = tuple(replace(node, bound=bound) for node, bound in pairs)
-    return replace(evaluator, nodes=coarse, has_graph=False)
-
-
-def coarse_where_sufficient(evaluator: Evaluator, theta: Floats) -> Evaluator:
-    """Return the coarser evaluator if its designs support theta, (d,), else the evaluator."""
-    coarse = coarser_evaluator(evaluator)
-    if coarse is None:
-        return evaluator
-    support = coarse.support(theta[None])
-    is_sufficient = [
-        support[name]["weight_ess"][0] >= bound.required_ess
-        for name, bound in coarse.reweighted.items()
-    ]
-    return coarse if all(is_sufficient) else evaluator
+    pairs = zip(evaluator.nodes, bounds, strict=True)
+    coarse_nodes = tuple([replace(node, bound=bound) for node, bound in pairs])
+    coarse = replace(evaluator, nodes=coarse_nodes, has_graph=False)
+    support = {} if theta is None else coarse.support(theta[None])
+    for name, values in support.items():
+        if not values["weight_ess"][0] >= coarse.reweighted[name].required_ess:
+            return None
+    return coarse
 
 
 @dataclass(frozen=True)

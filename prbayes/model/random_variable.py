@@ -553,8 +553,8 @@ def rv_signature(ndims: Sequence[int], ndim_supp: int) -> str:
     """Return the signature of a random variable, such as '(),(i10,i11)->()', or '->(o)'."""
     groups = []
     for k, ndim in enumerate(ndims):
-        axes = ",".join(f"i{k}{axis}" for axis in range(ndim))
-        groups.append(f"({axes})")
+        axes = [f"i{k}{axis}" for axis in range(ndim)]
+        groups.append(f"({','.join(axes)})")
     return ",".join(groups) + ("->(o)" if ndim_supp else "->()")
 
 
@@ -590,18 +590,6 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
         if node is not simulator:
             rv.owner.op.assign(rv.owner, node)
         by_variable[rv] = node
-    return by_variable
-
-
-def required_simulators(model: pm.Model) -> dict[Any, AnySimulator]:
-    """Return the simulators of a model as far as they are computed, or raise if it has none."""
-    by_variable = simulators(model)
-    if not by_variable:
-        raise ValueError(
-            "model: got one without a prb.Simulator, expected at least one; add "
-            "prb.Simulator(name, response, *inputs, metric=..., observed=...) inside the "
-            "`with pm.Model()`"
-        )
     return by_variable
 
 

@@ -46,9 +46,9 @@ from prbayes.model.random_variable import (
     known_value,
     printed_names,
     require_data,
-    required_simulators,
     response_name,
     rv_signature,
+    simulators,
 )
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.population_density import WeightedPoints
@@ -543,5 +543,9 @@ def measurements_of(model: pm.Model) -> dict[Any, Measurement]:
 
 def require_simulator(model: pm.Model) -> None:
     """Raise if a model has no simulator of any kind; nothing is run."""
-    if not any(isinstance(rv.owner.op, SpecimenRV) for rv in model.observed_RVs):
-        required_simulators(model)
+    if not simulators(model) and not specimen_likelihoods(model):
+        raise ValueError(
+            "model: got one without a prb.Simulator, expected at least one; add "
+            "prb.Simulator(name, response, *inputs, metric=..., observed=...) inside the "
+            "`with pm.Model()`"
+        )

@@ -18,36 +18,17 @@ def inside(points: Floats) -> Floats:
 def sobol(n: int, dimensions: int, seed: int) -> Floats:
     """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions).
 
-    References
-    ----------
-    .. [1] Owen, A. B. (1998), Scrambling Sobol and Niederreiter-Xing points,
-       doi:10.1006/jcom.1998.0487.
-
-    Examples
-    --------
-    >>> sobol(4, 1, 0).shape
-    (4, 1)
+    Source: Owen (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
     """
     from scipy.stats import qmc  # takes longer to import than the whole package
 
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
-    if n == 1:
-        return inside(engine.random(1))
-    return inside(engine.random_base2(int(np.ceil(np.log2(n))))[:n])
+    points = engine.random(1) if n == 1 else engine.random_base2(int(np.ceil(np.log2(n))))[:n]
+    return inside(points)
 
 
 def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
-    """Return n independent random points in the open unit cube, shape (n, dimensions).
-
-    References
-    ----------
-    .. [1] Oh et al. (2019), doi:10.1007/s00158-019-02288-6, whose case study has a million of them.
-
-    Examples
-    --------
-    >>> monte_carlo(4, 1, 0).shape
-    (4, 1)
-    """
+    """Return n independent random points in the open unit cube, shape (n, dimensions)."""
     return inside(np.random.default_rng(seed).random((n, dimensions)))
 
 

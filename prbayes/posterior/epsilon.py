@@ -24,8 +24,8 @@ from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, identity_of, require_same
 from prbayes.model.locking import locked
-from prbayes.model.random_variable import AnySimulator, required_simulators, simulators
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.random_variable import AnySimulator, simulators
+from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
 
 _log = logging.getLogger("prbayes")
@@ -299,7 +299,8 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     >>> prb.set_epsilon(model, {"y": 0.1})
     """
     refuse_without_epsilon(model, "set_epsilon")
-    by_metric = list(required_simulators(model).values())
+    require_simulator(model)
+    by_metric = list(simulators(model).values())
     values = checked_epsilon(epsilon, by_metric, model, "set_epsilon")
     for simulator in by_metric:
         if simulator.name in values:

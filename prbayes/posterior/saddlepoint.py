@@ -32,7 +32,7 @@ from prbayes.metrics.score import (
     specimen_scores,
     tabulated_scores,
 )
-from prbayes.model.evaluator import Evaluator, coarse_where_sufficient
+from prbayes.model.evaluator import Evaluator, coarser_evaluator
 from prbayes.numerics.derivatives import cross
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.design_refinement import noise_floors
@@ -178,7 +178,7 @@ def estimate_likelihood(
     if has_several_outputs or len(nodes) > 1 or fewest < options.few_specimens:
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
-    evaluator = coarse_where_sufficient(evaluator, point)
+    evaluator = coarser_evaluator(evaluator, point) or evaluator
     # The combinations of the scores that vary, by the populations at the point.
     score_groups = [
         _group_scores(evaluator, members, point, scales, options)

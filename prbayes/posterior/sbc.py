@@ -17,7 +17,7 @@ from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
-from prbayes.model.evaluator import Evaluator, has_other_terms, specimen_params
+from prbayes.model.evaluator import Evaluator, specimen_params
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
 from prbayes.optimize.maximum_likelihood import (
@@ -121,7 +121,7 @@ def simulation_based_calibration(
             f"simulation_based_calibration: {obstacle}, so that data sets cannot be drawn; "
             "calibrate data of your own simulations with prb.sample_smc"
         )
-    if evaluator.nodes and has_other_terms(evaluator):
+    if evaluator.nodes and evaluator.has_other_terms:
         raise ValueError(
             "simulation_based_calibration: got a model with likelihood terms or potentials "
             "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"

@@ -611,7 +611,7 @@ def _begin(
     """Begin a chain at its start, or in the state of a checkpoint."""
     (stream,) = seed.generate_state(1)
     for node in evaluator.nodes:
-        node.bound.restart(int(stream))
+        node.bound.stream, node.bound.draws = int(stream), 0
     if checkpoint is None:
         kernel.initialize(kernel.start, np.random.default_rng(seed))
         return

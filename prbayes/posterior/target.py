@@ -39,7 +39,7 @@ from prbayes.inference.resampling import (
     stored_populations,
 )
 from prbayes.metrics.score import prepared_on_population
-from prbayes.model.evaluator import TOLERABLE, Evaluator, coarse_where_sufficient, supports_each
+from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
 from prbayes.model.parameters import THETAS, log_posterior
 from prbayes.numerics.points import sobol
 from prbayes.numerics.threads import one_thread
@@ -301,7 +301,8 @@ def refit_likelihood(
     local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
     # Identified directions are known from all stored responses; an eighth is enough for the rest.
-    evaluator = coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
+    theta = continuation.within(thetas[:1])[0]
+    evaluator = coarser_evaluator(evaluator, theta) or evaluator
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0])

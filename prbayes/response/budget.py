@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from functools import partial
 
 from prbayes._validate import positive_integer, positive_number
 
@@ -73,11 +74,8 @@ def limited(max_seconds: float | None, max_runs: int | None) -> Iterator[None]:
         _current.reset(token)
 
 
-@contextmanager
-def unlimited() -> Iterator[None]:
-    """Suspend the budget in the block, for work that costs no response."""
-    with limited(None, None):
-        yield
+# Suspends the budget in a block, for work that costs no response.
+unlimited = partial(limited, None, None)
 
 
 @dataclass(frozen=True)

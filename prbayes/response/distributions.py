@@ -216,7 +216,7 @@ class PriorSampler:
 
     @interpreted()
     def __init__(self, roots: Sequence[TensorVariable]) -> None:
-        self._names = ", ".join(str(r.name) for r in roots)
+        self._names = ", ".join([str(r.name) for r in roots])
         self._shapes = [event_shape(r) for r in roots]
         # PyMC gives a `str_repr` to the variables of a model.
         parents = [v for v in ancestors(roots) if hasattr(v, "str_repr") and is_random(v)]

@@ -34,24 +34,16 @@ from prbayes._validate import called, positive_number
 from prbayes.response.failures import ResponseError
 
 
-@dataclass(frozen=True)
-class Capacity:
-    """Number of workers, and of chunks that are sent to them at a time."""
-
-    workers: int
-    chunks: int
-
-
-def capacity(executor: Executor | None) -> Capacity:
-    """Return the capacity of an executor; an unknown one is sent many chunks."""
+def capacity(executor: Executor | None) -> tuple[int, int]:
+    """Return the numbers of workers, and of chunks that are sent to them at a time."""
     if executor is None:
-        return Capacity(1, 1)
+        return 1, 1
     # Of processes, threads and loky; of MPI; of Dask.
     workers = getattr(executor, "_max_workers", 0) or getattr(executor, "num_workers", 0)
     workers = workers or sum((_dask_threads(executor) or {}).values())
     if not workers:
-        return Capacity(os.cpu_count() or 1, 1024)  # as many as the largest clusters in practice
-    return Capacity(int(workers), 2 * int(workers))  # a worker has its next chunk ready
+        return os.cpu_count() or 1, 1024  # as many as the largest clusters in practice
+    return int(workers), 2 * int(workers)  # a worker has its next chunk ready
 
 
 def _dask_threads(executor: Executor | None) -> dict[str, int] | None:

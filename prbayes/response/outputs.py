@@ -32,7 +32,7 @@ class Outputs:
     @property
     def names(self) -> tuple[str, ...]:
         """The labels as text."""
-        return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
+        return tuple([f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels])
 
     def by_key(self, values: Floats) -> dict[str, Floats]:
         """Return outputs in the last axis, (..., m), as a mapping with the response's keys."""
@@ -94,7 +94,19 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     label = f"{name}: observed"
     if isinstance(observed, Mapping):
         return _from_mapping(label, observed)
-    _refuse_texts(label, observed)
+    if hasattr(observed, "columns") and hasattr(observed, "dtypes"):
+        # Columns that are no numbers, such as names of groups.
+        texts = []
+        for place, (column, kind) in enumerate(zip(observed, observed.dtypes, strict=True)):
+            if kind.kind not in "biufO" or any(isinstance(v, str) for v in observed.iloc[:, place]):
+                texts.append(column)
+        if texts:
+            raise TypeError(
+                f"{label}: got a DataFrame whose columns {texts} hold no numbers, expected a "
+                "column of measured responses for each output; leave others out, as in "
+                "df['life'], and where one names groups, such as suppliers, index hyperparameters "
+                f"by prb.response.group({str(texts[0])!r})"
+            )
     if np.ma.is_masked(observed) and np.ndim(observed) == 2:
         observed = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
     values = observed if np.ma.is_masked(observed) else real_array(observed, label)
@@ -104,23 +116,6 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
         return values, _labelled_columns(observed, values.shape[1])
     unit = getattr(observed, "attrs", {}).get("units") if hasattr(observed, "dims") else None
     return values, Outputs(units=(str(unit),)) if unit else SINGLE_OUTPUT
-
-
-def _refuse_texts(label: str, observed: Any) -> None:
-    """Raise if columns of a DataFrame are no numbers, such as names of groups."""
-    if not hasattr(observed, "columns") or not hasattr(observed, "dtypes"):
-        return
-    texts = []
-    for place, (name, kind) in enumerate(zip(observed.columns, observed.dtypes, strict=True)):
-        if kind.kind not in "biufO" or any(isinstance(v, str) for v in observed.iloc[:, place]):
-            texts.append(name)
-    if texts:
-        raise TypeError(
-            f"{label}: got a DataFrame whose columns {texts} hold no numbers, expected a column "
-            "of measured responses for each output; leave others out, as in df['life'], and where "
-            "one names groups, such as suppliers, index hyperparameters by "
-            f"prb.response.group({str(texts[0])!r})"
-        )
 
 
 def _labelled_columns(observed: Any, m: int) -> Outputs:

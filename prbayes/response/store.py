@@ -113,8 +113,9 @@ class Store:
     ) -> None:
         self.folder = stated_path(folder, "folder", "folder")
         self.name = plain_text(name, "name")
-        if columns is not None:
-            positive_integer(columns, "columns")
+        for argument, value in (("columns", columns), ("outputs", outputs)):
+            if value is not None:
+                positive_integer(value, argument)
         if version is not None:
             plain_text(version, "version")
         self.columns = columns

@@ -16,8 +16,8 @@ import prbayes as prb
 from prbayes.model.description import (
     as_attribute,
     describe,
-    json_attribute,
     from_attributes,
+    json_attribute,
     labelled,
     observed_dataset,
     versions,
