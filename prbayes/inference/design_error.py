@@ -37,12 +37,13 @@ def design_error(sampling: SamplingDistribution) -> DesignErrors:
     """Return the distance to the optimum of another design along the worst axis."""
     points = emulators = np.nan
     if is_stored(sampling.evaluator):
-        bounds = [node.bound for node in sampling.evaluator.nodes]
+        nodes, designs = sampling.evaluator.nodes, sampling.evaluator.reweighted
+        on_line = {name for name, bound in designs.items() if bound.design.on_line}
         # Two designs differ by the root of two of one's error. Points on a line, which cut it into
         # parts of equal mass, count as exact.
-        if [bound for bound in bounds if bound.blocks.any() and not bound.is_line]:
+        if [node for node in nodes if node.bound.blocks.any() and node.name not in on_line]:
             points = float(np.sqrt(2) * _error_of_points(sampling).max(initial=0.0))
-        if [d for d in sampling.evaluator.reweighted.values() if d.design.is_emulated]:
+        if [bound for bound in designs.values() if bound.design.is_emulated]:
             emulators = float(np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0))
     return DesignErrors(points, emulators)
 
@@ -103,8 +104,9 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
         rate = 0.5 + 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)
     else:
         # The observed responses against each block.
+        on_line = {name for name, bound in bounds.items() if bound.design.on_line}
         blocks = [
-            np.zeros_like(node.bound.blocks) if node.bound.is_line else node.bound.blocks
+            0 * node.bound.blocks if node.name in on_line else node.bound.blocks
             for node in evaluator.nodes
         ]
         first = np.zeros(N_BLOCKS, dtype=int)

@@ -267,8 +267,11 @@ def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: flo
         if bound is None or node.name not in names:
             continue
         previous = bound.n_runs
-        batches = max(1, round((factor - 1) * previous / bound.batch_size))
-        size = min(batches * bound.batch_size, bound.config.most - previous)
+        batch = bound.config.n
+        if bound.design.is_emulated:
+            batch = max(batch // 4, bound.responses.workers)
+        batches = max(1, round((factor - 1) * previous / batch))
+        size = min(batches * batch, bound.config.most - previous)
         if size > 0:
             bound.add(_components(evaluator, thetas, k), size)
             added.append(f"{node.name} from {previous} to {bound.n_runs}")
@@ -358,10 +361,9 @@ def draw_samples(
         if bound is None or not bound.design.is_emulated or node.name not in names:
             continue
         components = _components(evaluator, thetas, k)
-        if larger:
-            is_drawn |= bound.widen(components, same_surfaces=same_surfaces)
-        else:
-            bound.reach(components, same_surfaces=same_surfaces)
+        if not larger or bound.design.emulated_size < SIZES.largest:
+            growth = 2 if larger else 1
+            bound.reach(components, same_surfaces=same_surfaces, growth=growth)
             is_drawn = True
     return is_drawn
 
@@ -408,7 +410,7 @@ def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
     if not error > 1.5 * AGREE:
         return []
     designs = [bound.design for bound in evaluator.reweighted.values()]
-    runs = max(design.n_runs for design in designs)
+    runs = max(len(design.runs) for design in designs)
     advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
     if min(len(design.emulated or ()) for design in designs) >= SIZES.largest:
         advice = (

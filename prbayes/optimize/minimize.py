@@ -286,7 +286,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
     if not evaluator.nodes:
         return maximize_likelihood(evaluator, settings)
     for node in evaluator.nodes:
-        node.bound.restart(settings.random_seed)
+        node.bound.stream, node.bound.draws = settings.random_seed, 0
     clock = time.perf_counter()
     hyperparameters = evaluator.hyperparameters
     search = Search(
