@@ -743,7 +743,7 @@ def test_a_ridge_ends_once_designs_identify_its_directions(
     monkeypatch.setattr(minimization, "refine_designs", regularised)
     optimum = prb.minimize(model, starts=0)
     # Else it stays at the ridge's center, with a message.
-    assert (np.abs(optimum.theta - expected.theta).max() < 1e-4) is supported
+    assert bool(np.abs(optimum.theta - expected.theta).max() < 1e-4) is supported
     assert ("were regularised" not in optimum.message) is supported
 
 
@@ -775,7 +775,7 @@ def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.Mo
 )  # fmt: skip
 def test_a_large_error_of_the_design_is_reported(sizes: list[int | None], advice: str) -> None:
     emulated = [None if size is None else range(size) for size in sizes]
-    designs = [SimpleNamespace(n_runs=300, emulated=points) for points in emulated]
+    designs = [SimpleNamespace(runs=range(300), emulated=points) for points in emulated]
     bounds = {f"y{k}": SimpleNamespace(design=design) for k, design in enumerate(designs)}
     evaluator: Any = SimpleNamespace(nodes=(), reweighted=bounds)
     (finding,) = optimum_findings(evaluator, None, (), 0.4)
