@@ -85,11 +85,9 @@ class _AlarmError(TimeoutError):
 
 @contextmanager
 def time_limit(seconds: float | None) -> Iterator[None]:
-    """Raise `TimeoutError` in the block after some seconds, or end this process a while later.
-
-    A signal interrupts the main thread. Other threads, and code that never returns to Python, end
-    with their process.
-    """
+    """Raise `TimeoutError` in the block after some seconds, or end this process a while later."""
+    # A signal interrupts the main thread. Other threads, and code that never returns to Python,
+    # end with their process.
     if seconds is None:
         yield
         return
@@ -257,10 +255,7 @@ class Pool:
         return future
 
     def done(self, futures: Iterable[Future[Any]]) -> set[Future[Any]]:
-        """Return the finished futures, at least one of them; log a long silence.
-
-        Ten minutes without any worker are an error.
-        """
+        """Return finished futures, at least one; ten minutes without any worker are an error."""
         waiting = list(futures)
         silent, absences = 0.0, 0
         while True:
