@@ -506,7 +506,6 @@ INNER = {
     "model.description": {
         "pymc.printing.str_for_dist",
         "pytensor.graph.basic.Variable",
-        "pytensor.graph.traversal.walk",
     },
     "model.parameters": {
         "pymc.pytensorf.join_nonshared_inputs",

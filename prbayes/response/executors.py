@@ -182,10 +182,11 @@ def has_slipped(failure: BaseException | None) -> bool:
 
     Its executor takes the result for an exception if the task is running again by then.
     """
-    frames = [frame for frame, _ in walk_tb(getattr(failure, "__traceback__", None))]
+    if not isinstance(failure, TypeError):
+        return False
+    frames = [frame for frame, _ in walk_tb(failure.__traceback__)]
     file = frames[-1].f_code.co_filename if frames else ""
-    is_dask = Path(file).parts[-2:] == ("distributed", "cfexecutor.py")
-    return isinstance(failure, TypeError) and is_dask
+    return Path(file).parts[-2:] == ("distributed", "cfexecutor.py")
 
 
 def failure_text(failure: BaseException) -> str:
@@ -224,10 +225,10 @@ class Pool:
         # The standard library and loky store their arguments under the same names.
         parameters = signature(kind).parameters
         arguments: dict[str, Any] = {"max_workers": getattr(self.original, "_max_workers", None)}
-        for name in ("mp_context", "context", "initializer", "initargs"):
-            value = getattr(self.original, f"_{name}", None)
-            if name in parameters and value is not None:
-                arguments[name] = value
+        for attribute in ("_mp_context", "_context", "_initializer", "_initargs"):
+            value = getattr(self.original, attribute, None)
+            if attribute[1:] in parameters and value is not None:
+                arguments[attribute[1:]] = value
         _replacements[self.original] = kind(**arguments)
 
     def refuse_dead(self) -> None:
