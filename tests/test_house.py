@@ -506,6 +506,7 @@ INNER = {
     "model.description": {
         "pymc.printing.str_for_dist",
         "pytensor.graph.basic.Variable",
+        "pytensor.graph.traversal.walk",
     },
     "model.parameters": {
         "pymc.pytensorf.join_nonshared_inputs",
@@ -613,7 +614,6 @@ INNER = {
         "pytensor.graph.basic.Variable",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.traversal.ancestors",
-        "pytensor.graph.traversal.walk",
         "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",
     },
