@@ -139,7 +139,7 @@ def _require_refits(optimum: Optimum) -> Optimum:
     if is_specimen_optimum(optimum):
         specimen_refits(optimum, "cross_validate")
         return optimum
-    return require_refits(optimum, "cross_validate", "; the model cannot be calibrated anew")
+    return require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
 
 
 def _folds(
