@@ -155,13 +155,6 @@ def test_it_is_pickled(surface: Any) -> None:
     np.testing.assert_array_equal(back.local_error(*points), fitted.local_error(*points))
 
 
-def test_a_regressor_without_length_before_its_fit_serves() -> None:
-    ensemble = pytest.importorskip("sklearn.ensemble")
-    forest = ensemble.RandomForestRegressor(n_estimators=5, random_state=0)
-    found = prb.Surrogate.fit(bent, BOX, 64, model=forest)
-    assert found(1.5, 1.5) == pytest.approx(bent(1.5, 1.5), abs=0.3)
-
-
 # -- in a model ------------------------------------------------------------------------------------
 
 
@@ -376,15 +369,6 @@ def test_noise_is_the_residuals_nearby_and_the_same_for_the_same_input() -> None
     local = np.sqrt(np.mean(plain.local_error(x, y) ** 2))
     assert np.sqrt(np.mean(added**2)) == pytest.approx(local, rel=0.06)
     assert np.mean(plain.with_error(2)(x, y) == noisy(x, y)) < 0.2
-
-
-def test_noise_widens_a_population_by_the_error() -> None:
-    rng = np.random.default_rng(0)
-    x = np.clip(rng.normal(1.5, 0.3, 20_000), 0, 3)
-    y = np.clip(rng.normal(1.5, 0.1, 20_000), 1, 2)
-    plain = prb.Surrogate.fit(bent, BOX, 64, model=prb.surrogate.Polynomial(1), outside=Abort())
-    more = plain.with_error()(x, y).var() - plain(x, y).var()
-    assert more == pytest.approx(np.mean(plain.local_error(x, y) ** 2), rel=0.1)
 
 
 def test_hashes_of_equal_rows_are_equal_and_their_bits_are_even() -> None:
