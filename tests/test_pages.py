@@ -24,24 +24,27 @@ BLOCK = re.compile(r"^```(?:python|bash|text|\{code-cell\} ipython3)\n(.*?)^```$
 UNSEEN = re.compile(r"\A:tags: \[.*remove-(?:cell|input)")
 
 
-@pytest.mark.parametrize("path", pages.PAGES, ids=lambda path: path.stem)
-def test_tables_are_what_the_benchmarks_found(path: Path) -> None:
-    page = path.read_text(encoding="utf-8")
-    assert pages.written(page) == page, "run python -m benchmarks.pages"
+README_AND_PAGES = [ROOT / "README.md", *pages.PAGES]
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem)
-def test_files_that_a_page_names_are_there(path: Path) -> None:
-    page = path.read_text(encoding="utf-8")
-    named = re.findall(r"\b(?:tests|benchmarks|examples|prbayes)/[\w/]+\.(?:py|json|csv)\b", page)
-    assert not [name for name in named if not (ROOT / name).exists()]
+def test_tables_are_those_of_the_benchmarks() -> None:
+    texts = {path.stem: path.read_text(encoding="utf-8") for path in pages.PAGES}
+    outdated = [name for name, text in texts.items() if pages.written(text) != text]
+    assert not outdated, "run python -m benchmarks.pages"
 
 
-@pytest.mark.parametrize("path", pages.PAGES, ids=lambda path: path.stem)
-def test_tests_that_a_page_names_are_there(path: Path) -> None:
-    named = re.findall(r"(tests/[\w/]+\.py)::(test_\w+)", path.read_text(encoding="utf-8"))
-    for file, test in named:
-        assert f"\ndef {test}(" in (ROOT / file).read_text(encoding="utf-8"), test
+def test_files_that_pages_name_exist() -> None:
+    name = re.compile(r"\b(?:tests|benchmarks|examples|prbayes)/[\w/]+\.(?:py|json|csv)\b")
+    names = {n for path in README_AND_PAGES for n in name.findall(path.read_text(encoding="utf-8"))}
+    assert not [name for name in names if not (ROOT / name).exists()]
+
+
+def test_tests_that_pages_name_exist() -> None:
+    for path in pages.PAGES:
+        for file, test in re.findall(
+            r"(tests/[\w/]+\.py)::(test_\w+)", path.read_text(encoding="utf-8")
+        ):
+            assert f"\ndef {test}(" in (ROOT / file).read_text(encoding="utf-8"), test
 
 
 def wide_lines(page: str) -> list[str]:
@@ -50,9 +53,9 @@ def wide_lines(page: str) -> list[str]:
     return [line for block in seen for line in block.splitlines() if len(line) > CODE_WIDTH]
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", *pages.PAGES], ids=lambda path: path.stem)
-def test_code_fits_on_the_page(path: Path) -> None:
-    assert not wide_lines(path.read_text(encoding="utf-8"))
+def test_code_fits_on_the_page() -> None:
+    wide = {path.stem: wide_lines(path.read_text(encoding="utf-8")) for path in README_AND_PAGES}
+    assert not {name: lines for name, lines in wide.items() if lines}
 
 
 def test_a_wide_line_of_code_is_found() -> None:

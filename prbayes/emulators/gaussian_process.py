@@ -133,7 +133,14 @@ class GaussianProcess(Surface):
                 f"GaussianProcess: lengths: got {len(self.lengths)}, expected one for each of "
                 f"{x.shape[1]} inputs"
             )
-        return mean_through(KERNELS[self.kernel], np.array(self.lengths), self.nugget, x, y)
+        from scipy.linalg import cho_solve
+
+        kernel, lengths = KERNELS[self.kernel], np.array(self.lengths)
+        scaled = x / lengths
+        root = _root(kernel(_squares(scaled, scaled))[0], self.nugget)
+        center = float(y.mean())
+        coefficients = cho_solve((root, True), y - center)
+        return partial(_mean, kernel, scaled, lengths, center, coefficients)
 
     def without_each(self, x: Floats, y: Floats, lacking: NDArray[np.bool_]) -> Predict:
         """Return the means of processes that lack some of the points each, from one inverse."""
@@ -167,17 +174,6 @@ class GaussianProcess(Surface):
         weighted = cho_solve((_root(correlation, self.nugget), True), terms)
         _, slope = np.linalg.lstsq(weighted.T @ terms, weighted.T @ y, rcond=None)[0]
         return float(slope)
-
-
-def mean_through(kernel: Kernel, lengths: Floats, nugget: float, x: Floats, y: Floats) -> Predict:
-    """Return the mean of a process given points, lengths and a nugget."""
-    from scipy.linalg import cho_solve
-
-    scaled = x / lengths
-    correlation, _ = kernel(_squares(scaled, scaled))
-    center = float(y.mean())
-    coefficients = cho_solve((_root(correlation, nugget), True), y - center)
-    return partial(_mean, kernel, scaled, lengths, center, coefficients)
 
 
 def _mean(

@@ -180,7 +180,7 @@ class Evaluator:
             log_other[rows] = self.log_other(block)
             for i, node in enumerate(self.nodes):
                 discrepancies[rows, i] = self.discrepancies(block, i)
-                lost[rows, i] = node.bound.lost
+                lost[rows, i] = node.bound.last_missing.lost
         log_prior[np.isnan(log_prior)] = -np.inf
         log_other[np.isnan(log_other)] = -np.inf
         discrepancies[np.isnan(discrepancies)] = np.inf

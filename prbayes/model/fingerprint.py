@@ -143,12 +143,16 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
     fields: dict[str, Any] = {}
     if isinstance(simulator, Node):
         bound = simulator.bound
+        batches = 1
+        if simulator.reweighted is not None:
+            design = simulator.reweighted.design
+            batches = len(design.batch_sizes) + design.n_emulated_samples
         order = np.lexsort((simulator.weights, *observed.reshape(len(observed), -1).T[::-1]))
         observed, weights = observed[order], simulator.weights[order]
         labels = None if labels is None else labels[order]
         fields = {
             "n_points": bound.n_runs,
-            "batches": 1 if simulator.reweighted is None else simulator.reweighted.design.n_drawn,
+            "batches": batches,
             "epsilon": simulator.epsilon_value,
             # Stored responses are appended to, so that the first stay the first.
             "responses": _tuples(bound.first_responses[:8].ravel()),

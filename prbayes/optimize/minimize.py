@@ -333,7 +333,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
     if not evaluator.nodes:
         return maximize_likelihood(evaluator, settings)
     for node in evaluator.nodes:
-        node.bound.restart(settings.random_seed)
+        node.bound.stream, node.bound.draws = settings.random_seed, 0
     clock = time.perf_counter()
     search = Search(
         evaluator,
@@ -625,7 +625,7 @@ def optimum_findings(
 def _design_finding(evaluator: Evaluator, error: float) -> Finding:
     """Report a large error of the optimum by the design."""
     designs = [bound.design for bound in evaluator.reweighted.values()]
-    runs = max(design.n_runs for design in designs)
+    runs = max(len(design.runs) for design in designs)
     if min(len(design.emulated or ()) for design in designs) < SIZES.largest:
         advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
     else:

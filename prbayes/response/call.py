@@ -29,7 +29,7 @@ from prbayes.response.executors import (
     is_loss,
     time_limit,
 )
-from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
+from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing, outputs_of_result
 from prbayes.response.store import Store, StoreError
 
@@ -160,7 +160,7 @@ def compute(
     if isinstance(function, bytes):
         function = _unpacked(function)
     clock = time.perf_counter()
-    known, n = outputs, len(points)
+    stated, n = outputs, len(points)
     values = np.full((n, *(() if outputs is None else outputs.event)), np.nan)
     raised = {}
     is_scalar = isinstance(function, scalar)
@@ -188,7 +188,7 @@ def compute(
         if not is_scalar:
             responses, outputs = checked(result, (rows.size,), arguments, outputs)
         values = assign_rows(values, rows, responses)
-    named = outputs if known is None else None
+    named = outputs if stated is None else None
     return Chunk(values, raised, time.perf_counter() - clock, named)
 
 
@@ -255,8 +255,8 @@ def checked(
         raise ResponseError(str(error.args[0])) from None
     except Exception as error:
         raise ResponseError(
-            f"the response returned {type(result).__name__} of which no array can be made "
-            f"({_reason(error)}), expected an array of real numbers"
+            f"the response returned {type(result).__name__} that is no array ({_reason(error)}), "
+            "expected an array of real numbers"
         ) from None
     if array.dtype.kind not in "fiub":
         got = f"{type(result).__name__} of dtype {array.dtype}"
@@ -389,7 +389,7 @@ def respond(
     raised: dict[int, str] = {}
     for attempt in range(policy.tries):
         is_last = attempt == policy.tries - 1
-        tolerant = policy.final.goes_on or not is_last
+        tolerant = isinstance(policy.final, Replace) or not is_last
         raised = {}
         for finished in chunks(settings, points, missing, tolerant, tally):
             if on_start is not None:
@@ -465,7 +465,7 @@ def _stored(settings: CallSettings, keys: Floats) -> tuple[Floats, Rows, dict[in
     if settings.outputs is not None:
         values = values.reshape(len(keys), *settings.outputs.event)
     failed = settings.store.failed(keys)
-    if settings.retry_failed or not settings.on_failure.final.goes_on:
+    if settings.retry_failed or not isinstance(settings.on_failure.final, Replace):
         is_stored[list(failed)] = False
         failed = {}
     return values, np.flatnonzero(~is_stored), failed
@@ -500,15 +500,15 @@ def _apply_policy(
     if not is_nan.any():
         return values
     first = next(iter(raised.values()), "it is NaN")
-    if policy.refuses_nan:
+    if policy == Abort(on_nan=True):
         raise _failure_error(settings, points, raised or {int(np.flatnonzero(is_nan)[0]): first})
-    if policy.replacement is not None:
+    if isinstance(policy, Replace):
         n_nan = int(is_nan.sum())
         tally.failures += n_nan
-        text = f"{n_nan} of {is_nan.size} responses failed, replaced by {policy.replacement}"
+        text = f"{n_nan} of {is_nan.size} responses failed, replaced by {policy.value}"
         report(Finding("responses-replaced", f"{settings.name}: {text}; the first: {first}"))
         tally.record_failures(points, dict.fromkeys(map(int, np.flatnonzero(is_nan)), "it is NaN"))
-        values[is_nan] = policy.replacement
+        values[is_nan] = policy.value
     return values
 
 
@@ -566,7 +566,7 @@ def chunks(
     if settings.executor is not None and not isinstance(settings.executor, ThreadPoolExecutor):
         function, options["timeout"] = packed(settings.function), settings.timeout
     work = partial(compute, function, **options)
-    limits = capacity(settings.executor)
+    workers, most_chunks = capacity(settings.executor)
     pool = Pool(settings.name, settings.executor)
     suspects: list[Rows] = []  # chunks at work when a worker was lost
     loss: BaseException | None = None
@@ -581,8 +581,8 @@ def chunks(
                     report(chunk_rows.size, "")
                     yield [(chunk_rows, chunk)]
                 suspects = []
-            while waiting.size and not suspects and len(begun) < limits.chunks:
-                size = chunk_size(settings, tally, waiting.size, limits.workers)
+            while waiting.size and not suspects and len(begun) < most_chunks:
+                size = chunk_size(settings, tally, waiting.size, workers)
                 try:
                     size = budget().grant(size, least=1)
                 except BudgetError as spent:
@@ -608,7 +608,7 @@ def chunks(
                     if chunk.raised and not tolerant:
                         waiting = waiting[:0]
                     tally.count(chunk_rows.size, chunk.seconds)
-                    report(chunk_rows.size, f"{limits.workers / max(tally.seconds, 1e-9):.3g}/s")
+                    report(chunk_rows.size, f"{workers / max(tally.seconds, 1e-9):.3g}/s")
                     finished.append((chunk_rows, chunk))
             if finished:
                 yield finished

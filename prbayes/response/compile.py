@@ -208,7 +208,7 @@ def _is_stateless(op: Op) -> bool:
     if not type(op).__module__.startswith("pytensor."):
         return False
     parts = [getattr(op, name, None) for name in getattr(op, "__props__", None) or ()]
-    return all(_is_stateless(part) for part in parts if isinstance(part, Op))
+    return all(map(_is_stateless, [part for part in parts if isinstance(part, Op)]))
 
 
 # -- batches ---------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,17 @@ class Inputs:
         self.groups = groups_of("", self.roots)
         self.event_shapes = tuple([event_shape(x) for x in self.aleatory])
         self.event_ndims = [x.type.ndim for x in (*self.aleatory, *self.epistemic)]
-        # Aleatory numbers that make one specimen.
+        # Numbers of one specimen in each argument, and those that are aleatory.
+        self.sizes = []
+        for argument in self.arguments:
+            if isinstance(argument, int):
+                shape = self.event_shapes[argument]
+            elif isinstance(argument, Variable):
+                is_static = None not in argument.type.shape
+                shape = argument.type.shape if is_static else argument.shape.eval()
+            else:
+                shape = np.shape(argument)
+            self.sizes.append(int(np.prod(shape, dtype=int)))
         self.dimensions = sum([int(np.prod(shape)) for shape in self.event_shapes])
         # Data that can be changed, as `pymc.Data`, by name.
         self.data: dict[str, Any] = {
@@ -53,20 +62,6 @@ class Inputs:
             for i, variable in enumerate(_ancestry([*self.aleatory, *self.epistemic]))
             if hasattr(variable, "get_value") and isinstance(variable, TensorVariable)
         }
-
-    @cached_property
-    def sizes(self) -> list[int]:
-        """How many numbers each argument of one specimen has."""
-        sizes = []
-        for argument in self.arguments:
-            if isinstance(argument, int):
-                shape = self.event_shapes[argument]
-            elif isinstance(argument, Variable):
-                shape = argument.shape.eval() if argument.type.ndim else ()
-            else:
-                shape = np.shape(argument)
-            sizes.append(int(np.prod(shape, dtype=int)))
-        return sizes
 
     def roots_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
         """Return the roots of the arguments at some positions; constants have none."""
@@ -79,11 +74,11 @@ class Inputs:
                 roots.update((v, None) for v in _ancestry([x], ends) if v in ends)
         return tuple(roots)
 
-    def ordered_as(self, other: Inputs) -> Inputs:
-        """Return the same arguments with the aleatory inputs in the order of equal ones."""
-        places = [other.aleatory.index(x) for x in self.aleatory]
+    def ordered_as(self, reference: Inputs) -> Inputs:
+        """Return the same arguments with the aleatory inputs in the order of a reference."""
+        places = [reference.aleatory.index(x) for x in self.aleatory]
         arguments = [places[a] if isinstance(a, int) else a for a in self.arguments]
-        return Inputs(arguments, other.aleatory, other.roots, self.nested)
+        return Inputs(arguments, reference.aleatory, reference.roots, self.nested)
 
     def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
         """Return the aleatory and epistemic inputs with the roots replaced by ``params``."""
@@ -135,7 +130,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             continue
         model_variables.update(filter(is_group, _ancestry([x], model_variables)))
         ancestry = _ancestry([x], model_variables)
-        roots.update((v, None) for v in ancestry if v in model_variables)
+        roots.update(dict.fromkeys([v for v in ancestry if v in model_variables]))
         latent = [v for v in ancestry if v not in model_variables and is_random(v)]
         _refuse_foreign_variables(x, ancestry, latent, label)
         if x in model_variables or not latent:
@@ -403,9 +398,9 @@ def group(dim: str) -> TensorVariable:
         raise TypeError(f"{caller}: got no model on the context, expected `with pm.Model():`")
     labels = model.coords.get(dim)
     if labels is None:
-        known = [name for name, values in model.coords.items() if values is not None]
+        dims = [name for name, values in model.coords.items() if values is not None]
         raise ValueError(
-            f"{caller}: dim: got {dim!r}, expected a dimension with a coordinate, of {known}; "
+            f"{caller}: dim: got {dim!r}, expected a dimension with a coordinate, of {dims}; "
             f"write pm.Model(coords={{{dim!r}: ['Adler', 'Busch']}}), with the names of the groups"
         )
     names = [str(label) for label in labels]

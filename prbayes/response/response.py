@@ -20,7 +20,7 @@ from prbayes.response.budget import budget
 from prbayes.response.call import CallSettings, Points, Tally, checked, respond, scalar, shapes
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
-from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
+from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
 from prbayes.response.inputs import Inputs, broadcast_batch
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.store import Store
@@ -193,13 +193,13 @@ class Responses:
     @property
     def replacement(self) -> float:
         """Value in place of a response that failed; NaN if nothing is."""
-        value = self._settings.on_failure.final.replacement
-        return np.nan if value is None else float(value)
+        final = self._settings.on_failure.final
+        return float(final.value) if isinstance(final, Replace) else np.nan
 
     @property
     def workers(self) -> int:
         """Number of workers."""
-        return capacity(self._settings.executor).workers
+        return capacity(self._settings.executor)[0]
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, inputs and constants, and output order."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytensor
-import pytensor.tensor as pt
 import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm
@@ -93,56 +92,6 @@ def test_other_observed_values_keep_the_metric_and_additive_ones_are_means_over_
     means = [u @ [e(x, v) for e in single] for v in (w, None)]
     additive = np.isclose(means[0] - means[1], d(x, w) - d(x), rtol=1e-9)
     assert additive == d.metric.additive == (name not in ("area", "kl-reverse"))
-
-
-def test_rows_of_weights_are_as_many_data_sets(metric: Metric, draw: Draw) -> None:
-    x, w, z, u = draw(15)
-    sets = np.random.default_rng(16).dirichlet(np.ones(z.size), (5, 1))
-    several = metric.against(z, u).with_observed(z, sets)
-    some = several.rows([3, 1])
-    basis = some.basis(x)
-    found = some.outer(*basis.features(np.stack([[w], [w[::-1]]])), xp=np)
-    pairs = ((sets[3, 0], w), (sets[1, 0], w[::-1]))
-    expected = [several.with_observed(z, data)(x, weights) for data, weights in pairs]
-    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-9)
-    np.testing.assert_array_equal(some.weights, several.weights[[3, 1]])
-
-
-@pytest.mark.parametrize("batch", [(2, 3), (0,)])
-def test_batches_equal_a_loop(metric: Metric, draw: Draw, batch: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(4)
-    x, w = rng.normal(size=(*batch, 9)), rng.dirichlet(np.ones(9), batch)
-    d = metric.against(draw(5)[2])
-    row = rng.normal(size=9)
-    for values, weights in ((x, w), (row, w), (x, np.arange(1.0, 10.0))):
-        result = d(values, weights)
-        xs, ws = np.broadcast_arrays(values, weights)
-        assert result.shape == batch
-        expected = [d(xs[i], ws[i]) for i in np.ndindex(*batch)]
-        np.testing.assert_allclose(result.ravel(), expected, rtol=1e-10)
-    assert type(d(row)) is float
-
-
-def test_basis_gives_the_same_discrepancy_in_numpy_and_pytensor_with_its_gradient(
-    metric: Metric, draw: Draw
-) -> None:
-    y, w, z, u = draw(6)
-    y[:2] = -30, 40
-    d = metric.against(z, u)
-    basis = d.basis(y)
-    rows = np.random.default_rng(7).dirichlet(np.ones(y.size), (2, 3))
-    np.testing.assert_allclose(by_basis(d, y, rows), d(y, rows), rtol=1e-10)
-    v = pt.vector("v")
-    graph = d.outer(*basis.features(v, pt), xp=pt)
-    result, gradient = pytensor.function([v], [graph, pytensor.grad(graph, v)], mode=PYTHON)(w)
-    np.testing.assert_allclose(result, d(y, w), rtol=1e-10)
-    e = 1e-7 * np.eye(w.size)
-    by_differences = (by_basis(d, y, w + e) - by_basis(d, y, w - e)) / 2e-7
-    np.testing.assert_allclose(gradient, by_differences, rtol=1e-5, atol=1e-6)
-    # A point without a response counts in no feature.
-    with_missing = by_basis(d, np.append(y, NAN), np.append(0.8 * w, 0.2))
-    expected = d.outer(*d.features(y, 0.8 * w, np), xp=np)
-    np.testing.assert_allclose(with_missing, expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("away", [1e3, -1e3, 1e300, INF])

@@ -122,27 +122,6 @@ def test_batches_equal_a_loop_in_any_layout(estimator: Any, batch: tuple[int, ..
 
 
 @both
-def test_equal_weights_however_they_are_passed_give_the_same_density(estimator: Any) -> None:
-    cells = estimator.cells(OBSERVED, EQUAL)
-    x = draw(10, 3, 8)[0]
-    expected = cells.density(x, np.full(8, 1 / 8))
-    for weights in (np.full((3, 8), 1 / 8), np.broadcast_to(1 / 8, (3, 8))):
-        np.testing.assert_array_equal(cells.density(x, weights), expected)
-    almost = np.full((3, 8), 1 / 8)
-    almost[2, 7] = 1.0
-    assert (cells.density(x, almost)[2] != expected[2]).any()
-
-
-@both
-def test_a_long_sample_is_the_sum_of_its_parts(estimator: Any) -> None:
-    n = (1 << 17) + 17
-    x = 3 * np.random.default_rng(3).normal(size=n)
-    cells = estimator.cells(OBSERVED, EQUAL)
-    parts = sum(cells.density(part, np.full(part.size, 1 / n)) for part in np.array_split(x, 7))
-    np.testing.assert_allclose(cells.density(x, np.full(n, 1 / n)), parts, rtol=1e-9, atol=1e-14)
-
-
-@both
 def test_basis_turns_weights_into_the_density(estimator: Any) -> None:
     cells = estimator.cells(OBSERVED, EQUAL)
     x = np.r_[draw(6, 20)[0], -50, 60, INF, OBSERVED]
