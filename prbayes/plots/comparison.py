@@ -97,7 +97,7 @@ def plot_comparison(
 
     canvas = Canvas(names, size=(4.8, 1.6 + 0.34 * n), pc_kwargs=pc_kwargs)
     for name in names:
-        panel = canvas.panel(name)
+        panel = canvas.panels[name]
         if scores:
             values = comparison[name].values
             finite = np.isfinite(values)

@@ -138,9 +138,9 @@ def plot_outputs(
     )
     calibrated = f"calibrated: {ensemble.label}, 50% and {INTERVAL:.0%}"
     for (i, j), name in names.items():
-        panel = canvas.panel(name)
+        panel = canvas.panels[name]
         if j > i:
-            panel.blank()
+            panel.target.set_axis_off()
             continue
         x = columns[j]
         y = columns[i + 1]

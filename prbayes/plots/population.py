@@ -102,13 +102,13 @@ def plot_population(
     pairs = _pairs(shown)
     canvas = Canvas([*names, *pairs], size=(4.6, 3.9), pc_kwargs=pc_kwargs)
     for margin in shown:
-        panel = canvas.panel(margin.name)
+        panel = canvas.panels[margin.name]
         grid, curves = densities[margin.name]
         Calibrated.of(curves, ensemble, prob).draw(panel, grid, ensemble, prob)
         y = "probability" if margin.discrete else "density"
         panel.axes(x=named(margin.name, labels), y=y)
     for name, (first, second) in pairs.items():
-        panel = canvas.panel(name)
+        panel = canvas.panels[name]
         correlation = _draw_pair(panel, ensemble, first, second, prob)
         title = f"correlation {correlation:.2f}"
         panel.axes(x=named(first.name, labels), y=named(second.name, labels), title=title)

@@ -113,7 +113,7 @@ def plot_posterior(
     refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
     canvas = Canvas(names, size=(4.6, 3.6), pc_kwargs=pc_kwargs)
     for name in names:
-        panel = canvas.panel(name)
+        panel = canvas.panels[name]
         top = _draw(panel, hyperparameters[name], prob)
         panel.axes(x=named(name, labels), y="density", yticks=round_ticks(0.0, top))
     return canvas.finish()

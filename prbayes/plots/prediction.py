@@ -79,7 +79,7 @@ def plot_prediction(
     refuse_labels(labels, names)
     canvas = Canvas(names, size=(5.0, 3.9), pc_kwargs=pc_kwargs)
     for pair in pairs:
-        panel = canvas.panel(pair.name)
+        panel = canvas.panels[pair.name]
         _draw(panel, pair, prob)
         failed = np.count_nonzero(np.isinf(pair.measured))
         title = f"{pair.measured.size} measured values" + (f", {failed} failed" if failed else "")

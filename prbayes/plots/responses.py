@@ -149,7 +149,7 @@ def plot_responses(
                 least, most = limits.get(output.axis, (low, high))
                 limits[output.axis] = min(low, least), max(high, most)
     for output, sample, first in contents:
-        panel = canvas.panel(output.name)
+        panel = canvas.panels[output.name]
         if sample.values.ndim == 2:
             picture.distribution(panel, output, sample, first, limits[output.axis])
         else:

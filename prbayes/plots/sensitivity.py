@@ -82,7 +82,7 @@ def plot_sensitivity(
     for kind, title in titles.items():
         factors = by_kind[kind]
         rows = n - 1.0 - np.arange(factors.sizes["factor"])
-        panel = canvas.panel(kind)
+        panel = canvas.panels[kind]
         for end in (0.0, 1.0):
             panel.line(f"end_{end:.0f}", [end, end], limits, GREY, style=DOTTED, width=1.0)
         for key, shift, color, marker, text in (

@@ -76,7 +76,7 @@ def plot_validity(
     # The panel of a single test has a name too
     canvas = Canvas([name or "u" for name in by_name], size=(4.6, 4.8), pc_kwargs=pc_kwargs)
     for name, test in by_name.items():
-        panel = canvas.panel(name or "u")
+        panel = canvas.panels[name or "u"]
         directions = in_directions(test)
         title = _title(name, test, "mean area" if directions else "area")
         if directions:
