@@ -29,7 +29,7 @@ from prbayes.plots.canvas import (
     round_ticks,
 )
 from prbayes.plots.curves import axis_range, central_range, outlines
-from prbayes.plots.ensemble import if_supported, read_before, read_result
+from prbayes.plots.ensemble import read_before, read_result
 from prbayes.plots.responses import Output, outputs_of
 
 # Most outputs of one picture: the pairs of more are too small to be read.
@@ -116,11 +116,10 @@ def plot_outputs(
     refuse_look(labels, pc_kwargs)
     ensemble = read_result(result, model, "prb.plot_outputs", n_draws)
     evaluator = ensemble.evaluator
-    start, text = read_before(result, evaluator, before)
+    start, text = read_before(result, evaluator, before, "plot_outputs")
     k = _simulator_index(evaluator, simulator)
     columns = _shown_outputs(evaluator, k, outputs)
     refuse_labels(labels, evaluator.simulators[k].outputs.names, evaluator=evaluator)
-    start = if_supported(evaluator, start, f"plot_outputs: before ({text})")
     population = _Population.of(evaluator, ensemble.mixture, k)
     earlier = _Population.of(evaluator, start, k) if len(start) else None
     limits = [_axis_limits(output, population, earlier) for output in columns]

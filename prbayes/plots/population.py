@@ -29,7 +29,7 @@ from prbayes.plots.canvas import (
     refuse_look,
 )
 from prbayes.plots.curves import GRID_POINTS, central_range, outlines, smooth_densities
-from prbayes.plots.ensemble import Calibrated, Ensemble, read_result
+from prbayes.plots.ensemble import Ensemble, draw_calibrated, read_result
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import PopulationSampler, is_mvnormal
 from prbayes.response.inputs import Inputs, aleatory_names
@@ -104,7 +104,7 @@ def plot_population(
     for margin in shown:
         panel = canvas.panels[margin.name]
         grid, curves = densities[margin.name]
-        Calibrated.of(curves, ensemble, prob).draw(panel, grid, ensemble, prob)
+        draw_calibrated(panel, grid, curves, ensemble, prob)
         y = "probability" if margin.discrete else "density"
         panel.axes(x=named(margin.name, labels), y=y)
     for name, (first, second) in pairs.items():

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._stats import INTERVAL
+from prbayes._stats import INTERVAL, distribution_function
 from prbayes._validate import share
 from prbayes.plots.canvas import BLUE, INK, Canvas, Panel, named, refuse_labels, refuse_look
 from prbayes.plots.curves import (
     GRID_POINTS,
     axis_range,
     central_range,
-    distribution_functions,
     pointwise_band,
     staircase,
 )
@@ -92,7 +91,7 @@ def _draw(panel: Panel, pair: Comparable, prob: float) -> None:
     weights = pair.weights
     limits = axis_range(pair.measured, central_range(pair.predicted, weights, tail=0.005), None)
     grid = np.linspace(*limits, GRID_POINTS)
-    curves = distribution_functions(pair.predicted, weights, grid)
+    curves = distribution_function(pair.predicted, weights, grid)
     if len(curves) > 1:
         text = f"{prob:.0%} of the populations"
         panel.band("band", grid, pointwise_band(curves, prob), BLUE, legend=text)

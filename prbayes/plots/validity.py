@@ -21,7 +21,7 @@ from prbayes.plots.canvas import (
     Panel,
     refuse_look,
 )
-from prbayes.plots.curves import steps
+from prbayes.plots.curves import steps, with_gaps
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.conditions import DIRECTION
 
@@ -140,14 +140,13 @@ def _draw_directions(
     panel.axes(x=name, y=f"share of values in each of {len(directions)} directions", title=title)
 
 
-def _ecdf(samples: Sequence[Floats]) -> tuple[Floats, Floats]:
+def _ecdf(samples: Sequence[Floats]) -> Floats:
     """Return the corners of ECDFs on [0, 1], with a gap between any two."""
-    xs, ys = [], []
+    curves = []
     for values in samples:
-        x, y = steps(np.sort(values), np.arange(values.size + 1) / values.size, 0.0, 1.0)
-        xs.append(np.append(x, np.nan))
-        ys.append(np.append(y, np.nan))
-    return np.concatenate(xs)[:-1], np.concatenate(ys)[:-1]
+        heights = np.arange(values.size + 1) / values.size
+        curves.append(np.column_stack(steps(np.sort(values), heights, 0.0, 1.0)))
+    return with_gaps(curves)
 
 
 def _between(x: Floats, y: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
