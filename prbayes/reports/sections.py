@@ -23,7 +23,6 @@ from prbayes.model.parameters import (
 )
 from prbayes.optimize.optimum import compared_in
 from prbayes.plots.canvas import named
-from prbayes.plots.outputs import correlation
 from prbayes.reports.assessment import (
     answers,
     diagnostics,
@@ -169,14 +168,11 @@ def _shown_columns(y: Floats) -> list[int]:
 
 def _correlations(name: str, m: Material) -> Section:
     """Return the correlations of outputs, each of the specimens that have both."""
-    y = m.observed[name][:, _shown_columns(m.observed[name])]
-    r = np.full((y.shape[1], y.shape[1]), np.nan)
-    for i, j in np.ndindex(r.shape):
-        pairs = y[:, [i, j]]
-        pairs = pairs[np.isfinite(pairs).all(axis=1)]
-        if len(pairs) > 2:
-            r[i, j] = correlation(pairs, np.ones(len(pairs)))
-    names = [m.outputs[name].names[j] for j in _shown_columns(m.observed[name])]
+    columns = _shown_columns(m.observed[name])
+    y = m.observed[name][:, columns]
+    pandas: Any = import_module("pandas")
+    r = pandas.DataFrame(np.where(np.isfinite(y), y, np.nan)).corr(min_periods=3).values
+    names = [m.outputs[name].names[j] for j in columns]
     about = (
         f"Correlations of the measured outputs of {name}, each of the specimens that have both; "
         "those that failed are in none."
