@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Floats, flag
+from prbayes._validate import flag
 from prbayes.plots.canvas import (
     BLUE,
     DOTTED,
@@ -114,7 +114,10 @@ def plot_comparison(
                     y = np.repeat(rows[i], 2)
                     panel.line(f"interval_{i}", ends, y, BLUE, width=3, legend=interval)
             panel.points("estimate", row.estimate.values, rows, INK, size=45, legend="estimate")
-        xlim = _axis_limits(values)
+        finite = values[np.isfinite(values)]
+        low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+        margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)  # for markers
+        xlim = float(low - margin), float(high + margin)
         panel.axes(
             x=named(name, METRIC_LABELS | dict(labels or {})),
             xlim=xlim,
@@ -123,11 +126,3 @@ def plot_comparison(
             yticks=(rows.tolist(), texts),
         )
     return canvas.finish()
-
-
-def _axis_limits(values: Floats) -> tuple[float, float]:
-    """Return the range of all finite values with a margin for markers."""
-    finite = values[np.isfinite(values)]
-    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-    margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)
-    return float(low - margin), float(high + margin)
