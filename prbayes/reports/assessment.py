@@ -32,7 +32,6 @@ from prbayes.reports.numbers import (
     probability,
     rows_table,
     sample_sd,
-    shown,
     span,
     with_zeros,
 )
@@ -348,7 +347,7 @@ def _cost(label: str, by: str, attrs: Mapping[Any, Any], responses: str) -> dict
         "result": label,
         "by": by,
         "responses": None if n is None else str(int(n)),
-        "seconds": None if seconds is None else shown(float(seconds)),
+        "seconds": None if seconds is None else f"{seconds:.{0 if seconds >= 9.95 else 1}f}",
         "seed": None if seed is None else str(seed),
     }
 
