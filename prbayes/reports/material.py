@@ -77,6 +77,13 @@ class Material:
         return dict(_estimates(self.results[label]).attrs)
 
     @property
+    def has_problems(self) -> bool:
+        """Whether a diagnosis found a problem."""
+        return any(
+            diagnosis is not None and not diagnosis.ok for diagnosis in self.diagnoses.values()
+        )
+
+    @property
     def is_by_specimen(self) -> bool:
         """Whether all simulators of all results have the log-likelihood by specimen."""
         flags = [
@@ -90,6 +97,11 @@ class Material:
     def variables(self) -> list[dict[str, Any]]:
         """The variables of the model; none where they are unknown."""
         return [] if self.description is None else list(self.description["variables"])
+
+    @property
+    def simulators(self) -> list[dict[str, Any]]:
+        """The simulators of the model; none where they are unknown."""
+        return [] if self.description is None else list(self.description["simulators"])
 
     @property
     def hyperparameters(self) -> list[str]:
