@@ -124,19 +124,18 @@ class Panel:
     def line(
         self,
         visual: str,
-        x: Any,
-        y: Any,
+        xy: Any,
         color: str,
         *,
         style: str = SOLID,
         width: float | None = 1.8,
         legend: str = "",
     ) -> None:
-        """Draw a line; without a width, that of Matplotlib's settings."""
-        look = {"color": color, "linestyle": style, "label": legend}
+        """Draw a line through places x and y; without a width, that of Matplotlib's settings."""
+        look: dict[str, Any] = {"color": color, "linestyle": style, "label": legend}
         if width is not None:
             look["width"] = width
-        self.artists[visual] = self.library.line(np.asarray(x), np.asarray(y), self.target, **look)
+        self.artists[visual] = self.library.line(*map(np.asarray, xy), self.target, **look)
 
     def band(
         self,
@@ -156,16 +155,15 @@ class Panel:
     def points(
         self,
         visual: str,
-        x: Any,
-        y: Any,
+        xy: Any,
         color: str,
         *,
         marker: str = CIRCLE,
         size: float = 30,
         legend: str = "",
     ) -> None:
-        """Draw markers of an area, in square points."""
-        places = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
+        """Draw markers of an area, in square points, at places x and y."""
+        places = np.broadcast_arrays(*map(np.atleast_1d, xy))
         self.artists[visual] = self.library.scatter(
             *places, self.target, color=color, marker=marker, size=size, label=legend
         )

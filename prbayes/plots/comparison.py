@@ -101,19 +101,19 @@ def plot_comparison(
         if scores:
             values = comparison[name].values
             finite = np.isfinite(values)
-            panel.points("score", values[finite], rows[finite], BLUE, size=45)
+            panel.points("score", (values[finite], rows[finite]), BLUE, size=45)
         else:
             row = comparison.sel(hyperparameter=name)
             values = np.concatenate([row.lower, row.upper, row.estimate])
             if n > 1:  # a line through the first result, for comparison
                 first = np.repeat(row.estimate.values[:1], 2)
                 text = f"estimate of {texts[0]}"
-                panel.line("first", first, limits, GREY, style=DOTTED, width=1.2, legend=text)
+                panel.line("first", (first, limits), GREY, style=DOTTED, width=1.2, legend=text)
             for i, ends in enumerate(np.column_stack([row.lower, row.upper])):
                 if np.isfinite(ends).all():
                     y = np.repeat(rows[i], 2)
-                    panel.line(f"interval_{i}", ends, y, BLUE, width=3, legend=interval)
-            panel.points("estimate", row.estimate.values, rows, INK, size=45, legend="estimate")
+                    panel.line(f"interval_{i}", (ends, y), BLUE, width=3, legend=interval)
+            panel.points("estimate", (row.estimate.values, rows), INK, size=45, legend="estimate")
         finite = values[np.isfinite(values)]
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
         margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)  # for markers

@@ -97,20 +97,20 @@ def plot_optimizer(
     finite = np.isfinite(values)
     x, values = evaluations[finite], values[finite]
     panel = canvas.panels["discrepancy"]
-    panel.points("asked", x, values, GREY, size=16, legend="evaluated")
+    panel.points("asked", (x, values), GREY, size=16, legend="evaluated")
     # Values of different scales cannot be compared
     if is_free or len(optimum.scales) == 1:
-        panel.line("best", x, np.minimum.accumulate(values), BLUE, legend="lowest so far")
+        panel.line("best", (x, np.minimum.accumulate(values)), BLUE, legend="lowest so far")
     panel.axes(x="evaluations", y=objective_label(optimum))
     scale_by_decades(panel.target, values)
 
     for name in hyperparameters:
         panel = canvas.panels[name]
-        panel.line("path", evaluations, path[name], GREY, width=0.8)
-        panel.points("asked", evaluations, path[name], GREY, size=16, legend="evaluated")
+        panel.line("path", (evaluations, path[name]), GREY, width=0.8)
+        panel.points("asked", (evaluations, path[name]), GREY, size=16, legend="evaluated")
         level = np.repeat(final[name], 2)
         ends = evaluations[[0, -1]]
-        panel.line("optimum", ends, level, VERMILION, style=DASHED, legend="optimum")
+        panel.line("optimum", (ends, level), VERMILION, style=DASHED, legend="optimum")
         panel.axes(x="evaluations", y=named(name, labels))
     return canvas.finish()
 
@@ -191,10 +191,10 @@ def plot_stages(
             color = CYCLE[c % len(CYCLE)]
             stages = np.flatnonzero(np.isfinite(row))
             if is_once[name]:
-                panel.points(visual, [c + 1.0], row[stages][-1:], color, size=45)
+                panel.points(visual, ([c + 1.0], row[stages][-1:]), color, size=45)
             else:
-                look = {"style": styles[c % len(styles)], "legend": f"chain {chain}"}
-                panel.line(visual, stages + 1.0, row[stages], color, **look)
+                look: Any = {"style": styles[c % len(styles)], "legend": f"chain {chain}"}
+                panel.line(visual, (stages + 1.0, row[stages]), color, **look)
         ticks = chains if is_once[name] else [str(stage + 1) for stage in range(rows.shape[1])]
         step = -(-len(ticks) // 10)  # at most ten
         places = [float(place + 1) for place in range(0, len(ticks), step)]

@@ -181,5 +181,5 @@ def draw_calibrated(
         top = max(top, float(sides[1].max()))
         text = f"{prob:.0%} band of the {ensemble.spread}"
         panel.band("band", grid, sides, BLUE, alpha=alpha, legend=text)
-    panel.line("after", grid, middle, BLUE, width=2.2, legend=f"{name}: {ensemble.label}")
+    panel.line("after", (grid, middle), BLUE, width=2.2, legend=f"{name}: {ensemble.label}")
     return top

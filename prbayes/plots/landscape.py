@@ -187,7 +187,7 @@ def _draw_plane(panel: Panel, surface: Landscape, objective: str) -> None:
     places = levels[::2]
     bar.set_ticks(places.tolist(), labels=distinct_texts(low + places**2 * (high - low)))
     bar.set_label(objective)
-    panel.line("path", *surface.path.T, INK, width=1.0)
+    panel.line("path", surface.path.T, INK, width=1.0)
     _draw_marks(panel, surface.path.T, surface.optimum.T, surface.local_optima.T)
 
 
@@ -215,7 +215,7 @@ def _draw_curve(panel: Panel, surface: Landscape, *, alone: bool) -> None:
         at = at[(at >= x[0]) & (at <= x[-1])]
         return np.stack([at, np.interp(at, x, heights)])
 
-    panel.line("landscape", x, heights, BLUE)
+    panel.line("landscape", (x, heights), BLUE)
     path = on_curve(surface.path) if alone else None
     local_optima = surface.local_optima if alone else surface.local_optima[:0]
     _draw_marks(panel, path, on_curve(surface.optimum), on_curve(local_optima))
@@ -224,11 +224,11 @@ def _draw_curve(panel: Panel, surface: Landscape, *, alone: bool) -> None:
 def _draw_marks(panel: Panel, path: Any, optimum: Floats, local_optima: Floats) -> None:
     """Mark points of the path, the optimum and other optima, shape (2, m) each."""
     if path is not None:
-        panel.points("asked", *path, INK, size=14, legend="path of the optimiser")
-    panel.points("optimum", *optimum, VERMILION, marker=DIAMOND, size=90, legend="optimum")
+        panel.points("asked", path, INK, size=14, legend="path of the optimiser")
+    panel.points("optimum", optimum, VERMILION, marker=DIAMOND, size=90, legend="optimum")
     if local_optima.size:
         look: dict[str, Any] = {"marker": CROSS, "size": 70, "legend": "other optima"}
-        panel.points("rivals", *local_optima, VERMILION, **look)
+        panel.points("rivals", local_optima, VERMILION, **look)
 
 
 # -- the objective and its values on a grid --------------------------------------------------
@@ -311,16 +311,15 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
         first, last = center[name][0] - reach, center[name][0] + reach
         # All marked points are within, by about the size of a marker.
         margin = 0.04 * (max(last, marked.max()) - min(first, marked.min()))
-        ends = [min(first, marked.min() - margin), max(last, marked.max() + margin)]
-        # Within the support of the priors, short of its end by less than a 32nd.
-        for i, end in enumerate(ends):
+        ends = []
+        for end in (min(first, marked.min() - margin), max(last, marked.max() + margin)):
+            # Within the support of the priors, short of its end by less than a 32nd.
             steps = np.linspace(center[name][0], end, 33)
             thetas = _thetas_at(evaluator, center | {name: steps})
             ok = np.isfinite(thetas).all(axis=1)
             ok[ok] = evaluator.hyperparameters.in_support(thetas[ok])
-            if not ok.all():
-                ends[i] = float(steps[max(np.argmin(ok) - 1, 0)])
-        axes.append(np.linspace(*ends, points))
+            ends.append(end if ok.all() else float(steps[max(int(np.argmin(ok)) - 1, 0)]))
+        axes.append(np.linspace(ends[0], ends[1], points))
 
     coordinates = np.meshgrid(*axes, indexing="ij")
     on_grid = {name: x.ravel() for name, x in zip(names, coordinates, strict=True)}

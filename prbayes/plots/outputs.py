@@ -154,7 +154,7 @@ def plot_outputs(
         points = _finite_pairs(x, y, *calibrated)
         _draw_regions(panel, "after", points, BLUE, SOLID, legend)
         measured = _finite_pairs(x, y, x.node.observed, x.node.weights)
-        panel.points("measured", *measured[0].T, INK, size=14, legend="measured")
+        panel.points("measured", measured[0].T, INK, size=14, legend="measured")
         correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
         # Names on the left and below all panels
         panel.axes(
@@ -259,7 +259,7 @@ def _draw_regions(
     probs = (0.5, INTERVAL)
     for prob, line in zip(probs, outlines(*sample, probs), strict=True):
         name = f"{visual}_{100 * prob:.0f}"
-        panel.line(name, *line, color, style=style, width=1.5, legend=text)
+        panel.line(name, line, color, style=style, width=1.5, legend=text)
 
 
 def _written(r: float) -> str:

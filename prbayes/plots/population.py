@@ -137,8 +137,9 @@ def _draw_pair(panel: Panel, ensemble: Ensemble, x: Margin, y: Margin, prob: flo
     half, region = outlines(points, weights, (0.5, prob))
     for visual, p, line, style in (("half", 0.5, half, DASHED), ("region", prob, region, SOLID)):
         text = f"{p:.0%} of the calibrated population: {ensemble.label}"
-        panel.line(visual, *line, BLUE, style=style, width=1.5, legend=text)
-    return float(np.corrcoef(points.T)[0, 1])
+        panel.line(visual, line, BLUE, style=style, width=1.5, legend=text)
+    correlations: Any = np.corrcoef(points.T)
+    return float(correlations[0, 1])
 
 
 # -- margins ---------------------------------------------------------------------------------

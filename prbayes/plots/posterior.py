@@ -192,19 +192,19 @@ def _draw(
 
     if prior is not None:
         density_before = bounded_density(prior, grid)
-        panel.line("prior", grid, density_before, GREY, style=DOTTED, legend="prior")
-    panel.line("posterior", grid, density, BLUE, width=2.2, legend="posterior")
+        panel.line("prior", (grid, density_before), GREY, style=DOTTED, legend="prior")
+    panel.line("posterior", (grid, density), BLUE, width=2.2, legend="posterior")
     levels = central_levels(prob)
     row = np.repeat(posterior_row, 2)
     text = f"{prob:.0%} intervals"
-    panel.line("interval", np.quantile(draws, levels), row, BLUE, width=3, legend=text)
-    panel.points("mean", draws.mean(), posterior_row, BLUE, size=90, legend="posterior mean")
+    panel.line("interval", (np.quantile(draws, levels), row), BLUE, width=3, legend=text)
+    panel.points("mean", (draws.mean(), posterior_row), BLUE, size=90, legend="posterior mean")
     if has_error:
         normal = norm(best, error)
         text = "normal with the optimum's standard error"
-        panel.line("normal", grid, normal.pdf(grid), VERMILION, style=DASHED, legend=text)
-        panel.line("stderr", normal.ppf(levels), np.repeat(optimum_row, 2), VERMILION, width=3)
+        panel.line("normal", (grid, normal.pdf(grid)), VERMILION, style=DASHED, legend=text)
+        panel.line("stderr", (normal.ppf(levels), np.repeat(optimum_row, 2)), VERMILION, width=3)
     if estimate is not None:
         look: dict[str, Any] = {"marker": DIAMOND, "size": 110, "legend": "optimum"}
-        panel.points("optimum", best, optimum_row, VERMILION, **look)
+        panel.points("optimum", (best, optimum_row), VERMILION, **look)
     return top

@@ -87,9 +87,9 @@ def plot_prediction(
         if len(curves) > 1:
             text = f"{prob:.0%} of the populations"
             panel.band("band", grid, pointwise_band(curves, prob), BLUE, legend=text)
-        panel.line("predicted", grid, curves.mean(axis=0), BLUE, width=2.2, legend="predicted")
+        panel.line("predicted", (grid, curves.mean(axis=0)), BLUE, width=2.2, legend="predicted")
         steps = staircase(measured, np.full(measured.size, 1 / measured.size), *limits)
-        panel.line("measured", *steps, INK, width=1.4, legend="measured")
+        panel.line("measured", steps, INK, width=1.4, legend="measured")
         failed = np.count_nonzero(np.isinf(measured))
         title = f"{measured.size} measured values" + (f", {failed} failed" if failed else "")
         panel.axes(x=named(pair.name, labels), y="share of specimens", title=title)

@@ -190,25 +190,20 @@ class _Drawing:
         grid = np.linspace(*limits, GRID_POINTS)
         curves_of = distribution_function if ecdf else smooth_densities
         if ecdf:
-            panel.line(
-                "measured",
-                *staircase(observed, weights, *limits),
-                INK,
-                width=1.4,
-                legend="measured",
-            )
             top = 1.0
+            stairs = staircase(observed, weights, *limits)
+            panel.line("measured", stairs, INK, width=1.4, legend="measured")
         else:
             x, y = histogram(observed, weights)
             top = float(y.max())
-            panel.line("measured", x, y, INK, width=0.9, legend="measured")
+            panel.line("measured", (x, y), INK, width=0.9, legend="measured")
             finite = observed[np.isfinite(observed)]
-            panel.points("rug", finite, 0.0, INK, marker="|", size=60)
+            panel.points("rug", (finite, 0.0), INK, marker="|", size=60)
         before = np.zeros(1)
         if earlier is not None:
             (before,) = curves_of(*earlier, grid)
             text = f"before: {self.start}"
-            panel.line("before", grid, before, VERMILION, style=DASHED, legend=text)
+            panel.line("before", (grid, before), VERMILION, style=DASHED, legend=text)
         curves = curves_of(*population, grid)
         top = max(top, draw_calibrated(panel, grid, curves, self.ensemble, self.prob))
         # A narrow peak before would dwarf all other curves
@@ -236,7 +231,7 @@ class _Drawing:
         if is_curve(outputs):
             places = np.array(outputs.labels, dtype=np.float64)
             order = np.argsort(places)
-            center, unit = 0.0, 1.0
+            center, unit = np.zeros(places.size), np.ones(places.size)
             xticks = None
         else:  # outputs with names, each in its own spread
             order = np.arange(len(outputs.labels))
@@ -261,12 +256,12 @@ class _Drawing:
         lower, upper = (middle_of(lines[:, i], self.ensemble) for i in (0, 2))
         text = f"{INTERVAL:.0%} of the calibrated population"
         panel.band("population", x, (lower, upper), BLUE, alpha=0.25, legend=text)
-        panel.line("measured", *_joined(x, measured), GREY, width=0.5, legend="measured")
+        panel.line("measured", _joined(x, measured), GREY, width=0.5, legend="measured")
         if earlier is not None:
             text = f"before: {self.start}"
             line = _joined(x, np.clip(before, low - room, high + room))
-            panel.line("before", *line, VERMILION, style=DASHED, legend=text)
-        median = {"name": "median, calibrated", "alpha": 0.55}
+            panel.line("before", line, VERMILION, style=DASHED, legend=text)
+        median: Any = {"name": "median, calibrated", "alpha": 0.55}
         draw_calibrated(panel, x, lines[:, 1], self.ensemble, self.prob, **median)
 
         incomplete = np.count_nonzero(np.isnan(observed).any(axis=1))

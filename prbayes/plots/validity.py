@@ -82,12 +82,12 @@ def plot_validity(
             # Conditions of one output are one line of their own
             single = test.u_values[~_is_of_direction(test)]
             lines = [single, *directions] if single.size else directions
-            panel.line("identity", [0.0, 1.0], [0.0, 1.0], INK, style=DASHED, width=None)
+            panel.line("identity", ([0.0, 1.0], [0.0, 1.0]), INK, style=DASHED, width=None)
             if not test.folded:
-                panel.line("ecdf", *_ecdf(lines), color, width=0.8)
+                panel.line("ecdf", _ecdf(lines), color, width=0.8)
             folded = _ecdf([np.abs(2 * u - 1) for u in (lines if test.folded else directions)])
             style = SOLID if test.folded else DOTTED
-            panel.line("folded", *folded, color, style=style, width=0.8)
+            panel.line("folded", folded, color, style=style, width=0.8)
             x = "u-value; dotted: |2u - 1|"
             y = f"share of values in each of {len(directions)} directions"
             statistic = "mean area"
@@ -96,8 +96,8 @@ def plot_validity(
             ecdf = _ecdf([values])
             panel.band("envelope", *_envelope(test), PALE, alpha=0.4)
             panel.band("area", *_between(*ecdf), color, alpha=0.4)
-            panel.line("identity", [0.0, 1.0], [0.0, 1.0], INK, style=DASHED, width=None)
-            panel.line("ecdf", *ecdf, color, width=None)
+            panel.line("identity", ([0.0, 1.0], [0.0, 1.0]), INK, style=DASHED, width=None)
+            panel.line("ecdf", ecdf, color, width=None)
             x = "u-value"
             y = f"share of {values.size} values"
             statistic = "area"

@@ -48,8 +48,8 @@ def diagnostics(m: Material) -> list[Section]:
     rows: list[dict[str, Any]] = []
     for label, diagnosis in m.diagnoses.items():
         if diagnosis is None:
-            text = "not diagnosed, because that needs the model, which was not given."
-            sentences.append((label, text))
+            missing = "not diagnosed, because that needs the model, which was not given."
+            sentences.append((label, missing))
             continue
         clear = diagnosis.all_clear
         messages = diagnosis.messages or (f"{clear[0].lower()}{clear[1:]}",)
@@ -315,13 +315,13 @@ def origin(m: Material) -> list[Section]:
     for label, table in m.decisions.items():
         costs.append((label, CALLED[kind_of_decision(table) or ""], table.attrs, "responses"))
     rows = []
-    for label, by, attrs, responses in costs:
+    for label, by, record, responses in costs:
         row: dict[str, Any] = {"result": label, "by": by}
-        row["responses"] = str(int(attrs[responses])) if responses in attrs else None
-        seconds = attrs.get("seconds")
+        row["responses"] = str(int(record[responses])) if responses in record else None
+        seconds = record.get("seconds")
         if seconds is not None:  # to a tenth below ten
             seconds = f"{seconds:.0f}" if seconds >= 9.95 else f"{seconds:.1f}"
-        seed = attrs.get("random_seed")
+        seed = record.get("random_seed")
         rows.append(row | {"seconds": seconds, "seed": None if seed is None else str(seed)})
     text = [
         "Responses are evaluations of the simulated response for one specimen, whatever the number "

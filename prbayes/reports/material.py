@@ -323,8 +323,9 @@ def _observed(
         units = values.attrs.get("units")
         if values.ndim != 2:
             observed[name] = np.ravel(values.values)
-            has_unit = isinstance(units, str) and units
-            outputs[name] = Outputs(units=(units,)) if has_unit else SINGLE_OUTPUT
+            outputs[name] = SINGLE_OUTPUT
+            if isinstance(units, str) and units:
+                outputs[name] = Outputs(units=(units,))
             continue
         if units is not None and not isinstance(units, str):  # of each output
             values = values.assign_coords(units=(values.dims[1], np.asarray(units)))
@@ -417,7 +418,7 @@ def _of_estimates(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
             yield f"{kind}: {name}: got no values (shape {values.shape}), expected some"
         elif values.dtype.kind == "f" and not np.isfinite(values.values).any():
             yield f"{kind}: {name}: got NaN or infinite values only, expected finite ones"
-    needed = {"calibration": ("discrepancy", "metric")}
+    needed: dict[str, tuple[str, ...]] = {"calibration": ("discrepancy", "metric")}
     if kind == "posterior":
         needed = {"calibration": _OF_CALIBRATION}
         if "sample_stats" in groups and "stage" in groups["sample_stats"].dims:
