@@ -228,9 +228,9 @@ def cell(m: int, n: int, metric: str, name: str, replicates: int) -> dict[str, d
         rng = np.random.default_rng([m, n, replicate])
         y = rng.standard_normal((n, m))
         y *= rng.choice([c for _, c in shape], (n, 1), p=[share for share, _ in shape])
-        white = whitening(y, np.full(n, 1 / n), np.arange(m))
-        z = (y - white.center) @ white.axes
-        back = np.linalg.inv(white.axes)
+        center, axes = whitening(y, np.full(n, 1 / n), np.arange(m))
+        z = (y - center) @ axes
+        back = np.linalg.inv(axes)
         best = likeliest(z, shape)
         for number in errors:
             mean, covariance = best
@@ -238,7 +238,7 @@ def cell(m: int, n: int, metric: str, name: str, replicates: int) -> dict[str, d
                 u = directions(m, number, 0)
                 mean, factor = fitted(z, u, metric, shape, best)
                 covariance = factor @ factor.T
-            errors[number].append(error(white.center + mean @ back, back.T @ covariance @ back))
+            errors[number].append(error(center + mean @ back, back.T @ covariance @ back))
     squares = {k: (np.array(e) ** 2).mean(0) for k, e in errors.items()}
     found = {}
     for number in numbers:

@@ -43,6 +43,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import DesignError
 
 OUT = record.RESULTS / "likelihood_coverage.json"
+ROWS = record.RESULTS / "rows" / "likelihood_coverage.json"
 PROB = 0.89
 _POINTS = 4096
 _DEGREES = 5.0
@@ -397,14 +398,15 @@ def main() -> None:
     parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
     arguments = parser.parse_args()
     logging.disable(logging.WARNING)
-    found = record.load(OUT, {"rows": {}, "summary": {}})
+    stored, found = record.load(ROWS, {}), record.load(OUT, {"summary": {}})
     for name in arguments.problems:
         problem = PROBLEMS[name]
         _model, likelihood = likelihood_of(problem)
-        rows = found["rows"].setdefault(name, [])
+        rows = stored.setdefault(name, [])
         while len(rows) < arguments.data_sets:
             rows += [data_set(problem, likelihood, len(rows) + i) for i in range(_BLOCK)]
             found["summary"][name] = summary(rows)
+            record.save(ROWS, stored)
             record.save(OUT, found)
             print(name, len(rows), found["summary"][name], flush=True)
 

@@ -18,7 +18,8 @@ from benchmarks import record
 from benchmarks.scoreboard import table as scoreboard
 from benchmarks.scoreboard.problems import PROBLEMS
 
-PAGES = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("appendix/*.md")])
 METRICS = {
     "PR": "ProbabilityResidual",
     "KLD": "KullbackLeibler",
@@ -120,28 +121,6 @@ def guard_sizes() -> Iterator[Row]:
         for check, cell in checks.items():
             share = f"{short(cell['share'], 3)} ± {short(cell['standard error'], 3)}"
             yield [problem, check, str(cell["data sets"]), share]
-
-
-def samplers() -> Iterator[Row]:
-    """Return the rows of sampling beside other packages."""
-    table = found("smc")
-    systems = {
-        "prbayes, `Reweighted(256)`": "reweighted",
-        "stock PyMC": "pymc",
-        "pyABC": "pyabc",
-    }
-    problems = {"y = x": "linear", "y = x² - 2x + 1": "quadratic"}
-    for (problem, at), (label, name) in product(problems.items(), systems.items()):
-        row = table[f"{at} {name}"]
-        yield [
-            problem,
-            label,
-            f"{row['responses']:,}",
-            f"{row['cpu']:.1f}",
-            ", ".join(f"{value:.2f}" for value in row["mean off"]),
-            ", ".join(f"{value:.2f}" for value in row["sd ratio"]),
-            "yes" if row["accurate"] else "no",
-        ]
 
 
 def partial_pooling() -> Iterator[Row]:
@@ -531,12 +510,6 @@ def between_runs() -> Iterator[Row]:
         yield [name, str(response.d), str(response.outputs), *columns]
 
 
-def placement() -> Iterator[Row]:
-    """Return the rows of errors by where runs are added."""
-    for name, cell in found("placement").items():
-        yield [name, *(f"{error:.3f}".lstrip("0") for error in cell.values())]
-
-
 def emulator_speed() -> Iterator[Row]:
     """Return the rows of what it costs to emulate."""
     for n, cell in found("emulator_speed").items():
@@ -583,26 +556,6 @@ def at_a_fold() -> Iterator[Row]:
             )
             cells.append(f"{short(row['mu'])} / {short(row['sigma'])}")
         yield [metric, *cells]
-
-
-def random_problems() -> Iterator[Row]:
-    """Return the row of problems that nobody chose."""
-    from benchmarks.random_problems import summary
-
-    of = summary(found("random_problems")["rows"])
-    errors = [short(of[key], 3) for key in ("median off", "farthest off")]
-    counts = [str(of[key]) for key in ("problems", "refused")]
-    runs = [f"{of[key]:,.0f}" for key in ("median runs", "most runs")]
-    yield [*counts, *errors, str(of["claimed more than 0.1"]), *runs, f"{of['median seconds']:.0f}"]
-
-
-def three_masses() -> Iterator[Row]:
-    """Return the rows of the benchmark of three masses."""
-    for case, rows in found("three_masses").items():
-        for row in rows:
-            errors = [abs(error) for pair in row["errors %"] for error in pair]
-            ends = (f"[{low:.3f}, {high:.3f}]" for low, high in row["ends"])
-            yield [case, str(row["runs"]), *ends, short(max(errors)), str(row["seconds"])]
 
 
 def two_fidelities() -> Iterator[Row]:
@@ -732,30 +685,9 @@ def thermal_tests() -> Iterator[Row]:
 
 def libraries() -> Iterator[Row]:
     """Return the rows of libraries' emulators."""
-    table = found("emulators")
-    of_all = table["error over that of the best emulator"]
-    labels = {
-        "quintic 2": ("SciPy, quintic splines", ""),
-        "sklearn RBF": ("scikit-learn, squared exponential", "scikit-learn"),
-        "sklearn Matern": ("scikit-learn, Matérn 5/2", "scikit-learn"),
-        "SMT RBF": ("SMT, squared exponential", "smt"),
-        "SMT Matern": ("SMT, Matérn 5/2", "smt"),
-        "OpenTURNS Matern": ("OpenTURNS, Matérn 5/2", "openturns"),
-        "by hand RBF, 1 start": ("prbayes, squared exponential", ""),
-        "by hand Matern, 1 start": ("prbayes, Matérn 5/2", ""),
-    }
-    for name, (label, package) in labels.items():
-        taken = [
-            sum(row["seconds"].values())
-            for row in table["rows"]
-            if row["emulator"] == name and row["n"] == 256 and "seconds" in row
-        ]
-        errors = []
-        for kind in ("smooth", "not smooth"):
-            mean, worst, _ = of_all[name][kind]
-            errors.append(f"{mean:.2f} ({worst:.1f})")
-        size = f"{table['dependencies'][package]['megabytes']:.0f}" if package else ""
-        yield [label, *errors, short(float(np.median(taken))), size]
+    for name, row in found("emulators").items():
+        errors = [f"{mean:.2f} ({worst:.1f})" for mean, worst in (row["smooth"], row["not smooth"])]
+        yield [name, *errors, short(row["seconds"])]
 
 
 def _matrix(key: str, several: bool) -> Iterator[Row]:
@@ -776,7 +708,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "likelihood, sizes of guards": guard_sizes,
     "saddlepoint": saddlepoint,
     "saddlepoint_refits": saddlepoint_refits,
-    "samplers": samplers,
     "size": sizes,
     "size, through prbayes": sizes_through,
     "size, several outputs": sizes_of_outputs,
@@ -803,13 +734,10 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "scale": scale,
     "busy workers": busy_workers,
     "between runs": between_runs,
-    "placement": placement,
     "emulators, time": emulator_speed,
     "few runs": few_runs,
     "many inputs": many_inputs,
     "at a fold": at_a_fold,
-    "random problems": random_problems,
-    "three masses": three_masses,
     "two fidelities": two_fidelities,
     "libraries": libraries,
     "planning": plans,
@@ -848,7 +776,7 @@ def written(page: str) -> str:
 
 def main() -> None:
     """Write all pages."""
-    for path in sorted(PAGES.glob("*.md")):
+    for path in PAGES:
         page = path.read_text(encoding="utf-8")
         path.write_text(written(page), encoding="utf-8")
 

@@ -37,6 +37,7 @@ from prbayes.model.specimen_likelihood import log_likelihood_graph
 from prbayes.model.specimen_preparation import prepared
 
 OUT = record.RESULTS / "readings_coverage.json"
+ROWS = record.RESULTS / "rows" / "readings_coverage.json"
 SIZE = 20
 _AT_ONCE = 4_000_000  # numbers of an array
 _POINTS = 1024  # of the importance sampling
@@ -400,17 +401,18 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
     arguments = parser.parse_args()
     logging.disable(logging.WARNING)
-    stored = record.load(OUT, {"rows": {}, "summary": {}})
+    stored, found = record.load(ROWS, {}), record.load(OUT, {"summary": {}})
     for name in arguments.cases:
         case = CASES[name]
         _model, likelihood = likelihood_of(case.problem, case.measurement)
-        rows = stored["rows"].setdefault(name, [])
+        rows = stored.setdefault(name, [])
         while len(rows) < arguments.data_sets:
             count = min(_BLOCK, arguments.data_sets - len(rows))
             rows += [data_set(case, likelihood, len(rows) + i) for i in range(count)]
-            stored["summary"][name] = table(rows)
-            record.save(OUT, stored)
-            print(name, len(rows), stored["summary"][name], flush=True)
+            found["summary"][name] = table(rows)
+            record.save(ROWS, stored)
+            record.save(OUT, found)
+            print(name, len(rows), found["summary"][name], flush=True)
 
 
 if __name__ == "__main__":

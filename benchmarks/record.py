@@ -47,10 +47,20 @@ def about(packages: Iterable[str] = PACKAGES) -> dict[str, Any]:
     }
 
 
+def _rounded(value: Any) -> Any:
+    """Return a value with seven digits of each number."""
+    if isinstance(value, float):
+        return float(f"{value:.7g}")
+    if isinstance(value, dict):
+        return {key: _rounded(inner) for key, inner in value.items()}
+    return [_rounded(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
 def save(path: Path, found: Any, packages: Iterable[str] = PACKAGES) -> None:
-    """Write what was found, and how."""
-    whole = {"run": about(packages), "found": found}
-    path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+    """Write results with seven digits, and how they were computed."""
+    path.parent.mkdir(exist_ok=True)
+    whole = {"run": about(packages), "found": _rounded(found)}
+    path.write_text(json.dumps(whole, separators=(",", ":")) + "\n", encoding="utf-8")
 
 
 def load(path: Path, missing: Any) -> Any:

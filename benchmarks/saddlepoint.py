@@ -235,7 +235,7 @@ def estimate_log_likelihood(y: Any) -> Callable[[Any, Any], Any]:
 
 def posterior(likelihood: Likelihood, starts: Any = None) -> Target:
     """Return the posterior of a likelihood, which begins at its point by default."""
-    places = likelihood.point[None] if starts is None else np.array(starts)
+    places = likelihood.starts[0][None] if starts is None else np.array(starts)
     return Target(likelihood.evaluator, likelihood.log_likelihood, places, likelihood.scale)
 
 
@@ -257,11 +257,11 @@ def given_estimate(
     clock = time.process_time()
     likelihood = function(optimum.evaluator, optimum)
     setup = time.process_time() - clock
-    draws, figures = sampled(likelihood, likelihood.point[None], likelihood.scale)
-    support = likelihood.evaluator.support(likelihood.point[None])
+    draws, figures = sampled(likelihood, likelihood.starts[0][None], likelihood.scale)
+    support = likelihood.evaluator.support(likelihood.starts[0][None])
     effective = min(float(of["weight_ess"][0]) for of in support.values())
     if isinstance(likelihood, RefitLikelihood):
-        points = len(likelihood.sets.estimates)
+        points = len(likelihood.estimates)
     else:
         points = max(
             len(each.scores.values) for each in likelihood.groups if isinstance(each, StoredScores)
@@ -426,7 +426,7 @@ def starts(name: str, number: int, count: int = 32) -> dict[str, Any]:
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
     evaluator = likelihood.evaluator
     density = posterior(likelihood).log_posterior
-    (best,) = laplace(density, likelihood.point[None], likelihood.scale)
+    (best,) = laplace(density, likelihood.starts[0][None], likelihood.scale)
     points = evaluator.hyperparameters.prior_points(count, number)
     possible = np.isfinite(density(points))
     arrived = 0

@@ -147,7 +147,7 @@ def tasks(size: int) -> dict[str, float]:
         call.respond(how, points, call.Tally())
         spent = time.perf_counter() - clock
     one, packed = points.at(np.arange(1)), call.packed(function)
-    task = cloudpickle.dumps((call.compute_packed, packed, one, False))
+    task = cloudpickle.dumps((call.compute, packed, one, False))
     return {
         "seconds a task": spent / size,
         "bytes a task": len(task),

@@ -60,13 +60,7 @@ def as_json(findings: Iterable[Finding]) -> str:
 
 
 def from_json(text: str) -> tuple[Finding, ...]:
-    """Return the findings of an attribute of a stored result.
-
-    Raises
-    ------
-    ValueError
-        If the text is no list of records of code, text and page.
-    """
+    """Return the findings of an attribute of a stored result, or raise `ValueError`."""
     try:
         records = json.loads(text)
         return tuple(

@@ -94,19 +94,9 @@ def distribution_function(
 def quantile(values: Floats, weights: Floats, probability: ArrayLike) -> Floats:
     """Return quantiles of weighted samples, linear between the mid-points of the function's steps.
 
-    With equal weights this is Hazen's definition. Below the first mid-point it is the smallest
-    value, above the last the largest.
-
-    Parameters
-    ----------
-    values, weights : ndarray, shape (..., n)
-        The weights of a row sum to one. A value of weight zero is a corner of the curve like any
-        other, and NaN makes quantiles beyond its lower neighbour NaN: leave both out.
-    probability : array_like, shape () or (m,)
-
-    Returns
-    -------
-    ndarray, shape (...) or (..., m)
+    Values and weights, (..., n), and a probability, () or (m,), give (...) or (..., m). The weights
+    of a row sum to one; with equal weights this is Hazen's definition. Leave out values of weight
+    zero, which are corners of the curve like others, and NaN.
     """
     quantiles = np.asarray(_row_quantiles(values, weights, np.atleast_1d(probability)))
     return quantiles if np.ndim(probability) > 0 else quantiles[..., 0]
@@ -126,20 +116,9 @@ _row_quantiles = np.vectorize(_quantiles_of_row, [np.float64], signature="(n),(n
 def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> NDArray[np.intp]:
     """Return the index at which the running sum of weights first reaches each level.
 
-    For values in ascending order this is the step-wise quantile; for points in any order, with
-    evenly spaced levels, it is systematic resampling.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (..., n)
-    levels : ndarray, shape (..., m)
-        A level that is never reached gives the last index.
-    normalized : bool
-        Whether the levels are relative to the sum of the weights.
-
-    Returns
-    -------
-    ndarray of int, shape (..., m)
+    Weights (..., n) and levels (..., m) give indices (..., m): the step-wise quantile of ascending
+    values, or systematic resampling with evenly spaced levels. A level that is never reached gives
+    the last index; ``normalized`` levels are relative to the sum of the weights.
     """
     total = np.cumsum(weights, axis=-1)
     if normalized:

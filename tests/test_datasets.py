@@ -1,49 +1,37 @@
+"""Measured data: shapes, values and sources."""
+
 import csv
-import doctest
 from importlib.resources import files
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from prbayes import datasets
 
 
-@pytest.fixture
-def crack() -> xr.Dataset:
-    return datasets.crack_growth()
-
-
-@pytest.fixture
-def rows() -> list[dict[str, str]]:
-    with files("prbayes.datasets").joinpath("crack_growth.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def test_shape_dims_and_coordinates(crack):
+def test_every_csv_row_stands_at_its_specimen_and_cycle() -> None:
+    crack = datasets.crack_growth()
     lengths = crack.crack_length_inch
     assert lengths.dims == ("specimen", "million_cycles")
     assert lengths.shape == (21, 13)
     np.testing.assert_array_equal(crack.specimen, np.arange(1, 22))
     np.testing.assert_allclose(crack.million_cycles, np.linspace(0, 0.12, 13), atol=1e-15)
-
-
-def test_every_csv_row_stands_at_its_specimen_and_cycle(crack, rows):
-    assert int(crack.crack_length_inch.notnull().sum()) == len(rows)
+    with files("prbayes.datasets").joinpath("crack_growth.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert int(lengths.notnull().sum()) == len(rows)
     for row in rows:
-        cell = crack.crack_length_inch.sel(
-            specimen=int(row["specimen"]), million_cycles=float(row["million_cycles"])
-        )
+        specimen, cycles = int(row["specimen"]), float(row["million_cycles"])
+        cell = lengths.sel(specimen=specimen, million_cycles=cycles)
         assert float(cell) == float(row["crack_length_inch"])
-
-
-def test_every_specimen_starts_at_the_notch(crack):
     assert crack.attrs["notch_inch"] == 0.90
-    assert (crack.crack_length_inch.sel(million_cycles=0) == 0.90).all()
+    assert (lengths.sel(million_cycles=0) == 0.90).all()
+    assert lengths.attrs["units"] == "inch"
+    for text in ("Lu and W. Q. Meeker (1993)", "Bogdanoff and F. Kozin (1985)"):
+        assert text in crack.attrs["source"]
 
 
-def test_nan_only_after_the_reading_at_which_the_specimen_failed(crack):
-    for lengths in crack.crack_length_inch.to_numpy():
+def test_nan_only_after_the_reading_at_which_the_specimen_failed() -> None:
+    for lengths in datasets.crack_growth().crack_length_inch.to_numpy():
         measured = lengths[np.isfinite(lengths)]
         assert np.isnan(lengths[measured.size :]).all()
         assert (np.diff(measured) > 0).all()
@@ -51,14 +39,8 @@ def test_nan_only_after_the_reading_at_which_the_specimen_failed(crack):
         assert measured.size == lengths.size or measured[-1] >= 1.60
 
 
-def test_units_and_source_are_stated(crack):
-    assert crack.crack_length_inch.attrs["units"] == "inch"
-    assert "Lu and W. Q. Meeker (1993)" in crack.attrs["source"]
-    assert "Bogdanoff and F. Kozin (1985)" in crack.attrs["source"]
-    assert "21 specimens" in crack.attrs["description"]
-
-
-def test_two_calls_give_independent_objects(crack):
+def test_two_calls_give_independent_objects() -> None:
+    crack = datasets.crack_growth()
     crack.crack_length_inch[:] = 0.0
     crack.attrs["notch_inch"] = 0.0
     again = datasets.crack_growth()
@@ -66,13 +48,7 @@ def test_two_calls_give_independent_objects(crack):
     assert again.attrs["notch_inch"] == 0.90
 
 
-def test_the_docstring_example_runs():
-    result = doctest.testmod(datasets)
-    assert result.attempted > 0
-    assert result.failed == 0
-
-
-def test_the_virkler_data_are_those_of_their_publications():
+def test_the_virkler_data_are_those_of_their_publications() -> None:
     data = datasets.virkler()
     lengths = data.half_crack_length_mm
     assert lengths.shape == (68, 12)

@@ -20,6 +20,7 @@ from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.random_variable import nodes
 from prbayes.optimize.design_refinement import _add_runs
 from prbayes.plots.population import margins, select_margins
+from prbayes.propagation.reweighted import same_points
 from prbayes.response.compile import PLAIN
 
 NAMES = ["Adler", "Busch"]
@@ -70,12 +71,12 @@ def test_all_groups_are_of_one_design() -> None:
     assert calls == before + 256
     assert [node.name for node in evaluator.nodes] == PARTS
     first, second = (node.bound for node in evaluator.nodes)
-    assert first.same_points(second)
+    assert same_points(first, second)
     # It grows for the populations of both at the same points.
     _add_runs(evaluator, evaluator.hyperparameters.prior_thetas(64, 1), {"y[Busch]"})
     assert calls == before + 512
     assert n_design_runs(evaluator) == evaluator.n_responses == 512
-    assert first.same_points(second)
+    assert same_points(first, second)
     assert evaluator.nodes[0].bound.n_runs == 512
     assert sum(node.bound.responses.computed for node in evaluator.nodes) == 512
 

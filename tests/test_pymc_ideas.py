@@ -1,7 +1,4 @@
-"""Ideas of PyMC's own tests of `pymc.Simulator` and of SMC, carried over; the rest stands elsewhere.
-
-`docs/pymc_and_arviz.md` lists all of them, each with the test that holds it.
-"""
+"""Ideas of PyMC's own tests of `pymc.Simulator` and of SMC, carried over."""
 
 from __future__ import annotations
 

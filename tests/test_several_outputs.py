@@ -36,18 +36,19 @@ def model_of(response=two, data=None, *, metric=JOINT, propagation=None):
     """Return a model with one unknown for each input, and priors close to the truth."""
     with pm.Model() as model:
         m = pm.Normal("m", [1.0, 2.0], 0.2, shape=2)
-        a = pm.Normal.dist(m[0], 0.3)
-        b = pm.Normal.dist(m[1], 0.2)
         prb.Simulator(
-            "y",
-            response,
-            a,
-            b,
+            *("y", response, pm.Normal.dist(m[0], 0.3), pm.Normal.dist(m[1], 0.2)),
             metric=metric,
             observed=observed() if data is None else data,
             propagation=propagation or prb.Reweighted(64),
         )
     return model
+
+
+def stored_values(model):
+    """Return the stored responses of each simulator."""
+    nodes = Evaluator.of(model).nodes
+    return [node.reweighted.design.sample.values for node in nodes]
 
 
 def node_of(model):
@@ -68,17 +69,18 @@ def as_groups(a, b):
     return {"both": two(a, b)}
 
 
-def of_one(a, b):
-    """Return the outputs of one specimen."""
-    return [a + b, a - 2 * b]
-
-
 def of_one_by_name(a, b):
     """Return the outputs of one specimen by name, in another order."""
     return {"difference": a - 2 * b, "sum": a + b}
 
 
+def never(a, b):
+    """Raise: no run is expected."""
+    raise AssertionError("computed")
+
+
 NAMED = {"sum": observed()[:, 0], "difference": observed()[:, 1]}
+SWAPPED = dict(reversed(NAMED.items()))
 
 
 @pytest.mark.long
@@ -87,13 +89,13 @@ NAMED = {"sum": observed()[:, 0], "difference": observed()[:, 1]}
     [
         (as_mapping, NAMED),
         (as_groups, {"both": observed()}),
-        (prb.scalar(of_one), observed()),
+        (prb.scalar(lambda a, b: [a + b, a - 2 * b]), observed()),
         (prb.scalar(of_one_by_name), NAMED),
     ],
 )
 @pytest.mark.parametrize("way", ["here", pytest.param("stored", marks=pytest.mark.slow), "threads"])
 def test_every_way_to_give_outputs_is_the_same_run(response, data, way, tmp_path):
-    expected = node_of(model_of(propagation=prb.Reweighted(64))).reweighted.design.sample.values
+    (expected,) = stored_values(model_of())
     with ThreadPoolExecutor(2) as pool:
         ways = {"here": {}, "stored": {"store": tmp_path}, "threads": {"executor": pool}}
         node = node_of(model_of(response, data, propagation=prb.Reweighted(64, **ways[way])))
@@ -103,27 +105,15 @@ def test_every_way_to_give_outputs_is_the_same_run(response, data, way, tmp_path
 
 def test_a_run_with_two_outputs_is_one_entry_of_the_store(tmp_path):
     propagation = prb.Reweighted(64, store=tmp_path, version="1")
-    first = node_of(model_of(propagation=propagation)).reweighted.design.sample.values
+    (first,) = stored_values(model_of(propagation=propagation))
     store = prb.response.Store(tmp_path, "y", version="1")
     assert len(store) == 64
     assert store.to_dataset()["response"].dims == ("point", "output")
-
-    def never(a, b):
-        raise AssertionError("computed again")
-
-    again = node_of(model_of(never, propagation=propagation)).reweighted.design.sample.values
+    (again,) = stored_values(model_of(never, propagation=propagation))
     np.testing.assert_array_equal(again, first)
-
-
-def test_a_store_of_other_outputs_is_refused(tmp_path):
-    first_use(model_of(propagation=prb.Reweighted(64, store=tmp_path, version="1")))
-
-    def three(a, b):
-        return np.stack([a, b, a * b], axis=-1)
-
     data = np.column_stack([observed(), specimens().prod(axis=1)])
     with pytest.raises(RuntimeError, match=r"2 outputs .* expected 3; .* pass version="):
-        model_of(three, data, propagation=prb.Reweighted(64, store=tmp_path, version="1"))
+        model_of(lambda a, b: np.stack([a, b, a * b], axis=-1), data, propagation=propagation)
 
 
 def test_two_simulators_of_a_response_with_outputs_share_its_runs():
@@ -146,29 +136,22 @@ def test_two_simulators_of_a_response_with_outputs_share_its_runs():
     assert sum(calls) == 64
 
 
-def test_simulators_that_observe_a_mapping_in_another_order_do_not_share_its_columns():
-    swapped = {"difference": NAMED["difference"], "sum": NAMED["sum"]}
+def test_the_order_of_a_mapping_is_that_of_the_data(tmp_path):
     with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("m", 1, 0.2), 0.3)
-        b = pm.Normal.dist(2.0, 0.2)
-        for name, data in (("y", NAMED), ("z", swapped)):
+        a, b = pm.Normal.dist(pm.Normal("m", 1, 0.2), 0.3), pm.Normal.dist(2.0, 0.2)
+        for name, data in (("y", NAMED), ("z", SWAPPED)):
             propagation = prb.Reweighted(64)
             prb.Simulator(
                 name, as_mapping, a, b, metric=JOINT, observed=data, propagation=propagation
             )
-    first, second = (node.reweighted.design.sample.values for node in Evaluator.of(model).nodes)
+    first, second = stored_values(model)
     np.testing.assert_array_equal(second, first[:, ::-1])
-
-
-def test_a_version_keeps_runs_of_another_order_of_outputs_apart(tmp_path):
-    swapped = {"difference": NAMED["difference"], "sum": NAMED["sum"]}
+    # A version keeps runs of another order apart.
     propagation = prb.Reweighted(64, store=tmp_path, version="1")
-    first = node_of(
-        model_of(as_mapping, NAMED, propagation=propagation)
-    ).reweighted.design.sample.values
-    second = node_of(
-        model_of(as_mapping, swapped, propagation=propagation)
-    ).reweighted.design.sample.values
+    first, second = (
+        stored_values(model_of(as_mapping, data, propagation=propagation))[0]
+        for data in (NAMED, SWAPPED)
+    )
     np.testing.assert_array_equal(second, first[:, ::-1])
 
 
@@ -178,31 +161,27 @@ def test_an_output_that_is_nan_costs_the_point_all_of_them():
         values[..., 1] = np.where(a > 1.5, np.nan, values[..., 1])
         return values
 
-    node = node_of(model_of(partly, propagation=prb.Reweighted(256)))
-    lost = np.isnan(node.reweighted.design.sample.values)
+    (values,) = stored_values(model_of(partly, propagation=prb.Reweighted(256)))
+    lost = np.isnan(values)
     assert 0 < lost[:, 0].mean() < 0.25
     np.testing.assert_array_equal(lost[:, 0], lost[:, 1])
 
 
 @pytest.mark.parametrize(
-    ("response", "expected"),
+    ("response", "data", "expected"),
     [
-        (lambda a, b: a + b, r"shape \(64,\) .* expected \(64, 2\): 2 outputs per specimen"),
-        (lambda a, b: np.stack([a, b, a], -1), r"shape \(64, 3\) .* expected \(64, 2\)"),
-        (as_mapping, "keys .*sum.* outputs have no names"),
+        (lambda a, b: a + b, None, r"shape \(64,\) .* expected \(64, 2\): 2 outputs per specimen"),
+        (as_mapping, None, "keys .*sum.* outputs have no names"),
+        (
+            as_mapping,
+            {"a": observed()[:, 0], "b": observed()[:, 1]},
+            r"keys \['sum', 'difference'\], expected \['a'",
+        ),
     ],
 )
-def test_a_response_with_other_outputs_than_observed_is_refused(response, expected):
-    model = model_of(response, propagation=prb.Reweighted(64))
+def test_a_response_with_other_outputs_than_observed_is_refused(response, data, expected):
     with pytest.raises(prb.response.ResponseError, match=expected):
-        first_use(model)
-
-
-def test_other_keys_than_those_observed_are_refused():
-    with pytest.raises(
-        prb.response.ResponseError, match=r"keys \['sum', 'difference'\], expected \['a'"
-    ):
-        first_use(model_of(as_mapping, {"a": observed()[:, 0], "b": observed()[:, 1]}))
+        first_use(model_of(response, data))
 
 
 @pytest.mark.parametrize(
@@ -217,9 +196,6 @@ def test_other_keys_than_those_observed_are_refused():
     ],
 )
 def test_bad_data_are_refused_before_any_run(data, metric, expected):
-    def never(a, b):
-        raise AssertionError("computed")
-
     with pytest.raises(ValueError, match=expected):
         model_of(never, data, metric=metric)
 

@@ -4,7 +4,7 @@
     uv run python -m benchmarks.pages
 
 The first writes `benchmarks/results/scoreboard.json`, from which the second writes the tables of
-`docs/scoreboard.md`. Bias is the mean over data sets of what lies between a mean and the
+`docs/appendix/scoreboard.md`. Bias is the mean over data sets of what lies between a mean and the
 reference's, in standard deviations of the reference, and rms the root of its mean square; width is
 the median ratio of the standard deviations; coverage that of 89% intervals, from twenty data sets
 on. Runs and seconds of a processor are medians over data sets.

@@ -101,7 +101,7 @@ class GaussianProcess(Surface):
         from scipy.optimize import minimize as scipy_minimize
 
         rows = np.linspace(0, len(x) - 1, min(MOST_TUNED, len(x))).astype(int)
-        likelihood = Likelihood(KERNELS[self.kernel], x[rows], y[rows] - y[rows].mean())
+        runs = KERNELS[self.kernel], x[rows], y[rows] - y[rows].mean()
         d = x.shape[1]
         # Far shorter, a process is noise; far longer, a plane.
         bounds = [(np.log(0.05), np.log(1e3))] * d + [(np.log(1e-10), 0.0)]
@@ -110,8 +110,9 @@ class GaussianProcess(Surface):
         starts = [(0.7, 1e-2), (2.0, 1e-6)] if len(rows) <= 128 else [(0.7, 1e-2)]
         fits = [
             scipy_minimize(
-                likelihood,
+                negative_log_likelihood,
                 np.log([*[length * np.sqrt(d)] * d, nugget]),
+                args=runs,
                 jac=True,
                 bounds=bounds,
                 method="L-BFGS-B",
@@ -132,33 +133,34 @@ class GaussianProcess(Surface):
                 f"GaussianProcess: lengths: got {len(self.lengths)}, expected one for each of "
                 f"{x.shape[1]} inputs"
             )
-        return mean_through(KERNELS[self.kernel], np.array(self.lengths), self.nugget, x, y)
+        from scipy.linalg import cho_solve
+
+        kernel, lengths = KERNELS[self.kernel], np.array(self.lengths)
+        scaled = x / lengths
+        root = _root(kernel(_squares(scaled, scaled))[0], self.nugget)
+        center = float(y.mean())
+        coefficients = cho_solve((root, True), y - center)
+        return partial(_mean, kernel, scaled, lengths, center, coefficients)
 
     def without_each(self, x: Floats, y: Floats, lacking: NDArray[np.bool_]) -> Predict:
         """Return the means of processes that lack some of the points each, from one inverse."""
         if self.lengths is None or self.nugget is None:
             return self.tuned(x, y).without_each(x, y, lacking)
-        kernel = KERNELS[self.kernel]
-        lengths = np.array(self.lengths)
+        kernel, lengths = KERNELS[self.kernel], np.array(self.lengths)
         scaled = x / lengths
-        correlation, _ = kernel(_squares(scaled, scaled))
-        inverse = _inverse(_root(correlation, self.nugget))
+        inverse = _inverse(_root(kernel(_squares(scaled, scaled))[0], self.nugget))
         mean = y.mean()
         of_ones = inverse.sum(axis=1)
         of_y = inverse @ (y - mean)
-        coefficients = []
-        centers = []
-        for row in lacking:
-            center = float(y[~row].mean())
-            all_points = of_y - (center - mean) * of_ones
+        centers = np.array([float(y[~row].mean()) for row in lacking])
+        coefficients = np.zeros((len(x), len(lacking)))
+        for b, row in enumerate(lacking):
+            all_points = of_y - (centers[b] - mean) * of_ones
             # The coefficients given the remaining points, by a block inverse.
             columns = inverse[:, row]
             reduced = all_points - columns @ np.linalg.solve(columns[row], all_points[row])
-            reduced[row] = 0.0
-            coefficients.append(reduced)
-            centers.append(center)
-        columns = np.stack(coefficients, axis=1)
-        return partial(_mean, kernel, scaled, lengths, np.array(centers), columns)
+            coefficients[~row, b] = reduced[~row]
+        return partial(_mean, kernel, scaled, lengths, centers, coefficients)
 
     def slope(self, x: Floats, y: Floats, along: Floats) -> float:
         """Return the likeliest slope with these lengths, that of generalised least squares."""
@@ -172,17 +174,6 @@ class GaussianProcess(Surface):
         weighted = cho_solve((_root(correlation, self.nugget), True), terms)
         _, slope = np.linalg.lstsq(weighted.T @ terms, weighted.T @ y, rcond=None)[0]
         return float(slope)
-
-
-def mean_through(kernel: Kernel, lengths: Floats, nugget: float, x: Floats, y: Floats) -> Predict:
-    """Return the mean of a process given points, lengths and a nugget."""
-    from scipy.linalg import cho_solve
-
-    scaled = x / lengths
-    correlation, _ = kernel(_squares(scaled, scaled))
-    center = float(y.mean())
-    coefficients = cho_solve((_root(correlation, nugget), True), y - center)
-    return partial(_mean, kernel, scaled, lengths, center, coefficients)
 
 
 def _mean(
@@ -203,39 +194,32 @@ def _mean(
     return np.asarray(center + deviations)
 
 
-@dataclass(frozen=True, eq=False)
-class Likelihood:
-    """Minus the log-likelihood of log lengths and log nugget, with its gradient."""
+def negative_log_likelihood(
+    parameters: Floats, kernel: Kernel, x: Floats, y: Floats
+) -> tuple[float, Floats]:
+    """Return minus the log-likelihood of log lengths and log nugget, and its gradient."""
+    from scipy.linalg import cholesky
 
-    correlation: Kernel
-    x: Floats
-    y: Floats
-
-    def __call__(self, parameters: Floats) -> tuple[float, Floats]:
-        """Return the value and the gradient."""
-        from scipy.linalg import cholesky
-
-        n = len(self.x)
-        lengths = np.exp(parameters[:-1])
-        nugget = np.exp(parameters[-1])
-        scaled = self.x / lengths
-        square = _squares(scaled, scaled)
-        np.fill_diagonal(square, 0)
-        correlation, slope = self.correlation(square)
-        try:
-            root = cholesky(correlation + nugget * np.eye(n), lower=True)
-        except np.linalg.LinAlgError:
-            return 1e10, np.zeros(parameters.size)
-        inverse = _inverse(root)
-        weights = inverse @ self.y
-        variance = max(float(self.y @ weights) / n, 1e-300)
-        outer = np.outer(weights, weights) / variance - inverse
-        inner = outer * slope
-        of_lengths = inner.sum(axis=1) @ scaled**2 - ((inner @ scaled) * scaled).sum(axis=0)
-        of_nugget = 0.5 * nugget * np.trace(outer)
-        log_determinant = np.log(np.diag(root)).sum()
-        value = 0.5 * n * np.log(variance) + log_determinant
-        return float(value), -np.append(of_lengths, of_nugget)
+    n = len(x)
+    nugget = np.exp(parameters[-1])
+    scaled = x / np.exp(parameters[:-1])
+    square = _squares(scaled, scaled)
+    np.fill_diagonal(square, 0)
+    correlation, slope = kernel(square)
+    try:
+        root = cholesky(correlation + nugget * np.eye(n), lower=True)
+    except np.linalg.LinAlgError:
+        return 1e10, np.zeros(parameters.size)
+    inverse = _inverse(root)
+    weights = inverse @ y
+    variance = max(float(y @ weights) / n, 1e-300)
+    outer = np.outer(weights, weights) / variance - inverse
+    inner = outer * slope
+    of_lengths = inner.sum(axis=1) @ scaled**2 - ((inner @ scaled) * scaled).sum(axis=0)
+    of_nugget = 0.5 * nugget * np.trace(outer)
+    log_determinant = np.log(np.diag(root)).sum()
+    value = 0.5 * n * np.log(variance) + log_determinant
+    return float(value), -np.append(of_lengths, of_nugget)
 
 
 def _root(correlation: Floats, nugget: float) -> Any:

@@ -1,13 +1,19 @@
 """Quintic radial basis interpolation with a polynomial, its Jacobian and left-out errors.
 
-The interpolant of values y_i at points z_i (Wendland 2005, ch. 8) is
+The interpolant of values y_i at points z_i is [1]_
 
     f(z) = -sum_i w_i |z - z_i|^5 + sum_j c_j p_j(z),    sum_i w_i p_j(z_i) = 0,
 
 with all polynomials p_j up to a degree. A nugget on the diagonal of the interpolation matrix keeps
 it well conditioned where runs are close to each other. The error at a point that is left out needs
-no other fit: it is w_i divided by the i-th diagonal element of the inverse of the matrix (Rippa
-1999). It selects degree and nugget.
+no other fit: it is w_i divided by the i-th diagonal element of the inverse of the matrix [2]_. It
+selects degree and nugget.
+
+References
+----------
+.. [1] Wendland, H. (2005), Scattered Data Approximation, Cambridge University Press, ch. 8.
+.. [2] Rippa, S. (1999), An algorithm for selecting a good value for the parameter c in radial basis
+   function interpolation, Adv. Comput. Math. 11, 193-210, doi:10.1023/A:1018975909870.
 """
 
 from __future__ import annotations
@@ -165,30 +171,12 @@ class Interpolant:
 
 @one_thread()
 def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None) -> Interpolant:
-    """Fit the interpolant whose polynomial degree has the smallest left-out errors.
+    """Fit the interpolant of outputs (n, m) at points (n, d) with the smallest left-out errors.
 
-    Parameters
-    ----------
-    z : ndarray, shape (n, d)
-        Different points; in units in which the response varies about equally with each coordinate.
-    y : ndarray, shape (n, m)
-        Outputs, finite.
-    near : ndarray of bool, shape (n,), optional
-        Runs whose left-out errors select the degree; all by default.
+    The points differ; their units are such that the response varies about equally with each
+    coordinate. ``near``, (n,), are the runs whose left-out errors count; all by default. Raises
+    numpy.linalg.LinAlgError if the points do not determine a polynomial of degree two.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the points do not determine a polynomial of degree two.
-
-    References
-    ----------
-    .. [1] Wendland, H. (2005), Scattered Data Approximation, Cambridge University Press.
-    .. [2] Rippa, S. (1999), An algorithm for selecting a good value for the parameter c in radial
-       basis function interpolation, Adv. Comput. Math. 11, 193-210, doi:10.1023/A:1018975909870.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> z = np.linspace(-1, 1, 24)[:, None]
     >>> values, jacobian = fit_interpolant(z, np.exp(z))(np.array([[0.5]]))

@@ -19,22 +19,7 @@ from prbayes.response.failures import Abort, Replace
 from prbayes.response.outputs import outputs_of_keys
 from prbayes.response.store import StoreError
 
-_SHIPPED = (RadialBasis, Polynomial, GaussianProcess)
-
-
-def settings_of(model: Any) -> dict[str, Any]:
-    """Return the settings of a surface that ships with prbayes; of others none."""
-    return asdict(model) if isinstance(model, _SHIPPED) else {}
-
-
-def shipped(kind: str, settings: dict[str, Any]) -> Surface | None:
-    """Return the surface with such settings, or None if no such kind ships with prbayes."""
-    # JSON has lists for tuples.
-    arguments: dict[str, Any] = {
-        key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()
-    }
-    surfaces: dict[str, type[Surface]] = {cls.__name__: cls for cls in _SHIPPED}
-    return surfaces[kind](**arguments) if kind in surfaces else None
+_SHIPPED: tuple[Any, ...] = (RadialBasis, Polynomial, GaussianProcess)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +29,7 @@ class SavedSurrogate:
     fields: dict[str, Any]  # of the surrogate
     kind: str  # name of the surface's class
     model: Surface | None  # the surface, if it ships with prbayes
-    joined: bool | None  # how a coarse response is followed; None if none is
+    follows_coarse: bool
     probes: Floats  # (k,) or (k, m): values of the surface at fixed points, which identify it
 
 
@@ -53,12 +38,14 @@ def write(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
     responses = surrogate.responses
     output = ["output"] if responses.ndim > 1 else []
     names = surrogate._named
+    model = surrogate.model
+    settings = asdict(model) if isinstance(model, _SHIPPED) else {}
     configuration = {
         "inputs": [
             {"name": r.name, "shape": list(r.event), "constant": r.constant}
             for r in surrogate.domain.inputs
         ],
-        "model": {"kind": type(surrogate.model).__name__, **settings_of(surrogate.model)},
+        "model": {"kind": type(model).__name__, **settings},
         # As text: JSON has no NaN.
         "outside": str(surrogate.outside.value) if hasattr(surrogate.outside, "value") else None,
         "noise": surrogate.noise,
@@ -87,8 +74,10 @@ def read(path: str | PathLike[str]) -> SavedSurrogate:
         with xr.open_dataset(path, engine="h5netcdf") as data:
             data.load()
         config = json.loads(data.attrs["configuration"])
-        settings = config["model"]
-        kind = settings.pop("kind")
+        # JSON has lists for tuples.
+        kind = config["model"].pop("kind")
+        settings = {k: tuple(x) if isinstance(x, list) else x for k, x in config["model"].items()}
+        model = next((cls(**settings) for cls in _SHIPPED if cls.__name__ == kind), None)
         sd = data["population_sd"].values
         outside = config["outside"]
         outputs = config.get("outputs")
@@ -107,7 +96,7 @@ def read(path: str | PathLike[str]) -> SavedSurrogate:
             "_joined": bool(joined),
             "_named": outputs,
         }
-        return SavedSurrogate(fields, kind, shipped(kind, settings), joined, data["probes"].values)
+        return SavedSurrogate(fields, kind, model, joined is not None, data["probes"].values)
     # Damaged files raise any error of the library that meets the damage.
     except Exception as error:
         raise StoreError(

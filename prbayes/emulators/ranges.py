@@ -14,7 +14,7 @@ from pytensor.graph.basic import Variable
 from prbayes._validate import Floats, real_array
 from prbayes.numerics.points import sobol
 from prbayes.response.compile import compile_batched
-from prbayes.response.distributions import PopulationSampler, prior_draws, valid
+from prbayes.response.distributions import PopulationSampler, PriorSampler, valid
 from prbayes.response.inputs import model_on_context, read_inputs
 
 # Ranges are quantiles of these 2^15 draws: with a coverage of .999 some 16 draws are beyond either
@@ -120,18 +120,7 @@ class Ranges:
         ]
 
     def columns(self, values: Sequence[ArrayLike]) -> tuple[Floats, tuple[int, ...]]:
-        """Return inputs as rows, and their leading shape.
-
-        Parameters
-        ----------
-        values : sequence of array_like, shapes (..., *event)
-            One per input; leading shapes broadcast.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If there are too few or many inputs, or one has the wrong shape.
-        """
+        """Return inputs, (..., *event) each, as rows, and their leading shape; or raise."""
         if len(values) != len(self.inputs):
             names = ", ".join(r.name for r in self.inputs)
             raise TypeError(
@@ -140,11 +129,10 @@ class Ranges:
         arrays = [real_array(x, r.name) for r, x in zip(self.inputs, values, strict=True)]
         leading = []
         for r, array in zip(self.inputs, arrays, strict=True):
-            n_leading = array.ndim - len(r.event)
             if r.event and array.shape[-len(r.event) :] != r.event:
                 event = ", ".join(map(str, r.event))
                 raise ValueError(f"{r.name}: got shape {array.shape}, expected (..., {event})")
-            leading.append(array.shape[:n_leading])
+            leading.append(array.shape[: array.ndim - len(r.event)])
         batch = np.broadcast_shapes(*leading)
         rows = [
             np.broadcast_to(array, batch + r.event).reshape(-1, r.size)
@@ -163,28 +151,11 @@ class Ranges:
 def read_ranges(
     name: str, inputs: Any, coverage: float, random_seed: int
 ) -> tuple[Ranges, Floats | None]:
-    """Return the ranges of inputs, and rows of the prior predictive distribution inside them.
+    """Return the ranges of inputs, and rows (n, columns) of the prior predictive inside them.
 
-    Parameters
-    ----------
-    name : str
-        For messages.
-    inputs : mapping or sequence
-        One entry per input: (low, high), a ``.dist()``, a variable of the model, or a number.
-    coverage : float
-        Share of its prior predictive distribution that the range of a random input covers.
-    random_seed : int
-
-    Returns
-    -------
-    ranges : Ranges
-    rows : ndarray, shape (n, columns), or None
-        None where no input is random; inputs with a range are uniform.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an input is no range, distribution or number, a range is empty, or all are constants.
+    An input is (low, high), a ``.dist()``, a variable of the model, or a number. ``coverage`` is
+    the share of its prior predictive distribution that the range of a random input covers. The rows
+    are None where no input is random; inputs with a range are uniform.
     """
     is_collection = isinstance(inputs, Mapping | Sequence) and not isinstance(inputs, str)
     if not is_collection or not len(inputs):
@@ -249,13 +220,11 @@ def _range(name: str, key: str | int, entry: Any, draws: Floats | None, coverage
 def predictive_inputs(name: str, variables: list[Any], random_seed: int) -> list[Floats]:
     """Return prior predictive draws of variables, shapes (populations, specimens, *event).
 
-    The variables are ``.dist()`` objects and variables of the model on the context. Raises
-    TypeError if there is no model on the context, ValueError if the parameters of the inputs are
-    invalid at all draws of the priors.
+    Raises ValueError if the parameters of the inputs are invalid at all draws of the priors.
     """
     model = model_on_context(None, f"{name}: inputs that are distributions")
     inputs = read_inputs(name, variables, model)
-    roots = prior_draws(inputs.roots, POPULATIONS, random_seed)
+    roots = PriorSampler(inputs.roots)(POPULATIONS, random_seed)
     symbols = inputs.placeholders()
     (is_valid,) = compile_batched(symbols, [valid(inputs, inputs.rebuilt(symbols)[0])])(*roots)
     usable = np.flatnonzero(np.broadcast_to(is_valid, POPULATIONS))

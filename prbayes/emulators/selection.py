@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -84,17 +84,8 @@ def cross_validated(
 ) -> Floats:
     """Return responses less predictions of surfaces without their tenth of the points, as y.
 
-    Parameters
-    ----------
-    model : MultifidelityModel, Surface or regressor
-    x : ndarray, shape (n, d)
-        In the unit cube.
-    y : ndarray, shape (n,) or (n, m)
-        Each output has a surface.
-    random_seed : int
-        Of the assignment of points to folds.
-    coarse : ndarray, shape (n,), optional
-        A coarse response, for a model that follows one.
+    Points (n, d) in the unit cube have responses (n,), or (n, m) with a surface for each output. A
+    coarse response, (n,), is for a `MultifidelityModel`.
     """
     if y.ndim > 1:
         return np.stack([cross_validated(model, x, output, random_seed) for output in y.T], axis=1)
@@ -206,72 +197,56 @@ def predict_outputs(
     at: Floats,
     mask: NDArray[np.bool_] | None = None,
     coarse: Floats | None = None,
+    known: Mapping[int, Floats] = {},
 ) -> Floats:
     """Return outputs at points, (k, d) -> (k, m), predicted by a model of each output.
 
     Where the nearest run failed, the outputs are those of that run. Predictions are at most one
     range of the runs' outputs beyond them. ``mask``, (n,), selects the runs of the fit; ``coarse``,
-    (k, m), is a coarse response at the points.
+    (k, m), is a coarse response at the points; ``known`` has predictions of some outputs, (k,).
     """
     mask = np.ones(len(runs.x), dtype=bool) if mask is None else mask
     rows = runs.among(mask)
+    x, y = runs.scaled(runs.x[rows]), runs.y[rows]
     points = runs.scaled(at)
-    outputs = [_predicted(model, runs, rows, k, points, coarse) for k, model in enumerate(models)]
-    return _bounded(np.stack(outputs, axis=1), runs, rows, mask, at)
+    outputs = []
+    for k, model in enumerate(models):
+        if k in known:
+            outputs.append(known[k])
+            continue
+        coarse_runs = None if runs.coarse is None else runs.coarse[rows, k]
+        coarse_points = None if coarse is None else coarse[:, k]
+        outputs.append(predict(model, x, y[:, k], points, coarse_runs, coarse_points))
+    lowest, highest = y.min(axis=0), y.max(axis=0)
+    reach = highest - lowest
+    values = np.clip(np.stack(outputs, axis=1), lowest - reach, highest + reach)
+    if not runs.good[mask].all():
+        from scipy.spatial import cKDTree
+
+        places = np.flatnonzero(mask)
+        _, index = cKDTree(runs.scaled(runs.x[places])).query(points)
+        nearest = places[index]
+        failed = ~runs.good[nearest]
+        values[failed] = runs.y[nearest[failed]]
+    return values
 
 
 def predict_without_blocks(
     models: Sequence[Any], runs: Runs, at: Floats, coarse: Floats | None = None
 ) -> Iterator[Floats]:
     """Yield the predictions, (k, m), of surfaces without each block of the runs."""
-    fitted = runs.among(np.ones(len(runs.x), dtype=bool))
-    x = runs.scaled(runs.x[fitted])
+    rows = runs.among(np.ones(len(runs.x), dtype=bool))
+    x = runs.scaled(runs.x[rows])
     points = runs.scaled(at)
     by_output = {}  # (k, B), where a surface has a short way
     for k, model in enumerate(models):
         if isinstance(model, Surface):
-            surfaces = model.without_each(x, runs.y[fitted, k], runs.block_masks[:, fitted])
+            surfaces = model.without_each(x, runs.y[rows, k], runs.block_masks[:, rows])
             if surfaces is not None:
                 by_output[k] = surfaces(points)
     for b, block in enumerate(runs.block_masks):
-        rows = runs.among(~block)
-        outputs = [
-            by_output[k][:, b]
-            if k in by_output
-            else _predicted(model, runs, rows, k, points, coarse)
-            for k, model in enumerate(models)
-        ]
-        yield _bounded(np.stack(outputs, axis=1), runs, rows, ~block, at)
-
-
-def _predicted(
-    model: Any, runs: Runs, rows: NDArray[np.intp], k: int, points: Floats, coarse: Floats | None
-) -> Floats:
-    """Return output k at scaled points, (k,), by a surface through some of the runs."""
-    coarse_runs = None if runs.coarse is None else runs.coarse[rows, k]
-    coarse_points = None if coarse is None else coarse[:, k]
-    x = runs.scaled(runs.x[rows])
-    return predict(model, x, runs.y[rows, k], points, coarse_runs, coarse_points)
-
-
-def _bounded(
-    values: Floats, runs: Runs, rows: NDArray[np.intp], mask: NDArray[np.bool_], at: Floats
-) -> Floats:
-    """Return values, (k, m), not far beyond those of the runs; failed where the nearest did."""
-    y = runs.y[rows]
-    lowest = y.min(axis=0)
-    highest = y.max(axis=0)
-    reach = highest - lowest
-    values = np.clip(values, lowest - reach, highest + reach)
-    if not runs.good[mask].all():
-        from scipy.spatial import cKDTree
-
-        places = np.flatnonzero(mask)
-        _, index = cKDTree(runs.scaled(runs.x[places])).query(runs.scaled(at))
-        nearest = places[index]
-        failed = ~runs.good[nearest]
-        values[failed] = runs.y[nearest[failed]]
-    return values
+        known = {k: values[:, b] for k, values in by_output.items()}
+        yield predict_outputs(models, runs, at, ~block, coarse, known)
 
 
 def left_out_predictions(models: Sequence[Any], runs: Runs) -> Floats:
@@ -320,16 +295,18 @@ def select_surfaces(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], 
     m = runs.y.shape[1]
     best = _Selection((None,) * m, np.empty_like(runs.y), np.full(m, np.inf))
     smallest = rows.size - rows.size // len(runs.block_masks) - 1
+    most_important = runs.most_important(rows)
+    x, y = runs.scaled(runs.x[most_important]), runs.y[most_important]
     tuned = []
     for model in tried:
         if not has_enough_runs(model, smallest, runs.x.shape[1]):
             continue
-        try:
-            models = _tuned(model, runs, rows)
+        models = [model] * m
+        with suppress(np.linalg.LinAlgError):
+            if isinstance(model, Surface):
+                models = [model.tuned(x, (v - v.mean()) / (v.std() or 1.0)) for v in y.T]
             best = best.improved(models, runs, rows)
-        except np.linalg.LinAlgError:
-            continue
-        tuned.append(models)
+            tuned.append(models)
     if None in best.models:
         raise np.linalg.LinAlgError("no surface goes through the runs")
     if runs.coarse is not None:
@@ -338,15 +315,6 @@ def select_surfaces(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], 
         for models in tuned:
             best = _with_following(best, models, otherwise, runs, rows, joined=True)
     return best.models, best.predictions
-
-
-def _tuned(model: Any, runs: Runs, rows: NDArray[np.intp]) -> list[Any]:
-    """Return a model tuned to each output."""
-    if not isinstance(model, Surface):
-        return [model] * runs.y.shape[1]
-    rows = runs.most_important(rows)
-    x = runs.scaled(runs.x[rows])
-    return [model.tuned(x, (y - y.mean()) / (y.std() or 1.0)) for y in runs.y[rows].T]
 
 
 def _with_following(
@@ -365,8 +333,8 @@ def _with_following(
     """
     assert runs.coarse is not None
     rows_with_coarse = rows[np.isfinite(runs.coarse[rows]).all(axis=1)]
-    largest_block = max(int(block[rows_with_coarse].sum()) for block in runs.block_masks)
-    smallest = rows_with_coarse.size - largest_block
+    largest_block = runs.block_masks[:, rows_with_coarse].sum(axis=1).max()
+    smallest = rows_with_coarse.size - int(largest_block)
     dimensions = runs.x.shape[1] + joined
     if not all(has_enough_runs(model, smallest, dimensions) for model in models):
         return best
@@ -399,16 +367,14 @@ def mixing_weight(
 
     bias, variance = 0.0, 0.0
     member = (blocks == np.unique(blocks)[:, None]).astype(float)
-    importance = weights.mean(axis=0)
     for output, prediction in zip(y.T, predictions.T, strict=True):
-        levels, width = _levels(output, importance)
+        levels, width = _levels(output, weights.mean(axis=0))
         below = _below(output, levels, width)
         # Error of the emulator's distribution functions: by block, (T, B, L).
         error = _below(prediction, levels, width) - below
         errors = np.einsum("tn,bn,nl->tbl", weights, member, error)
-        total = errors.sum(axis=1)
-        scatter = variance_of_sum(errors)
-        bias += float(np.maximum(total**2 - scatter, 0.0).sum(axis=-1).mean())
+        squared_bias = errors.sum(axis=1) ** 2 - variance_of_sum(errors)
+        bias += float(np.maximum(squared_bias, 0.0).sum(axis=-1).mean())
         # Weighted runs around their distribution function.
         function = np.einsum("tn,nl->tl", weights, below)
         deviations = below - function[:, None, :]

@@ -263,23 +263,37 @@ class MultifidelitySurface:
     rho: float
     scaling: tuple[float, float] | None  # center and unit of a coarse response that is an input
     rest: Predict  # surface of the remainder
+    otherwise: Predict | None  # surface of the response itself, where there is no coarse one
 
     def __call__(self, at: Floats, coarse: Floats) -> Floats:
         """Return responses, (k,), at points, (k, d), given the coarse ones."""
-        return self.rho * coarse + self.rest(_points(at, coarse, self.scaling))
+        follows = np.isfinite(coarse)
+        values = np.empty(len(at))
+        points, following = at[follows], coarse[follows]
+        rest = self.rest(_points(points, following, self.scaling))
+        values[follows] = self.rho * following + rest
+        if self.otherwise is not None and not follows.all():
+            values[~follows] = self.otherwise(at[~follows])
+        return values
 
 
 def fit_multifidelity(
-    model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool
+    model: MultifidelityModel, x: Floats, y: Floats, coarse: Floats, *, all_follow: bool = False
 ) -> MultifidelitySurface:
-    """Return a response (n,) at points (n, d) as a multiple of a finite coarse one, and a surface.
+    """Return a response (n,) at points (n, d) as a multiple of a coarse one, and a surface.
 
-    A `Surface` estimates rho; ``joined`` makes the coarse response an input of the surface.
+    Coarse responses that are not finite are left out. The surface without the coarse response is
+    not fitted if ``all_follow``.
     """
-    scaling = _scaling(x, coarse) if joined else None
-    points = _points(x, coarse, scaling)
-    rho = _rho(model, points, y, coarse)
-    return MultifidelitySurface(rho, scaling, fitted(model, points, y - rho * coarse))
+    follows = np.isfinite(coarse)
+    inputs, outputs, coarse = x[follows], y[follows], coarse[follows]
+    scaling = _scaling(inputs, coarse) if model.joined else None
+    points = _points(inputs, coarse, scaling)
+    rho = _rho(model.model, points, outputs, coarse)
+    rest = fitted(model.model, points, outputs - rho * coarse)
+    return MultifidelitySurface(
+        rho, scaling, rest, None if all_follow else fitted(model.otherwise, x, y)
+    )
 
 
 def tuned_for_remainder(model: Any, x: Floats, y: Floats, coarse: Floats, *, joined: bool) -> Any:
@@ -289,8 +303,7 @@ def tuned_for_remainder(model: Any, x: Floats, y: Floats, coarse: Floats, *, joi
     points = _points(x, coarse, _scaling(x, coarse) if joined else None)
     # Settings for the response estimate rho from changes over short distances; a model with another
     # input has no settings yet.
-    rho = _rho(None if joined else model, points, y, coarse)
-    rest = y - rho * coarse
+    rest = y - _rho(None if joined else model, points, y, coarse) * coarse
     return model.tuned(points, (rest - rest.mean()) / (rest.std() or 1.0))
 
 
@@ -311,16 +324,8 @@ def predict(
         return fitted(model, x, y)(at)
     assert coarse is not None
     assert coarse_at is not None
-    has_coarse = np.isfinite(coarse)
-    follows = np.isfinite(coarse_at)
-    surface = fit_multifidelity(
-        model.model, x[has_coarse], y[has_coarse], coarse[has_coarse], joined=model.joined
-    )
-    values = np.empty(len(at))
-    values[follows] = surface(at[follows], coarse_at[follows])
-    if not follows.all():
-        values[~follows] = fitted(model.otherwise, x, y)(at[~follows])
-    return values
+    all_follow = bool(np.isfinite(coarse_at).all())
+    return fit_multifidelity(model, x, y, coarse, all_follow=all_follow)(at, coarse_at)
 
 
 def _rho(model: Any, x: Floats, y: Floats, coarse: Floats) -> float:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from os import PathLike
 from typing import Any, cast
 
@@ -30,7 +30,6 @@ from prbayes.emulators.ranges import Ranges, read_ranges
 from prbayes.emulators.selection import CrossValidation, cross_validated, points_needed
 from prbayes.emulators.surfaces import (
     MultifidelityModel,
-    MultifidelitySurface,
     Predict,
     RadialBasis,
     Surface,
@@ -41,7 +40,7 @@ from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, is_missing
-from prbayes.response.response import check_call_settings, refuse_coarse, refuse_misfit
+from prbayes.response.response import check_call_settings, refuse_misfit, refuse_uncallable
 from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
@@ -110,7 +109,7 @@ class Surrogate:
     _warned: list[bool] = field(repr=False, default_factory=list)
     # Names of the outputs in the response's mapping; None without names.
     _named: Outputs | None = field(repr=False, default=None)
-    _fitted: _FittedSurface = field(repr=False, default=cast("_FittedSurface", None))
+    _surface: Any = field(repr=False, default=None)  # fitted, in the unit cube
 
     @classmethod
     def fit(
@@ -203,10 +202,18 @@ class Surrogate:
         share(prob, f"{name}: prob")
         seed = seed_number(random_seed, f"{name}: random_seed")
         domain, predictive = read_ranges(name, inputs, prob, seed)
-        refuse_misfit(name, response, lambda: [r.size for r in domain.inputs], None)
+        refuse_misfit(name, response, [r.size for r in domain.inputs])
         n_needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=n_needed)
-        design = _design(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
+        unit = sobol(n, domain.dimensions, seed)
+        if points == "predictive":
+            if predictive is None:
+                raise ValueError(
+                    f"{name}: points: got 'predictive' for inputs that are ranges, expected a "
+                    "`.dist()` among them; leave points= out"
+                )
+            unit = domain.like(predictive, unit)
+        design = domain.at(unit)
 
         # Compute the responses; the coarse ones first, as an error in them then costs no run.
         coarse_values = None if coarse is None else _first_coarse(name, coarse, domain, design)
@@ -216,8 +223,10 @@ class Surrogate:
         settings = CallSettings(
             name, response, executor, database, policy, retry_failed, outputs=None
         )
+        tally, runs = Tally(), Points(domain.arguments(design), domain.varying)
         with shown(progressbar):
-            responses, tally = _computed(settings, Points(domain.arguments(design), domain.varying))
+            _learn_names(settings, runs, tally)
+            responses = respond(settings, runs, tally)
         usable = _usable(responses)
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
@@ -230,24 +239,20 @@ class Surrogate:
             coarse = None
             _log.info("%s: the coarse response does not improve the fit, and is not followed", name)
         surrogate = cls(
-            domain,
-            design,
-            responses,
-            model,
-            outside,
-            tally.computed,
-            CrossValidation(residuals, _spread(y)),
+            *(domain, design, responses, model, outside, tally.computed),
+            error=CrossValidation(residuals, _spread(y)),
             coarse=coarse,
             _joined=bool(joined),
             _named=tally.named,
-        )._with_surface()
+            _surface=_fitted_surface(model, domain, design, responses, coarse, joined=bool(joined)),
+        )
         if predictive is not None:
             values = surrogate._at(predictive)
             error = CrossValidation(residuals, _spread(values[_usable(values)]))
             surrogate = replace(surrogate, error=error)
-        computed = tally.computed
         _log.info(
-            "%s: %d responses computed; cross-validated error %s", name, computed, surrogate.error
+            "%s: %d responses computed; cross-validated error %s",
+            *(name, tally.computed, surrogate.error),
         )
         return surrogate
 
@@ -276,25 +281,21 @@ class Surrogate:
         values = np.full((len(columns), *event), np.nan)
         values[~bad] = self._at(columns[~bad])
         if bad.any():
-            values[bad] = self._outside_value(columns, is_outside)
+            text = f"surrogate: {self.domain.complaint(columns, is_outside)}"
+            if isinstance(self.outside, Abort):
+                raise ValueError(
+                    f"{text}; fit it on wider ranges, or with outside=prb.response.Replace(), "
+                    "which gives NaN there"
+                )
+            replacement = cast(Replace, self.outside).value
+            values[bad] = replacement
+            # Once: a sampler calls thousands of times, and a simulator reports the mass it loses.
+            level = logging.DEBUG if self._warned else logging.WARNING
+            once = f"{text}; they give {replacement}; this warning appears once."
+            report(Finding("outside-ranges", once), level=level)
+            self._warned[:] = [True]
         values = values.reshape((*batch, *event))
         return values if self._named is None else self._named.by_key(values)
-
-    def _outside_value(self, columns: Floats, is_outside: NDArray[np.bool_]) -> float:
-        """Return the replacement outside the ranges with a warning, or raise."""
-        text = f"surrogate: {self.domain.complaint(columns, is_outside)}"
-        if isinstance(self.outside, Abort):
-            raise ValueError(
-                f"{text}; fit it on wider ranges, or with outside=prb.response.Replace(), which "
-                "gives NaN there"
-            )
-        value = cast(Replace, self.outside).value
-        # Once: a sampler calls thousands of times, and a simulator reports the mass it loses.
-        level = logging.DEBUG if self._warned else logging.WARNING
-        once = f"{text}; they give {value}; this warning appears once."
-        report(Finding("outside-ranges", once), level=level)
-        self._warned[:] = [True]
-        return value
 
     def local_error(self, *inputs: ArrayLike) -> Floats:
         """Return the root mean square of the cross-validation residuals nearby.
@@ -348,7 +349,7 @@ class Surrogate:
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        write(path, self, self._fitted.probes())
+        write(path, self, _probes(self))
 
     @classmethod
     def load(
@@ -379,45 +380,59 @@ class Surrogate:
         TypeError, ValueError
             If a regressor is needed, or the surface is not that which was saved.
         """
-        record = read(file_path(path, "path"))
-        model = record.model if model is None else model
+        saved = read(file_path(path, "path"))
+        model = saved.model if model is None else model
         if model is None:
             raise TypeError(
-                f"Surrogate.load: got no model, expected the {record.kind} it was fitted with; "
+                f"Surrogate.load: got no model, expected the {saved.kind} it was fitted with; "
                 "pass model="
             )
-        if record.joined is not None and coarse is None:
+        if saved.follows_coarse and coarse is None:
             raise TypeError(
                 "Surrogate.load: got no coarse response, expected the one that the surrogate "
                 "follows: a file does not keep it; pass coarse="
             )
-        coarse = None if record.joined is None else coarse
-        surrogate = cls(**record.fields, model=model, coarse=coarse)._with_surface()
-        responses = surrogate.responses
-        spread = np.asarray(_spread(responses[_usable(responses)]))
+        coarse = coarse if saved.follows_coarse else None
+        fields = saved.fields
+        runs = fields["domain"], fields["points"], fields["responses"]
+        surface = _fitted_surface(model, *runs, coarse, joined=fields["_joined"])
+        surrogate = cls(**fields, model=model, coarse=coarse, _surface=surface)
+        spread = np.asarray(_spread(surrogate.responses[_usable(surrogate.responses)]))
         size = np.where(spread > 0, spread, 1.0)
-        probes, saved = surrogate._fitted.probes() / size, record.probes / size
+        probes, expected = _probes(surrogate) / size, saved.probes / size
         # The tolerance is above rounding on another processor, below the effect of a setting.
-        if not np.allclose(probes, saved, rtol=0, atol=1e-6, equal_nan=True):
-            and_coarse = "" if record.joined is None else ", and the same coarse response"
+        if not np.allclose(probes, expected, rtol=0, atol=1e-6, equal_nan=True):
+            and_coarse = ", and the same coarse response" if saved.follows_coarse else ""
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
-                f"{record.kind} that was saved in this file, expected the same one with the same "
+                f"{saved.kind} that was saved in this file, expected the same one with the same "
                 f"settings (and a fixed seed of its own){and_coarse}"
             )
         return surrogate
 
-    def _with_surface(self) -> Surrogate:
-        """Return the surrogate with its surface."""
-        surface = _FittedSurface.of(
-            self.model,
-            self.domain,
-            self.points,
-            self.responses,
-            self.coarse,
-            joined=self._joined,
-        )
-        return replace(self, _fitted=surface)
+    @cached_property
+    def _trees(self) -> tuple[Any, Any]:
+        """Search trees of all runs and of the usable ones, in the unit cube."""
+        from scipy.spatial import cKDTree
+
+        unit = self.domain.scaled(self.points)
+        return cKDTree(unit), cKDTree(unit[_usable(self.responses)])
+
+    def _surface_at(self, columns: Floats, unit: Floats) -> Floats:
+        """Return values of the surface at rows, and at the same rows in the unit cube."""
+        if self.coarse is None:
+            return np.asarray(self._surface(unit))
+        coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
+        n_lost = (~np.isfinite(coarse)).sum()
+        if n_lost:
+            report(
+                Finding(
+                    "coarse-without-number",
+                    f"surrogate: coarse: got no number at {n_lost} of {len(unit)} points, where "
+                    "the surface goes on without it.",
+                )
+            )
+        return np.asarray(self._surface(unit, coarse))
 
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
@@ -425,12 +440,18 @@ class Surrogate:
             return np.empty((0, *self.responses.shape[1:]))
         # Rounding may put a point on the edge outside.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
-        values = self._fitted(columns, unit)
+        values = self._surface_at(columns, unit)
         if self.noise is not None:
-            values = values + _hashed_noise(self._nearby(unit), columns, self.noise)
+            # One of the k residuals nearby, with either sign, by a hash of the input.
+            residuals = self._nearby(unit)
+            n, k = residuals.shape[:2]
+            number, sign = np.divmod(hashed_rows(columns, self.noise), np.uint64(2))
+            place = (number % np.uint64(k)).astype(np.intp)
+            signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
+            values = values + residuals[np.arange(n), place] * signs
         failed = ~_usable(self.responses)
         if failed.any():
-            _, nearest = self._fitted.all_runs.query(unit)
+            _, nearest = self._trees[0].query(unit)
             is_failed = failed[nearest]
             values[is_failed] = self.responses[nearest[is_failed]]
         return values
@@ -441,84 +462,8 @@ class Surrogate:
         # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
         k = min(len(residuals), 4 * (unit.shape[1] + 1))
         # Points that are not finite are outside: any neighbours will do.
-        _, nearest = self._fitted.usable_runs.query(np.where(np.isfinite(unit), unit, 0.5), k=k)
+        _, nearest = self._trees[1].query(np.where(np.isfinite(unit), unit, 0.5), k=k)
         return np.asarray(residuals[nearest])
-
-
-@dataclass(frozen=True, eq=False)
-class _FittedSurface:
-    """A surface through the usable runs, and search trees of runs."""
-
-    domain: Ranges
-    predict: Predict
-    coarse: Callable[..., Any] | None
-    multifidelity: MultifidelitySurface | None  # with a coarse response
-    all_runs: Any
-    usable_runs: Any
-
-    @classmethod
-    def of(
-        cls,
-        model: Any,
-        domain: Ranges,
-        points: Floats,
-        responses: Floats,
-        coarse: Callable[..., Any] | None,
-        *,
-        joined: bool,
-    ) -> _FittedSurface:
-        """Fit a surface, or one for each output, to the runs of a design."""
-        from scipy.spatial import cKDTree
-
-        unit = domain.scaled(points)
-        usable = _usable(responses)
-        trees = cKDTree(unit), cKDTree(unit[usable])
-        x, y = unit[usable], responses[usable]
-        if y.ndim > 1:
-            surfaces = partial(_outputs, [fitted(model, x, output) for output in y.T])
-            return cls(domain, surfaces, None, None, *trees)
-        surface = fitted(model, x, y)
-        if coarse is None:
-            return cls(domain, surface, None, None, *trees)
-        coarse_values = _coarse_at("surrogate", coarse, domain, points)
-        usable &= np.isfinite(coarse_values)
-        x, y = unit[usable], responses[usable]
-        multifidelity = fit_multifidelity(model, x, y, coarse_values[usable], joined=joined)
-        return cls(domain, surface, coarse, multifidelity, *trees)
-
-    def __call__(self, columns: Floats, unit: Floats) -> Floats:
-        """Return values of the surface at rows, and at the same rows in the unit cube."""
-        if self.coarse is None or self.multifidelity is None:
-            return self.predict(unit)
-        coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
-        has_coarse = np.isfinite(coarse)
-        values = np.empty(len(unit))
-        values[has_coarse] = self.multifidelity(unit[has_coarse], coarse[has_coarse])
-        if not has_coarse.all():
-            values[~has_coarse] = self.predict(unit[~has_coarse])
-            n_lost = (~has_coarse).sum()
-            report(
-                Finding(
-                    "coarse-without-number",
-                    f"surrogate: coarse: got no number at {n_lost} of {len(unit)} points, where "
-                    "the surface goes on without it.",
-                )
-            )
-        return values
-
-    def probes(self) -> Floats:
-        """Return values of the surface at 64 fixed points, which identify it."""
-        unit = sobol(64, self.domain.dimensions, 0)
-        return self(self.domain.at(unit), unit)
-
-
-def _hashed_noise(residuals: Floats, columns: Floats, random_seed: int) -> Floats:
-    """Return one of k residuals for each row, (n, k, ...) -> (n, ...), with either sign."""
-    n, k = residuals.shape[:2]
-    number, sign = np.divmod(hashed_rows(columns, random_seed), np.uint64(2))
-    place = (number % np.uint64(k)).astype(np.intp)
-    signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
-    return residuals[np.arange(n), place] * signs
 
 
 def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
@@ -537,18 +482,30 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
     return h
 
 
-def _design(
-    name: str, points: str, domain: Ranges, predictive: Floats | None, unit: Floats
-) -> Floats:
-    """Return the design's rows for points of the unit cube: even, or as the prior predictive."""
-    if points == "even":
-        return domain.at(unit)
-    if predictive is None:
-        raise ValueError(
-            f"{name}: points: got 'predictive' for inputs that are ranges, expected a `.dist()` "
-            "among them; leave points= out"
-        )
-    return domain.at(domain.like(predictive, unit))
+def _fitted_surface(
+    model: Any,
+    domain: Ranges,
+    points: Floats,
+    responses: Floats,
+    coarse: Callable[..., Any] | None,
+    *,
+    joined: bool,
+) -> Any:
+    """Return a surface through the usable runs, or one for each output, in the unit cube."""
+    usable = _usable(responses)
+    x, y = domain.scaled(points)[usable], responses[usable]
+    if y.ndim > 1:
+        return partial(_outputs, [fitted(model, x, output) for output in y.T])
+    if coarse is None:
+        return fitted(model, x, y)
+    coarse_values = _coarse_at("surrogate", coarse, domain, points)[usable]
+    return fit_multifidelity(MultifidelityModel(model, model, joined), x, y, coarse_values)
+
+
+def _probes(surrogate: Surrogate) -> Floats:
+    """Return values of the surface at 64 fixed points, which identify it."""
+    unit = sobol(64, surrogate.domain.dimensions, 0)
+    return surrogate._surface_at(surrogate.domain.at(unit), unit)
 
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:
@@ -579,10 +536,11 @@ def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
     keys, values = store.known()
     if values.ndim == 1:
         return
-    usable = np.flatnonzero(_usable(values) & points.have_same_constants(keys))[:1]
+    stored_points, have_same_constants = points.read_keys(keys)
+    usable = np.flatnonzero(_usable(values) & have_same_constants)[:1]
     if not usable.size:
         return
-    (again,) = respond(replace(settings, store=None), points.from_keys(keys[usable]), tally)
+    (again,) = respond(replace(settings, store=None), stored_points.at(usable), tally)
     (stored,) = values[usable]
     moved = np.allclose(np.sort(again), np.sort(stored)) and not np.allclose(again, stored)
     if tally.named is not None and moved:
@@ -590,13 +548,6 @@ def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
             f"{settings.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
             "numbers are stored in another order, expected the same one; pass another version="
         )
-
-
-def _computed(settings: CallSettings, points: Points) -> tuple[Floats, Tally]:
-    """Return the responses at points, and the count of runs."""
-    tally = Tally()
-    _learn_names(settings, points, tally)
-    return respond(settings, points, tally), tally
 
 
 def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool) -> None:
@@ -625,7 +576,7 @@ def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: F
 
 def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
     """Return a coarse response at the design, or raise if it is no response of the inputs."""
-    refuse_coarse(f"{name}: coarse", coarse)
+    refuse_uncallable(name, coarse, "coarse")
     values = _coarse_at(name, coarse, domain, columns)
     if not np.isfinite(values).any():
         raise ResponseError(
@@ -658,10 +609,7 @@ def _best(
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:
     """Raise if an argument of `Surrogate.fit` is not of its kind."""
-    if not callable(response):
-        raise TypeError(
-            f"{name}: response: got {type(response).__name__}, expected a function of the inputs"
-        )
+    refuse_uncallable(name, response)
     is_regressor = hasattr(model, "fit") and hasattr(model, "predict")
     is_surface = isinstance(model, Surface) or is_regressor
     if isinstance(model, type) or not is_surface:

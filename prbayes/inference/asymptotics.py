@@ -402,7 +402,7 @@ def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_
         product = product + (even_change * odd_change * lengths).sum(axis=-1)
         even_square = even_square + (even_change**2 * lengths).sum(axis=-1)
         odd_square = odd_square + (odd_change**2 * lengths).sum(axis=-1)
-    # Correlation of the changes. Half or twice of .35 changes no answer (docs/constants.md).
+    # Correlation of the changes. Half or twice of .35 changes no answer.
     return np.asarray(product > 0.35 * np.sqrt(even_square * odd_square))
 
 

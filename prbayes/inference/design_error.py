@@ -80,7 +80,9 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
     """
     evaluator = sampling.evaluator
     blocks = [
-        np.zeros_like(node.bound.blocks) if node.bound.is_line else node.bound.blocks
+        np.zeros_like(node.bound.blocks)
+        if node.reweighted is not None and node.reweighted.design.on_line
+        else node.bound.blocks
         for node in evaluator.nodes
     ]
     if not any(block.any() for block in blocks):

@@ -132,7 +132,9 @@ class ContinuedEvaluator(Evaluator):
     @classmethod
     def continuing(cls, evaluator: Evaluator, continuation: Continuation) -> ContinuedEvaluator:
         """Return an evaluator with the simulators and compiled functions of another."""
-        fields = {f.name: getattr(evaluator, f.name) for f in dataclasses.fields(Evaluator)}
+        fields = {
+            f.name: getattr(evaluator, f.name) for f in dataclasses.fields(Evaluator) if f.init
+        }
         inner = evaluator.hyperparameters
         fields["hyperparameters"] = ContinuedHyperparameters(
             inner.model, inner.point, continuation=continuation, inner=inner

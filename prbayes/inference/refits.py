@@ -25,7 +25,7 @@ from prbayes.inference.asymptotics import (
 )
 from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, simulated_sets
 from prbayes.metrics.base import Basis, Discrepancy, Minimum
-from prbayes.model.evaluator import Evaluator, has_other_terms
+from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.batched_minimisers import Descent, descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
 from prbayes.numerics.threads import one_thread
@@ -536,7 +536,7 @@ def sampling_obstacle(evaluator: Evaluator) -> str | None:
 def refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why the model cannot be calibrated to other data sets, or None."""
     obstacle = sampling_obstacle(evaluator)
-    if obstacle is None and has_other_terms(evaluator):
+    if obstacle is None and evaluator.has_other_terms:
         return "the model has likelihood terms or potentials besides its simulators"
     return obstacle
 

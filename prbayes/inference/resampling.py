@@ -18,6 +18,7 @@ from prbayes.metrics.base import Discrepancy
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
+from prbayes.propagation.reweighted import same_points
 from prbayes.response.distributions import PopulationSampler
 
 # Points of a resimulated population from which data sets are drawn: hundreds of data sets are then
@@ -107,10 +108,9 @@ def aligned(nodes: Sequence[Node]) -> bool:
     inputs = [id(x) for x in first.bound.inputs.aleatory]
     return all(
         [id(x) for x in node.bound.inputs.aleatory] == inputs
-        and type(node.bound) is type(first.bound)
         and node.propagation == first.propagation
-        and node.bound.same_points(first.bound)
-        for node in nodes
+        and same_points(node.bound, first.bound)
+        for node in nodes[1:]
     )
 
 

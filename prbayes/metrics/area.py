@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from prbayes._stats import finite_sample, ranked, summed_below
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.metrics.base import Basis, Discrepancy, Features, Metric, Minimum, Part, PartSum
+from prbayes.metrics.base import (
+    Basis,
+    Discrepancy,
+    Features,
+    Metric,
+    Minimum,
+    Part,
+    PartSum,
+    projected,
+)
 from prbayes.metrics.grid import compiled
 
 
@@ -52,7 +61,7 @@ class AreaDiscrepancy(Discrepancy):
         return mean_deviation if mean_deviation > 0 else 1.0
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
-        """Return F - S_N on each interval of the pooled values, and the interval's length."""
+        """Return the area, (..., 1): the sum of |F - S_N| times length over intervals, eq. 5."""
         observed = self.observed
         observed_weights = self.weights
         if xp is np:
@@ -72,56 +81,25 @@ class AreaDiscrepancy(Discrepancy):
         is_finite = xp.abs(pooled[..., 1:]) < np.inf
         upper = xp.where(is_finite, pooled[..., 1:], 0.0)
         lower = xp.where(is_finite, pooled[..., :-1], 0.0)
-        return gap, upper - lower
+        return ((xp.abs(gap) * (upper - lower)).sum(axis=-1)[..., None],)
 
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
         """Return the ranks of the values among all finite values, the knots."""
         pooled = np.concatenate([simulated, self.observed])
         knots = np.unique(pooled[np.isfinite(pooled)])
-        starts = knots[:-1]
-        arrays = (
-            *ranked(simulated, starts, kind="quicksort"),
-            *ranked(self.observed, starts, kind="quicksort"),
-            np.diff(knots),
-        )
-        return RankedBasis(arrays, self.weights)
+        order, below = ranked(simulated, knots[:-1], kind="quicksort")
+        observed_order, observed_below = ranked(self.observed, knots[:-1], kind="quicksort")
+        arrays = [order, below, observed_order, observed_below, np.diff(knots)]
+        return RankedBasis(tuple([array[None] for array in arrays]), (self.weights,))
 
     def outer(self, *features: Any, xp: Any) -> Any:
-        """Return the sum of |F - S_N| times length: eq. 5."""
-        gap, lengths = features
-        return (xp.abs(gap) * lengths).sum(axis=-1)
+        """Return the area."""
+        (areas,) = features
+        return areas[..., 0]
 
     def together(self, parts: tuple[Part, ...]) -> PartSum:
-        """Return areas whose features are their values, which take little memory."""
+        """Return areas side by side."""
         return AreaSum(parts)
-
-
-@dataclass(frozen=True, eq=False)
-class RankedBasis(Basis):
-    """The ranks of stored and observed values among the knots.
-
-    The arrays are, for either side, the order of the values and the number of values up to each
-    knot, then the lengths of the intervals between knots.
-    """
-
-    observed_weights: Floats
-
-    def features(self, weights: Any, xp: Any = np) -> Features:
-        """Return F - S_N on each interval between knots, and the interval's length."""
-        order, below, observed_order, observed_below, lengths = self.arrays
-        if xp is np and weights.size > 1 << 16:  # where a compiled loop repays its loading
-            rows = np.ascontiguousarray(weights).reshape(-1, weights.shape[-1])
-            simulated = np.empty((len(rows), len(below)))
-            sum_below(rows, order, below, simulated)
-            simulated = simulated.reshape(*weights.shape[:-1], -1)
-        else:
-            simulated = summed_below(weights, order, below, xp)
-        observed = summed_below(self.observed_weights, observed_order, observed_below, xp)
-        return simulated - observed, lengths
-
-    def rows(self, index: Any) -> Self:
-        """Return the ranks for some of several data sets."""
-        return replace(self, observed_weights=self.observed_weights[index])
 
 
 class AreaSum(PartSum):
@@ -129,18 +107,14 @@ class AreaSum(PartSum):
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the areas, (..., K)."""
-        areas = []
-        for target, values in self.projected(simulated, xp):
-            gap_and_lengths = target.features(values, weights, xp)
-            areas.append(target.outer(*gap_and_lengths, xp=xp))
-        return (xp.stack(areas, axis=-1),)
+        return (xp.concatenate(super().features(simulated, weights, xp), axis=-1),)
 
     def basis(self, simulated: Floats, most: float) -> Basis:
         """Return the ranks of all projections."""
-        bases = [target.basis(values) for target, values in self.projected(simulated)]
-        arrays = zip(*(basis.arrays for basis in bases), strict=True)
-        weights = tuple(part.target.weights for part in self.parts)
-        return StackedRanks(tuple(_padded(rows) for rows in arrays), weights)
+        bases = [target.basis(values) for target, values in projected(self.parts, simulated)]
+        columns = zip(*[basis.arrays for basis in bases], strict=True)
+        arrays = [_padded([row for (row,) in column]) for column in columns]
+        return RankedBasis(tuple(arrays), tuple([part.target.weights for part in self.parts]))
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the areas times their shares."""
@@ -149,10 +123,12 @@ class AreaSum(PartSum):
 
 
 @dataclass(frozen=True, eq=False)
-class StackedRanks(Basis):
-    """Ranks of several projections, padded by intervals without length.
+class RankedBasis(Basis):
+    """The ranks of stored and observed values among the knots, for each of K projections.
 
-    The graph of many projections is then no larger than that of one.
+    The arrays, with a row for each projection, are for either side the order of the values and the
+    number of values up to each knot, then the lengths of the intervals between knots. Intervals
+    without length fill shorter rows: the graph of many projections is no larger than that of one.
     """
 
     observed_weights: tuple[Floats, ...]
@@ -161,10 +137,20 @@ class StackedRanks(Basis):
         """Return the areas, (..., K)."""
         if xp is np:  # one after another takes less memory
             areas = []
-            for *ranks, observed_weights in zip(*self.arrays, self.observed_weights, strict=True):
-                gap, lengths = RankedBasis(tuple(ranks), observed_weights).features(weights)
-                areas.append((np.abs(gap) * lengths).sum(axis=-1))
-            return (np.stack(areas, -1),)
+            for *ranks, lengths, observed_weights in zip(
+                *self.arrays, self.observed_weights, strict=True
+            ):
+                order, below, observed_order, observed_below = ranks
+                if weights.size > 1 << 16:  # where a compiled loop repays its loading
+                    rows = np.ascontiguousarray(weights).reshape(-1, weights.shape[-1])
+                    simulated = np.empty((len(rows), len(below)))
+                    sum_below(rows, order, below, simulated)
+                    simulated = simulated.reshape(*weights.shape[:-1], -1)
+                else:
+                    simulated = summed_below(weights, order, below)
+                observed = summed_below(observed_weights, observed_order, observed_below)
+                areas.append((np.abs(simulated - observed) * lengths).sum(axis=-1))
+            return (np.stack(areas, axis=-1),)
         order, below, observed_order, observed_below, lengths = self.arrays
         simulated = _rows_summed_below(xp.take(weights, order), below, xp)
         rows = np.arange(len(self.observed_weights))[:, None]

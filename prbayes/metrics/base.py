@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, ClassVar, Self
 
@@ -32,68 +32,34 @@ from prbayes.metrics.grid import product
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """The whole response."""
-
-    def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return the projection of simulated responses, outputs along the last axis."""
-        return simulated
-
-    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return the projection of observed values, and the rows that have one."""
-        return self.of(values), np.arange(len(values))
-
-
-@dataclass(frozen=True, eq=False)
-class OnlyOutput(View):
-    """The only output, without its axis."""
-
-    def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return the output, (..., n, 1) -> (..., n)."""
-        return simulated[..., 0]
-
-
-@dataclass(frozen=True, eq=False)
-class Centered(View):
-    """Some of the outputs, less a center; several projections share one record."""
+class Projection:
+    """Some of the outputs less a center: a linear combination of them, or all in their units."""
 
     outputs: NDArray[np.intp]  # (p,): indices
     caps: Floats  # (p,): the value of a specimen that failed
-    center: Floats  # (p,)
+    center: Floats  # (p,); projections with the same array have the same outputs and caps
+    direction: Floats | None = None  # (p,): of the combination
+    unit: Floats | None = None  # (p,): of the outputs without a direction
 
-    def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return the outputs (..., n, p), a failure as the cap; NaN stays."""
+    def centered(self, simulated: Any, xp: Any = np) -> Any:
+        """Return the outputs less the center, (..., n, p), a failure as the cap; NaN stays."""
         outputs = simulated[..., self.outputs]
         return xp.where(outputs >= np.inf, self.caps, outputs) - self.center
 
-
-@dataclass(frozen=True, eq=False)
-class Projection(View):
-    """A linear combination of outputs."""
-
-    centered: Centered
-    direction: Floats  # (p,)
-
     def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return the combination, shape (..., n)."""
-        return self.centered.of(simulated, xp) @ self.direction
+        """Return the combination, (..., n), or the outputs in their units, (..., n, p)."""
+        outputs = self.centered(simulated, xp)
+        return outputs / self.unit if self.direction is None else outputs @ self.direction
 
     def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return the combination, of the rows that have all necessary outputs."""
-        index = np.flatnonzero(~np.isnan(values[:, self.centered.outputs]).any(axis=-1))
+        """Return the projection of observed values, and the rows that have it.
+
+        A combination needs all outputs; without a direction all rows count.
+        """
+        index = np.arange(len(values))
+        if self.direction is not None:
+            index = np.flatnonzero(~np.isnan(values[:, self.outputs]).any(axis=-1))
         return self.of(values[index]), index
-
-
-@dataclass(frozen=True, eq=False)
-class Standardized(View):
-    """Several outputs, each in its unit; rows that lack some of them count as well."""
-
-    centered: Centered
-    unit: Floats  # (p,)
-
-    def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return the outputs, shape (..., n, p)."""
-        return self.centered.of(simulated, xp) / self.unit
 
 
 type Features = tuple[Any, ...]
@@ -126,15 +92,17 @@ class Part:
     target: Discrepancy  # of one number of each specimen, unless its event is not empty
     share: float  # factor in the sum
     label: str  # name for messages and plots
-    view: View = field(default_factory=View)  # projection of a response
+    projection: Projection | None = None  # of a response; None for the response itself
 
     def of(self, simulated: Any, xp: Any = np) -> Any:
         """Return the projection, (..., n, m) -> (..., n); NaN where an output is NaN."""
-        return self.view.of(simulated, xp)
+        return simulated if self.projection is None else self.projection.of(simulated, xp)
 
     def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
         """Return the projection of observed values, (n, m) -> (n',), and the rows that have it."""
-        return self.view.observed_of(values)
+        if self.projection is None:
+            return values, np.arange(len(values))
+        return self.projection.observed_of(values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,37 +277,40 @@ def is_likelihood(target: Discrepancy) -> bool:
     return len(target.parts) == 1 and target.parts[0].target.metric.likelihood
 
 
+def projected(
+    parts: Sequence[Part], simulated: Any, xp: Any = np
+) -> Iterator[tuple[Discrepancy, Any]]:
+    """Yield the discrepancy of each component with its projection of simulated responses."""
+    center: Any = None
+    outputs: Any = None
+    for part in parts:
+        view = part.projection
+        if view is None or view.direction is None:
+            yield part.target, part.of(simulated, xp)
+            continue
+        if view.center is not center:  # outputs are centred once for many directions
+            center = view.center
+            outputs = view.centered(simulated, xp)
+        yield part.target, outputs @ view.direction
+
+
 @dataclass(frozen=True, eq=False)
 class PartSum:
     """Components of a sum that are evaluated together: here one after another."""
 
     parts: tuple[Part, ...]
 
-    def projected(self, simulated: Any, xp: Any = np) -> Iterator[tuple[Discrepancy, Any]]:
-        """Yield the discrepancy of each component with its projection."""
-        centered: Any = None
-        outputs: Any = None
-        for part in self.parts:
-            view = part.view
-            if not isinstance(view, Projection):
-                yield part.target, part.of(simulated, xp)
-                continue
-            if view.centered is not centered:  # outputs are centred once for many directions
-                centered = view.centered
-                outputs = centered.of(simulated, xp)
-            yield part.target, outputs @ view.direction
-
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the features of all components."""
         return tuple(
             feature
-            for target, values in self.projected(simulated, xp)
+            for target, values in projected(self.parts, simulated, xp)
             for feature in target.features(values, weights, xp)
         )
 
     def basis(self, simulated: Floats, most: float) -> Basis:
         """Return the map from weights to the features."""
-        return joined([target.basis(y, most) for target, y in self.projected(simulated)])
+        return joined([target.basis(y, most) for target, y in projected(self.parts, simulated)])
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the components times their shares, shape (..., K)."""
@@ -399,6 +370,10 @@ class Metric(ABC):
         gradient.
     takes_weights : bool
         Whether simulated responses may have unequal weights, as under `Reweighted`.
+    takes_outputs : bool
+        Whether it compares several outputs at a time, (N, m), as `Joint` does.
+    by_specimen : bool
+        Whether it is a likelihood of each specimen's record, and compares no distributions.
     counts_failures : bool
         Whether observed values may be +inf, specimens that failed, as simulated ones may.
     tail_responses : int
@@ -417,26 +392,14 @@ class Metric(ABC):
     symbolic: ClassVar[bool] = True
     counts_failures: ClassVar[bool] = False
     tail_responses: ClassVar[int] = 0
+    takes_weights: ClassVar[bool] = True
+    takes_outputs: ClassVar[bool] = False
+    by_specimen: ClassVar[bool] = False
 
     @property
     def additive(self) -> bool:
         """Whether the gradient in the hyperparameters is a mean over observations."""
         return self.minimum is Minimum.QUADRATIC
-
-    @property
-    def takes_weights(self) -> bool:
-        """Whether simulated responses may have unequal weights, as under `Reweighted`."""
-        return True
-
-    @property
-    def by_specimen(self) -> bool:
-        """Whether it is a likelihood of each specimen's record, and compares no distributions."""
-        return False
-
-    @property
-    def takes_outputs(self) -> bool:
-        """Whether it compares several outputs at a time, (N, m), as `Joint` does."""
-        return False
 
     def like(self, metric: Metric) -> Metric:
         """Return the comparison of the same outputs by another metric of one output."""

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from prbayes._validate import AT_ONCE, Floats, positive_number, sample_weights
 from prbayes.metrics.base import (
     Basis,
-    Centered,
     DenseBasis,
     Discrepancy,
     Features,
     Minimum,
     Part,
     Projection,
-    Standardized,
 )
 from prbayes.metrics.grid import product
 from prbayes.metrics.multivariate import CompositeDiscrepancy, LiftedMetric, failure_caps
@@ -84,17 +82,10 @@ class MarginalCorrelation(LiftedMetric):
             )
         for weight in self.weights:
             positive_number(weight, "weights")
-
-    @property
-    def minimum(self) -> Minimum:  # type: ignore[override]
-        """Quadratic if the metric's is, else unknown: correlations have squares."""
-        quadratic = self.metric.minimum is Minimum.QUADRATIC
-        return Minimum.QUADRATIC if quadratic else Minimum.UNKNOWN
-
-    @property
-    def additive(self) -> bool:
-        """No: the gradient is not linear in the observed correlations' specimens."""
-        return False
+        # Correlations have squares, and are not linear in the observed specimens.
+        is_quadratic = self.metric.minimum is Minimum.QUADRATIC
+        object.__setattr__(self, "minimum", Minimum.QUADRATIC if is_quadratic else Minimum.UNKNOWN)
+        object.__setattr__(self, "additive", False)
 
     def _prepare_outputs(self, observed: Floats, weights: Floats) -> Discrepancy:
         caps = failure_caps(observed)
@@ -110,15 +101,17 @@ class MarginalCorrelation(LiftedMetric):
             column_weights = column_weights / column_weights.sum()
             column = observed[is_finite][:, index]
             center[index], unit[index] = units(column, column_weights, index)
-            view = Projection(Centered(index, caps[index], center[index]), 1 / unit[index])
+            view = Projection(index, caps[index], center[index], direction=1 / unit[index])
             values, rows = view.observed_of(observed)
             target = self.metric.against(values, weights[rows])
             parts.append(Part(target, marginal_weight / target.scale, f"output {j}", view))
-        together = Standardized(Centered(np.arange(m), caps, center), unit)
+        # Rows that lack some of the outputs count in the correlations of the others.
+        together = Projection(np.arange(m), caps, center, unit=unit)
         values, _ = together.observed_of(observed)
         correlations = CorrelationDiscrepancy.between(self, values, weights)
         parts.append(Part(correlations, correlation_weight, "correlations", together))
-        return CompositeDiscrepancy.of_parts(self, observed, weights, parts)
+        shares = np.array([part.share for part in parts])
+        return CompositeDiscrepancy(self, observed, weights, tuple(parts), shares)
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,7 +52,7 @@ class FunctionMetric(Metric):
         flag(self.weighted, "weighted")
 
     @property
-    def takes_weights(self) -> bool:
+    def takes_weights(self) -> bool:  # type: ignore[override]
         """Whether the function takes the weights of simulated responses."""
         return self.weighted
 
@@ -97,9 +97,9 @@ class FunctionDiscrepancy(Discrepancy):
     def _value(self, simulated: Floats, observed_weights: Floats, weights: Floats) -> Floats:
         """Return the checked value of the function for one data set."""
         observed = repeated(self.observed, observed_weights, self.size)
-        arguments: tuple[Floats, ...] = (simulated, observed)
+        arguments = [simulated, observed]
         if self.metric.weighted:
-            arguments += (np.broadcast_to(weights, simulated.shape),)
+            arguments.append(np.broadcast_to(weights, simulated.shape))
         elif not np.allclose(weights, np.asarray(weights)[..., :1]):
             raise ValueError(
                 "weights: got unequal ones for a FunctionMetric whose function takes none; "
@@ -124,8 +124,7 @@ def repeated(values: Floats, weights: Floats, size: int) -> Floats:
     """Return a sample in which each value, (n,), is repeated in proportion to its weight.
 
     It has ``size`` values if the weights are multiples of its inverse; else the value of smallest
-    weight occurs once, as in a subset. Raises ValueError if the weights are not counts, as those of
-    the loss-likelihood bootstrap.
+    weight occurs once, as in a subset. Weights that are no counts raise a ValueError.
     """
     for counts in (weights * size, weights / weights[weights > 0].min()):
         whole = np.round(counts)

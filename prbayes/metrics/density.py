@@ -11,13 +11,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import AT_ONCE, Floats, positive_integer, positive_number, sample_weights
-from prbayes.metrics.base import Basis, DenseBasis, Discrepancy, Features, Minimum, Part, PartSum
+from prbayes.metrics.base import (
+    Basis,
+    DenseBasis,
+    Discrepancy,
+    Features,
+    Minimum,
+    Part,
+    PartSum,
+    projected,
+)
 from prbayes.metrics.grid import BinCells, Cells, KernelCells, product
 
 # Grid nodes per bandwidth: the density is exact to 3e-5 of a kernel's peak (test).
@@ -46,19 +56,10 @@ def spread(sample: Floats, weights: Floats) -> float:
 
 
 def silverman(sample: Floats, weights: Floats) -> float:
-    """Return Silverman's bandwidth, 0.9 min(sd, IQR/1.34) n^(-1/5), n the effective sample size.
+    """Return Silverman's bandwidth (1986, eq. 3.31), 0.9 min(sd, IQR/1.34) n^(-1/5).
 
-    Parameters
-    ----------
-    sample, weights : ndarray, shape (N,)
-        Weights sum to one.
+    The sample size n is the effective one.
 
-    References
-    ----------
-    .. [1] Silverman, B. W. (1986), Density Estimation for Statistics and Data Analysis, eq. 3.31.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> round(silverman(np.arange(32.0), np.full(32, 1 / 32)), 3)
     4.155
@@ -68,7 +69,7 @@ def silverman(sample: Floats, weights: Floats) -> float:
 
 def twice_silverman(sample: Floats, weights: Floats) -> float:
     """Return two Silverman bandwidths: the default of the metrics that smooth both sides alike."""
-    return 2.0 * silverman(sample, weights)
+    return float(1.8 * spread(sample, weights) * (weights**2).sum() ** 0.2)
 
 
 def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:
@@ -141,43 +142,42 @@ class GaussianKDE(DensityEstimator):
                 f"{np.ptp(observed):g}, expected a positive one; pass GaussianKDE(bandwidth=...) "
                 "in units of the response, or use AreaMetric, which needs none"
             )
+        # The grid ends where kernels of the observed values have at most `_FLOOR` of their mass.
         step = h / _PER_BANDWIDTH
-        low, n_nodes = _grid(observed, h, step)
+        length = float(np.ptp(observed))
+        margin = max(6.0 * h, length / 2)
+        low = float(observed.min()) - margin
+        n_nodes = int(np.ceil((float(observed.max()) - low + margin) / step)) + 1
+        if n_nodes > _MAX_CELLS:
+            allowed = _MAX_CELLS / _PER_BANDWIDTH / 2
+            raise ValueError(
+                f"bandwidth: got {h:g} for observed values that span {length:g}, expected a span "
+                f"below {allowed:g} bandwidths; look for outliers, pass a larger "
+                "GaussianKDE(bandwidth=...), or use AreaMetric"
+            )
+        # The kernel at the nodes, less the variance step^2 / 3 of a cubic B-spline, up to where it
+        # is 2e-11 of its peak.
+        s = np.sqrt(h**2 - step**2 / 3)
+        reach = int(np.ceil(7 * s / step))
+        u = step * np.arange(-reach, reach + 1) / s
+        kernel = np.exp(-0.5 * u**2) / (s * np.sqrt(2 * np.pi))
+        # The mass of a kernel up to each of its nodes, and beyond either end of the grid.
+        mass = np.concatenate([[0.0], np.cumsum(kernel * step)])
+        nodes = np.arange(n_nodes + 2 * (reach + 2)) - (reach + 2)
+        below = mass[np.clip(reach - nodes, 0, mass.size - 1)]
         tight = 2 * np.sqrt(np.pi) * h  # the integral of a kernel's square is 1 / tight
+        centers = low + step * np.arange(n_nodes, dtype=np.float64)
         return KernelCells(
             widths=np.r_[np.full(n_nodes, step), tight, tight],
-            centers=low + step * np.arange(n_nodes, dtype=np.float64),
+            centers=centers,
             smooth=True,
             bandwidth=h,
             step=step,
-            kernel=_narrowed_kernel(h, step),
+            kernel=kernel,
+            low=float(centers[0] / step),
+            margin=reach + 2,
+            mass_outside=np.stack([below, below[::-1]]),
         )
-
-
-def _grid(observed: Floats, h: float, step: float) -> tuple[float, int]:
-    """Return the first node of a grid over observed values and their margins, and its length."""
-    length = float(np.ptp(observed))
-    # Beyond six bandwidths a kernel has 1e-9 of its mass, as much as `_FLOOR`.
-    margin = max(6.0 * h, length / 2)
-    low = float(observed.min()) - margin
-    high = float(observed.max())
-    n_nodes = int(np.ceil((high - low + margin) / step)) + 1
-    if n_nodes > _MAX_CELLS:
-        allowed = _MAX_CELLS / _PER_BANDWIDTH / 2
-        raise ValueError(
-            f"bandwidth: got {h:g} for observed values that span {length:g}, expected a span below "
-            f"{allowed:g} bandwidths; look for outliers, pass a larger GaussianKDE(bandwidth=...), "
-            "or use AreaMetric"
-        )
-    return low, n_nodes
-
-
-def _narrowed_kernel(h: float, step: float) -> Floats:
-    """Return a Gaussian kernel at the nodes, less the variance step^2 / 3 of a cubic B-spline."""
-    s = np.sqrt(h**2 - step**2 / 3)
-    reach = int(np.ceil(7 * s / step))  # where the kernel is 2e-11 of its peak
-    u = step * np.arange(-reach, reach + 1) / s
-    return np.asarray(np.exp(-0.5 * u**2) / (s * np.sqrt(2 * np.pi)))
 
 
 @dataclass(frozen=True)
@@ -248,11 +248,6 @@ def density_estimator(
     )
 
 
-def floored(density: Any, floor: Any) -> Any:
-    """Return a density with its floor, which has 1e-9 of the mass."""
-    return (1 - _FLOOR) * density + floor
-
-
 @dataclass(frozen=True, eq=False)
 class DensityDiscrepancy(Discrepancy):
     """A discrepancy of two densities on the same cells.
@@ -314,17 +309,17 @@ class DensityDiscrepancy(Discrepancy):
         """One: divergences and log densities have no units."""
         return 1.0
 
-    def floored(self, density: Any) -> Any:
+    @property
+    def floor(self) -> Any:
+        """The density of the floor, which has 1e-9 of the mass in all cells."""
+        return _FLOOR / self.cells.widths.sum()
+
+    def floored(self, density: Any, floor: Any = None) -> Any:
         """Mix a density with 1e-9 of the uniform density over all cells: the package's only floor.
 
         It bounds logarithms at log(1e-9 / length) where a population leaves the observed values.
         """
-        return floored(density, self.floor)
-
-    @property
-    def floor(self) -> Any:
-        """The floor's density in each cell."""
-        return _FLOOR / self.cells.widths.sum()
+        return (1 - _FLOOR) * density + (self.floor if floor is None else floor)
 
 
 class CellwiseDiscrepancy(DensityDiscrepancy):
@@ -347,8 +342,7 @@ class CellwiseDiscrepancy(DensityDiscrepancy):
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum over the cells."""
-        (density,) = features
-        return self.terms(density, self.constants, xp).sum(axis=-1)
+        return self.terms(features[0], self.constants, xp).sum(axis=-1)
 
 
 class DensitySum(PartSum):
@@ -362,9 +356,8 @@ class DensitySum(PartSum):
     @cached_property
     def _slices(self) -> list[slice]:
         """The place of each component's cells."""
-        sizes = [cells.widths.size for cells in self.cells]
-        ends = np.cumsum(sizes).tolist()
-        return [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+        ends = np.cumsum([0, *(cells.widths.size for cells in self.cells)]).tolist()
+        return [slice(start, end) for start, end in pairwise(ends)]
 
     @property
     def n_cells(self) -> int:
@@ -375,19 +368,16 @@ class DensitySum(PartSum):
     def _constants(self) -> tuple[Floats, ...] | None:
         """The constants of one sum over all cells; None unless each component is such a sum."""
         targets = [part.target for part in self.parts]
-        if any(type(target).outer is not CellwiseDiscrepancy.outer for target in targets):
+        if not all(isinstance(target, CellwiseDiscrepancy) for target in targets):
             return None
         by_part = [cast(CellwiseDiscrepancy, target).constants for target in targets]
-        return tuple(self._side_by_side(numbers) for numbers in zip(*by_part, strict=True))
-
-    def _side_by_side(self, numbers: tuple[Any, ...]) -> Floats:
-        """Return numbers by cell, (..., m_k) or one for all of a component, as (..., all cells)."""
-        batch = np.broadcast_shapes(*(np.shape(x)[:-1] for x in numbers))
-        columns = [
-            np.broadcast_to(x, (*batch, cells.widths.size))
-            for x, cells in zip(numbers, self.cells, strict=True)
-        ]
-        return np.concatenate(columns, axis=-1)
+        side_by_side = []
+        for numbers in zip(*by_part, strict=True):  # by cell, or one for all of a component
+            batch = np.broadcast_shapes(*(np.shape(x)[:-1] for x in numbers))
+            shapes = [(*batch, cells.widths.size) for cells in self.cells]
+            columns = map(np.broadcast_to, numbers, shapes)
+            side_by_side.append(np.concatenate(list(columns), axis=-1))
+        return tuple(side_by_side)
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
         """Return the densities side by side, (..., cells)."""
@@ -396,10 +386,12 @@ class DensitySum(PartSum):
     def basis(self, simulated: Floats, most: float) -> Basis:
         """Return one matrix, (n, cells), or the projections where they are smaller."""
         if len(self.parts) > 1 and len(simulated) * self.n_cells > most:
-            projections = np.stack([values for _, values in self.projected(simulated)], axis=-1)
+            projections = np.stack(
+                [values for _, values in projected(self.parts, simulated)], axis=-1
+            )
             return BinnedBasis((projections,), self)
         matrix = np.empty((len(simulated), self.n_cells))
-        values_by_part = (values for _, values in self.projected(simulated))
+        values_by_part = (values for _, values in projected(self.parts, simulated))
         for values, cells, place in zip(values_by_part, self.cells, self._slices, strict=True):
             matrix[:, place] = cells.basis(values)
         return DenseBasis((matrix,))
@@ -419,7 +411,7 @@ class DensitySum(PartSum):
         """
         total: Any = 0.0
         for values, cells, place in zip(projections.T, self.cells, self._slices, strict=True):
-            total = total + cells.value(values, cotangent[..., place])
+            total = total + cells.adjoint(values, cotangent[..., place])
         return np.asarray(total)
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
@@ -451,12 +443,12 @@ def is_differentiable(target: Discrepancy) -> bool:
 
     A histogram has none in the values.
     """
-    targets = [part.target for part in target.parts]
-    return all(
-        inner.metric.minimum is Minimum.QUADRATIC
-        and not (isinstance(inner, DensityDiscrepancy) and not inner.cells.smooth)
-        for inner in targets
-    )
+    for part in target.parts:
+        inner = part.target
+        has_bins = isinstance(inner, DensityDiscrepancy) and not inner.cells.smooth
+        if has_bins or inner.metric.minimum is not Minimum.QUADRATIC:
+            return False
+    return True
 
 
 def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
@@ -466,8 +458,8 @@ def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
     outside the inner cells does not count.
     """
     batch = np.shape(simulated)[: np.ndim(simulated) - 1 - len(target.event)]
-    smallest = np.ones(batch)
-    for inner, values in PartSum(target.parts).projected(simulated):
+    cosines = [np.ones(batch)]
+    for inner, values in projected(target.parts, simulated):
         if not isinstance(inner, DensityDiscrepancy):
             continue
         p = inner.cells.density(values, weights)[..., :-2]
@@ -475,5 +467,5 @@ def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
         dz = inner.cells.widths[:-2]
         size = np.sqrt(((p**2) * dz).sum(axis=-1) * ((q**2) * dz).sum(axis=-1))
         cosine = (p * q * dz).sum(axis=-1) / np.where(size > 0, size, 1.0)
-        smallest = np.minimum(smallest, np.nan_to_num(cosine))
-    return smallest
+        cosines.append(np.nan_to_num(cosine))
+    return np.asarray(np.min(cosines, axis=0))

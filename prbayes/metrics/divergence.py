@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -15,9 +15,7 @@ from prbayes.metrics.density import (
     DensityEstimator,
     GaussianKDE,
     density_estimator,
-    floored,
 )
-from prbayes.metrics.grid import Cells
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,9 @@ class ProbabilityResidual(Metric):
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         cells = self.density.cells(observed, weights)
-        return ResidualDiscrepancy.on_cells(self, observed, weights, cells)
+        density = cells.density(observed, weights)
+        scale_factor = float(self.scale_base ** -np.floor(np.log10(density.max())))  # eq. 10
+        return ResidualDiscrepancy(self, observed, weights, cells, density, scale_factor)
 
     def on_one_scale(self, slices: Sequence[Any]) -> Sequence[Any]:
         """Return the residuals with one factor S, the smallest: that of the highest peak."""
@@ -79,43 +79,29 @@ class ProbabilityResidual(Metric):
 
 @dataclass(frozen=True, eq=False)
 class ResidualDiscrepancy(CellwiseDiscrepancy):
-    """The probability residual against fixed observed values; ``scale_factor`` is S of eq. 10."""
+    """The probability residual against fixed observed values.
+
+    Against other values, by `with_observed`, it keeps its scale factor S.
+    """
 
     metric: ProbabilityResidual
     scale_factor: float
 
-    @classmethod
-    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
-        """Return the residual from observed values, S from the peak of their density (eq. 10).
-
-        Against other values, by `with_observed`, it keeps this S.
-        """
-        density = cells.density(observed, weights)
-        scale_factor = float(metric.scale_base ** -np.floor(np.log10(density.max())))
-        return cls(metric, observed, weights, cells, density, scale_factor)
-
-    @property
-    def _measure(self) -> Any:
-        """The measure of a cell: its width in the integral form, one in the sum form."""
-        return self.cells.widths if self.cells.smooth else 1.0
-
-    @property
-    def _root(self) -> Any:
-        """The root of S, which times a density is of the order of one.
-
-        np.float64, because PyTensor casts Python floats to float32.
-        """
-        return np.sqrt(np.float64(self.scale_factor))
-
     @property
     def scale(self) -> float:
         """The residual of a population without any density: S times the integral of q squared."""
-        return float(((self._root * self.density) ** 2 * self._measure).sum())
+        root, observed, measure = self.constants
+        return float(((root * observed) ** 2 * measure).sum())
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """The root of S, the observed density, and the measure of a cell."""
-        return self._root, self.density, self._measure
+        """The root of S, which gives densities of the order of one, q, and the measure of a cell.
+
+        The measure is the width in the integral form, one in the sum form.
+        """
+        # np.float64, because PyTensor casts Python floats to float32.
+        root = np.sqrt(np.float64(self.scale_factor))
+        return root, self.density, self.cells.widths if self.cells.smooth else 1.0
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return S times (p - q)^2, times the width of the cell: eq. 6, 8, 9."""
@@ -172,7 +158,8 @@ class KullbackLeibler(Metric):
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         cells = self.density.cells(observed, weights)
-        return DivergenceDiscrepancy.on_cells(self, observed, weights, cells)
+        density = cells.density(observed, weights)
+        return DivergenceDiscrepancy(self, observed, weights, cells, density)
 
 
 class DivergenceDiscrepancy(CellwiseDiscrepancy):
@@ -188,6 +175,6 @@ class DivergenceDiscrepancy(CellwiseDiscrepancy):
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return the integral of a log(a / b), (a, b) = (q, p) forward, (p, q) in reverse."""
         q, floor, widths = constants
-        p = floored(density, floor)
+        p = self.floored(density, floor)
         a, b = (p, q) if self.metric.reverse else (q, p)
         return a * xp.log(a / b) * widths

@@ -10,8 +10,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property, update_wrapper
-from typing import cast
+from functools import update_wrapper
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,15 +67,12 @@ class Cells(ABC):
         """Return the reading of a block of points."""
 
     @abstractmethod
-    def value(self, sample: Floats, cotangent: Floats) -> Floats:
+    def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
         """Return the derivatives of ``(density(sample, weights) * cotangent).sum()`` for weights.
 
-        Shapes (..., n), (..., m) -> (..., n), with as many leading axes in both.
+        Or those for the sample, where all weights are one. Shapes (..., n), (..., m) -> (..., n),
+        with as many leading axes in both.
         """
-
-    @abstractmethod
-    def slope(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return the derivatives of the same sum for the sample, where all weights are one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,28 +87,11 @@ class KernelCells(Cells):
     bandwidth: float  # standard deviation of the kernel, in units of the response
     step: float  # distance of two nodes
     kernel: Floats  # (2 k + 1,): the kernel that smooths counts at nodes into densities
-
-    @property
-    def _low(self) -> float:
-        """The position of the first node, in steps."""
-        return float(self.centers[0] / self.step)
-
-    @property
-    def _margin(self) -> int:
-        """The number of additional nodes on either side on which values are binned.
-
-        From farther out a kernel reaches no node, whichever of four its spline brings it to.
-        """
-        return self.kernel.size // 2 + 2
-
-    @cached_property
-    def _mass_outside(self) -> Floats:
-        """The part of a kernel at each binning node below and above the grid, (2, g + 2 margin)."""
-        nodes = np.arange(self.centers.size + 2 * self._margin) - self._margin
-        # The mass of a kernel up to each of its nodes.
-        mass = np.concatenate([[0.0], np.cumsum(self.kernel * self.step)])
-        below = mass[np.clip(self.kernel.size // 2 - nodes, 0, mass.size - 1)]
-        return np.stack([below, below[::-1]])
+    low: float  # position of the first node, in steps
+    # Additional nodes on either side on which values are binned: from farther out a kernel reaches
+    # no node, whichever of four its spline brings it to.
+    margin: int
+    mass_outside: Floats  # (2, g + 2 margin): of a kernel at each of these nodes, below and above
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return densities at the nodes, then mass below and above divided by a cluster's width."""
@@ -119,19 +99,21 @@ class KernelCells(Cells):
         rows = int(np.prod(batch, dtype=int))
         nodes = self.centers.size
         # Equal weights, the usual case, are passed as a single number.
-        equal = _are_equal(weights)
+        equal = weights.size > 0 and (not any(weights.strides) or weights.min() == weights.max())
         flat_weights = (weights if equal else np.broadcast_to(weights, sample.shape)).ravel()
         # Bin the sample on the grid; values that all rows share are passed once.
         is_shared = not any(sample.strides[:-1])
         values = sample.reshape(rows, n)[:1] if is_shared else sample.reshape(rows, n)
         values = np.ascontiguousarray(values, dtype=np.float64)
-        counts = np.zeros((rows, nodes + 2 * self._margin))
+        counts = np.zeros((rows, nodes + 2 * self.margin))
         outside = np.zeros((rows, 2))
-        count(values, flat_weights, equal, self._low, 1 / self.step, self._margin, counts, outside)
+        count(
+            values, flat_weights, bool(equal), self.low, 1 / self.step, self.margin, counts, outside
+        )
         # Smooth the counts, within the grid and beyond its ends.
         inner = np.zeros((rows, nodes))
-        smooth(counts, self.kernel, -self._margin, inner)
-        for side, mass in enumerate(self._mass_outside):
+        smooth(counts, self.kernel, -self.margin, inner)
+        for side, mass in enumerate(self.mass_outside):
             reached = np.flatnonzero(mass)
             block = slice(reached[0], reached[-1] + 1)
             outside[:, side] += (counts[:, block] * mass[block]).sum(axis=-1)
@@ -144,7 +126,7 @@ class KernelCells(Cells):
         Points off the grid are read at the cell of the mass on their side.
         """
         # A point is a node and a fraction of a step beyond it.
-        t = points / self.step - self._low
+        t = points / self.step - self.low
         last = self.centers.size - 2
         below = t < 1
         above = t >= last
@@ -167,60 +149,36 @@ class KernelCells(Cells):
         matrix[above, -1] = 1.0
         return product(weights, matrix)
 
-    def value(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return the smoothed cotangent at the sample; the kernel is its own transpose."""
-        outer = cotangent[..., -2:] / self.widths[-1]
-        return self._interpolated(sample, cotangent, _SPLINE, outer)
-
-    def slope(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return the derivative of the smoothed cotangent at the sample."""
-        derivatives = _SPLINE[:, 1:] * [1, 2, 3] / self.step
-        quadratics = np.pad(derivatives, [(0, 0), (0, 1)])
-        return self._interpolated(sample, cotangent, quadratics, np.zeros(2))
-
-    def _interpolated(
-        self, sample: Floats, cotangent: Floats, spline: Floats, outer: Floats
-    ) -> Floats:
-        """Return splines at a sample (..., n) with the coefficients of a smoothed cotangent.
-
-        ``spline``, (4, 4), has the coefficients of powers of the fraction of a step, for the four
-        splines that reach a point; ``outer``, (..., 2), the results below and above the grid.
-        """
+    def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
+        """Return the smoothed cotangent at the sample, or its derivative there."""
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
         rows = int(np.prod(batch, dtype=int))
         n = sample.shape[-1]
-        smoothed = self._spread(cotangent)
-        nodes = smoothed.shape[-1]
-        smoothed = np.broadcast_to(smoothed, (*batch, nodes)).reshape(rows, nodes)
+        inner = self.centers.size
+        nodes = inner + 2 * self.margin
+        # Smooth the cotangent; the kernel is its own transpose.
+        flat = np.ascontiguousarray(cotangent[..., :inner]).reshape(-1, inner)
+        smoothed = np.zeros((len(flat), nodes))
+        smooth(flat, self.kernel, self.margin, smoothed)
+        ends = cotangent[..., -2:] / self.widths[-1]
+        smoothed = smoothed.reshape(*cotangent.shape[:-1], nodes)
+        for side, mass in enumerate(self.mass_outside):
+            smoothed = smoothed + ends[..., side, None] * mass
         # The cubic beyond each node, from the splines around: (rows, g, 4).
+        spline = _SPLINE
+        if for_sample:
+            spline = np.pad(_SPLINE[:, 1:] * [1, 2, 3] / self.step, [(0, 0), (0, 1)])
+            ends = np.zeros(2)
+        smoothed = np.broadcast_to(smoothed, (*batch, nodes)).reshape(rows, nodes)
         padded = np.pad(smoothed, [(0, 0), (1, 2)])
         cubics = np.stack([padded[:, k : k + nodes] for k in range(4)], axis=-1) @ spline
         # Values that all rows share are passed once.
         values = sample if sample.ndim == 1 else np.broadcast_to(sample, (*batch, n))
         values = np.ascontiguousarray(values, dtype=np.float64).reshape(-1, n)
-        ends = np.ascontiguousarray(np.broadcast_to(outer, (*batch, 2)).reshape(rows, 2))
+        ends = np.ascontiguousarray(np.broadcast_to(ends, (*batch, 2)).reshape(rows, 2))
         out = np.empty((rows, n))
-        read(values, cubics, ends, self._low, 1 / self.step, self._margin, out)
+        read(values, cubics, ends, self.low, 1 / self.step, self.margin, out)
         return out.reshape(*batch, n)
-
-    def _spread(self, cotangent: Floats) -> Floats:
-        """Return the transpose of the smoothing, shapes (..., g + 2) -> (..., g + 2 margin)."""
-        nodes = self.centers.size
-        rows = np.ascontiguousarray(cotangent[..., :nodes]).reshape(-1, nodes)
-        spread = np.zeros((len(rows), nodes + 2 * self._margin))
-        smooth(rows, self.kernel, self._margin, spread)
-        outer = cotangent[..., -2:] / self.widths[-1]
-        spread = spread.reshape(*cotangent.shape[:-1], -1)
-        for side, mass in enumerate(self._mass_outside):
-            spread = spread + outer[..., side, None] * mass
-        return spread
-
-
-def _are_equal(weights: Floats) -> bool:
-    """Return whether there are weights, and all are the same number."""
-    if weights.size == 0:
-        return False
-    return not any(weights.strides) or bool(weights.min() == weights.max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,31 +215,29 @@ class BinCells(Cells):
         cell = np.where(position < -1e-9, bins, cell)
         return np.where(np.isnan(position), bins + 2, cell)
 
-    def value(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return the cell's cotangent."""
+    def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
+        """Return the cell's cotangent, or zero for the sample: a step function."""
+        if for_sample:
+            batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
+            return np.zeros((*batch, sample.shape[-1]))
         padded = np.concatenate([cotangent, np.zeros_like(cotangent[..., :1])], axis=-1)
         return np.take_along_axis(padded / self.widths[0], self._cell(sample), axis=-1)
 
-    def slope(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return zero: a step function."""
-        batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
-        return np.zeros((*batch, sample.shape[-1]))
 
-
-def compiled[**P](loop: Callable[P, None]) -> Callable[P, None]:
+def compiled(loop: Callable[..., None]) -> Callable[..., None]:
     """Compile with Numba at the first call, as it takes long to import, with a cache on disk."""
+    function: Callable[..., None] | None = None
 
-    @cache
-    def compiled() -> Callable[P, None]:
-        from numba import njit
+    def call(*args: Any) -> None:
+        nonlocal function
+        if function is None:
+            from numba import njit
 
-        try:
-            return njit(cache=True, nogil=True)(loop)
-        except RuntimeError:  # no folder for the cache
-            return njit(nogil=True)(loop)
-
-    def call(*args: P.args, **kwargs: P.kwargs) -> None:
-        compiled()(*args, **kwargs)
+            try:
+                function = njit(cache=True, nogil=True)(loop)
+            except RuntimeError:  # no folder for the cache
+                function = njit(nogil=True)(loop)
+        function(*args)
 
     return update_wrapper(call, loop)
 

@@ -14,10 +14,8 @@ from prbayes.metrics.density import (
     DensityEstimator,
     GaussianKDE,
     density_estimator,
-    floored,
     likelihood_bandwidth,
 )
-from prbayes.metrics.grid import Cells
 from prbayes.metrics.readings import Readings
 
 
@@ -98,11 +96,6 @@ class LogLikelihood(Metric):
     tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
 
     def __post_init__(self) -> None:
-        measurement = {
-            "error": _hashable(self.error, "error"),
-            "censored": _limits(self.censored),
-            "rounded": _hashable(self.rounded, "rounded"),
-        }
         flag(self.relative, "LogLikelihood: relative")
         gross = self.gross_errors
         if isinstance(gross, int | float) and not isinstance(gross, bool) and not 0 < gross < 1:
@@ -110,6 +103,20 @@ class LogLikelihood(Metric):
                 f"LogLikelihood: gross_errors: got {gross!r}, expected True, a share in (0, 1) or "
                 "a variable of the model"
             )
+        limits: Any = self.censored
+        if limits is not None:
+            if not isinstance(limits, tuple | list) or len(limits) != 2 or limits == (None, None):
+                raise ValueError(
+                    f"LogLikelihood: censored: got {limits!r}, expected (lower, upper), one of "
+                    "which may be None"
+                )
+            arrays = [x if x is None else real_array(x, "LogLikelihood: censored") for x in limits]
+            limits = tuple(x if x is None else _as_tuples(x) for x in arrays)
+        measurement = {
+            "error": _hashable(self.error, "error"),
+            "censored": limits,
+            "rounded": _hashable(self.rounded, "rounded"),
+        }
         for name, value in measurement.items():
             object.__setattr__(self, name, value)
         if self.density is None:
@@ -131,7 +138,7 @@ class LogLikelihood(Metric):
         return f"LogLikelihood({arguments})"
 
     @property
-    def by_specimen(self) -> bool:
+    def by_specimen(self) -> bool:  # type: ignore[override]
         """Whether it is the log-likelihood by specimen, which compares no two samples."""
         return self.density is None
 
@@ -156,21 +163,16 @@ class LogLikelihood(Metric):
                     + (f", or {event}, one for each output" if event else "")
                 ) from None
 
-        readings = Readings.exact(values)
-        sd = readings.error if error is None else full(error, "error")
-        step = readings.step if self.rounded is None else full(self.rounded, "rounded")
-        lower, upper = readings.lower.copy(), readings.upper.copy()
-        if self.censored is not None:
-            low, high = self.censored
-            is_low = values <= (full(low, "censored") if low is not None else -np.inf)
-            is_high = values >= (full(high, "censored") if high is not None else np.inf)
-            if low is not None:
-                lower[is_low], upper[is_low] = -np.inf, full(low, "censored")[is_low]
-            if high is not None:
-                lower[is_high], upper[is_high] = full(high, "censored")[is_high], np.inf
-            values = np.where(is_low | is_high, np.nan, values)
+        sd = np.zeros(values.shape) if error is None else full(error, "error")
+        step = np.zeros(values.shape) if self.rounded is None else full(self.rounded, "rounded")
+        low, high = self.censored or (None, None)
+        lowest = full(-np.inf if low is None else low, "censored")
+        highest = full(np.inf if high is None else high, "censored")
+        is_low, is_high = values <= lowest, values >= highest
+        lower = np.where(is_high, highest, np.where(is_low, -np.inf, np.nan))
+        upper = np.where(is_high, np.inf, np.where(is_low, lowest, np.nan))
         return Readings(
-            values=values,
+            values=np.where(is_low | is_high, np.nan, values),
             error=np.where(np.isfinite(sd), sd, 0.0),
             step=step,
             lower=lower,
@@ -186,7 +188,8 @@ class LogLikelihood(Metric):
                 "prb.LogLikelihood(density=prb.GaussianKDE())"
             )
         cells = self.density.cells(observed, weights)
-        return LikelihoodDiscrepancy.on_cells(self, observed, weights, cells)
+        density, reading = cells.density(observed, weights), cells.reading(observed, weights)
+        return LikelihoodDiscrepancy(self, observed, weights, cells, density, reading)
 
 
 def _hashable(value: Any, name: str) -> Any:
@@ -197,22 +200,6 @@ def _hashable(value: Any, name: str) -> Any:
     if not (array > 0).all():
         raise ValueError(f"LogLikelihood: {name}: got {value!r}, expected positive numbers")
     return _as_tuples(array)
-
-
-def _limits(censored: Any) -> tuple[Any, Any] | None:
-    """Return lower and upper limits as numbers or nested tuples, None where there is none."""
-    if censored is None:
-        return None
-    if not isinstance(censored, tuple | list) or len(censored) != 2 or censored == (None, None):
-        raise ValueError(
-            f"LogLikelihood: censored: got {censored!r}, expected (lower, upper), one of which may "
-            "be None"
-        )
-    lower, upper = (
-        None if limit is None else _as_tuples(real_array(limit, "LogLikelihood: censored"))
-        for limit in censored
-    )
-    return lower, upper
 
 
 def _as_tuples(array: Floats) -> Any:
@@ -228,13 +215,6 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     reading: Floats
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
 
-    @classmethod
-    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
-        """Return the likelihood of observed values, to be read from densities on given cells."""
-        density = cells.density(observed, weights)
-        reading = cells.reading(observed, weights)
-        return cls(metric, observed, weights, cells, density, reading)
-
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
         """Return the same metric, on the same cells, against other values; for resampling."""
         target = super().with_observed(observed, weights)
@@ -248,7 +228,7 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return the terms of minus the weighted mean of log p at the observed values."""
         floor, reading = constants
-        return -(xp.log(floored(density, floor)) * reading)
+        return -(xp.log(self.floored(density, floor)) * reading)
 
 
 def kernel_width(target: Discrepancy) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cache, cached_property
 from typing import Any, ClassVar, Self
@@ -14,12 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._validate import AT_ONCE, Floats, called, positive_integer, real_array, sample_weights
 from prbayes.metrics.base import (
     Basis,
-    Centered,
     Discrepancy,
     Features,
     Metric,
-    Minimum,
-    OnlyOutput,
     Part,
     PartSum,
     Projection,
@@ -31,11 +27,12 @@ from prbayes.metrics.whitening import (
     LEFT_OUT,
     MOST_OUTPUTS,
     Components,
-    Whitening,
     principal_components,
     units,
     whitening,
 )
+
+type _Coordinates = tuple[Floats, Floats]  # center and axes, see `whitening`
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,19 +45,6 @@ class CompositeDiscrepancy(Discrepancy):
     # Of sets of outputs that are compared by principal components.
     components: tuple[Components, ...] = ()
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "shares")
-
-    @classmethod
-    def of_parts(
-        cls,
-        metric: Any,
-        observed: Floats,
-        weights: Floats,
-        parts: Sequence[Part],
-        components: tuple[Components, ...] = (),
-    ) -> Self:
-        """Return the sum of parts that have been prepared against these values, (N, m) and (N,)."""
-        shares = np.array([part.share for part in parts])
-        return cls(metric, observed, weights, tuple(parts), shares, components)
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -115,9 +99,7 @@ class CompositeDiscrepancy(Discrepancy):
         """Components that are evaluated together, with their places; the last have one number."""
         several = [k for k, part in enumerate(self.members) if part.target.event]
         single = [k for k, part in enumerate(self.members) if not part.target.event]
-        sums: list[tuple[list[int], PartSum]] = [
-            ([k], PartSum((self.members[k],))) for k in several
-        ]
+        sums = [([k], PartSum((self.members[k],))) for k in several]
         if single:
             parts = tuple(self.members[k] for k in single)
             sums.append((single, parts[0].target.together(parts)))
@@ -144,16 +126,15 @@ class CompositeDiscrepancy(Discrepancy):
         return total
 
 
-def components_summary(target: Discrepancy) -> str:
-    """Return what principal components leave out, for a reader; empty if there are none."""
+def components_summary(target: Discrepancy, *, missed: bool = False) -> str:
+    """Return what principal components leave out, or only the structure of the data among it."""
     components = target.components if isinstance(target, CompositeDiscrepancy) else ()
-    return "; ".join(c.summary for c in components)
+    texts = [c.missed if missed else c.summary for c in components]
+    return "; ".join(filter(None, texts))
 
 
-def components_missed(target: Discrepancy) -> str:
-    """Return the structure of the data that principal components leave out; empty if none."""
-    components = target.components if isinstance(target, CompositeDiscrepancy) else ()
-    return "; ".join(c.missed for c in components if c.missed)
+# What a metric of several outputs declares as its metric of one output does.
+_DECLARED = "minimum", "additive", "symbolic", "takes_weights", "tail_responses", "distance"
 
 
 @dataclass(frozen=True)
@@ -162,53 +143,17 @@ class LiftedMetric(Metric):
 
     metric: Metric
     counts_failures: ClassVar[bool] = True
+    takes_outputs: ClassVar[bool] = True
+    additive = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.metric, Metric):
+        if not isinstance(self.metric, Metric) or self.metric.takes_outputs:
             raise TypeError(
                 f"metric: got {called(self.metric)}, expected a metric of one output, such as "
                 "prb.ProbabilityResidual()"
             )
-        if self.metric.takes_outputs:
-            raise TypeError(
-                f"metric: got {called(self.metric)}, which compares several outputs already, "
-                "expected a metric of one output, such as prb.ProbabilityResidual()"
-            )
-
-    @property
-    def minimum(self) -> Minimum:  # type: ignore[override]
-        """How a discrepancy behaves around its minimum: as that of one output does."""
-        return self.metric.minimum
-
-    @property
-    def symbolic(self) -> bool:  # type: ignore[override]
-        """Whether the outer function can be written as a graph."""
-        return self.metric.symbolic
-
-    @property
-    def tail_responses(self) -> int:  # type: ignore[override]
-        """Simulated responses for each observation that one output needs."""
-        return self.metric.tail_responses
-
-    @property
-    def distance(self) -> bool:  # type: ignore[override]
-        """Whether equal samples have a discrepancy of zero."""
-        return self.metric.distance
-
-    @property
-    def additive(self) -> bool:
-        """Whether the gradient is a mean over observations, where all outputs are measured."""
-        return self.metric.additive
-
-    @property
-    def takes_weights(self) -> bool:
-        """Whether simulated responses may have unequal weights, as under `Reweighted`."""
-        return self.metric.takes_weights
-
-    @property
-    def takes_outputs(self) -> bool:
-        """Yes."""
-        return True
+        for name in _DECLARED:
+            object.__setattr__(self, name, getattr(self.metric, name))
 
     def like(self, metric: Metric) -> Metric:
         """Return the same comparison of outputs by another metric of one."""
@@ -239,8 +184,9 @@ class LiftedMetric(Metric):
         if observed.shape[1] > 1:
             return self._prepare_outputs(observed, weights)
         target = self.metric.against(observed[:, 0], weights)
-        part = Part(target, 1.0, "output", OnlyOutput())
-        return CompositeDiscrepancy.of_parts(self, observed, weights, [part])
+        view = Projection(np.array([0]), np.array([np.inf]), np.zeros(1), np.ones(1))
+        parts = (Part(target, 1.0, "output", view),)
+        return CompositeDiscrepancy(self, observed, weights, parts, np.ones(1))
 
     @abstractmethod
     def _prepare_outputs(self, observed: Floats, weights: Floats) -> Discrepancy:
@@ -410,22 +356,26 @@ class Joint(LiftedMetric):
                 runs = design[:, outputs]
                 runs = _capped(runs[~np.isnan(runs).any(axis=1)], caps[outputs])
             sample = observed[:, outputs]
-            white, principal = self._white(sample, weights, outputs, caps[outputs], runs, n_inputs)
+            (center, axes), principal = self._white(
+                sample, weights, outputs, caps[outputs], runs, n_inputs
+            )
             components += principal
-            centered = Centered(outputs, caps[outputs], white.center)
-            m = white.axes.shape[1]
+            m = axes.shape[1]
             number = 1 if m == 1 else self.directions or sufficient_directions(m)
             which = ""
             if outputs.size < observed.shape[1]:
                 which = f" of outputs {', '.join(map(str, outputs.tolist()))}"
             for k, direction in enumerate(directions(m, number, self.random_seed)):
-                view = Projection(centered, white.axes @ direction)
+                view = Projection(outputs, caps[outputs], center, axes @ direction)
                 values, index = view.observed_of(observed)
                 target = self.metric.against(values, weights[index])
                 parts.append(Part(target, share / number, f"direction {k + 1}{which}", view))
         targets = self.metric.on_one_scale([part.target for part in parts])
         parts = [replace(p, target=target) for p, target in zip(parts, targets, strict=True)]
-        return CompositeDiscrepancy.of_parts(self, observed, weights, parts, tuple(components))
+        shares = np.array([part.share for part in parts])
+        return CompositeDiscrepancy(
+            self, observed, weights, tuple(parts), shares, tuple(components)
+        )
 
     def _white(
         self,
@@ -435,34 +385,32 @@ class Joint(LiftedMetric):
         caps: Floats,
         design: Floats | None,
         n_inputs: int | None,
-    ) -> tuple[Whitening, list[Components]]:
+    ) -> tuple[_Coordinates, list[Components]]:
         """Return white coordinates of some outputs, or of their principal components."""
-        uses_components = outputs.size > MOST_OUTPUTS or self.components is not None
-        if outputs.size < 2 or not uses_components:
-            is_finite = np.isfinite(sample).all(axis=-1)
-            sample, weights = sample[is_finite], weights[is_finite]
-            white = whitening(sample, weights, outputs)
-            if n_inputs is not None and n_inputs < outputs.size:
-                white = _flat(sample, weights, outputs, n_inputs) or white
-            return white, []
-        is_complete = ~np.isnan(sample).any(axis=-1)
-        sample, weights = _capped(sample[is_complete], caps), weights[is_complete]
-        weights = weights / weights.sum()
-        principal = principal_components(sample, weights, self.components, design)
-        return _whitened_scores(principal, sample, weights), [principal]
+        if outputs.size > 1 and (outputs.size > MOST_OUTPUTS or self.components is not None):
+            is_complete = ~np.isnan(sample).any(axis=-1)
+            sample, weights = _capped(sample[is_complete], caps), weights[is_complete]
+            weights = weights / weights.sum()
+            principal = principal_components(sample, weights, self.components, design)
+            return _whitened_scores(principal, sample, weights), [principal]
+        is_finite = np.isfinite(sample).all(axis=-1)
+        sample, weights = sample[is_finite], weights[is_finite]
+        white = whitening(sample, weights, outputs)
+        if n_inputs is not None and n_inputs < outputs.size:
+            white = _flat(sample, weights, outputs, n_inputs) or white
+        return white, []
 
 
-def _whitened_scores(principal: Components, sample: Floats, weights: Floats) -> Whitening:
+def _whitened_scores(principal: Components, sample: Floats, weights: Floats) -> _Coordinates:
     """Return white coordinates of the scores on principal components."""
     scores = (sample - principal.center) @ principal.axes
-    white = whitening(scores, weights, np.arange(principal.number))
-    center = principal.center + principal.axes @ white.center
-    return Whitening(center, principal.axes @ white.axes)
+    center, axes = whitening(scores, weights, np.arange(principal.number))
+    return principal.center + principal.axes @ center, principal.axes @ axes
 
 
 def _flat(
     sample: Floats, weights: Floats, outputs: NDArray[np.intp], n_inputs: int
-) -> Whitening | None:
+) -> _Coordinates | None:
     """Return white coordinates of a surface that outputs of fewer inputs lie on; None if too bent.
 
     Whitening weights the bend of a surface as much as the places of specimens on it, which say more
@@ -474,8 +422,8 @@ def _flat(
     for number in range(max(1, n_inputs), outputs.size):
         principal = principal_components(standard, weights, number)
         if principal.left_out <= LEFT_OUT:
-            white = _whitened_scores(principal, standard, weights)
-            return Whitening(center + unit * white.center, white.axes / unit[:, None])
+            inner, axes = _whitened_scores(principal, standard, weights)
+            return center + unit * inner, axes / unit[:, None]
     return None
 
 

@@ -28,14 +28,7 @@ class Readings:
     def exact(cls, values: Floats) -> Readings:
         """Return readings without error, (N, m)."""
         zero, missing = np.zeros_like(values), np.full_like(values, np.nan)
-        return cls(
-            values=values,
-            error=zero,
-            step=zero,
-            lower=missing,
-            upper=missing,
-            is_relative=np.zeros(values.shape, dtype=bool),
-        )
+        return cls(values, zero, zero, missing, missing, np.zeros(values.shape, dtype=bool))
 
     def __len__(self) -> int:
         return len(self.values)
@@ -154,7 +147,7 @@ class Repeats:
         return terms.sum(axis=-1)
 
 
-def side_by_side[Record: (Readings, Repeats)](records: Sequence[Record]) -> Record:
+def side_by_side(records: Sequence[Any]) -> Any:
     """Return the records of different outputs of the same specimens as one."""
     first = records[0]
     names = [f.name for f in fields(first)]
@@ -167,16 +160,9 @@ def averaged(
 ) -> tuple[Readings, Floats, Repeats]:
     """Return the readings of S specimens with their scale, (S, m); the mean of repeated readings.
 
-    Parameters
-    ----------
-    readings : Readings
-        N rows.
-    scale : ndarray, shape (N, m)
-        Standard deviation of each reading's error, in any unit e; positive for repeated readings.
-    numbers : ndarray of int, shape (N,)
-        Specimen of each row.
-    count : ndarray of int, shape (S, m)
-        Number of readings of each output.
+    ``scale``, (N, m), is the standard deviation of each reading's error, in any unit e; it is
+    positive for repeated readings. ``numbers``, (N,), is the specimen of each row, and ``count``,
+    (S, m), the number of readings of each output.
     """
     present = np.nonzero(readings.is_measured | readings.is_censored)
     places = numbers[present[0]], present[1]
@@ -188,17 +174,20 @@ def averaged(
         result[places] = values[present]
         return result
 
-    names = ("values", "lower", "upper")
-    arrays: dict[str, Any] = {name: by_specimen(getattr(readings, name), np.nan) for name in names}
-    for name in ("error", "step"):
-        values = getattr(readings, name)
-        arrays[name] = by_specimen(values, np.median(values, axis=0))
-    arrays["is_relative"] = np.broadcast_to(readings.is_relative[:1], count.shape)
-    combined = by_specimen(scale, np.median(scale, axis=0))
+    error = by_specimen(readings.error, np.median(readings.error, axis=0))
+    combined = Readings(
+        values=by_specimen(readings.values, np.nan),
+        error=error,
+        step=by_specimen(readings.step, np.median(readings.step, axis=0)),
+        lower=by_specimen(readings.lower, np.nan),
+        upper=by_specimen(readings.upper, np.nan),
+        is_relative=np.broadcast_to(readings.is_relative[:1], count.shape),
+    )
+    single_scale = by_specimen(scale, np.median(scale, axis=0))
     is_repeated = count > 1
-    zero = np.zeros(count.shape)
     if not is_repeated.any():
-        return Readings(**arrays), combined, Repeats(zero, zero, zero)
+        zero = np.zeros(count.shape)
+        return combined, single_scale, Repeats(zero, zero, zero)
 
     def total(values: Floats) -> Floats:
         result = np.zeros(count.shape)
@@ -211,14 +200,17 @@ def averaged(
         mean = total(y / c**2) / precision
         within = total(((y - mean[places]) / c) ** 2)
         mean_scale = precision**-0.5
-        error = arrays["error"]
-        arrays["error"] = np.where(is_repeated, error / combined * mean_scale, error)
+        mean_error = error / single_scale * mean_scale
         normal = (count - 1) / 2 * np.log(2 * np.pi)
         constant = np.log(mean_scale) - total(np.log(c)) - normal
-    arrays["values"] = np.where(is_repeated, mean, arrays["values"])
+    combined = replace(
+        combined,
+        values=np.where(is_repeated, mean, combined.values),
+        error=np.where(is_repeated, mean_error, error),
+    )
     n_extra = np.where(is_repeated, count - 1.0, 0.0)
     repeats = Repeats(n_extra, within, np.where(is_repeated, constant, 0.0))
-    return Readings(**arrays), np.where(is_repeated, mean_scale, combined), repeats
+    return combined, np.where(is_repeated, mean_scale, single_scale), repeats
 
 
 def log_interval_probability(low: Any, high: Any, xp: Any = np) -> Any:

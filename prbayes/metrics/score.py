@@ -21,29 +21,16 @@ from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """Options of scores.
+    """Options of scores."""
 
-    Attributes
-    ----------
-    reach : float
-        Default bandwidths beyond the ends of the data, farther than which the score of a
-        log-density is constant. It would grow without bound, and the tail of the population would
-        decide on the posterior. The extremes expected of all specimens of the model count as data.
-    step : float
-        Relative step of central differences.
-    block : int
-        Number of specimens that are evaluated at once.
-    nodes : int
-        Nodes of the tables of scores as functions of a response.
-    margin : float
-        Default bandwidths beyond all responses at the estimate where the tables end.
-    """
-
+    # Default bandwidths beyond the ends of the data, farther than which the score of a log-density
+    # is constant. It would grow without bound, and the tail of the population would decide on the
+    # posterior. The extremes expected of all specimens of the model count as data.
     reach: float = 2.0
-    step: float = 1e-4
-    block: int = 128
-    nodes: int = 1024
-    margin: float = 10.0
+    step: float = 1e-4  # relative step of central differences
+    block: int = 128  # specimens that are evaluated at once
+    nodes: int = 1024  # of the tables of scores as functions of a response
+    margin: float = 10.0  # default bandwidths beyond all responses where the tables end
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,22 +48,20 @@ class WeightSlopes:
         positive = np.maximum(self.weights, 1e-3 * self.weights.mean())
         return np.asarray(np.sqrt((self.slopes**2 / positive).sum(axis=1)))
 
-    def neighbours(self, part: Part, options: ScoreOptions) -> tuple[list[Floats], list[Floats]]:
-        """Return features of a part at theta plus and minus a step, (d, ...) each."""
+    def neighbours(
+        self, part: Part, options: ScoreOptions
+    ) -> tuple[list[Floats], list[Floats], Floats]:
+        """Return features of a part at theta plus and minus a step, (d, ...), and steps, (d,)."""
+        steps = np.asarray(options.step / np.maximum(self.spread, np.finfo(float).tiny))
         basis = part.target.basis(part.of(self.responses))
         features = basis.features(self.weights[None])
         slopes = basis.features(self.slopes)
-        column = self.steps(options)[:, None]
         upper, lower = [], []
         for feature, slope in zip(features, slopes, strict=True):
-            shift = column * slope
+            shift = steps[:, None] * slope
             upper.append(feature + shift)
             lower.append(feature - shift)
-        return upper, lower
-
-    def steps(self, options: ScoreOptions) -> Floats:
-        """Return the steps of the elements, (d,)."""
-        return np.asarray(options.step / np.maximum(self.spread, np.finfo(float).tiny))
+        return upper, lower, steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,23 +71,21 @@ class ShiftedResponses:
     responses: Floats  # (M,) or (M, m): at theta itself
     upper: Floats  # (d, M) or (d, M, m)
     lower: Floats
-    lengths: Floats  # (d,): the steps
+    steps: Floats  # (d,)
 
     @property
     def weights(self) -> Floats:
         """Equal weights of the responses, (M,)."""
         return np.full(len(self.responses), 1 / len(self.responses))
 
-    def neighbours(self, part: Part, options: ScoreOptions) -> tuple[list[Floats], list[Floats]]:
-        """Return features of a part at theta plus and minus a step, (d, ...) each."""
+    def neighbours(
+        self, part: Part, options: ScoreOptions
+    ) -> tuple[list[Floats], list[Floats], Floats]:
+        """Return features of a part at theta plus and minus a step, (d, ...), and steps, (d,)."""
         weights = np.full(self.upper.shape[:2], 1 / self.upper.shape[1])
         upper = part.target.features(part.of(self.upper), weights, np)
         lower = part.target.features(part.of(self.lower), weights, np)
-        return list(upper), list(lower)
-
-    def steps(self, options: ScoreOptions) -> Floats:
-        """Return the steps of the elements, (d,)."""
-        return self.lengths
+        return list(upper), list(lower), self.steps
 
 
 def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floats) -> Discrepancy:
@@ -125,16 +108,14 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
     rows = responses.reshape(len(responses), -1)
     # Remote responses without weight would stretch the grid.
     is_used = np.isfinite(rows).all(axis=1) & (weights > 1e-8 * weights.max())
-    used_weights = weights[is_used]
-    used_weights = used_weights / used_weights.sum()
+    used_weights = weights[is_used] / weights[is_used].sum()
     prepared = metric.like(inner).against(responses[is_used], used_weights)
     return prepared.with_observed(target.observed)
 
 
 def _bandwidth_of_fewer(sample: Floats, weights: Floats, rule: BandwidthRule, size: int) -> float:
     """Return the bandwidth of a number of specimens, by a rule in proportion to n^(-1/5)."""
-    squares = (weights**2).sum()
-    factor = (squares * size) ** -0.2
+    factor = ((weights**2).sum() * size) ** -0.2
     return float(factor * rule(sample, weights))
 
 
@@ -210,33 +191,24 @@ def _part_scores(
 ) -> Floats:
     """Return the scores, (n, d), of values that a part compares, (n,)."""
     target = part.target
-    upper, lower = population.neighbours(part, options)
     if target.metric.likelihood:
-        values = _within_reach(part, population, values, options, total)
+        # Limit the values to the reach of the data, or of as many specimens as all simulators have.
+        observed, weights = finite_sample(target.observed, target.weights)
+        lowest, highest = observed.min(), observed.max()
+        if total > len(target.observed):
+            simulated, mass = np.asarray(part.of(population.responses)), population.weights
+            is_finite = np.isfinite(simulated)
+            prob = 1 / (total + 1)
+            extremes = quantile(simulated[is_finite], mass[is_finite], [prob, 1 - prob])
+            lowest, highest = min(lowest, extremes[0]), max(highest, extremes[1])
+        margin = options.reach * twice_silverman(observed, weights)
+        limited = np.clip(values, lowest - margin, highest + margin)
+        values = np.where(np.isfinite(values), limited, values)
+    # Central differences of the discrepancy from each specimen.
+    upper, lower, steps = population.neighbours(part, options)
     blocks = []
     for start in range(0, len(values), options.block):
         block = values[start : start + options.block]
         single = target.with_observed(block, np.eye(len(block))[:, None])
         blocks.append(single.outer(*upper, xp=np) - single.outer(*lower, xp=np))
-    return np.asarray(np.concatenate(blocks) / (2 * population.steps(options)))
-
-
-def _within_reach(
-    part: Part,
-    population: WeightSlopes | ShiftedResponses,
-    values: Floats,
-    options: ScoreOptions,
-    total: int,
-) -> Floats:
-    """Return values of a log-density's part limited to the reach of the data, (n,)."""
-    target = part.target
-    observed, weights = finite_sample(target.observed, target.weights)
-    lower, upper = observed.min(), observed.max()
-    if total > len(target.observed):
-        simulated = np.asarray(part.of(population.responses))
-        is_finite = np.isfinite(simulated)
-        prob = 1 / (total + 1)
-        extremes = quantile(simulated[is_finite], population.weights[is_finite], [prob, 1 - prob])
-        lower, upper = min(lower, extremes[0]), max(upper, extremes[1])
-    margin = options.reach * twice_silverman(observed, weights)
-    return np.where(np.isfinite(values), np.clip(values, lower - margin, upper + margin), values)
+    return np.asarray(np.concatenate(blocks) / (2 * steps))

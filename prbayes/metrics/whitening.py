@@ -64,21 +64,12 @@ class Components:
 def principal_components(
     sample: Floats, weights: Floats, number: int | None = None, design: Floats | None = None
 ) -> Components:
-    """Return principal components of observed outputs and of a design together.
+    """Return principal components of observed outputs, (n, m), and of a design, (k, m), together.
 
     They are those of the mean of both scatters, each in units of its variance, and so span what the
     data vary in, and what similar populations could vary in. The weight of a specimen falls with
-    its distance from the middle of the data.
-
-    Parameters
-    ----------
-    sample, weights : ndarray, shapes (n, m), (n,)
-        Finite, of outputs in one unit.
-    number : int, optional
-        By default the fewest that leave out a hundredth of either variance, at most eight, or one
-        for five specimens.
-    design : ndarray, shape (k, m), optional
-        Simulated outputs, finite.
+    its distance from the middle of the data. By default their ``number`` is the fewest that leave
+    out a hundredth of either variance, at most eight, or one for five specimens.
     """
     n, m = sample.shape
     middle = np.array([quantile(y, weights, 0.5) for y in sample.T])
@@ -90,20 +81,19 @@ def principal_components(
         equal = np.full(len(design), 1 / len(design))
         scatters.append(_robust_moments(design, equal, middle, typical)[1])
     scaled = [s / max(float(np.trace(s)), np.finfo(float).tiny) for s in scatters]
-    _, vectors = np.linalg.eigh(np.mean(scaled, axis=0))
-    axes = vectors[:, ::-1]
-    # The variance that the first components explain of each.
-    shares = [np.einsum("ij,ik,kj->j", axes, s, axes) for s in scaled]
-    explained = np.array([np.cumsum(share) for share in shares])
+    axes = np.linalg.eigh(np.mean(scaled, axis=0))[1][:, ::-1]
+    # The variance of each scatter that the first components explain.
+    variances = [np.einsum("ij,ik,kj->j", axes, s, axes) for s in scaled]
+    explained = np.cumsum(variances, axis=1)
     if number is None:
         is_sufficient = (explained >= 1 - LEFT_OUT).all(axis=0)
         sufficient = int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m
         number = min(sufficient, max(1, min(m, MOST_OUTPUTS, n // 5)))
     # Signs that do not depend on the algorithm.
     largest = np.abs(axes).argmax(axis=0)
-    signs = np.sign(axes[largest, np.arange(m)])
-    axes = (axes * signs)[:, :number]
+    axes = (axes * np.sign(axes[largest, np.arange(m)]))[:, :number]
     left_out = 1 - explained[:, number - 1].clip(0, 1)
+    # The correlation of neighbours in the remainder.
     centered = sample - center
     rest = centered - centered @ axes @ axes.T
     rest = rest - rest.mean(axis=0)
@@ -140,24 +130,14 @@ def _robust_moments(
 _DEGREES = (1.0, 3.0, np.inf)
 
 
-@dataclass(frozen=True, eq=False)
-class Whitening:
-    """Coordinates ``(y - center) @ axes`` of outputs y, in units of a normal sample's sd."""
-
-    center: Floats  # (m,)
-    axes: Floats  # (m, m): a coordinate a column
-
-
-def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whitening:
-    """Return invariant coordinates of a weighted sample.
+def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return center and axes of invariant coordinates ``(y - center) @ axes`` of a sample, (n, m).
 
     They are the same, to rounding, after any invertible affine map of the outputs: location and
     scatter are maximum likelihood of a t distribution [1]_, axes and signs are those of another
     scatter and of a third moment relative to it [2]_. All of them are robust to gross outliers.
-
-    The sample, (n, m), and weights are finite; messages use the numbers of the outputs, (m,).
-    Raises ValueError if an output has equal values, outputs depend on each other linearly, or the
-    specimens are fewer than m + 2.
+    Messages use the numbers of the ``outputs``, (m,). Raises ValueError if an output has equal
+    values, outputs depend on each other linearly, or the specimens are fewer than m + 2.
 
     References
     ----------
@@ -202,7 +182,7 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     squares = (white**2).sum(axis=-1)
     size = quantile(squares, weights, 0.5) / (2 * gammaincinv(m / 2, 0.5))
     axes = root / np.sqrt(size)
-    return Whitening(center + location * unit, axes / unit[:, None])
+    return center + location * unit, axes / unit[:, None]
 
 
 def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -264,4 +244,5 @@ def _singular(x: Floats, weights: Floats) -> tuple[Floats, Floats]:
 
 
 def _listed(outputs: NDArray[np.intp]) -> str:
+    """Return the numbers of outputs for a message."""
     return ", ".join(map(str, outputs.tolist()))

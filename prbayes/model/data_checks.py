@@ -96,31 +96,18 @@ def _has_few_steps(column: Floats) -> bool:
 
 @dataclass(frozen=True)
 class DataCheckOptions:
-    """Thresholds of the checks.
+    """Thresholds of the checks."""
 
-    Parameters
-    ----------
-    step : float
-        Largest step of rounded values, in standard deviations, that a monotone response allows. At
-        .25 the standard deviation is .05 posterior standard deviations too large with 200
-        specimens, at .5 .21.
-    step_at_turning_point : float
-        The same where the response has a turning point. At .02 the bias is .02 posterior standard
-        deviations with 200 specimens, at .05 .08 (folded response).
-    censored : float
-        Largest p-value of a pile at an end.
-    repeated : float
-        Largest p-value of repeats among specimens that are rounded in all outputs.
-    draws : int
-        Bootstrap samples of each p-value.
-    seed : int
-    """
-
+    # Largest step of rounded values, in standard deviations, for a monotone response. At .25 the
+    # standard deviation is .05 posterior standard deviations too large with 200 specimens, at .5
+    # .21.
     step: float = 0.25
+    # The same for a response with a turning point. At .02 the bias is .02 posterior standard
+    # deviations with 200 specimens, at .05 .08 (folded response).
     step_at_turning_point: float = 0.02
-    censored: float = 0.05
-    repeated: float = 0.01
-    draws: int = 399
+    censored: float = 0.05  # largest p-value of a pile at an end
+    repeated: float = 0.01  # largest p-value of repeats among specimens rounded in all outputs
+    draws: int = 399  # bootstrap samples of each p-value
     seed: int = 0
 
 
@@ -150,22 +137,14 @@ def resolution(y: Floats, tolerance: float = 1e-6) -> float:
     return 0.0
 
 
-@dataclass(frozen=True)
-class Ends:
-    """Numbers of values at the largest and at the smallest value of a sample, with p-values.
+def count_at_ends(
+    y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0
+) -> tuple[NDArray[np.intp], Floats]:
+    """Return the numbers of values at the largest and smallest one, (2,), and p-values, (2,).
 
-    Each p-value is adjusted for both ends.
-    """
-
-    counts: tuple[int, int]
-    p_values: tuple[float, float]
-
-
-def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0) -> Ends:
-    """Count the values at either end, and return p-values of the hypothesis of no censoring.
-
-    Two exact values are never equal, so that two values at an end suffice without rounding: size 0,
-    power .98 for 10 % censored of 50 specimens.
+    The hypothesis is that no value is censored; p-values are adjusted for both ends. Two exact
+    values are never equal, so that two values at an end suffice without rounding: size 0, power
+    .98 for 10 % censored of 50 specimens.
 
     For rounded values the null distribution is a bootstrap of normal values with the same step. A
     population that is not normal piles up at an end by itself. Therefore the density at the end
@@ -192,9 +171,7 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
         width = (cells + 0.5) * step
         near = np.array([np.sum(y > high - width), np.sum(y < low + width)])
         p_values = np.maximum(bootstrap, bdtrc(at_end - 1, near, 1 / (1 + cells)))
-    top, bottom = at_end.tolist()
-    p_top, p_bottom = p_values.tolist()
-    return Ends((top, bottom), (p_top, p_bottom))
+    return at_end, p_values
 
 
 def identical_specimens(y: Floats) -> tuple[tuple[int, ...], ...]:
@@ -221,7 +198,11 @@ def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0)
 
     Steps, (m,), are 0 for exact outputs, in which specimens do not agree by chance.
     """
-    repeats = _count_repeats(y)
+
+    def count_repeats(values: Floats) -> int:
+        return sum(len(group) - 1 for group in identical_specimens(values))
+
+    repeats = count_repeats(y)
     if not repeats:
         return 1.0
     measured = np.isfinite(y)
@@ -234,13 +215,8 @@ def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0)
     null = []
     for _ in range(draws):
         move = np.where(steps > 0, fine * rng.integers(-1, 2, y.shape), rng.random(y.shape))
-        null.append(_count_repeats(cells + move))
+        null.append(count_repeats(cells + move))
     return (np.sum(np.array(null) >= repeats) + 1) / (draws + 1)
-
-
-def _count_repeats(y: Floats) -> int:
-    """Return the number of specimens that repeat an earlier one."""
-    return sum(len(group) - 1 for group in identical_specimens(y))
 
 
 def data_findings(
@@ -251,26 +227,11 @@ def data_findings(
     rounded: ArrayLike = np.nan,
     options: DataCheckOptions | None = None,
 ) -> tuple[Finding, ...]:
-    """Return findings of rounded, censored and repeated data.
+    """Return findings of rounded, censored and repeated data, (N,) or (N, m), by output.
 
-    Parameters
-    ----------
-    y : array_like, shape (N,) or (N, m)
-        Measured outputs. Values that are not finite count as not measured.
-    labels : sequence of str, optional
-        Names of the outputs.
-    several_roots : bool
-        Whether several inputs have the same response, as beside a turning point. There rounding is
-        never harmless.
-    rounded : array_like, shape () or (m,)
-        Steps that the user stated. NaN where none was.
-    options : DataCheckOptions, optional
-
-    Returns
-    -------
-    tuple of Finding
-        Codes ``rounded-data``, ``censored-data`` and ``identical-specimens``. An output with a
-        stated step has no finding of rounding.
+    Values that are not finite count as not measured. With several roots inputs have the same
+    response, as beside a turning point, and rounding is never harmless. ``rounded`` are the steps
+    that the user stated, () or (m,), NaN where none was: such an output has no finding of rounding.
 
     Examples
     --------
@@ -286,7 +247,6 @@ def data_findings(
     y = np.where(np.isfinite(y), y, np.nan).reshape(len(y), -1)
     m = y.shape[1]
     labels = [f"observed[{j}]" for j in range(m)] if labels is None else labels
-    stated_steps = np.broadcast_to(rounded, m)
     largest_step = options.step_at_turning_point if several_roots else options.step
     # Copies of a specimen would pile up at the ends of its outputs.
     copies = [i for group in identical_specimens(y) for i in group[1:]]
@@ -295,60 +255,45 @@ def data_findings(
     findings: list[Finding] = []
     steps = np.zeros(m)
     exact = y.copy()  # NaN at a limit, where specimens are equal by censoring
-    for j, label in enumerate(labels):
+    for j, (label, stated) in enumerate(zip(labels, np.broadcast_to(rounded, m), strict=True)):
         values = y[np.isfinite(y[:, j]), j]
         if len(values) < 3:
             continue
-        is_stated = not np.isnan(stated_steps[j])
-        steps[j] = step = float(stated_steps[j] if is_stated else resolution(values))
-        if not is_stated and step > largest_step * values.std(ddof=1):
-            findings.append(_rounded(label, values, step, largest_step))
+        steps[j] = step = float(resolution(values) if np.isnan(stated) else stated)
+        share = step / values.std(ddof=1) if step else 0.0
+        if np.isnan(stated) and share > largest_step:
+            text = (
+                f"{label}: got {len(values)} values that are all multiples of a step of {step:.4g} "
+                f"({share:.3g} standard deviations), expected exact values, or a step of at most "
+                f"{largest_step:g} standard deviations; pass rounded={step:.4g}."
+            )
+            findings.append(Finding("rounded-data", text, "likelihood.md#rounded-data"))
         sample = y[counted & np.isfinite(y[:, j]), j]
-        ends = count_at_ends(sample, step, options.draws, options.seed)
-        limits = {"largest": sample.max(), "smallest": sample.min()}
-        for (side, limit), count, p_value in zip(
-            limits.items(), ends.counts, ends.p_values, strict=True
-        ):
-            if p_value <= options.censored:
-                findings.append(_censored(label, side, count, len(sample), limit))
+        counts, p_values = count_at_ends(sample, step, options.draws, options.seed)
+        ends = {
+            "largest": (sample.max(), "(None, {:.6g})"),
+            "smallest": (sample.min(), "({:.6g}, None)"),
+        }
+        for (side, (limit, argument)), count, p in zip(ends.items(), counts, p_values, strict=True):
+            if p <= options.censored:
+                text = (
+                    f"{label}: got {count} of {len(sample)} values equal to the {side}, "
+                    f"{limit:.6g}, expected fewer without a limit of measurement; pass "
+                    f"censored={argument.format(limit)} if they lie beyond it, or leave out copies."
+                )
+                findings.append(Finding("censored-data", text, "likelihood.md#censored-data"))
                 exact[np.abs(y[:, j] - limit) <= step / 2, j] = np.nan
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:
-        findings.append(_identical(identical_specimens(exact)))
+        groups = identical_specimens(exact)
+        listed = "; ".join(" and ".join(map(str, group)) for group in groups[:3])
+        more = f" and {len(groups) - 3} groups more" if len(groups) > 3 else ""
+        text = (
+            f"Got specimens {listed}{more} (counted from 0) with identical values of all outputs, "
+            "expected different ones; leave out copies, pass specimens= and error= for repeated "
+            "readings, or rounded= for coarse ones."
+        )
+        findings.append(Finding("identical-specimens", text, "likelihood.md#identical-specimens"))
     return tuple(findings)
-
-
-def _rounded(label: str, values: Floats, step: float, largest: float) -> Finding:
-    share = step / values.std(ddof=1)
-    return Finding(
-        "rounded-data",
-        f"{label}: got {len(values)} values that are all multiples of a step of {step:.4g} "
-        f"({share:.3g} standard deviations), expected exact values, or a step of at most "
-        f"{largest:g} standard deviations; pass rounded={step:.4g}.",
-        "likelihood.md#rounded-data",
-    )
-
-
-def _censored(label: str, side: str, count: int, n: int, limit: float) -> Finding:
-    limits = f"(None, {limit:.6g})" if side == "largest" else f"({limit:.6g}, None)"
-    return Finding(
-        "censored-data",
-        f"{label}: got {count} of {n} values equal to the {side}, {limit:.6g}, expected fewer "
-        f"without a limit of measurement; pass censored={limits} if they lie beyond it, or "
-        "leave out copies.",
-        "likelihood.md#censored-data",
-    )
-
-
-def _identical(groups: tuple[tuple[int, ...], ...]) -> Finding:
-    shown = "; ".join(" and ".join(map(str, group)) for group in groups[:3])
-    more = f" and {len(groups) - 3} groups more" if len(groups) > 3 else ""
-    return Finding(
-        "identical-specimens",
-        f"Got specimens {shown}{more} (counted from 0) with identical values of all outputs, "
-        "expected different ones; leave out copies, pass specimens= and error= for repeated "
-        "readings, or rounded= for coarse ones.",
-        "likelihood.md#identical-specimens",
-    )
 
 
 # Runs of a response, for the log-likelihood by specimen.
@@ -510,16 +455,15 @@ def misfit_findings(
 
     The largest misfit in nats is still an error of the emulator: ten standard deviations, (m,).
     """
-    best = np.full(len(readings), np.inf)
-    np.minimum.at(best, roots.specimen, roots.misfit)
-    has_root = np.isfinite(best)
-    poor: NDArray[np.intp] = np.flatnonzero(has_root & (best > largest))
+    # The first root of each specimen with the smallest misfit.
+    order = np.lexsort((roots.misfit, roots.specimen))
+    specimens, first = np.unique(roots.specimen[order], return_index=True)
+    best = order[first]
+    has_root = np.isfinite(roots.misfit[best])
+    is_poor = has_root & (roots.misfit[best] > largest)
+    poor, rows = specimens[is_poor], best[is_poor]
     if not poor.size:
         return []
-    rows = [
-        int(np.flatnonzero(roots.specimen == i)[np.argmin(roots.misfit[roots.specimen == i])])
-        for i in poor
-    ]
     sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
     off = np.sqrt(np.mean((roots.residual[rows] * sd) ** 2, axis=0))
     outputs = ", ".join(f"{value:.2g}" for value in off)

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
@@ -24,7 +23,7 @@ from prbayes.model.measurement import Measurement
 from prbayes.model.random_variable import Node, nodes, response_name
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.response.inputs import Inputs, is_random
+from prbayes.response.inputs import is_random
 from prbayes.response.outputs import Outputs
 
 # Fields of the description of a variable, and of a simulator.
@@ -43,24 +42,22 @@ def describe(model: pm.Model) -> dict[str, Any]:
         ``variables``: name, role and distribution of each; ``simulators``: name, response, inputs,
         metric, propagation, the number of its points, and specimens.
     """
-    variables = known_variables(model)
+    named = {*model.basic_RVs, *model.deterministics}
     by_metric = nodes(model)
     likelihoods = specimen_likelihoods(model)
-    described = [(rv, "hyperparameter", _distribution(rv, variables)) for rv in model.free_RVs]
-    for variable in model.deterministics:
-        described.append(
-            (variable, "deterministic", f"computed from {_parents(variable, variables)}")
-        )
+    described = [(rv, "hyperparameter", _distribution(rv, named)) for rv in model.free_RVs]
+    for v in model.deterministics:
+        described.append((v, "deterministic", f"computed from {_parents(v, named)}"))
     for rv in model.observed_RVs:
         if rv not in by_metric and rv not in likelihoods:
-            described.append((rv, "observed", _distribution(rv, variables)))
+            described.append((rv, "observed", _distribution(rv, named)))
     simulators = []
     for node in by_metric.values():
         propagation = without_addresses(node.propagation)
-        simulators.append(_simulator(node, variables, propagation, node.bound.n_points))
+        simulators.append(_simulator(node, named, propagation, node.bound.n_points))
     for rv, measurement in measurements_of(model).items():
         n_runs = len(prepared(likelihoods[rv]).emulation.z)
-        simulators.append(_simulator(measurement, variables, f"emulator of {n_runs} runs", n_runs))
+        simulators.append(_simulator(measurement, named, f"emulator of {n_runs} runs", n_runs))
     return {
         "variables": [
             {"name": str(variable.name), "role": role, "distribution": text}
@@ -71,16 +68,33 @@ def describe(model: pm.Model) -> dict[str, Any]:
 
 
 def _simulator(
-    simulator: Node | Measurement, known: Set[Any], propagation: str, n_points: int
+    simulator: Node | Measurement, named: Set[Any], propagation: str, n_points: int
 ) -> dict[str, str]:
+    """Return the description of a simulator."""
+    inputs = []
+    for argument in simulator.inputs.arguments:
+        if isinstance(argument, int):  # the place of an aleatory input
+            inputs.append(_distribution(simulator.inputs.aleatory[argument], named))
+        elif isinstance(argument, Variable):
+            inputs.append(str(argument.name or f"an expression of {_parents(argument, named)}"))
+        else:
+            value = np.asarray(argument)
+            number = f"{value.item():.6g}" if value.size == 1 else ""
+            inputs.append(number or f"an array of shape {value.shape}")
+    specimens = ""
+    if simulator.specimens is not None:
+        labels = list(dict.fromkeys(map(str, simulator.specimens.tolist())))
+        specimens = f"{len(labels)} specimens: {', '.join(labels[:40])}"  # three lines of a report
+        if len(labels) > 40:
+            specimens += f", and {len(labels) - 40} more"
     return {
         "name": simulator.name,
         "response": response_name(simulator.responses.function),
-        "inputs": _arguments(simulator.inputs, known),
+        "inputs": ", ".join(inputs),
         "metric": without_addresses(simulator.metric),
         "propagation": propagation,
         "n_points": str(n_points),
-        "specimens": _specimens(simulator.specimens),
+        "specimens": specimens,
     }
 
 
@@ -95,16 +109,14 @@ def without_addresses(configuration: object) -> str:
 
 def as_attribute(model: pm.Model) -> dict[str, str]:
     """Return the description as an attribute of a file; none where it is too long for one."""
-    text = json.dumps(describe(model))
-    return {"model": text} if fits_attribute(text) else {}
+    return json_attribute("model", describe(model))
 
 
-def fits_attribute(text: str) -> bool:
-    """Return whether a JSON text is short enough for an attribute of an HDF5 file, below 64 KiB.
-
-    JSON writes letters beyond ASCII as six characters of a byte each: its characters are bytes.
-    """
-    return len(text) <= 60_000
+def json_attribute(name: str, content: Mapping[str, Any]) -> dict[str, str]:
+    """Return JSON as an attribute of an HDF5 file; none where it is too long, near 64 KiB."""
+    # JSON writes letters beyond ASCII as six characters of a byte each: its characters are bytes.
+    text = json.dumps(content)
+    return {name: text} if len(text) <= 60_000 else {}
 
 
 def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
@@ -119,35 +131,18 @@ def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
         return None
 
 
-def _arguments(inputs: Inputs, known: Set[Any]) -> str:
-    """Return the arguments of a response as text; an int is the place of an aleatory input."""
-    texts = []
-    for argument in inputs.arguments:
-        if isinstance(argument, int):
-            texts.append(_distribution(inputs.aleatory[argument], known))
-        elif isinstance(argument, Variable):
-            texts.append(str(argument.name or f"an expression of {_parents(argument, known)}"))
-        else:
-            value = np.asarray(argument)
-            is_number = value.size == 1
-            texts.append(f"{value.item():.6g}" if is_number else f"an array of shape {value.shape}")
-    return ", ".join(texts)
+def as_pymc_writes(rv: Any, named: Set[Any]) -> str:
+    """Return a distribution as PyMC prints it, with names of some variables.
 
-
-def known_variables(model: pm.Model) -> set[Any]:
-    """Return the variables that distributions are written with by name."""
-    return {*model.basic_RVs, *model.deterministics}
-
-
-def as_pymc_writes(rv: Any, known: Set[Any]) -> str:
-    """Return a distribution as PyMC prints it; results recognise their model by this text."""
-    text: str = str_for_dist(rv, named_vars=known)
+    Results recognise their model by this text.
+    """
+    text: str = str_for_dist(rv, named_vars=named)
     return text.removeprefix(f"{rv.name} ~ ")
 
 
-def _distribution(rv: Any, known: Set[Any]) -> str:
+def _distribution(rv: Any, named: Set[Any]) -> str:
     """Return a distribution as text for a report, with the numbers of arrays, which PyMC omits."""
-    text = as_pymc_writes(rv, known).replace("_lkjcholeskycov(", "LKJCholeskyCov(")
+    text = as_pymc_writes(rv, named).replace("_lkjcholeskycov(", "LKJCholeskyCov(")
     arrays = _constants(rv)
     if text.count(_CONSTANT) == len(arrays):
         for array in arrays:
@@ -178,39 +173,28 @@ def _constants(rv: Any) -> list[str]:
     return texts
 
 
-def _parents(variable: Any, known: Set[Any]) -> str:
+def _parents(variable: Any, named: Set[Any]) -> str:
     """Return the names of the nearest variables of the model that a variable depends on."""
 
     def inputs_of(v: Any) -> Any:
-        return None if v in known or v.owner is None else v.owner.inputs
+        return None if v in named or v.owner is None else v.owner.inputs
 
     start = [] if variable.owner is None else variable.owner.inputs
-    names = [str(v.name) for v in walk(start, inputs_of) if v in known]
+    names = [str(v.name) for v in walk(start, inputs_of) if v in named]
     return ", ".join(names) or "constants"
 
 
-def _specimens(specimens: NDArray[Any] | None) -> str:
-    """Return labels of specimens as text: three lines of a report at most."""
-    if specimens is None:
-        return ""
-    labels = list(dict.fromkeys(map(str, specimens.tolist())))
-    text = f"{len(labels)} specimens: {', '.join(labels[:40])}"
-    return f"{text}, and {len(labels) - 40} more" if len(labels) > 40 else text
-
-
-_version = cache(importlib.metadata.version)
-
-
+@cache
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     packages = ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy")
-    result = {f"{package}_version": _version(package) for package in packages}
+    result = {f"{package}_version": importlib.metadata.version(package) for package in packages}
     return {**result, "python_version": platform.python_version()}
 
 
 def arviz_attributes() -> dict[str, str]:
     """Return the attributes that ArviZ gives a group."""
-    version = _version("prbayes")
+    version = versions()["prbayes_version"]
     return {
         "created_at": datetime.now(UTC).isoformat(),
         "creation_library": "prbayes",
@@ -238,19 +222,16 @@ def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, in
     return xr.Dataset(variables, coords=coords)
 
 
-def _simulators(evaluator: Evaluator) -> list[Node | Measurement]:
-    return [*evaluator.nodes, *evaluator.measurements]
-
-
 def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the points whose response failed: simulator, inputs, reason, and replacement.
 
     Dims (failure) and (failure, column): the arguments of the response one after the other, NaN
     where another simulator has more of them. The replacement, ``instead``, is NaN for none.
     """
+    simulators: list[Node | Measurement] = [*evaluator.nodes, *evaluator.measurements]
     failures = [
         (simulator.name, simulator.responses.replacement, failure)
-        for simulator in _simulators(evaluator)
+        for simulator in simulators
         for failure in simulator.responses.failed
     ]
     columns = max((failure.inputs.size for _, _, failure in failures), default=0)
@@ -271,7 +252,8 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
 
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the observed responses of all simulators, labelled; several outputs by their names."""
-    observed = {simulator.name: simulator.observed for simulator in _simulators(evaluator)}
+    observed = {node.name: node.observed for node in evaluator.nodes}
+    observed |= {m.name: m.observed for m in evaluator.measurements}
     return labelled_responses(evaluator, observed)
 
 
@@ -284,7 +266,8 @@ def labelled_responses(
     """
     sizes = dict(zip(("chain", "draw"), leading, strict=False))
     data = labelled(evaluator, values, sizes)
-    for simulator in _simulators(evaluator):
+    simulators: list[Node | Measurement] = [*evaluator.nodes, *evaluator.measurements]
+    for simulator in simulators:
         name, outputs = simulator.name, simulator.outputs
         if name in values:
             if outputs.event:

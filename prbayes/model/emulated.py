@@ -8,7 +8,7 @@ reports use.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
@@ -35,24 +35,16 @@ from prbayes.response.response import Responses
 
 @dataclass(frozen=True)
 class EmulatedSizes:
-    """Sizes of emulated samples.
+    """Sizes of emulated samples."""
 
-    Attributes
-    ----------
-    specimens : int
-        Specimens of a population in plots and scores: the error of a quantile is far below the
-        width of a posterior band.
-    populations, of_each : int
-        Populations of the result, and specimens of each, in the weighted sample of a decision.
-        Twice as many change probabilities by less than their reported error.
-    blocks : int
-        Parts of the sample whose differences give its error.
-    """
-
+    # Specimens of a population in plots and scores: the error of a quantile is far below the width
+    # of a posterior band.
     specimens: int = 1024
+    # Populations of the result, and specimens of each, in the weighted sample of a decision. Twice
+    # as many change probabilities by less than their reported error.
     populations: int = 64
     of_each: int = 64
-    blocks: int = 8
+    blocks: int = 8  # parts of the sample whose differences give its error
 
 
 _SIZES = EmulatedSizes()
@@ -94,7 +86,9 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
 
     Raises a DesignError if fewer than eight runs have a finite response.
     """
-    runs = likelihood.coordinates.inputs(prepared(likelihood).emulation.z)
+    preparation = prepared(likelihood)
+    run_z = preparation.emulation.z
+    runs = likelihood.coordinates.inputs(run_z)
     points = values_of(runs, likelihood.inputs, responses.inputs)
     values = responses(points, [])
     coordinates = Coordinates.of_prior(responses.inputs)
@@ -107,7 +101,12 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
             f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
             "prb.predict, which computes responses at new specimens"
         )
-    is_near = _near_specimens(likelihood)
+    # Runs within the range of the specimens' roots; all if few are.
+    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
+    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
+    is_near = ((run_z >= low) & (run_z <= high)).all(axis=1)
+    if is_near.sum() < 16:
+        is_near = np.ones(len(run_z), dtype=bool)
     distinct = np.unique(z[is_finite], axis=0, return_index=True)[1]
     rows = np.flatnonzero(is_finite)[distinct]
     has_near = is_near[rows].any()
@@ -115,16 +114,6 @@ def _emulate_at_runs(likelihood: SpecimenLikelihood, responses: Responses) -> Em
     left_out = surface.left_out[is_near[rows]] if has_near else surface.left_out
     error = np.sqrt((left_out**2).mean(axis=0))
     return EmulatedResponse(coordinates, z, y, surface, slice(None), values.shape[1:], error)
-
-
-def _near_specimens(likelihood: SpecimenLikelihood) -> NDArray[np.bool_]:
-    """Return which runs are within the range of the specimens' roots, (n,); all if few are."""
-    preparation = prepared(likelihood)
-    roots = preparation.points.z[np.isfinite(preparation.points.log_a)]
-    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
-    z = preparation.emulation.z
-    is_near = ((z >= low) & (z <= high)).all(axis=1)
-    return is_near if is_near.sum() >= 16 else np.ones(len(z), dtype=bool)
 
 
 def values_of(values: Sequence[Floats], inputs: Inputs, subset: Inputs) -> list[Floats]:
@@ -143,81 +132,47 @@ class EmulatedSimulator:
     likelihood: SpecimenLikelihood
     measurement: Measurement
     place: int | None = None  # index of the group; None without groups
+    name: str = field(init=False)  # such as 'y', or 'y[Adler]' of a group
+    group: str = field(init=False)  # name of the group, empty without groups
+    rows: NDArray[np.intp] = field(init=False)  # (N,): which of the measurement's rows these are
+    observed: Floats = field(init=False)  # measured responses, (N,) or (N, m)
+    weights: Floats = field(init=False)  # of the specimens, (N,); they sum to one
+    specimens: NDArray[Any] | None = field(init=False)  # (N,): labels
+    n_specimens: float = field(init=False)  # effective number
+    metric: Metric = field(init=False)
+    inputs: Inputs = field(init=False)
+    responses: Responses = field(init=False)
+    outputs: Outputs = field(init=False)
+    has_specimens: bool = field(init=False)  # whether a population has specimens without a run
 
     is_emulated: ClassVar[Literal[True]] = True
     # As of a Node: no response is weighted.
     reweighted: ClassVar[None] = None
     max_lost: ClassVar[float] = MAX_LOST
 
-    @property
-    def has_specimens(self) -> bool:
-        """Whether a population has specimens without a run."""
-        return not self.likelihood.calls_response
-
-    @property
-    def name(self) -> str:
-        """Name of the simulator, such as 'y', or 'y[Adler]' of a group."""
-        groups = self.inputs.groups
-        if groups is None or self.place is None:
-            return self.measurement.name
-        return groups.name(self.measurement.name, self.place)
-
-    @property
-    def group(self) -> str:
-        """Name of the group, empty without groups."""
-        groups = self.inputs.groups
-        return "" if groups is None or self.place is None else groups.names[self.place]
-
-    @cached_property
-    def rows(self) -> NDArray[np.intp]:
-        """Which of the simulator's rows these are, (N,)."""
-        groups = self.measurement.groups
-        if groups is None:
-            return np.arange(len(self.measurement.observed))
-        return np.flatnonzero(groups == self.place)
-
-    @property
-    def observed(self) -> Floats:
-        """Measured responses, (N,) or (N, m)."""
-        return self.measurement.observed[self.rows]
-
-    @property
-    def weights(self) -> Floats:
-        """Weights of the specimens, (N,), which sum to one."""
-        weights = self.measurement.weights
-        factors = np.ones(len(self.rows)) if weights is None else weights[self.rows]
-        return np.asarray(factors / factors.sum())
-
-    @property
-    def specimens(self) -> NDArray[Any] | None:
-        """Labels, (N,), or None."""
-        labels = self.measurement.specimens
-        return None if labels is None else labels[self.rows]
-
-    @property
-    def n_specimens(self) -> float:
-        """Effective number of specimens."""
-        return float(1 / (self.weights**2).sum())
-
-    @property
-    def metric(self) -> Metric:
-        """The log-likelihood by specimen."""
-        return self.measurement.metric
-
-    @property
-    def inputs(self) -> Inputs:
-        """The inputs of the response."""
-        return self.measurement.inputs
-
-    @property
-    def responses(self) -> Responses:
-        """The response, and how it is called."""
-        return self.measurement.responses
-
-    @property
-    def outputs(self) -> Outputs:
-        """The outputs of a run."""
-        return self.measurement.outputs
+    def __post_init__(self) -> None:
+        """Set the attributes of the measurement, or of one of its groups."""
+        m, groups = self.measurement, self.measurement.inputs.groups
+        name, group, rows = m.name, "", np.arange(len(m.observed))
+        if groups is not None and self.place is not None:
+            name, group = groups.name(m.name, self.place), groups.names[self.place]
+            rows = np.flatnonzero(m.groups == self.place)
+        weights = np.ones(len(rows)) if m.weights is None else m.weights[rows]
+        weights = weights / weights.sum()
+        vars(self).update(
+            name=name,
+            group=group,
+            rows=rows,
+            observed=m.observed[rows],
+            weights=weights,
+            specimens=None if m.specimens is None else m.specimens[rows],
+            n_specimens=float(1 / (weights**2).sum()),
+            metric=m.metric,
+            inputs=m.inputs,
+            responses=m.responses,
+            outputs=m.outputs,
+            has_specimens=not self.likelihood.calls_response,
+        )
 
     @cached_property
     def _emulated(self) -> EmulatedResponse:
@@ -289,7 +244,10 @@ class EmulatedSample:
     points: list[Floats]  # (n, *event) by input
     log_mixture: Floats  # (n,): log-density of the specimens in the mixture
     blocks: NDArray[np.intp]  # (n,): eight parts, each of which represents the mixture
+    inputs: Inputs  # of the specimens
+    n_points: int  # number of specimens
 
+    max_lost: ClassVar[float] = MAX_LOST  # largest share of a population without response
     has_runs: ClassVar[Literal[False]] = False  # a design has runs as points
 
     @classmethod
@@ -307,22 +265,7 @@ class EmulatedSample:
         log_p = _log_density(simulator.inputs, roots, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
         blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
-        return cls(simulator, flat, log_mixture, blocks)
-
-    @property
-    def inputs(self) -> Inputs:
-        """The inputs of the specimens."""
-        return self.simulator.inputs
-
-    @property
-    def n_points(self) -> int:
-        """Number of specimens."""
-        return len(self.log_mixture)
-
-    @property
-    def max_lost(self) -> float:
-        """Largest share of a population that may have no response."""
-        return MAX_LOST
+        return cls(simulator, flat, log_mixture, blocks, simulator.inputs, len(log_mixture))
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""

@@ -6,7 +6,6 @@ It says as well whether a design supports the populations at theta, and where it
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,14 +19,13 @@ from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, roots_of, variable_names
+from prbayes.model.parameters import Hyperparameters, roots_of
 from prbayes.model.random_variable import (
     Node,
     SimulatorRV,
+    building,
     log_kernel,
     nodes,
-    priors_alone,
-    without_epsilon_warning,
 )
 from prbayes.model.specimen_likelihood import (
     log_likelihoods,
@@ -40,7 +38,7 @@ from prbayes.propagation.base import Bound
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
-from prbayes.response.compile import compiled, ninf_for_invalid, untraced
+from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 from prbayes.response.inputs import is_group
 
 # Points of a design from which on samplers start with an eighth of them.
@@ -78,6 +76,25 @@ class Evaluator:
     # Whether the nodes have the data and designs of the model, whose graph is the objective then.
     has_graph: bool = True
     functions: dict[Any, Any] = field(default_factory=dict, repr=False)  # compiled and shared
+    # The nodes, then simulators whose responses are emulated, by group.
+    simulators: list[PopulationSimulator] = field(init=False, repr=False)
+    reweighted: dict[str, ReweightedBound] = field(init=False, repr=False)  # designs by simulator
+    responses_per_theta: int = field(init=False)  # number of scalar responses of one theta
+    # Observed variables without a metric of distributions.
+    ordinary: list[Any] = field(init=False, repr=False)
+    has_other_terms: bool = field(init=False)  # whether there are such variables, or potentials
+
+    def __post_init__(self) -> None:
+        """Set the attributes of all simulators, and of the other terms."""
+        rvs = self.model.observed_RVs
+        ordinary = [rv for rv in rvs if not isinstance(rv.owner.op, SimulatorRV)]
+        vars(self).update(
+            simulators=[*self.nodes, *self.emulated],
+            reweighted={n.name: n.reweighted for n in self.nodes if n.reweighted is not None},
+            responses_per_theta=sum([node.bound.n_per_theta for node in self.nodes]),
+            ordinary=ordinary,
+            has_other_terms=bool(ordinary or self.model.potentials),
+        )
 
     @classmethod
     def of(cls, model: pm.Model) -> Evaluator:
@@ -105,16 +122,6 @@ class Evaluator:
         return _unpickled, (cloudpickle.dumps((self.model, targets)),)
 
     @property
-    def simulators(self) -> list[PopulationSimulator]:
-        """All simulators: `nodes`, then those whose responses are emulated, by group."""
-        return [*self.nodes, *self.emulated]
-
-    @property
-    def reweighted(self) -> dict[str, ReweightedBound]:
-        """The simulators that reweight the stored responses of a design, by name."""
-        return {n.name: n.reweighted for n in self.nodes if n.reweighted is not None}
-
-    @property
     def epsilon(self) -> Floats:
         """The simulators' epsilons, shape (k,), NaN where unset."""
         return np.array([node.epsilon_value for node in self.nodes])
@@ -122,19 +129,11 @@ class Evaluator:
     @property
     def n_responses(self) -> int:
         """Number of scalar responses that were computed; shared responses count once."""
-        counts = [node.bound.responses.count for node in self.nodes]
-        return _sum_over_runs(self, counts) + sum(m.responses.count for m in self.measurements)
-
-    @property
-    def responses_per_theta(self) -> int:
-        """Number of scalar responses that one theta costs."""
-        return sum(node.bound.n_per_theta for node in self.nodes)
-
-    def cached(self, key: Any, compile_function: Callable[[], Any]) -> Any:
-        """Return compiled functions by their key; the first call compiles them."""
-        if key not in self.functions:
-            self.functions[key] = compile_function()
-        return self.functions[key]
+        counts: dict[int, int] = {}  # by runs
+        for node in self.nodes:
+            runs = id(node.responses.runs)
+            counts[runs] = max(node.responses.count, counts.get(runs, 0))
+        return sum(counts.values()) + sum([m.responses.count for m in self.measurements])
 
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
@@ -145,13 +144,12 @@ class Evaluator:
                 values = log_likelihoods(likelihood, specimen_params(self, thetas, k))
                 total += values.sum(axis=1)
                 evaluated |= {m.name for m in likelihood.measurements}
-        ordinary = [rv for rv in _other_variables(self.model) if rv.name not in evaluated]
-        if ordinary or self.model.potentials:
-            function = self.cached(
-                "log_other",
-                lambda: self.hyperparameters.compile([_log_other(self.model, ordinary)]),
-            )
-            (values,) = function(np.ascontiguousarray(thetas))
+        variables = [rv for rv in self.ordinary if rv.name not in evaluated]
+        if variables or self.model.potentials:
+            if "log_other" not in self.functions:
+                graph = _log_other(self.model, variables)
+                self.functions["log_other"] = self.hyperparameters.compile([graph])
+            (values,) = self.functions["log_other"](np.ascontiguousarray(thetas))
             total = total + values
         return total
 
@@ -182,7 +180,7 @@ class Evaluator:
             log_other[rows] = self.log_other(block)
             for i, node in enumerate(self.nodes):
                 discrepancies[rows, i] = self.discrepancies(block, i)
-                lost[rows, i] = node.bound.lost
+                lost[rows, i] = node.bound.last_missing.lost
         log_prior[np.isnan(log_prior)] = -np.inf
         log_other[np.isnan(log_other)] = -np.inf
         discrepancies[np.isnan(discrepancies)] = np.inf
@@ -208,14 +206,31 @@ class Evaluator:
         The prior's density is in the user's own units, as in `pymc.find_MAP`: without Jacobian.
         Raise NotImplementedError or TypeError if the objective has no gradient.
         """
+        model = self.model
         if not self.has_graph:
             if prior or gradient:
                 raise NotImplementedError("on other data the objective is evaluated, not compiled")
             return lambda theta, scales: (self.total(theta[None], scales)[0],)
-        function = self.cached(
-            ("objective", prior, gradient),
-            lambda: _compile_objective(self, prior=prior, gradient=gradient),
-        )
+        key = ("objective", prior, gradient)
+        if key not in self.functions:
+            with interpreted():
+                graphs = [
+                    pt.as_tensor(node.bound.discrepancy(params))
+                    for node, params in zip(self.nodes, _simulator_params(self), strict=True)
+                ]
+                graphs = model.replace_rvs_by_values(graphs)
+                scales = pt.dvector("scales")
+                scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
+                total = scaled - _log_other(model, self.ordinary)
+                with building("priors"):
+                    log_prior = model.logp(vars=model.free_RVs, jacobian=False)
+                value = pt.switch(
+                    log_prior > -np.inf, total - log_prior if prior else total, np.inf
+                )
+                (value,), theta = self.hyperparameters.joined([value])
+                outputs = [value, pt.grad(value, theta)] if gradient else [value]
+                self.functions[key] = compiled([theta, scales], ninf_for_invalid(outputs))
+        function = self.functions[key]
         symbolic = [node.bound for node in self.nodes if node.bound.symbolic]
 
         def counted(theta: Floats, scales: Floats) -> Any:
@@ -246,11 +261,9 @@ class Evaluator:
         targets = []
         for node in self.nodes:
             observed = data[node.name]
-            if weights is not None:
-                counted: Floats | None = weights[node.name]
-            else:
-                same_size = np.shape(observed) == node.target.observed.shape
-                counted = node.target.weights if same_size else None
+            counted = None if weights is None else weights[node.name]
+            if weights is None and np.shape(observed) == node.observed.shape:
+                counted = node.weights
             target = (metric or node.metric).against(observed, counted)
             bound = node.bound
             dimensions = bound.inputs.dimensions
@@ -263,7 +276,12 @@ class Evaluator:
             simulator = self.emulated[k - len(self.nodes)]
             return roots_of(self.hyperparameters, thetas, simulator.inputs, simulator.place)
         key = ("roots", *(node.name for node in self.nodes))
-        function, ends = self.cached(key, lambda: _compile_roots(self))
+        if key not in self.functions:
+            params = _simulator_params(self)
+            graphs = self.model.replace_rvs_by_values([p for group in params for p in group])
+            ends = np.cumsum([0, *map(len, params)])
+            self.functions[key] = self.hyperparameters.compile(graphs), ends
+        function, ends = self.functions[key]
         values = function(np.ascontiguousarray(thetas))[ends[k] : ends[k + 1]]
         return [np.broadcast_to(value, (len(thetas), *np.shape(value)[1:])) for value in values]
 
@@ -311,51 +329,14 @@ def _simulator_params(evaluator: Evaluator) -> list[list[Any]]:
     return params
 
 
-def _compile_roots(evaluator: Evaluator) -> tuple[Any, Any]:
-    """Compile the roots of all nodes; return the function, and where the roots of each node end."""
-    params = _simulator_params(evaluator)
-    graphs = evaluator.model.replace_rvs_by_values([p for group in params for p in group])
-    return evaluator.hyperparameters.compile(graphs), np.cumsum([0, *map(len, params)])
-
-
-@untraced()
-def _compile_objective(evaluator: Evaluator, *, prior: bool, gradient: bool) -> Any:
-    """Compile the objective of `Evaluator.objective`."""
-    model = evaluator.model
-    graphs = [
-        pt.as_tensor(node.bound.discrepancy(params))
-        for node, params in zip(evaluator.nodes, _simulator_params(evaluator), strict=True)
-    ]
-    scales = pt.dvector("scales")
-    scaled = sum(graph / scales[k] for k, graph in enumerate(model.replace_rvs_by_values(graphs)))
-    total = scaled - _log_other(model, _other_variables(model))
-    with priors_alone():
-        log_prior = model.logp(vars=model.free_RVs, jacobian=False)
-    objective = total - log_prior if prior else total
-    within = pt.switch(log_prior > -np.inf, objective, np.inf)
-    (value,), theta = evaluator.hyperparameters.joined([within])
-    outputs = [value, pt.grad(value, theta)] if gradient else [value]
-    return compiled([theta, scales], ninf_for_invalid(outputs))
-
-
 # Terms beside the discrepancies.
-
-
-def _other_variables(model: pm.Model) -> list[Any]:
-    """Return the observed variables without a metric of distributions."""
-    return [rv for rv in model.observed_RVs if not isinstance(rv.owner.op, SimulatorRV)]
 
 
 def _log_other(model: pm.Model, variables: list[Any]) -> Any:
     """Return the graph of the log-likelihood of observed variables, plus potentials."""
-    with without_epsilon_warning():
+    with building("ordinary"):
         likelihood = model.logp(vars=variables) if variables else pt.constant(0.0)
     return likelihood + model.potentiallogp
-
-
-def has_other_terms(evaluator: Evaluator) -> bool:
-    """Return whether there are observed variables without a metric, or potentials."""
-    return bool(_other_variables(evaluator.model) or evaluator.model.potentials)
 
 
 def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
@@ -373,8 +354,9 @@ def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
         if joined.intersection(ancestors([rv])):
             joined.add(rv)
     indirect = {str(rv.name) for rv in joined - direct}
+    names = [str(model.values_to_rvs[v].name) for v in model.value_vars]
     sizes = [int(np.prod(s, dtype=int)) for s in evaluator.hyperparameters.shapes.values()]
-    return np.repeat([name in indirect for name in variable_names(model)], sizes)
+    return np.repeat([name in indirect for name in names], sizes)
 
 
 def likelihood_of(evaluator: Evaluator, measurement: Measurement) -> SpecimenLikelihood:
@@ -404,15 +386,14 @@ def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, 
     result = {m.name: np.empty((len(thetas), 0)) for m in evaluator.measurements}
     for k, likelihood in enumerate(evaluator.likelihoods):
         if likelihood.needs_graph:
-            functions = evaluator.cached(
-                "specimens",
-                lambda: [
-                    evaluator.hyperparameters.compile([g]) for g in specimen_graphs(evaluator)
-                ],
-            )
+            if "specimens" not in evaluator.functions:
+                graphs = specimen_graphs(evaluator)
+                compiled_graphs = [evaluator.hyperparameters.compile([g]) for g in graphs]
+                evaluator.functions["specimens"] = compiled_graphs
             rows = max(1, IN_CACHE // prepared(likelihood).points.log_a.size)
             blocks = np.split(np.ascontiguousarray(thetas), range(rows, len(thetas), rows))
-            values = np.concatenate([functions[k](block)[0] for block in blocks])
+            function = evaluator.functions["specimens"][k]
+            values = np.concatenate([function(block)[0] for block in blocks])
         else:
             values = log_likelihoods(likelihood, specimen_params(evaluator, thetas, k))
         result[likelihood.measurements[-1].name] = values
@@ -431,19 +412,13 @@ def is_current(evaluator: Evaluator) -> bool:
     return len(now) == len(previous) and all(a is b for a, b in zip(now, previous, strict=True))
 
 
-def _sum_over_runs(evaluator: Evaluator, counts: list[int]) -> int:
-    """Return the sum of counts by node; nodes that share their runs count once."""
-    by_runs: dict[int, int] = {}
-    for node, count in zip(evaluator.nodes, counts, strict=True):
-        runs = id(node.bound.responses.runs)
-        by_runs[runs] = max(count, by_runs.get(runs, 0))
-    return sum(by_runs.values())
-
-
 def n_design_runs(evaluator: Evaluator) -> int:
     """Return the number of runs of all designs; shared runs count once."""
-    bounds = [node.reweighted for node in evaluator.nodes]
-    return _sum_over_runs(evaluator, [0 if bound is None else bound.n_runs for bound in bounds])
+    counts: dict[int, int] = {}  # by runs
+    for bound in evaluator.reweighted.values():
+        runs = id(bound.responses.runs)
+        counts[runs] = max(bound.n_runs, counts.get(runs, 0))
+    return sum(counts.values())
 
 
 def missing_mass(evaluator: Evaluator, theta: Floats, k: int) -> dict[str, float]:
@@ -455,8 +430,11 @@ def missing_mass(evaluator: Evaluator, theta: Floats, k: int) -> dict[str, float
     return {"lost_mass": float(missing.lost[0]), "failed_mass": float(missing.failed[0])}
 
 
-def coarser_evaluator(evaluator: Evaluator) -> Evaluator | None:
-    """Return an evaluator with an eighth of the points of large designs; None if none is large."""
+def coarser_evaluator(evaluator: Evaluator, theta: Floats | None = None) -> Evaluator | None:
+    """Return an evaluator with an eighth of the points of large designs.
+
+    None if no design is large, or if the smaller designs do not support theta, (d,).
+    """
     bounds: list[Bound] = []
     for node in evaluator.nodes:
         bound = node.reweighted
@@ -464,24 +442,16 @@ def coarser_evaluator(evaluator: Evaluator) -> Evaluator | None:
             bounds.append(bound.copied(bound.design.rows(bound.blocks == 0)))
         else:
             bounds.append(node.bound)
-    pairs = list(zip(evaluator.nodes, bounds, strict=True))
-    if all(node.bound is bound for node, bound in pairs):
+    if bounds == [node.bound for node in evaluator.nodes]:
         return None
-    coarse = tuple(replace(node, bound=bound) for node, bound in pairs)
-    return replace(evaluator, nodes=coarse, has_graph=False)
-
-
-def coarse_where_sufficient(evaluator: Evaluator, theta: Floats) -> Evaluator:
-    """Return the coarser evaluator if its designs support theta, (d,), else the evaluator."""
-    coarse = coarser_evaluator(evaluator)
-    if coarse is None:
-        return evaluator
-    support = coarse.support(theta[None])
-    is_sufficient = [
-        support[name]["weight_ess"][0] >= bound.required_ess
-        for name, bound in coarse.reweighted.items()
-    ]
-    return coarse if all(is_sufficient) else evaluator
+    pairs = zip(evaluator.nodes, bounds, strict=True)
+    coarse_nodes = tuple([replace(node, bound=bound) for node, bound in pairs])
+    coarse = replace(evaluator, nodes=coarse_nodes, has_graph=False)
+    support = {} if theta is None else coarse.support(theta[None])
+    for name, values in support.items():
+        if not values["weight_ess"][0] >= coarse.reweighted[name].required_ess:
+            return None
+    return coarse
 
 
 @dataclass(frozen=True)
@@ -497,8 +467,7 @@ class Requirement:
 
 # Of the optimiser and the samplers, whose designs grow until they meet it. A mean weight of 0.8 to
 # 1.25 is a fifth of the population's mass either way. Half the effective sample size moves an
-# optimum by .05 standard errors; twice is more than 1024 points give with two inputs
-# (docs/constants.md).
+# optimum by .05 standard errors; twice is more than 1024 points give with two inputs.
 ENOUGH = Requirement(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
 # Of predictions, whose designs do not grow. Laxer: draws at the edge of a posterior are less well
 # supported than its centre, and resampling needs no derivative.
@@ -510,45 +479,14 @@ VISIBLE = Requirement(ess=0.2, lowest_ess=0.2, mass=(0.5, 2.0), tails=False)
 
 @dataclass(frozen=True)
 class Shortcoming:
-    """Requirements that a design does not meet for populations; false if it meets all."""
+    """Requirements that a design does not meet for populations."""
 
-    # Share of a population's weight on points without response, at the 95% quantile, if too much.
-    lost: float | None
-    # Weight effective sample size, 5% quantile and median, if too small.
-    ess: tuple[float, float] | None
-    mass: tuple[float, float] | None  # mean raw weight, lowest and highest, if out of bounds
-    max_lost: float
-    required_ess: float
-    n_points: int
-    requirement: Requirement
-
-    def __bool__(self) -> bool:
-        """Whether the design falls short of a requirement."""
-        return any(value is not None for value in (self.lost, self.ess, self.mass))
+    text: str  # what was got and expected, as the end of a sentence
+    is_lost: bool  # whether too much weight is on points without response
 
     def __str__(self) -> str:
-        """Return what was got and expected, as the end of a sentence."""
-        if self.lost is not None:
-            return (
-                f"lost mass: {self.lost:.1%} of a population's weight is on points whose response "
-                f"is NaN, expected at most max_lost = {self.max_lost:.1%}"
-            )
-        complaints = []
-        if self.ess is not None:
-            low, middle = self.ess
-            least = self.requirement.lowest_ess * self.required_ess
-            need = self.requirement.ess * self.required_ess
-            complaints.append(
-                f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) "
-                f"of {self.n_points} points, expected {least:.0f} and {need:.0f}"
-            )
-        if self.mass is not None:
-            low, high = self.mass
-            least, most = self.requirement.mass
-            complaints.append(
-                f"mean raw weight from {low:.2f} to {high:.2f}, expected within {least} to {most}"
-            )
-        return ", and ".join(complaints)
+        """Return the text."""
+        return self.text
 
 
 def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
@@ -557,7 +495,7 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]
     for name, support in evaluator.support(thetas).items():
         bound = evaluator.reweighted[name]
         short = shortcoming(support, bound.required_ess, bound.max_lost, bound.n_points, ENOUGH)
-        if short:
+        if short is not None:
             result[name] = short
     return result
 
@@ -580,29 +518,33 @@ def shortcoming(
     max_lost: float,
     n_points: int,
     requirement: Requirement,
-) -> Shortcoming:
-    """Return how a design of n points falls short of its required effective sample size.
+) -> Shortcoming | None:
+    """Return how a design of n points falls short of a requirement; None if it meets it.
 
     ``support`` has ``weight_ess``, ``mean_weight`` and ``lost_mass`` of the populations, (P,).
     """
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
+    most_lost = float(np.quantile(lost, 0.95))
+    if most_lost > max_lost:
+        return Shortcoming(
+            f"lost mass: {most_lost:.1%} of a population's weight is on points whose response "
+            f"is NaN, expected at most max_lost = {max_lost:.1%}",
+            is_lost=True,
+        )
+    complaints = []
     # Single populations far out may fall short.
     low, middle = np.quantile(ess, [0.05, 0.5])
-    at = [0.05, 0.95] if requirement.tails else [0.5, 0.5]
-    mass_low, mass_high = np.quantile(mass, at)
-    most_lost = float(np.quantile(lost, 0.95))
-    least, most = requirement.mass
+    least, need = requirement.lowest_ess * required_ess, requirement.ess * required_ess
     # A comparison with NaN is false: the design falls short.
-    has_ess = (
-        middle >= requirement.ess * required_ess and low >= requirement.lowest_ess * required_ess
-    )
-    is_covered = mass_low >= least and mass_high <= most
-    return Shortcoming(
-        lost=most_lost if most_lost > max_lost else None,
-        ess=(float(low), float(middle)) if not has_ess else None,
-        mass=(float(mass_low), float(mass_high)) if not is_covered else None,
-        max_lost=max_lost,
-        required_ess=required_ess,
-        n_points=n_points,
-        requirement=requirement,
-    )
+    if not (middle >= need and low >= least):
+        complaints.append(
+            f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) "
+            f"of {n_points} points, expected {least:.0f} and {need:.0f}"
+        )
+    lowest, highest = np.quantile(mass, [0.05, 0.95] if requirement.tails else [0.5, 0.5])
+    least, most = requirement.mass
+    if not (lowest >= least and highest <= most):
+        complaints.append(
+            f"mean raw weight from {lowest:.2f} to {highest:.2f}, expected within {least} to {most}"
+        )
+    return Shortcoming(", and ".join(complaints), is_lost=False) if complaints else None

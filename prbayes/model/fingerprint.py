@@ -9,25 +9,20 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from enum import IntEnum
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import pymc as pm
 from pymc.printing import str_for_dist
 
-from prbayes._validate import Floats
-from prbayes.model.description import (
-    as_pymc_writes,
-    fits_attribute,
-    known_variables,
-    without_addresses,
-)
+from prbayes.model.description import as_pymc_writes, json_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import Measurement
-from prbayes.model.parameters import fixed_points, plain_names
+from prbayes.model.parameters import fixed_points
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.response.compile import interpreted
@@ -68,10 +63,10 @@ class SimulatorIdentity:
     inputs: str  # the response's arguments, as PyMC prints them
     metric: str
     propagation: str
-    n_points: int  # runs of the design
-    batches: int  # how often points of the design were drawn
-    epsilon: float  # NaN while unset
-    responses: tuple[float, ...]  # the first ones
+    n_points: int = 0  # runs of the design
+    batches: int = 1  # how often points of the design were drawn
+    epsilon: float = 1.0  # NaN while unset
+    responses: tuple[float, ...] = ()  # the first ones
     discrepancies: tuple[float, ...] = ()  # at fixed thetas; empty where they would cost responses
     # Aleatory inputs of the first two responses; empty where the response has epistemic ones.
     points: tuple[tuple[float, ...], ...] = ()
@@ -94,28 +89,29 @@ class Identity:
 
 def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) -> Identity:
     """Return the identity of an evaluator's problem, with numbers; computes no response."""
-    names = evaluator.hyperparameters
-    thetas = fixed_points(names, 4)  # a power of two: Sobol points are balanced then
+    hyperparameters = evaluator.hyperparameters
+    # A power of two: Sobol points are balanced then.
+    thetas, order = fixed_points(hyperparameters, 4)
     simulators = []
     for k, node in enumerate(evaluator.nodes):
         values = evaluator.discrepancies(thetas, k) if node.bound.stored else np.empty(0)
-        simulators.append(_node_identity(node, values))
-    simulators += map(_measurement_identity, evaluator.measurements)
+        simulators.append(replace(_simulator_identity(node), discrepancies=_tuples(values)))
+    simulators += map(_simulator_identity, evaluator.measurements)
     return _identity(
         evaluator.model,
         simulators,
-        shapes=names.shapes,
+        shapes=hyperparameters.shapes,
         prior_minimised=prior_minimised,
-        thetas=_tuples(thetas[:, np.argsort(plain_names(names))]),
-        log_prior=_tuples(names.log_prior(thetas)),
+        thetas=_tuples(thetas[:, order]),
+        log_prior=_tuples(hyperparameters.log_prior(thetas)),
         log_other=_tuples(evaluator.log_other(thetas)),
     )
 
 
 def identity_of_model(model: pm.Model) -> Identity:
     """Return the identity of a model without densities and discrepancies, which are compiled."""
-    simulators = [_node_identity(node, np.empty(0)) for node in nodes(model).values()]
-    simulators += map(_measurement_identity, measurements_of(model).values())
+    simulators = [*map(_simulator_identity, nodes(model).values())]
+    simulators += map(_simulator_identity, measurements_of(model).values())
     values = [model.rvs_to_values[rv] for rv in model.free_RVs]
     shapes = {str(value.name): value.type.shape for value in values}
     if any(None in shape for shape in shapes.values()):
@@ -125,59 +121,54 @@ def identity_of_model(model: pm.Model) -> Identity:
     return _identity(model, simulators, shapes=shapes)
 
 
-def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **fields: Any) -> Identity:
-    variables = known_variables(model)
+def _identity(model: pm.Model, simulators: list[SimulatorIdentity], **fields: Any) -> Identity:
+    """Return the identity with distributions and other terms as texts."""
+    named = {*model.basic_RVs, *model.deterministics}
     simulated = {*nodes(model), *specimen_likelihoods(model)}
     observed = [rv for rv in model.observed_RVs if rv not in simulated]
-    terms = [f"{rv.name} ~ {as_pymc_writes(rv, variables)}" for rv in observed]
+    terms = [f"{rv.name} ~ {as_pymc_writes(rv, named)}" for rv in observed]
     terms += [str(potential.name) for potential in model.potentials]
     return Identity(
-        priors={str(rv.name): as_pymc_writes(rv, variables) for rv in model.free_RVs},
+        priors={str(rv.name): as_pymc_writes(rv, named) for rv in model.free_RVs},
         terms=tuple(sorted(terms)),
         # Clones may order variables in other ways.
-        simulators=tuple(sorted(simulators, key=lambda simulator: simulator.name)),
+        simulators=tuple(sorted(simulators, key=attrgetter("name"))),
         **fields,
     )
 
 
-def _node_identity(node: Node, discrepancies: Floats) -> SimulatorIdentity:
-    observed, weights, bound = node.observed, node.weights, node.bound
-    order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
-    labels = [] if node.specimens is None else node.specimens[order].tolist()
+def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
+    observed, weights, labels = simulator.observed, simulator.weights, simulator.specimens
+    groups = None
+    fields: dict[str, Any] = {}
+    if isinstance(simulator, Node):
+        bound = simulator.bound
+        batches = 1
+        if simulator.reweighted is not None:
+            design = simulator.reweighted.design
+            batches = len(design.batch_sizes) + design.n_emulated_samples
+        order = np.lexsort((simulator.weights, *observed.reshape(len(observed), -1).T[::-1]))
+        observed, weights = observed[order], simulator.weights[order]
+        labels = None if labels is None else labels[order]
+        fields = {
+            "n_points": bound.n_runs,
+            "batches": batches,
+            "epsilon": simulator.epsilon_value,
+            # Stored responses are appended to, so that the first stay the first.
+            "responses": _tuples(bound.first_responses[:8].ravel()),
+            "points": _points(simulator),
+        }
+    else:
+        groups = simulator.groups
     return SimulatorIdentity(
-        name=node.name,
-        data=_digest(observed[order].tobytes()),
-        weights=_digest(weights[order].tobytes()),
-        specimens=_digest(repr(labels).encode()),
-        inputs=_inputs(bound.inputs),
-        metric=without_addresses(node.metric),
-        propagation=without_addresses(node.propagation),
-        n_points=bound.n_runs,
-        batches=1 if node.reweighted is None else node.reweighted.design.n_drawn,
-        epsilon=node.epsilon_value,
-        # Stored responses are appended to, so that the first stay the first.
-        responses=_tuples(bound.first_responses[:8].ravel()),
-        discrepancies=_tuples(discrepancies),
-        points=_points(node),
-    )
-
-
-def _measurement_identity(measurement: Measurement) -> SimulatorIdentity:
-    labels = [] if measurement.specimens is None else measurement.specimens.tolist()
-    weights = b"" if measurement.weights is None else measurement.weights.tobytes()
-    groups = b"" if measurement.groups is None else measurement.groups.tobytes()
-    return SimulatorIdentity(
-        name=measurement.name,
-        data=_digest(measurement.observed.tobytes() + groups),
+        name=simulator.name,
+        data=_digest(observed, groups),
         weights=_digest(weights),
-        specimens=_digest(repr(labels).encode()),
-        inputs=_inputs(measurement.inputs),
-        metric=without_addresses(measurement.metric),
-        propagation=without_addresses(measurement.propagation),
-        n_points=0,
-        batches=1,
-        epsilon=1.0,
-        responses=(),
+        specimens=_digest(repr([] if labels is None else labels.tolist())),
+        inputs=_inputs(simulator.inputs),
+        metric=without_addresses(simulator.metric),
+        propagation=without_addresses(simulator.propagation),
+        **fields,
     )
 
 
@@ -204,12 +195,14 @@ def _inputs(inputs: Inputs) -> str:
             texts.append(str(argument.name or "an expression"))
         else:
             values = np.asarray(argument, dtype=np.float64)
-            texts.append(f"{values}" if values.ndim == 0 else _digest(values.tobytes()))
+            texts.append(f"{values}" if values.ndim == 0 else _digest(values))
     return ", ".join(texts)
 
 
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:16]
+def _digest(*contents: Any) -> str:
+    """Return a digest of arrays and texts; None is empty."""
+    data = [x.encode() if isinstance(x, str) else x.tobytes() for x in contents if x is not None]
+    return hashlib.sha256(b"".join(data)).hexdigest()[:16]
 
 
 def _tuples(values: Any) -> Any:
@@ -242,8 +235,7 @@ def from_text(text: str) -> Identity:
 
 def as_attributes(identity: Identity | None) -> dict[str, str]:
     """Return an identity as an attribute of a file; none where it is unknown or too long."""
-    text = "" if identity is None else as_text(identity)
-    return {"identity": text} if text and fits_attribute(text) else {}
+    return {} if identity is None else json_attribute("identity", asdict(identity))
 
 
 def from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
@@ -317,57 +309,79 @@ def require_together(
 def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
     """Return the differences of two problems, up to a level, as texts; numbers up to rounding."""
     if got.shapes != expected.shapes:
-        texts = [_shapes_text(identity.shapes) for identity in (got, expected)]
+        texts = []
+        for shapes in (got.shapes, expected.shapes):
+            names = [f"{name} {shape}" if shape else name for name, shape in shapes.items()]
+            texts.append(", ".join(names))
         return [_unlike("hyperparameters", *texts)]
-    names = [[simulator.name for simulator in i.simulators] for i in (got, expected)]
-    if names[0] != names[1]:
-        return [_unlike("simulators", *names)]
-    pairs = list(zip(got.simulators, expected.simulators, strict=True))
+    names_of = [[simulator.name for simulator in i.simulators] for i in (got, expected)]
+    if names_of[0] != names_of[1]:
+        return [_unlike("simulators", *names_of)]
     priors = _prior_differences(got, expected)
-    result: list[str] = []
-    for a, b in pairs:
-        # Design points are drawn through the priors: other priors give other responses.
-        comparable = not priors and a.propagation == b.propagation
-        result += _population_differences(a, b, comparable=comparable)
+    minimised = []
+    if got.prior_minimised is not None and expected.prior_minimised is not None:
+        goals = (
+            "one of the discrepancy alone",
+            "an optimum of discrepancy and prior together (prior=True)",
+        )
+        if got.prior_minimised != expected.prior_minimised:
+            was, should_be = goals[got.prior_minimised], goals[expected.prior_minimised]
+            minimised.append(f"got {was}, expected {should_be}")
+    pairs = list(zip(got.simulators, expected.simulators, strict=True))
+    by_level = [_simulator_differences(a, b, same_priors=not priors) for a, b in pairs]
+    result = [text for texts in by_level for text in texts[Level.POPULATIONS]]
     if level >= Level.PRIORS:
         result += priors
     if level >= Level.OPTIMUM:
-        result += _minimised_differences(got.prior_minimised, expected.prior_minimised)
-        for a, b in pairs:
-            result += _discrepancy_differences(a, b)
-    for a, b in pairs if level >= Level.POSTERIOR else ():
-        if not _close([a.epsilon], [b.epsilon]):
-            result.append(_unlike(f"epsilon of {a.name}", a.epsilon, b.epsilon))
-    for a, b in pairs if level >= Level.RUN else ():
-        if not _same_design(a, b):
-            result.append(_unlike(f"number of responses of {a.name}", a.n_points, b.n_points))
+        result += minimised
+    for each in (Level.OPTIMUM, Level.POSTERIOR, Level.RUN):
+        if level >= each:
+            result += [text for texts in by_level for text in texts[each]]
     return result
 
 
-def _same_design(a: SimulatorIdentity, b: SimulatorIdentity) -> bool:
-    return (a.n_points, a.batches) == (b.n_points, b.batches)
-
-
-def _population_differences(
-    a: SimulatorIdentity, b: SimulatorIdentity, *, comparable: bool
-) -> list[str]:
+def _simulator_differences(
+    a: SimulatorIdentity, b: SimulatorIdentity, *, same_priors: bool
+) -> dict[Level, list[str]]:
+    """Return the differences of two simulators by level."""
     data = {
         "data": "observed values",
         "weights": "weights of observed values",
         "specimens": "labels of specimens",
     }
-    result = [
+    populations = [
         f"other {text} of {a.name}"
         for field, text in data.items()
         if getattr(a, field) != getattr(b, field)
     ]
     # Names of inputs do not matter to a population.
     inputs = [re.sub(r"(^|, )[^,()~]+ ~ ", r"\1", simulator.inputs) for simulator in (a, b)]
+    # Design points are drawn through the priors: other priors give other responses.
+    has_same_points = same_priors and a.propagation == b.propagation
     if inputs[0] != inputs[1]:
-        result.append(_unlike(f"inputs of {a.name}", a.inputs, b.inputs))
-    elif comparable and not _close(a.responses, b.responses):
-        result.append(f"the response of {a.name} has other values at the same points")
-    return result
+        populations.append(_unlike(f"inputs of {a.name}", a.inputs, b.inputs))
+    elif has_same_points and not _close(a.responses, b.responses):
+        populations.append(f"the response of {a.name} has other values at the same points")
+    optimum = [
+        _unlike(f"{field} of {a.name}", getattr(a, field), getattr(b, field))
+        for field in ("metric", "propagation")
+        if getattr(a, field) != getattr(b, field)
+    ]
+    has_same_design = (a.n_points, a.batches) == (b.n_points, b.batches)
+    is_comparable = a.discrepancies and b.discrepancies and has_same_design
+    if not optimum and is_comparable and not _close(a.discrepancies, b.discrepancies):
+        optimum.append(f"the discrepancy of {a.name} has other values at the same hyperparameters")
+    posterior, run = [], []
+    if not _close([a.epsilon], [b.epsilon]):
+        posterior.append(_unlike(f"epsilon of {a.name}", a.epsilon, b.epsilon))
+    if not has_same_design:
+        run.append(_unlike(f"number of responses of {a.name}", a.n_points, b.n_points))
+    return {
+        Level.POPULATIONS: populations,
+        Level.OPTIMUM: optimum,
+        Level.POSTERIOR: posterior,
+        Level.RUN: run,
+    }
 
 
 def _prior_differences(got: Identity, expected: Identity) -> list[str]:
@@ -388,34 +402,8 @@ def _prior_differences(got: Identity, expected: Identity) -> list[str]:
     return []
 
 
-def _minimised_differences(got: bool | None, expected: bool | None) -> list[str]:
-    if None in (got, expected) or got == expected:
-        return []
-    texts = {
-        True: "an optimum of discrepancy and prior together (prior=True)",
-        False: "one of the discrepancy alone",
-    }
-    return [f"got {texts[bool(got)]}, expected {texts[bool(expected)]}"]
-
-
-def _discrepancy_differences(a: SimulatorIdentity, b: SimulatorIdentity) -> list[str]:
-    result = [
-        _unlike(f"{field} of {a.name}", getattr(a, field), getattr(b, field))
-        for field in ("metric", "propagation")
-        if getattr(a, field) != getattr(b, field)
-    ]
-    comparable = a.discrepancies and b.discrepancies and _same_design(a, b)
-    if not result and comparable and not _close(a.discrepancies, b.discrepancies):
-        result.append(f"the discrepancy of {a.name} has other values at the same hyperparameters")
-    return result
-
-
 def _unlike(what: str, got: object, expected: object) -> str:
     return f"{what}: got {got}, expected {expected}"
-
-
-def _shapes_text(shapes: Mapping[str, tuple[int, ...]]) -> str:
-    return ", ".join(f"{name} {shape}" if shape else name for name, shape in shapes.items())
 
 
 def _close(got: Any, expected: Any) -> bool:

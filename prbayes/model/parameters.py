@@ -7,7 +7,7 @@ Elements of variables have names such as 'mu[1]' or 'mu[Adler]', by which tables
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from typing import Any
@@ -16,13 +16,19 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
+from numpy.typing import NDArray
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._validate import Floats, called, real_array, refuse_single_precision
-from prbayes.model.random_variable import priors_alone
+from prbayes.model.random_variable import building
 from prbayes.numerics.points import sobol
-from prbayes.response.compile import compiled, interpreted, ninf_for_invalid, untraced
+from prbayes.response.compile import (
+    compiled,
+    interpreted,
+    ninf_for_invalid,
+    with_leading_axis,
+)
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import Inputs, event_shape, is_group
 
@@ -32,27 +38,41 @@ THETAS = 256
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
-    """The free variables of a model as vectors theta of numbers, and their prior.
-
-    Attributes
-    ----------
-    model : pymc.Model
-    point : dict
-        PyMC's initial point: values of the value variables by name.
-    """
+    """The free variables of a model as vectors theta of numbers, and their prior."""
 
     model: pm.Model
-    point: dict[str, Any]
+    point: dict[str, Any]  # PyMC's initial point: values of the value variables by name
+    shapes: dict[str, tuple[int, ...]] = field(init=False)  # of the value variables, as in theta
+    initial: Floats = field(init=False)  # the initial point as theta, (d,)
+    size: int = field(init=False)  # of theta, d
+    names: list[str] = field(init=False)  # of elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'
+    readable_names: list[str] = field(init=False)  # by untransformed variables, such as 'sigma'
+    cache: dict[Any, Any] = field(init=False, repr=False)  # compiled functions, and prior draws
+
+    def __post_init__(self) -> None:
+        """Set the attributes that follow from the model and the point."""
+        shapes = {str(v.name): np.shape(self.point[v.name]) for v in self.model.value_vars}
+        values = [np.ravel(self.point[name]) for name in shapes]
+        initial = np.concatenate([np.empty(0), *values])
+        names: list[str] = []
+        readable_names: list[str] = []
+        for v in self.model.value_vars:
+            variable = str(self.model.values_to_rvs[v].name)
+            labels = coordinates(self.model, variable)
+            names += element_names(str(v.name), shapes[str(v.name)], labels)
+            readable_names += element_names(variable, shapes[str(v.name)], labels)
+        vars(self).update(
+            shapes=shapes,
+            initial=initial,
+            size=initial.size,
+            names=names,
+            readable_names=readable_names,
+            cache={},
+        )
 
     @classmethod
     def of(cls, model: pm.Model) -> Hyperparameters:
-        """Return the hyperparameters of a model.
-
-        Raises
-        ------
-        TypeError
-            If one is discrete.
-        """
+        """Return the hyperparameters of a model; raise a TypeError if one is discrete."""
         discrete = [v.name for v in model.value_vars if not v.dtype.startswith("float")]
         if discrete:
             raise TypeError(
@@ -64,35 +84,6 @@ class Hyperparameters:
         with interpreted():
             return cls(model, model.initial_point(random_seed=0))
 
-    @cached_property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the value variables, in the order of theta."""
-        return {str(v.name): np.shape(self.point[v.name]) for v in self.model.value_vars}
-
-    @cached_property
-    def initial(self) -> Floats:
-        """PyMC's initial point as theta, shape (d,)."""
-        return np.concatenate([np.ravel(self.point[v.name]) for v in self.model.value_vars])
-
-    @property
-    def size(self) -> int:
-        """Number of elements of theta, d."""
-        return self.initial.size
-
-    # Names.
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the elements of theta, such as 'sigma_log__', 'mu[1]' or 'mu[Adler]'."""
-        return _element_names(self, list(self.shapes))
-
-    @property
-    def readable_names(self) -> list[str]:
-        """The same with the names of the untransformed variables, such as 'sigma'."""
-        return _element_names(self, variable_names(self.model))
-
-    # Functions of theta.
-
     def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
         """Return graphs of the value variables as graphs of one vector theta, and that vector."""
         outputs, theta = join_nonshared_inputs(self.point, list(graphs), self.model.value_vars)
@@ -103,18 +94,18 @@ class Hyperparameters:
 
         Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
         """
-        with untraced():
+        with interpreted():
             outputs, theta = self.joined(graphs)
             batch = pt.dmatrix("thetas")
             batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
             return compiled([batch], batched)
 
     @cached_property
-    @untraced()
+    @interpreted()
     def _log_prior(self) -> Any:
         """The log-density of each free variable, in its own units, and the Jacobian of all."""
         model = self.model
-        with priors_alone():
+        with building("priors"):
             terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
         jacobian: Any = np.float64(0.0)
         for rv in model.free_RVs:
@@ -128,10 +119,9 @@ class Hyperparameters:
     def log_prior_terms(self, thetas: Floats) -> dict[str, Floats]:
         """Return the log-density of each free variable in the user's own units, shapes (P,)."""
         values = self._log_prior(np.ascontiguousarray(thetas))[:-1]
-        names = [str(rv.name) for rv in self.model.free_RVs]
         return {
-            name: np.array(np.broadcast_to(value, len(thetas)))
-            for name, value in zip(names, values, strict=True)
+            str(rv.name): np.array(np.broadcast_to(value, len(thetas)))
+            for rv, value in zip(self.model.free_RVs, values, strict=True)
         }
 
     def log_prior(self, thetas: Floats) -> Floats:
@@ -143,30 +133,28 @@ class Hyperparameters:
         """Return which thetas have a finite log prior, shape (P,)."""
         return np.isfinite(self.log_prior(thetas))
 
-    @cached_property
-    @untraced()
-    def _constrain(self) -> Any:
-        return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
-
     def constrained(self, thetas: Floats) -> dict[str, Floats]:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
         if not size:  # PyTensor transforms no empty matrices
             return {name: v[:0] for name, v in self.constrained(self.initial[None]).items()}
-        values = self._constrain(np.ascontiguousarray(thetas))
+        variables = self.model.unobserved_RVs
+        if "constrained" not in self.cache:
+            with interpreted():
+                graphs = self.model.replace_rvs_by_values(variables)
+                self.cache["constrained"] = self.compile(graphs)
+        values = self.cache["constrained"](np.ascontiguousarray(thetas))
         # Values that do not depend on theta have no leading axis, or one of length one.
         return {
             variable.name: np.array(np.broadcast_to(value, (size, *np.shape(value)[1:])))
-            for variable, value in zip(self.model.unobserved_RVs, values, strict=True)
+            for variable, value in zip(variables, values, strict=True)
         }
 
     def unconstrained(self, point: Mapping[str, Any]) -> Floats:
         """Return theta, shape (d,), of a point given in the user's own units.
 
-        Raises
-        ------
-        KeyError, TypeError, ValueError
-            If the names are not the model's free variables, or a value is outside its support.
+        Raise KeyError, TypeError or ValueError if names are not those of the free variables, or a
+        value is outside its support.
         """
         if not isinstance(point, Mapping):
             raise TypeError(
@@ -192,42 +180,33 @@ class Hyperparameters:
         theta: Floats = thetas[0]
         return theta
 
-    @cached_property
-    @untraced()
-    def _transform(self) -> Any:
-        """The compiled function of values of the free variables that returns thetas."""
-        free = self.model.free_RVs
-        columns = []
-        for value_variable in self.model.value_vars:
-            rv = self.model.values_to_rvs[value_variable]
-            transform = self.model.rvs_to_transforms[rv]
-            value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
-            columns.append(pt.atleast_1d(value).ravel())
-        symbols = [rv.type() for rv in free]
-        swap = dict(zip(free, symbols, strict=True))
-        theta = graph_replace(pt.concatenate(columns), swap, strict=False)
-        batched = [pt.tensor(dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
-        thetas = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
-        return compiled(batched, [thetas], allow_input_downcast=True)
-
     def thetas_of(self, draws: Sequence[Floats]) -> Floats:
         """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
-        (thetas,) = self._transform(*draws)
+        free = self.model.free_RVs
+        if "thetas" not in self.cache:
+            with interpreted():
+                columns = []
+                for value_variable in self.model.value_vars:
+                    rv = self.model.values_to_rvs[value_variable]
+                    transform = self.model.rvs_to_transforms[rv]
+                    value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
+                    columns.append(pt.atleast_1d(value).ravel())
+                symbols = [rv.type() for rv in free]
+                swap = dict(zip(free, symbols, strict=True))
+                theta = graph_replace(pt.concatenate(columns), swap, strict=False)
+                batched = with_leading_axis(symbols)
+                graph = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
+                self.cache["thetas"] = compiled(batched, [graph], allow_input_downcast=True)
+        (thetas,) = self.cache["thetas"](*draws)
         return np.asarray(thetas)
-
-    # The prior.
-
-    @cached_property
-    def _prior_draws(self) -> tuple[PriorSampler, dict[tuple[int, int], Floats]]:
-        """The sampler of the prior, and its draws of thetas by size and seed."""
-        return PriorSampler(self.model.free_RVs), {}
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        sampler, draws = self._prior_draws
-        if (size, seed) not in draws:
-            draws[size, seed] = self.thetas_of(sampler(size, seed))
-        return draws[size, seed].copy()
+        if (size, seed) not in self.cache:
+            if "sampler" not in self.cache:
+                self.cache["sampler"] = PriorSampler(self.model.free_RVs)
+            self.cache[size, seed] = self.thetas_of(self.cache["sampler"](size, seed))
+        return np.array(self.cache[size, seed])
 
     @cached_property
     def prior_sd(self) -> Floats:
@@ -256,28 +235,8 @@ class Hyperparameters:
         """
         if self.quantiles is None:
             return self.prior_thetas(size, seed)
-        return _thetas_at(self, self.quantiles, sobol(size, self.quantiles.size, seed))
-
-
-def variable_names(model: pm.Model) -> list[str]:
-    """Return the names of the free variables, in the order of theta."""
-    return [str(model.values_to_rvs[v].name) for v in model.value_vars]
-
-
-def _element_names(hyperparameters: Hyperparameters, names: list[str]) -> list[str]:
-    """Return the names of the elements of theta, from those of the variables."""
-    model = hyperparameters.model
-    elements: list[str] = []
-    shapes = hyperparameters.shapes.values()
-    for name, variable, shape in zip(names, variable_names(model), shapes, strict=True):
-        elements += element_names(name, shape, coordinates(model, variable))
-    return elements
-
-
-def plain_names(hyperparameters: Hyperparameters) -> list[str]:
-    """Return the names of the elements of theta with indices in place of coordinates."""
-    shapes = hyperparameters.shapes.items()
-    return [name for variable, shape in shapes for name in element_names(variable, shape)]
+        thetas = self.thetas_of(self.quantiles(sobol(size, self.quantiles.size, seed)))
+        return np.where(np.isfinite(thetas), thetas, self.initial)
 
 
 def log_posterior(
@@ -296,32 +255,27 @@ def log_posterior(
     return result
 
 
-def _thetas_at(hyperparameters: Hyperparameters, quantiles: PriorPoints, cube: Floats) -> Floats:
-    """Return thetas at points of the unit cube, shape (P, size)."""
-    thetas = hyperparameters.thetas_of(quantiles(cube))
-    return np.where(np.isfinite(thetas), thetas, hyperparameters.initial)
+def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, NDArray[np.intp]]:
+    """Return thetas, (size, d), and the alphabetical order of their elements, (d,).
 
-
-def fixed_points(hyperparameters: Hyperparameters, size: int) -> Floats:
-    """Return thetas, shape (size, d), that do not depend on the order of the variables.
-
-    Clones of a model may order variables in other ways.
+    In this order the thetas are the same for clones of a model, which may order variables in other
+    ways.
     """
+    plain = [
+        n for name, shape in hyperparameters.shapes.items() for n in element_names(name, shape)
+    ]
+    order = np.argsort(plain)
     quantiles = hyperparameters.quantiles
     if quantiles is None:
-        offsets = sobol(size, hyperparameters.size, seed=0) - 0.5
-        return hyperparameters.initial + _columns_by_name(offsets, plain_names(hyperparameters))
+        offsets = np.empty((size, hyperparameters.size))
+        offsets[:, order] = sobol(size, hyperparameters.size, seed=0) - 0.5
+        return hyperparameters.initial + offsets, order
     free = hyperparameters.model.free_RVs
     names = [name for rv in free for name in element_names(rv.name, event_shape(rv))]
-    cube = sobol(size, quantiles.size, seed=0)
-    return _thetas_at(hyperparameters, quantiles, _columns_by_name(cube, names))
-
-
-def _columns_by_name(columns: Floats, names: Sequence[str]) -> Floats:
-    """Return columns of which the first is that of the first name in the alphabet, and so on."""
-    result = np.empty_like(columns)
-    result[:, np.argsort(names)] = columns
-    return result
+    cube = np.empty((size, quantiles.size))
+    cube[:, np.argsort(names)] = sobol(size, quantiles.size, seed=0)
+    thetas = hyperparameters.thetas_of(quantiles(cube))
+    return np.where(np.isfinite(thetas), thetas, hyperparameters.initial), order
 
 
 def roots_of(
@@ -369,12 +323,12 @@ def coordinates(model: Any, name: str) -> tuple[Any, ...]:
     return tuple(model.coords.get(dim) for dim in dims)
 
 
-def _names_of(name: Any, value: Any, leading: int = 0) -> list[str]:
-    """Return the names of the elements of an array, after some leading axes."""
+def _element_names_of(name: Any, value: Any) -> list[str]:
+    """Return the names of the elements of arrays (n, *shape), with their coordinates."""
     labels = []
     if isinstance(value, xr.DataArray):
         labels = [value.coords[d].values if d in value.coords else None for d in value.dims]
-    return element_names(str(name), np.shape(value)[leading:], labels[leading:])
+    return element_names(str(name), np.shape(value)[1:], labels[1:])
 
 
 # Values by name.
@@ -387,20 +341,16 @@ def split_elements(values: Mapping[Any, Any]) -> dict[str, Floats]:
     """
     result: dict[str, Floats] = {}
     for name, value in values.items():
-        array = np.asarray(value)
-        names = _names_of(name, value, leading=1)
-        columns = array.reshape(len(array), len(names))
+        names = _element_names_of(name, value)
+        columns = np.asarray(value).reshape(len(value), len(names))
         result |= dict(zip(names, columns.T, strict=True))
     return result
 
 
-def single_elements(values: Mapping[Any, Any]) -> dict[str, float]:
+def single_elements(values: Mapping[Any, xr.DataArray]) -> dict[str, float]:
     """Return numbers by the names of elements, of one value of each variable."""
-    result: dict[str, float] = {}
-    for name, value in values.items():
-        numbers = np.ravel(value).astype(float).tolist()
-        result |= dict(zip(_names_of(name, value), numbers, strict=True))
-    return result
+    columns = split_elements({name: value.expand_dims("row") for name, value in values.items()})
+    return {name: float(column[0]) for name, column in columns.items()}
 
 
 # Elements and variables in tables.
@@ -414,41 +364,34 @@ def table_elements(values: Mapping[Any, Any]) -> list[str]:
     """
     elements = []
     for name, value in values.items():
-        is_shown = _is_informative(np.asarray(value)).ravel()
-        names = _names_of(name, value, leading=1)
-        elements += [element for element, shown in zip(names, is_shown, strict=True) if shown]
+        array = np.asarray(value)
+        is_shown = np.ones(array.shape[1:], dtype=bool)
+        if is_shown.ndim == 2 and is_shown.shape[0] == is_shown.shape[1] and len(array):
+            # A few operations change a few units in the last place.
+            rounding = 1e-12 * np.abs(array).max(axis=0)
+            is_fixed = np.ptp(array, axis=0) <= rounding
+            is_symmetric = (np.abs(array - array.swapaxes(1, 2)) <= rounding).all()
+            if not is_fixed.all():  # else nothing moved: show that
+                is_shown = np.triu(~is_fixed) if is_symmetric else ~is_fixed
+        names = np.array(_element_names_of(name, value), dtype=object)
+        elements += names[is_shown.ravel()].tolist()
     return elements
 
 
-def optimum_elements(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> list[str]:
+def optimum_elements(point: Mapping[Any, xr.DataArray], stderr: Mapping[Any, Any]) -> list[str]:
     """Return the elements that a table shows of an optimum, with standard errors by variable."""
-    elements = []
+    bounds = {}
     for name, value in point.items():
-        estimate, error = np.asarray(value), np.asarray(stderr[name])
+        error = np.asarray(stderr[name])
         # An unknown error is not zero: any number does.
         error = np.where(np.isfinite(error), error, 1.0)
-        is_shown = _is_informative(np.stack([estimate - error, estimate + error])).ravel()
-        names = _names_of(name, value)
-        elements += [element for element, shown in zip(names, is_shown, strict=True) if shown]
-    return elements
-
-
-def _is_informative(array: Floats) -> Any:
-    """Return which elements of arrays (n, *shape) are neither constant nor a copy, (*shape)."""
-    shape = array.shape[1:]
-    if len(shape) != 2 or shape[0] != shape[1] or not len(array):
-        return np.ones(shape, dtype=bool)
-    # A few operations change a few units in the last place.
-    rounding = 1e-12 * np.abs(array).max(axis=0)
-    fixed = np.ptp(array, axis=0) <= rounding
-    if fixed.all():  # nothing moved: show that
-        return np.ones(shape, dtype=bool)
-    symmetric = np.abs(array - array.swapaxes(1, 2)) <= rounding
-    return np.triu(~fixed) if symmetric.all() else ~fixed
+        pair = np.stack([value.values - error, value.values + error])
+        bounds[name] = value.expand_dims(bound=2).copy(data=pair)
+    return table_elements(bounds)
 
 
 def readable_variables(names: Iterable[str], among: Collection[str]) -> list[str]:
-    """Return the variables that a table shows in place of these, each once.
+    """Return the variables that a table shows, each once.
 
     For a `pymc.LKJCholeskyCov`, a packed factor, its standard deviations and correlations.
     """
@@ -470,27 +413,32 @@ def readable_elements(elements: Iterable[str]) -> list[str]:
 # Draws.
 
 
-def stacked_draws(posterior: Any, names: Iterable[str] | None = None) -> dict[str, xr.DataArray]:
-    """Return the draws of variables, (chains x draws, *shape), with their other coordinates."""
+def stacked_draws(
+    posterior: Any, names: Iterable[str] | None = None, model: pm.Model | None = None
+) -> dict[str, xr.DataArray]:
+    """Return the draws of variables, (chains x draws, *shape), with their other coordinates.
+
+    Axes without coordinates have those of a model, if one is given.
+    """
     stacked = {}
     for name in posterior.data_vars if names is None else names:
         variable = posterior[name].transpose("chain", "draw", ...)
         values = variable.values
         dims = variable.dims[2:]
-        coords = {dim: variable.coords[dim].values for dim in dims if dim in variable.coords}
+        coords = {}
+        if model is not None:
+            labels = coordinates(model, str(name))
+            for dim, size, label in zip(dims, values.shape[2:], labels, strict=False):
+                if len(labels) == len(dims) and label is not None and len(label) == size:
+                    coords[dim] = np.asarray(label)
+        coords |= {dim: variable.coords[dim].values for dim in dims if dim in variable.coords}
         flat = values.reshape(-1, *values.shape[2:])
         stacked[str(name)] = xr.DataArray(flat, coords, ["draws", *dims])
     return stacked
 
 
 def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:
-    """Return the draws of free variables, which define populations.
-
-    Raises
-    ------
-    ValueError
-        If one is no finite number: no population belongs to it.
-    """
+    """Return the draws of free variables; raise a ValueError if one is not finite."""
     by_name = {name: draws.values for name, draws in stacked_draws(posterior, names).items()}
     for name, draws in by_name.items():
         is_finite = np.isfinite(draws).reshape(len(draws), -1).all(axis=1)
@@ -501,17 +449,3 @@ def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:
                 "again"
             )
     return by_name
-
-
-def with_coordinates(draws: Mapping[str, xr.DataArray], model: Any) -> dict[str, xr.DataArray]:
-    """Return draws, (n, *shape) by variable, with a model's coordinates where they have none."""
-    result = {}
-    for name, values in draws.items():
-        labels = coordinates(model, name)
-        dims = values.dims[1:]
-        for dim, coordinate in zip(dims, labels, strict=True) if len(labels) == len(dims) else ():
-            is_missing = coordinate is not None and dim not in values.coords
-            if is_missing and len(coordinate) == values.sizes[dim]:
-                values = values.assign_coords({dim: np.asarray(coordinate)})
-        result[name] = values
-    return result

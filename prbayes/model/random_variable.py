@@ -11,10 +11,10 @@ import logging
 import sys
 import weakref
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import partial
 from inspect import signature
 from math import ceil
 from typing import Any, ClassVar, Literal
@@ -68,51 +68,34 @@ class Node:
     outputs: Outputs = SINGLE_OUTPUT  # of a run
     group: str = ""  # name of the group of its specimens
 
+    # Attributes of the target and of the bound.
+    metric: Metric = field(init=False)
+    observed: Floats = field(init=False)  # measured responses, (N,) or (N, m)
+    weights: Floats = field(init=False)  # of the specimens, (N,); they sum to one
+    inputs: Inputs = field(init=False)
+    responses: Responses = field(init=False)  # the response, and how it is called
+    has_specimens: bool = field(init=False)  # whether a population has specimens without a run
+    max_lost: float = field(init=False)  # largest share of a population without response
+    reweighted: ReweightedBound | None = field(init=False)  # the bound, if it has a design
+
     is_emulated: ClassVar[Literal[False]] = False
 
-    @property
-    def metric(self) -> Metric:
-        """The calibration metric."""
-        return self.target.metric
-
-    @property
-    def responses(self) -> Responses:
-        """The response, and how it is called."""
-        return self.bound.responses
-
-    @property
-    def observed(self) -> Floats:
-        """Measured responses, (N,) or (N, m)."""
-        return self.target.observed
-
-    @property
-    def weights(self) -> Floats:
-        """Weights of the specimens, (N,), which sum to one."""
-        return self.target.weights
-
-    @property
-    def inputs(self) -> Inputs:
-        """The inputs of the response."""
-        return self.bound.inputs
-
-    @property
-    def has_specimens(self) -> bool:
-        """Whether a population has specimens without a run."""
-        return self.bound.stored
-
-    @property
-    def max_lost(self) -> float:
-        """Largest share of a population that may have no response."""
-        return self.bound.max_lost
+    def __post_init__(self) -> None:
+        """Set the attributes of the target and of the bound."""
+        vars(self).update(
+            metric=self.target.metric,
+            observed=self.target.observed,
+            weights=self.target.weights,
+            inputs=self.bound.inputs,
+            responses=self.bound.responses,
+            has_specimens=self.bound.stored,
+            max_lost=self.bound.max_lost,
+            reweighted=reweighted_of(self.bound),
+        )
 
     def populations(self, roots: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return responses and weights of populations, (k, n) or (k, n, m) and (k, n)."""
         return self.bound.populations(list(roots))
-
-    @property
-    def reweighted(self) -> ReweightedBound | None:
-        """The propagation with its design, None where it stores no responses."""
-        return reweighted_of(self.bound)
 
     @property
     def epsilon_value(self) -> float:
@@ -128,9 +111,9 @@ class Node:
         """Return the same simulator with other observed responses; it computes no response.
 
         It is the same object where the values are the same. Raise TypeError or ValueError if the
-        metric does not take them, or weights or labels go with as many as before.
+        metric does not take the values, or weights or labels belong to another number of them.
         """
-        target = self.target
+        target, bound = self.target, self.bound
         data = np.asarray(data)
         if np.array_equal(data, target.observed.astype(data.dtype), equal_nan=True):
             return self
@@ -140,22 +123,19 @@ class Node:
                 f"{self.name}: observed: got shape {values.shape}, expected "
                 f"{('N', *target.event)}, as when the simulator was made"
             )
-        weights: Floats | None = target.weights
         n = len(target.weights)
-        if len(values) != n:
-            # Weights and labels belong to the values before.
-            if self.specimens is not None or np.ptp(target.weights) > 0:
-                raise ValueError(
-                    f"{self.name}: observed: got {len(values)} specimens, expected "
-                    f"{n}, as many as there are specimens= or weights=; build the "
-                    "model again with those of the new ones"
-                )
-            weights = None
+        is_same_size = len(values) == n
+        if not is_same_size and (self.specimens is not None or np.ptp(target.weights) > 0):
+            raise ValueError(
+                f"{self.name}: observed: got {len(values)} specimens, expected "
+                f"{n}, as many as there are specimens= or weights=; build the "
+                "model again with those of the new ones"
+            )
         try:
-            target = self.metric.against(values, weights)
+            target = self.metric.against(values, target.weights if is_same_size else None)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
-        bound = self.bound.copied()
+        bound = bound.copied()
         dimensions = bound.inputs.dimensions
         bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
         changed = replace(self, target=bound.target, bound=bound)
@@ -184,44 +164,7 @@ class Specification:
     group: str = ""
     progressbar: bool = True
     original: Specification | None = None  # of a clone, which takes the runs of the original
-
-    @property
-    def node(self) -> Node:
-        """The simulator, with its first responses: the first access computes them.
-
-        After an error, or an interruption, the next access tries again.
-        """
-        with lock(self):
-            return self._node
-
-    @cached_property
-    def _node(self) -> Node:
-        if self.original is not None:
-            return replace(self.original.node.copied(), epsilon=self.epsilon)
-        # Counts and notes of an attempt that fails are dropped with the copy.
-        responses = self.responses.copied()
-        responses.runs = self.responses.runs
-        responses.on_start = partial(_log_first_runs, self.propagation, responses)
-        with shown(self.progressbar):
-            bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
-            dimensions = bound.inputs.dimensions
-            metric = self.target.metric
-            bound.target = metric.with_design(self.target, bound.first_responses, dimensions)
-        responses.on_start = None
-        warn_out_of_range(
-            self.name, self.target.observed, bound.first_responses, self.outputs.names
-        )
-        return Node(
-            self.name,
-            bound.target,
-            bound,
-            self.propagation,
-            self.epsilon,
-            self.specimens,
-            self.same_inputs,
-            self.outputs,
-            self.group,
-        )
+    node: Node | None = field(default=None, init=False)  # set at the first use
 
     def copied(self) -> Specification:
         """Return the same simulator with its own epsilon, for a clone of the model."""
@@ -232,11 +175,51 @@ class Specification:
 type AnySimulator = Specification | Node
 
 
-def computed_node(simulator: AnySimulator) -> Node | None:
-    """Return a simulator with its first responses; None if they are not computed yet."""
+def computed(simulator: AnySimulator) -> Node:
+    """Return a simulator with its first responses, which the first call computes.
+
+    After an error, or an interruption, the next call tries again.
+    """
     if isinstance(simulator, Node):
         return simulator
-    return simulator.node if "_node" in vars(simulator.original or simulator) else None
+    with lock(simulator):
+        if simulator.node is not None:
+            return simulator.node
+        if simulator.original is not None:
+            node = replace(computed(simulator.original).copied(), epsilon=simulator.epsilon)
+        else:
+            propagation, target = simulator.propagation, simulator.target
+            # Counts and notes of an attempt that fails are dropped with the copy.
+            responses = simulator.responses.copied()
+            responses.runs = simulator.responses.runs
+            responses.on_start = partial(_log_first_runs, propagation, responses)
+            with shown(simulator.progressbar):
+                bound = propagation.bind(simulator.name, responses.inputs, target, responses)
+                dimensions = bound.inputs.dimensions
+                bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
+            responses.on_start = None
+            outputs = simulator.outputs
+            warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
+            node = Node(
+                simulator.name,
+                bound.target,
+                bound,
+                propagation,
+                simulator.epsilon,
+                simulator.specimens,
+                simulator.same_inputs,
+                outputs,
+                simulator.group,
+            )
+        vars(simulator)["node"] = node
+        return node
+
+
+def computed_node(simulator: AnySimulator) -> Node | None:
+    """Return a simulator with its first responses; None if they are not computed yet."""
+    if isinstance(simulator, Specification) and (simulator.original or simulator).node is None:
+        return None
+    return computed(simulator)
 
 
 def _log_first_runs(
@@ -248,12 +231,11 @@ def _log_first_runs(
         return  # known after the first call
     responses.on_start = None
 
-    def with_duration(number: int) -> str:
+    counts = []
+    for number in (runs, cost.per_theta):
         total = ceil(number / responses.workers) * seconds
-        if not number or np.isnan(total):
-            return str(number)
-        return f"{number}, {f'about {duration(total)}' if total >= 1 else 'less than 1 s'}"
-
+        time = f", about {duration(total)}" if total >= 1 else ", less than 1 s"
+        counts.append(f"{number}{time}" if number and not np.isnan(total) else str(number))
     setting = type(propagation).__name__
     if hasattr(propagation, "n"):
         setting += f"(n={propagation.n})"
@@ -261,8 +243,7 @@ def _log_first_runs(
         "%s: runs at first: %s; for each value of the hyperparameters: %s; to change this, pass "
         "another number in propagation=%s; more: %s",
         responses.name,
-        with_duration(runs),
-        with_duration(cost.per_theta),
+        *counts,
         setting,
         cost.growth,
     )
@@ -331,7 +312,7 @@ class SimulatorRV(RandomVariable):
         label = f"Simulator of {response} by {type(simulator.target.metric).__name__}"
         super().__init__(name=name or label, signature=signature, dtype=dtype, inplace=inplace)
         self._simulator = weakref.ref(simulator)
-        self._owner: weakref.ref[Any] | None = None
+        self.owner: weakref.ref[Any] | None = None
         self._warned = False
 
     @property
@@ -341,12 +322,6 @@ class SimulatorRV(RandomVariable):
         if simulator is None:
             raise RuntimeError(f"{self}: got an operation of a model that is gone")
         return simulator
-
-    @property
-    def node(self) -> Node:
-        """The simulator with its first responses, which the first access computes."""
-        simulator = self.simulator
-        return simulator if isinstance(simulator, Node) else simulator.node
 
     def __eq__(self, other: object) -> bool:
         """Return whether it is of the same simulator, and applied alike."""
@@ -376,31 +351,17 @@ class SimulatorRV(RandomVariable):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the owner: a copy that is unpickled belongs to a model of its own."""
-        return {**self.__dict__, "_owner": None, "_simulator": self.simulator}
+        return {**self.__dict__, "owner": None, "_simulator": self.simulator}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the weak reference; the application references the simulator."""
         self.__dict__.update(state)
         self._simulator = weakref.ref(state["_simulator"])
 
-    def own_simulator(self, apply: Apply[Any, Any]) -> AnySimulator:
-        """Return the simulator that belongs to an application of this operation in a model.
-
-        Clones of a model share the operation with the original. Each is then given an operation
-        with copies of design, count and epsilon, which leave the original unchanged.
-        """
-        if self._owner is None:
-            self._owner = weakref.ref(apply)
-        if self._owner() is apply:
-            return self.simulator
-        simulator = self.simulator.copied()
-        self.assign(apply, simulator)
-        return simulator
-
     def assign(self, apply: Apply[Any, Any], simulator: AnySimulator) -> None:
         """Give an application in a model an operation of its own, which carries a simulator."""
         operation = SimulatorRV(**{**self._props_dict(), "simulator": simulator})
-        operation._owner = weakref.ref(apply)
+        operation.owner = weakref.ref(apply)
         apply.op = operation
         apply.tag.simulator = simulator
 
@@ -419,8 +380,8 @@ class SimulatorRV(RandomVariable):
                 )
             )
         *params, size = arguments
-        bound = self.node.bound
-        event = self.node.target.event
+        bound = computed(self.simulator).bound
+        event = bound.target.event
         batches = [
             param.shape[: param.ndim - root.type.ndim]
             for root, param in zip(bound.inputs.roots, params, strict=True)
@@ -465,27 +426,21 @@ def printed_names(function: Any, metric: str) -> tuple[str, str]:
 # The log-density.
 
 # The terms for which densities are built: PyMC builds those of all variables, also for a part.
-_TERMS: ContextVar[str] = ContextVar("terms that are built", default="all")
+TERMS: ContextVar[str] = ContextVar("terms that are built", default="all")
 
 
 @contextmanager
-def without_epsilon_warning(terms: str = "ordinary") -> Iterator[None]:
-    """Build terms that contain no epsilon: log no warning if it is not set."""
-    token = _TERMS.set(terms)
+def building(terms: str) -> Iterator[None]:
+    """Build densities of some terms.
+
+    Of the "ordinary" ones, which contain no epsilon: no warning if it is not set. Or of the
+    "priors" alone: likelihoods by specimen are left out.
+    """
+    token = TERMS.set(terms)
     try:
         yield
     finally:
-        _TERMS.reset(token)
-
-
-def priors_alone() -> AbstractContextManager[None]:
-    """Build the densities of hyperparameters: likelihoods by specimen are left out."""
-    return without_epsilon_warning("priors")
-
-
-def builds_priors_alone() -> bool:
-    """Return whether the densities of hyperparameters alone are built."""
-    return _TERMS.get() == "priors"
+        TERMS.reset(token)
 
 
 @_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
@@ -495,7 +450,9 @@ def _log_density(
     """Return the log-density of the observed data: a graph of the roots and of epsilon."""
     (value,) = values
     data = known_value(value)
-    node = op.node if data is None else op.node.observing(data)
+    node = computed(op.simulator)
+    if data is not None:
+        node = node.observing(data)
     unset = Finding(
         "epsilon-unset",
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
@@ -505,7 +462,7 @@ def _log_density(
     )
     if np.isnan(node.epsilon_value):
         # nutpie shows only the number of an error; other samplers show the message themselves.
-        is_hidden = "nutpie" in sys.modules and _TERMS.get() == "all"
+        is_hidden = "nutpie" in sys.modules and TERMS.get() == "all"
         report(unset, level=logging.WARNING if is_hidden else logging.DEBUG)
     epsilon = CheckParameterValue(str(unset))(node.epsilon, pt.gt(node.epsilon, 0.0))
     density = log_kernel(node.bound.discrepancy(node.bound.inputs.core(params)), epsilon)
@@ -596,49 +553,43 @@ def rv_signature(ndims: Sequence[int], ndim_supp: int) -> str:
     """Return the signature of a random variable, such as '(),(i10,i11)->()', or '->(o)'."""
     groups = []
     for k, ndim in enumerate(ndims):
-        axes = ",".join(f"i{k}{axis}" for axis in range(ndim))
-        groups.append(f"({axes})")
+        axes = [f"i{k}{axis}" for axis in range(ndim)]
+        groups.append(f"({','.join(axes)})")
     return ",".join(groups) + ("->(o)" if ndim_supp else "->()")
 
 
 def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
-    """Return the simulators of a model as far as they are computed, by their observed variables.
+    """Return the simulators of a model, computed or not, by their observed variables.
 
-    In a clone they are copies, which the first call makes.
+    In a clone they are copies with their own design, count and epsilon, which the first call makes.
     """
     if not isinstance(model, pm.Model):
         raise TypeError(f"model: got {called(model)}, expected a pm.Model")
-    applied = {rv: rv.owner for rv in model.observed_RVs if isinstance(rv.owner.op, SimulatorRV)}
-    return {rv: apply.op.own_simulator(apply) for rv, apply in applied.items()}
+    by_variable = {}
+    for rv in model.observed_RVs:
+        apply = rv.owner
+        if isinstance(apply.op, SimulatorRV):
+            if apply.op.owner is None:
+                apply.op.owner = weakref.ref(apply)
+            # Clones of a model share the operation with the original.
+            if apply.op.owner() is not apply:
+                apply.op.assign(apply, apply.op.simulator.copied())
+            by_variable[rv] = apply.op.simulator
+    return by_variable
 
 
 def nodes(model: pm.Model) -> dict[Any, Node]:
-    """Return the simulators of a model, keyed by their observed variables, in the model's order.
+    """Return the simulators of a model with their first responses, by observed variable.
 
-    The first call computes their first responses. In a clone it makes copies, which compiled
-    functions of the clone follow. Where `pymc.set_data` or `pymc.observe` changed the data, the
-    metric is prepared again, and the responses are the same. If the first responses cannot be
-    computed, the next call tries again.
+    The first call computes the first responses. In a clone it makes copies. Where `pymc.set_data`
+    or `pymc.observe` changed the data, the metric is prepared again for the same responses.
     """
-    computed = {}
+    by_variable = {}
     for rv, simulator in simulators(model).items():
-        node = simulator if isinstance(simulator, Node) else simulator.node
-        node = node.observing(known_value(model.rvs_to_values[rv]))
+        node = computed(simulator).observing(known_value(model.rvs_to_values[rv]))
         if node is not simulator:
             rv.owner.op.assign(rv.owner, node)
-        computed[rv] = node
-    return computed
-
-
-def required_simulators(model: pm.Model) -> dict[Any, AnySimulator]:
-    """Return the simulators of a model as far as they are computed, or raise if it has none."""
-    by_variable = simulators(model)
-    if not by_variable:
-        raise ValueError(
-            "model: got one without a prb.Simulator, expected at least one; add "
-            "prb.Simulator(name, response, *inputs, metric=..., observed=...) inside the "
-            "`with pm.Model()`"
-        )
+        by_variable[rv] = node
     return by_variable
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -56,12 +56,14 @@ from prbayes.response.inputs import (
     Inputs,
     group_indices,
     is_group,
-    is_labelled,
     model_on_context,
     read_inputs,
 )
-from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, read_observed
+from prbayes.response.outputs import read_observed
 from prbayes.response.response import Responses, refuse_uncallable
+
+# Settings of a propagation for calls of the response.
+_CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", "timeout")
 
 
 def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
@@ -190,46 +192,62 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     groups, measured = None, observed
     if arguments.groups is not None:
         groups, measured = group_indices(name, observed, arguments.groups)
-    values, outputs = read_observed(name, _numbers(name, measured))
+    if isinstance(measured, Variable):
+        measured = _present_numbers(name, measured)
+    values, outputs = read_observed(name, measured)
     metric = LogLikelihood() if metric is None else metric
-    if isinstance(metric, Metric) and metric.by_specimen:
+    by_specimen = isinstance(metric, Metric) and metric.by_specimen
+    if by_specimen:
         _refuse_by_specimen(name, arguments, epsilon, propagation)
         values = checked_specimens(name, values)
-        settings = _checked_propagation(name, propagation)
+    else:
+        target = _prepared_metric(name, metric, values, weights)
+    settings = Reweighted() if propagation is None else propagation
+    if not isinstance(settings, Propagation):
+        raise TypeError(
+            f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
+            "prb.Resimulated(n) or prb.Fresh(n)"
+        )
+    calls: dict[str, Any] = {key: getattr(settings, key) for key in _CALL_SETTINGS}
+    calls["outputs"] = outputs
+    labels = None
+    if specimens is not None:
+        labels = sample_labels(specimens, len(values), f"{name}: specimens")
+    if by_specimen:
         settings.check_likelihood(name)
-        factors = None
-        labels = _labels(name, specimens, len(values))
         partners = _with_common_specimens(name, labels, model)
         arguments = _inputs_of_partners(name, arguments, partners)
         if weights is not None:
-            factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)
-        responses = _responses(name, response, arguments, settings, outputs)
+            weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
+        responses = Responses(name, response, arguments, **calls)
         extras = _measurement_variables(name, model, metric, partners)
         measurement = Measurement(
-            name, cast(LogLikelihood, metric), values, factors, labels, arguments, responses,
+            name, cast(LogLikelihood, metric), values, weights, labels, arguments, responses,
             settings, outputs, groups, extras,
         )  # fmt: skip
         return _add_measurement(model, measurement, partners, observed, dims)
-    target = _prepared_metric(name, metric, values, weights)
-    settings = _checked_propagation(name, propagation)
-    labels = _labels(name, specimens, len(target.observed))
     if labels is not None:
         _refuse_ambiguous_labels(name, labels, list(simulators(model).values()))
-    dims = _checked_dims(name, dims, target.observed.shape, model)
+    if dims is not None:
+        dims = _checked_dims(name, dims, target.observed.shape, model)
     if epsilon is not None:
         positive_number(epsilon, f"{name}: epsilon")
     flag(progressbar, "progressbar")
-    terms = [_Term(name, target, labels)]
+    parts = [(name, target, labels, "")]
     if arguments.groups is not None and groups is not None:
-        terms = _terms_by_group(terms[0], arguments.groups, groups, dims)
+        parts = _parts_by_group(name, target, labels, arguments.groups, groups, dims)
     variables = []
-    for term in terms:
-        responses = _responses(term.name, response, arguments, settings, outputs)
-        data = observed if arguments.groups is None else term.target.observed
-        variables.append(
-            _add_term(term, model, responses, settings, epsilon, progressbar, data, dims)
-        )
-    return variables[0] if arguments.groups is None else tuple(variables)
+    for place, (part_name, part, part_labels, group) in enumerate(parts):
+        responses = Responses(part_name, response, arguments, **calls)
+        scale = 1 / effective_specimens(part, part_labels) if is_likelihood(part) else np.nan
+        scale = scale if epsilon is None else epsilon
+        specification = Specification(
+            part_name, part, responses, settings, shared_epsilon(part_name, scale), part_labels,
+            outputs=outputs, group=group, progressbar=progressbar,
+        )  # fmt: skip
+        data = observed if arguments.groups is None else part.observed
+        variables.append(_add_simulator(model, specification, place, data, dims))
+    return tuple(variables) if arguments.groups is not None else variables[0]
 
 
 # The log-likelihood by specimen.
@@ -253,6 +271,8 @@ def _add_measurement(
             f"{name}: dims: got dimensions of {(with_dims or [name])[0]}, whose specimens have "
             "several readings, expected none: log-likelihoods are by specimen; leave dims= out"
         )
+    if dims is not None:
+        dims = _checked_dims(name, dims, measurement.observed.shape, model)
     groups = measurement.groups
     params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables(names)]
     rv = SpecimenDistribution(
@@ -262,7 +282,7 @@ def _add_measurement(
         likelihood=likelihood,
         simulators=names,
         observed=_pymc_data(observed, measurement.observed),
-        dims=_checked_dims(name, dims, measurement.observed.shape, model),
+        dims=dims,
     )
     for partner in joined:
         set_likelihood(partner, likelihood)
@@ -437,83 +457,62 @@ def checked_specimens(name: str, observed: Floats) -> Floats:
 # Metrics of distributions.
 
 
-@dataclass(frozen=True, eq=False)
-class _Term:
-    """Observed responses that are compared with one population: all, or those of a group."""
-
-    name: str
-    target: Discrepancy
-    labels: NDArray[Any] | None  # of specimens
-    group: str = ""
-    place: int = 0  # of the group
-
-
-def _add_term(
-    term: _Term,
+def _add_simulator(
     model: pm.Model,
-    responses: Responses,
-    propagation: Propagation,
-    epsilon: float | None,
-    progressbar: bool,
+    specification: Specification,
+    place: int,
     observed: Any,
-    dims: tuple[str, ...] | None,
+    dims: str | Sequence[str] | None,
 ) -> TensorVariable:
-    """Add an observed variable with a metric of distributions to a model."""
-    name, target, inputs = term.name, term.target, responses.inputs
+    """Add an observed variable with a metric of distributions; place is that of its group."""
+    name, target, labels = specification.name, specification.target, specification.specimens
+    responses, inputs = specification.responses, specification.responses.inputs
     earlier = list(simulators(model).values())
-    propagation.check_simulator(name, inputs, target)
+    specification.propagation.check_simulator(name, inputs, target)
     for simulator in earlier:
-        if simulator.propagation == propagation and responses.same_as(simulator.responses):
+        has_same_propagation = simulator.propagation == specification.propagation
+        if has_same_propagation and responses.same_as(simulator.responses):
             responses.share(simulator.responses)
             break
-    if term.labels is None:
+    if labels is None:
         warn_duplicates(name, target.observed)
-    if epsilon is None:
-        epsilon = 1 / effective_specimens(target, term.labels) if is_likelihood(target) else np.nan
+    else:
+        _warn_shared_specimens(specification, labels, earlier)
     aleatory = set(inputs.aleatory)
-    specification = Specification(
-        name,
-        target,
-        responses,
-        propagation,
-        shared_epsilon(name, epsilon),
-        term.labels,
-        tuple(
-            simulator.name
-            for simulator in earlier
-            if simulator.group == term.group
-            and not aleatory.isdisjoint(simulator.responses.inputs.aleatory)
-        ),
-        responses.outputs or SINGLE_OUTPUT,
-        term.group,
-        progressbar,
-    )
-    _warn_shared_specimens(specification, earlier)
-    place = pt.constant(term.place, dtype="int64")
+    same_inputs = [
+        simulator.name
+        for simulator in earlier
+        if simulator.group == specification.group
+        and not aleatory.isdisjoint(simulator.responses.inputs.aleatory)
+    ]
+    group = pt.constant(place, dtype="int64")
     rv = SimulatorDistribution(
         name,
-        *(place if is_group(v) else v for v in inputs.roots),
-        simulator=specification,
+        *(group if is_group(v) else v for v in inputs.roots),
+        simulator=replace(specification, same_inputs=tuple(same_inputs)),
         observed=_pymc_data(observed, target.observed),
         dims=dims,
     )
-    rv.owner.op.own_simulator(rv.owner)
+    rv.owner.op.owner = weakref.ref(rv.owner)  # before a clone of the model claims it
     return rv
 
 
-def _terms_by_group(
-    whole: _Term, groups: Groups, places: NDArray[np.intp], dims: tuple[str, ...] | None
-) -> list[_Term]:
-    """Return the term of each group; places are the groups of the specimens."""
-    name, target = whole.name, whole.target
+def _parts_by_group(
+    name: str,
+    target: Discrepancy,
+    labels: NDArray[Any] | None,
+    groups: Groups,
+    places: NDArray[np.intp],
+    dims: str | Sequence[str] | None,
+) -> list[tuple[str, Discrepancy, NDArray[Any] | None, str]]:
+    """Return name, target, labels and group of each group; places (N,) are those of specimens."""
     if dims is not None:
         raise ValueError(
             f"{name}: dims: got {list(dims)}, expected none: specimens are divided into the groups "
             f"{groups.names}, each with observed values of its own; leave dims= out"
         )
     place_of: dict[object, int] = {}
-    labels = [] if whole.labels is None else whole.labels.tolist()
-    for label, place in zip(labels, places.tolist(), strict=False):
+    for label, place in zip([] if labels is None else labels.tolist(), places, strict=False):
         first = place_of.setdefault(label, place)
         if first != place:
             raise ValueError(
@@ -521,15 +520,14 @@ def _terms_by_group(
                 f"{groups.names[place]}, expected each specimen in one group; write labels that "
                 "are different"
             )
-    terms = []
+    parts = []
     for place, group in enumerate(groups.names):
         rows = places == place
         weights = target.weights[rows] if np.ptp(target.weights) > 0 else None
-        group_name = groups.name(name, place)
-        part = _prepared_metric(group_name, target.metric, target.observed[rows], weights)
-        group_labels = None if whole.labels is None else whole.labels[rows]
-        terms.append(_Term(group_name, part, group_labels, group, place))
-    return terms
+        part_name = groups.name(name, place)
+        part = _prepared_metric(part_name, target.metric, target.observed[rows], weights)
+        parts.append((part_name, part, None if labels is None else labels[rows], group))
+    return parts
 
 
 def _prepared_metric(
@@ -554,13 +552,12 @@ def _prepared_metric(
         raise type(error)(f"{name}: {error}") from None
 
 
-def _warn_shared_specimens(simulator: AnySimulator, earlier: list[AnySimulator]) -> None:
+def _warn_shared_specimens(
+    simulator: AnySimulator, labels: NDArray[Any], earlier: list[AnySimulator]
+) -> None:
     """Warn if default epsilons count specimens more than once."""
-    if simulator.specimens is None:
-        return
-    labels = set(simulator.specimens.tolist())
     for second in earlier:
-        if second.specimens is None or labels.isdisjoint(second.specimens.tolist()):
+        if second.specimens is None or set(labels.tolist()).isdisjoint(second.specimens.tolist()):
             continue
         if has_default_epsilon(simulator) or has_default_epsilon(second):
             report(
@@ -578,11 +575,9 @@ def _warn_shared_specimens(simulator: AnySimulator, earlier: list[AnySimulator])
 # Arguments of both kinds.
 
 
-def _numbers(name: str, observed: Any) -> Any:
-    """Return observed responses as they were passed; of `pymc.Data` the present numbers."""
-    if not isinstance(observed, Variable):
-        return observed
-    values = None if is_labelled(observed) else known_value(observed)
+def _present_numbers(name: str, observed: Any) -> Any:
+    """Return the present numbers of `pymc.Data`."""
+    values = None if hasattr(observed.type, "dims") else known_value(observed)
     if values is None:
         raise TypeError(
             f"{name}: observed: got {observed} of type {observed.type}, expected numbers or pm.Data"
@@ -600,46 +595,10 @@ def _pymc_data(observed: Any, values: Floats) -> Any:
     return pt.constant(values) if np.isnan(values).any() else values
 
 
-def _checked_propagation(name: str, propagation: Propagation | None) -> Propagation:
-    """Return the propagation, which is `Reweighted` by default."""
-    if propagation is None:
-        return Reweighted()
-    if not isinstance(propagation, Propagation):
-        raise TypeError(
-            f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
-            "prb.Resimulated(n) or prb.Fresh(n)"
-        )
-    return propagation
-
-
-def _responses(
-    name: str,
-    response: Callable[..., Any],
-    inputs: Inputs,
-    propagation: Propagation,
-    outputs: Outputs,
-) -> Responses:
-    """Return the response with the propagation's settings of its calls."""
-    return Responses(
-        name,
-        response,
-        inputs,
-        executor=propagation.executor,
-        store=propagation.store,
-        version=propagation.version,
-        on_failure=propagation.on_failure,
-        retry_failed=propagation.retry_failed,
-        timeout=propagation.timeout,
-        outputs=outputs,
-    )
-
-
 def _checked_dims(
     name: str, dims: object, shape: tuple[int, ...], model: pm.Model
-) -> tuple[str, ...] | None:
+) -> tuple[str, ...]:
     """Return names of the observed dimensions, which the model has in the lengths of the data."""
-    if dims is None:
-        return None
     names = [dims] if isinstance(dims, str) else dims
     if not isinstance(names, list | tuple) or {type(dim) for dim in names} != {str}:
         raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
@@ -662,11 +621,6 @@ def _checked_dims(
                 "are observed values"
             )
     return tuple(names)
-
-
-def _labels(name: str, specimens: ArrayLike | None, size: int) -> NDArray[Any] | None:
-    """Return the labels of the specimens, (N,), or None."""
-    return None if specimens is None else sample_labels(specimens, size, f"{name}: specimens")
 
 
 def _refuse_ambiguous_labels(

@@ -37,14 +37,6 @@ def differences(
     """Return a function of theta that returns value, gradient by differences, and evaluations.
 
     ``values`` maps thetas (P, d) to values (P,); ``step`` has shape (d,).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> square = differences(lambda thetas: (thetas**2).sum(axis=-1), np.array([1e-3, 1e-3]))
-    >>> value, gradient, evaluations = square(np.array([1.0, 2.0]))
-    >>> np.allclose(gradient, [2.0, 4.0]), evaluations
-    (True, 5)
     """
 
     def function(theta: Floats) -> tuple[float, Floats, int]:
@@ -61,27 +53,21 @@ def stencil(r: int) -> Floats:
     """
     unit = np.eye(r)
     rows = list(cross(np.zeros(r), np.ones(r)))
-    for i, j in np.stack(np.tril_indices(r, -1), axis=-1):
-        a = unit[i]
-        b = unit[j]
+    for i, j in zip(*np.tril_indices(r, -1), strict=True):
+        a, b = unit[i], unit[j]
         rows += [a + b, a - b, b - a, -a - b]
     return np.array(rows)
 
 
 def hessian_of(values: Floats, r: int) -> Floats:
     """Return the Hessian, (r, r), from values at the points of `stencil`, by unit differences."""
-    center = values[0]
-    ends = [1, 1 + r, 1 + 2 * r]
-    _, up, down, corners = np.split(values, ends)
+    center, up, down, corners = np.split(values, [1, 1 + r, 1 + 2 * r])
     # Values that are not finite give NaN, which callers judge.
     with np.errstate(invalid="ignore"):
         hessian = np.diag(up - 2 * center + down)
+        pp, pm, mp, mm = corners.reshape(-1, 4).T
         rows, columns = np.tril_indices(r, -1)
-        for i, j, around in zip(rows, columns, corners.reshape(-1, 4), strict=True):
-            pp, pm, mp, mm = around
-            mixed = (pp - pm - mp + mm) / 4
-            hessian[i, j] = mixed
-            hessian[j, i] = mixed
+        hessian[rows, columns] = hessian[columns, rows] = (pp - pm - mp + mm) / 4
     return hessian
 
 

@@ -18,36 +18,30 @@ def inside(points: Floats) -> Floats:
 def sobol(n: int, dimensions: int, seed: int) -> Floats:
     """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions).
 
-    References
-    ----------
-    .. [1] Owen, A. B. (1998), Scrambling Sobol and Niederreiter-Xing points,
-       doi:10.1006/jcom.1998.0487.
-
-    Examples
-    --------
-    >>> sobol(4, 1, 0).shape
-    (4, 1)
+    Source: Owen (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
     """
     from scipy.stats import qmc  # takes longer to import than the whole package
 
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
-    if n == 1:
-        return inside(engine.random(1))
-    return inside(engine.random_base2(int(np.ceil(np.log2(n))))[:n])
+    points = engine.random(1) if n == 1 else engine.random_base2(int(np.ceil(np.log2(n))))[:n]
+    return inside(points)
+
+
+def farthest_rows(points: Floats, count: int, squares: Floats | None = None) -> list[int]:
+    """Return rows of points, (n, d), selected one by one: each is farthest from those before.
+
+    ``squares``, (n,), are squared distances from earlier points; without them row 0 is the first.
+    """
+    squares = np.full(len(points), np.inf) if squares is None else squares
+    rows: list[int] = []
+    while len(rows) < count:
+        rows.append(int(np.argmax(squares)))
+        squares = np.minimum(squares, ((points - points[rows[-1]]) ** 2).sum(axis=1))
+    return rows
 
 
 def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
-    """Return n independent random points in the open unit cube, shape (n, dimensions).
-
-    References
-    ----------
-    .. [1] Oh et al. (2019), doi:10.1007/s00158-019-02288-6, whose case study has a million of them.
-
-    Examples
-    --------
-    >>> monte_carlo(4, 1, 0).shape
-    (4, 1)
-    """
+    """Return n independent random points in the open unit cube, shape (n, dimensions)."""
     return inside(np.random.default_rng(seed).random((n, dimensions)))
 
 

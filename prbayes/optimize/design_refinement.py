@@ -29,10 +29,11 @@ from prbayes.optimize.convergence import (
 )
 from prbayes.optimize.objective import Ridge
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound, designs_restored
 
 _log = logging.getLogger("prbayes")
-# Batches after which a design is refused; half or twice changes no answer (docs/constants.md).
+# Batches after which a design is refused; half or twice changes no answer.
 MAX_ROUNDS = 8
 # Share of it for points and for emulators: together they then have it all.
 _SHARE = np.sqrt(0.5)
@@ -176,7 +177,7 @@ def refine_at(
     """
     short = shortcomings(evaluator, thetas)
     for name, shortcoming in short.items():
-        if shortcoming.lost is not None:
+        if shortcoming.is_lost:
             raise DesignError(
                 f"{name}: {shortcoming}; repair the response there, return +inf for specimens "
                 "that fail, narrow the priors, or raise max_lost"
@@ -256,8 +257,11 @@ def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: flo
         if bound is None or node.name not in names:
             continue
         previous = bound.n_runs
-        batches = max(1, round((factor - 1) * previous / bound.batch_size))
-        size = min(batches * bound.batch_size, bound.config.most - previous)
+        batch = bound.config.n
+        if bound.design.is_emulated:
+            batch = max(batch // 4, bound.responses.workers)
+        batches = max(1, round((factor - 1) * previous / batch))
+        size = min(batches * batch, bound.config.most - previous)
         if size > 0:
             bound.add(_components(evaluator, thetas, k), size)
             added.append(f"{node.name} from {previous} to {bound.n_runs}")
@@ -360,7 +364,10 @@ def _enlarge_samples(
     """Draw larger samples for the populations at thetas; return whether any could be."""
     is_larger = False
     for k, bound in _emulated_designs(evaluator, names):
-        is_larger |= bound.widen(_components(evaluator, thetas, k), same_surfaces=same_surfaces)
+        if bound.design.emulated_size < SIZES.largest:
+            components = _components(evaluator, thetas, k)
+            bound.reach(components, same_surfaces=same_surfaces, growth=2)
+            is_larger = True
     return is_larger
 
 

@@ -41,7 +41,7 @@ from prbayes.inference.checks.prior import prior_end_findings, prior_ends
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import SamplingDistribution, jumping_simulators
 from prbayes.inference.resampling import SETS
-from prbayes.metrics.multivariate import components_missed
+from prbayes.metrics.multivariate import components_summary
 from prbayes.model.cost import explained, kept
 from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
@@ -333,7 +333,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
     if not evaluator.nodes:
         return maximize_likelihood(evaluator, settings)
     for node in evaluator.nodes:
-        node.bound.restart(settings.random_seed)
+        node.bound.stream, node.bound.draws = settings.random_seed, 0
     clock = time.perf_counter()
     search = Search(
         evaluator,
@@ -604,7 +604,7 @@ def optimum_findings(
     design_error: float,
 ) -> tuple[Finding, ...]:
     """Report what the metric leaves out, the design's error, other optima, and identification."""
-    missed = {node.name: components_missed(node.target) for node in evaluator.nodes}
+    missed = {n.name: components_summary(n.target, missed=True) for n in evaluator.nodes}
     findings = [
         Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
     ]
@@ -625,7 +625,7 @@ def optimum_findings(
 def _design_finding(evaluator: Evaluator, error: float) -> Finding:
     """Report a large error of the optimum by the design."""
     designs = [bound.design for bound in evaluator.reweighted.values()]
-    runs = max(design.n_runs for design in designs)
+    runs = max(len(design.runs) for design in designs)
     if min(len(design.emulated or ()) for design in designs) < SIZES.largest:
         advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
     else:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator, has_other_terms
+from prbayes.model.evaluator import Evaluator
 
 # Theta (d,) -> value, gradient (d,) or None, number of evaluations.
 type Function = Callable[[Floats], tuple[float, Floats | None, int]]
@@ -144,7 +144,7 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
 
 def _has_varying_terms(evaluator: Evaluator) -> bool:
     """Return whether other terms do more than exclude hyperparameters."""
-    if not has_other_terms(evaluator):
+    if not evaluator.has_other_terms:
         return False
     # A power of two, as Sobol points are then balanced.
     values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))

@@ -31,7 +31,6 @@ from prbayes.model.description import (
 )
 from prbayes.model.evaluator import (
     Evaluator,
-    has_other_terms,
     likelihood_of,
     missing_mass,
     specimen_log_likelihoods,
@@ -319,7 +318,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
     record = replace(record, result=_final_result(search, fit, record, is_affordable=is_affordable))
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
-    elif len(scales) > 1 or search.prior or has_other_terms(evaluator):
+    elif len(scales) > 1 or search.prior or evaluator.has_other_terms:
         values = np.full(len(scales), np.nan)
     else:
         values = fit.run.lowest * scales

@@ -31,7 +31,7 @@ from prbayes.plots.canvas import (
 from prbayes.plots.curves import GRID_POINTS, central_range, outlines, smooth_densities
 from prbayes.plots.ensemble import Ensemble, draw_calibrated, read_result
 from prbayes.response.compile import compile_batched
-from prbayes.response.distributions import PopulationSampler, is_mvnormal
+from prbayes.response.distributions import MVNORMAL, PopulationSampler
 from prbayes.response.inputs import Inputs, aleatory_names
 
 
@@ -276,7 +276,7 @@ def _exact(inputs: Inputs, margin: Margin, roots: list[Floats], grid: Floats) ->
     dists, *_ = inputs.rebuilt(symbols)
     dist: Any = dists[margin.position]
     x = pt.lvector("x") if margin.discrete else pt.dvector("x")
-    if is_mvnormal(dist):
+    if isinstance(dist.owner.op, MVNORMAL):
         mean, covariance = dist.owner.op.dist_params(dist.owner)
         (i,) = margin.index
         logp = pm.logp(pm.Normal.dist(mean[i], pt.sqrt(covariance[i, i])), x)

@@ -157,7 +157,8 @@ def _select(names: list[str], var_names: Sequence[str] | None) -> list[str]:
     """Return the hyperparameters of the picture; by default those that a reader wants."""
     if var_names is None:
         return list(readable_elements(names))
-    selection = [var_names] if isinstance(var_names, str) else list(var_names)
+    is_list = isinstance(var_names, Sequence) and not isinstance(var_names, str)
+    selection = list(var_names) if is_list else [var_names]
     unknown = set(selection) - {*names, *map(variable_of, names)}
     if unknown or not selection:
         got = [name for name in selection if name in unknown] or "none"

@@ -14,10 +14,11 @@ from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.inference.asymptotics import unidentified_directions
 from prbayes.inference.refits import is_prepared_by_data, refit, refit_prepared
 from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, simulated_sets
+from prbayes.model.description import observed_dataset, versions
 from prbayes.model.locking import locked
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_refits
-from prbayes.posterior.results import bootstrap_tree
+from prbayes.posterior.results import posterior_group
 
 
 @locked
@@ -91,37 +92,35 @@ def bootstrap(
     positive_integer(draws, "draws", minimum=2)
     flag(parametric, "parametric")
     seed = seed_number(random_seed)
-    refitted = _specimen_estimates if by_specimen else _minimisers
+    evaluator = optimum.evaluator
     with shown(progressbar):
-        thetas, converged = refitted(optimum, draws, seed, parametric=parametric)
-    return bootstrap_tree(
-        optimum.evaluator,
-        thetas[None],
-        sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
-        converged=float(converged.mean()),
-        seed=seed,
-        n_responses=optimum.n_responses,
-        seconds=time.perf_counter() - clock,
-    )
-
-
-def _minimisers(
-    optimum: Optimum, draws: int, seed: int, *, parametric: bool
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return minimisers of the discrepancies, (draws, d), and whether they converged."""
-    evaluator, sampling = optimum.evaluator, optimum.sampling()
-    names = evaluator.hyperparameters.readable_names
-    unidentified = unidentified_directions(sampling.local.unidentified, names)
-    if unidentified:
-        raise ValueError(_unidentified(unidentified))
-    if parametric:
-        data = simulated_sets(evaluator, optimum.theta, draws, seed)
-    else:
-        data = reweighted_sets(evaluator, draws, seed)
-    x, converged = refit(sampling, data)
-    if is_prepared_by_data(sampling.evaluator):
-        x, converged = refit_prepared(sampling, data, x)
-    return sampling.thetas(x), converged
+        if by_specimen:
+            thetas, converged = _specimen_estimates(optimum, draws, seed, parametric=parametric)
+        else:
+            sampling = optimum.sampling()
+            names = evaluator.hyperparameters.readable_names
+            _require_identified(unidentified_directions(sampling.local.unidentified, names))
+            if parametric:
+                data = simulated_sets(evaluator, optimum.theta, draws, seed)
+            else:
+                data = reweighted_sets(evaluator, draws, seed)
+            x, converged = refit(sampling, data)
+            if is_prepared_by_data(sampling.evaluator):
+                x, converged = refit_prepared(sampling, data, x)
+            thetas = sampling.thetas(x)
+    attrs = {
+        "sampler": "parametric bootstrap" if parametric else "loss-likelihood bootstrap",
+        "converged": float(converged.mean()),
+        "n_responses": optimum.n_responses,
+        "seconds": time.perf_counter() - clock,
+        "random_seed": str(seed),
+        **versions(),
+    }
+    groups = {
+        "posterior": posterior_group(evaluator, thetas[None], attrs),
+        "observed_data": observed_dataset(evaluator),
+    }
+    return xr.DataTree.from_dict(groups)
 
 
 def _specimen_estimates(
@@ -129,19 +128,17 @@ def _specimen_estimates(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return maximum-likelihood estimates, (draws, d), and whether they converged."""
     refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
-    unidentified = np.array(optimum.names)[np.isinf(np.diag(optimum.covariance))]
-    if unidentified.size:
-        raise ValueError(_unidentified(unidentified.tolist()))
+    _require_identified(np.array(optimum.names)[np.isinf(np.diag(optimum.covariance))].tolist())
     if not parametric:
         return refits.reweighted(dirichlet_weights(refits.evaluator.emulated, draws, seed))
-    estimates = list(refits.simulated(draws, seed))
-    thetas = np.array([estimate.theta for estimate in estimates])
-    return thetas, np.array([estimate.converged for estimate in estimates])
+    thetas, converged, _ = zip(*refits.simulated(draws, seed), strict=True)
+    return np.array(thetas), np.array(converged)
 
 
-def _unidentified(names: Sequence[str]) -> str:
-    return (
-        f"bootstrap: the data tell less than the prior about {', '.join(names)}, along which the "
-        "estimate is arbitrary; use prb.sample_smc, whose posterior falls back on the prior there, "
-        "or fix a hyperparameter"
-    )
+def _require_identified(unidentified: Sequence[str]) -> None:
+    if unidentified:
+        raise ValueError(
+            f"bootstrap: the data tell less than the prior about {', '.join(unidentified)}, along "
+            "which the estimate is arbitrary; use prb.sample_smc, whose posterior falls back on "
+            "the prior there, or fix a hyperparameter"
+        )

@@ -13,7 +13,6 @@ from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, positive_number
 from prbayes.inference.asymptotics import (
     Information,
-    LinearArea,
     first_order_shifts,
     identified_by_area,
     identified_by_curvature,
@@ -25,9 +24,11 @@ from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, identity_of, require_same
 from prbayes.model.locking import locked
-from prbayes.model.random_variable import AnySimulator, required_simulators, simulators
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.random_variable import AnySimulator, simulators
+from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
 from prbayes.optimize.optimum import Optimum, require_minimiser, require_sampling
+
+_log = logging.getLogger("prbayes")
 
 
 @locked
@@ -98,48 +99,40 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             f"calibrate_epsilon: got {type(optimum).__name__}, expected an Optimum; call "
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
-    refuse_without_epsilon(
-        optimum.model, "calibrate_epsilon", "sample it with prb.sample_smc or pm.sample"
-    )
+    refuse_without_epsilon(optimum.model, "calibrate_epsilon")
     evaluator = require_sampling(optimum, "calibrate_epsilon").evaluator
     require_minimiser(optimum, "calibrate_epsilon")
-    epsilons = {
-        node.name: _epsilon(Information(evaluator, k, optimum.theta))
-        for k, node in enumerate(evaluator.nodes)
-    }
-    for group in groups(evaluator.nodes):
-        names = [evaluator.nodes[k].name for k in group]
-        ratio = _variance_ratio(optimum, group, np.array([epsilons[name] for name in names]))
-        epsilons |= {name: epsilons[name] * ratio for name in names}
-    return Epsilon(epsilons, optimum.identity)
+    nodes = evaluator.nodes
+    information = [Information(evaluator, k, optimum.theta) for k in range(len(nodes))]
+    epsilons = np.array([_epsilon_of(item) for item in information])
+    for group in groups(nodes):
+        ratio = _variance_ratio([information[k] for k in group], epsilons[group])
+        epsilons[group] *= ratio
+    by_name = {node.name: float(value) for node, value in zip(nodes, epsilons, strict=True)}
+    return Epsilon(by_name, optimum.identity)
 
 
-def _variance_ratio(optimum: Optimum, group: list[int], epsilon: Floats) -> float:
-    """Return the ratio of variances of the minimiser with shared and with different specimens.
-
-    The latter are the same data sets, exchanged between the simulators. The ratio is averaged over
-    the identified directions.
-    """
-    information = [Information(optimum.evaluator, k, optimum.theta) for k in group]
-    if len(group) < 2 or any(i.node.metric.minimum is Minimum.UNKNOWN for i in information):
+def _variance_ratio(information: list[Information], epsilon: Floats) -> float:
+    """Return the ratio of variances of the minimiser with shared and with different specimens."""
+    if len(information) < 2 or any(i.node.metric.minimum is Minimum.UNKNOWN for i in information):
         return 1.0
     basis = local_sampling(information, epsilon).identified
     if not basis.shape[1]:
         return 1.0
     sets = information[0].data_sets
-
-    def variance(shift: int) -> Floats:
+    variances = []
+    # Different specimens are the same data sets, exchanged between the simulators.
+    for shift in range(5):
         weights = [np.roll(w, shift * k, axis=0) for k, w in enumerate(sets.weights)]
         shifts = first_order_shifts(information, epsilon, basis, DataSets(sets.values, weights))
-        return np.atleast_2d(np.cov(shifts, rowvar=False))
-
+        variances.append(np.atleast_2d(np.cov(shifts, rowvar=False)))
     # The mean of several has a negligible error.
-    different = np.mean([variance(shift) for shift in range(1, 5)], axis=0)
-    ratio = np.linalg.solve(different, variance(0))
+    ratio = np.linalg.solve(np.mean(variances[1:], axis=0), variances[0])
     return float(np.trace(ratio) / len(ratio))
 
 
-def _epsilon(information: Information) -> float:
+def _epsilon_of(information: Information) -> float:
+    """Return the epsilon of a simulator by itself."""
     node = information.node
     if is_likelihood(node.target):
         return 1 / node.n_specimens
@@ -149,36 +142,32 @@ def _epsilon(information: Information) -> float:
             f"epsilon cannot be calibrated: {obstacle}; pass epsilon= to prb.Simulator (the "
             "standard deviation of the discrepancy at a good theta is a start)"
         )
-    match node.metric.minimum:
-        case Minimum.QUADRATIC:
-            return _by_sandwich(information)
-        case Minimum.ABSOLUTE:
-            return _by_coverage(information)
-        case Minimum.UNKNOWN:
-            return _by_refits(information)
-
-
-def _require_identified(information: Information, n_identified: int) -> None:
-    """Raise if no direction is identified."""
-    if not n_identified:
+    methods = {
+        Minimum.QUADRATIC: _by_sandwich,
+        Minimum.ABSOLUTE: _by_coverage,
+        Minimum.UNKNOWN: _by_refits,
+    }
+    epsilon = methods[node.metric.minimum](information)
+    if epsilon is None:
         raise ValueError(
-            f"{information.node.name}: the data tell less than the prior about every "
-            "hyperparameter, so epsilon cannot be calibrated; look at the optimum, widen the "
-            "priors, or pass epsilon="
+            f"{node.name}: the data tell less than the prior about every hyperparameter, so "
+            "epsilon cannot be calibrated; look at the optimum, widen the priors, or pass epsilon="
         )
+    return epsilon
 
 
-def _by_sandwich(information: Information) -> float:
-    """Return trace(H^-1 J) / p over the p identified directions."""
+def _by_sandwich(information: Information) -> float | None:
+    """Return trace(H^-1 J) / p over the p identified directions, None without any."""
     unit = np.outer(information.prior_sd, information.prior_sd)
     noise = information.sampling_covariance * unit
     values, vectors, is_identified = identified_by_curvature(information.hessian * unit, noise)
-    _require_identified(information, int(is_identified.sum()))
+    if not is_identified.any():
+        return None
     variances = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
     return float(np.mean(variances[is_identified] / values[is_identified]))
 
 
-def _by_refits(information: Information) -> float:
+def _by_refits(information: Information) -> float | None:
     """Return the mean of delta . grad d / p, delta from the sampling distribution.
 
     The derivative along delta is the difference between one and a half and half of it: exact for a
@@ -190,7 +179,8 @@ def _by_refits(information: Information) -> float:
     )
     local = refits.local()
     p = local.identified.shape[1]
-    _require_identified(information, p)
+    if not p:
+        return None
     # A delta for each data set, and its opposite, in units of the prior's spread.
     z = np.random.default_rng(0).standard_normal((len(refits.shifts), p))
     root = np.linalg.cholesky(local.covariance)
@@ -204,15 +194,15 @@ def _by_refits(information: Information) -> float:
     return float(slopes[np.isfinite(slopes)].mean() / p)
 
 
-def _by_coverage(information: Information) -> float:
+def _by_coverage(information: Information) -> float | None:
     """Solve for the epsilon whose posteriors cover, with features that are linear in theta."""
-    areas = information.areas(*information.data_set)
     # The strongest directions are last. The information of a sample of one response beyond two
     # directions, close to its location and spread, is of the order of the error of derivatives of
     # stored weights; m outputs have as many locations, spreads and correlations.
     (m,) = information.node.target.event or (1,)
     basis = identified_by_area(information)[:, -m * (m + 3) // 2 :]
-    _require_identified(information, basis.shape[1])
+    if not basis.shape[1]:
+        return None
     shifts = first_order_shifts([information], np.ones(1), basis, information.data_sets)
     covariance = np.atleast_2d(np.cov(shifts, rowvar=False))
     variances, vectors = np.linalg.eigh(covariance)
@@ -220,46 +210,27 @@ def _by_coverage(information: Information) -> float:
     directions = axes * information.prior_sd[:, None]  # (d, r), a standard error long
     # Thetas around the optimum, three times as wide as the sampling distribution, to reach all
     # posteriors. Half or twice their number changes epsilon by 3%, half of the width by 2%, and
-    # twice the width by 11% (docs/constants.md).
+    # twice the width by 11%.
     z = np.random.default_rng(0).standard_normal((500, directions.shape[1]))
-    distances = _distances(areas, 3.0 * (z @ directions.T))
+    thetas = 3.0 * (z @ directions.T)
+    distances: Any = 0  # (n_sets, M)
+    for area in information.areas(*information.data_set):
+        change = thetas @ area.slopes
+        rows = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
+        distances = distances + np.array(rows)
+    log_proposal = -0.5 * (z**2).sum(axis=-1)
     # Coverage grows with epsilon.
     low, high = (information.noise_floor * factor for factor in (1e-3, 10.0))
     for _ in range(40):  # to rounding
         middle = float(np.sqrt(low * high))
-        if _coverage(z, distances, middle) < INTERVAL:
-            low = middle
-        else:
-            high = middle
+        logs = -distances / middle - log_proposal
+        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
+        weights /= weights.sum(axis=1, keepdims=True)
+        # The posterior probability below the optimum, which is at zero, by axis and data set.
+        below = np.stack([(weights * (column < 0)).sum(axis=1) for column in z.T])
+        coverage = float(np.mean(np.abs(below - 0.5) < INTERVAL / 2))
+        low, high = (middle, high) if coverage < INTERVAL else (low, middle)
     return float(np.sqrt(low * high))
-
-
-def _distances(areas: Sequence[LinearArea], shifts: Floats) -> Floats:
-    """Return areas of data sets at shifts of theta, (M, d) -> (n_sets, M)."""
-    total: Any = 0
-    for area in areas:
-        change = shifts @ area.slopes
-        rows = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
-        total = total + np.array(rows)
-    return np.asarray(total)
-
-
-def _coverage(z: Floats, distances: Floats, epsilon: float) -> float:
-    """Return how often posterior intervals of the data sets contain the optimum, on average.
-
-    Thetas have standard normal coordinates, (M, r), along the axes of the sampling distribution,
-    and distances from the data sets, (n_sets, M).
-    """
-    log_proposal = -0.5 * (z**2).sum(axis=-1)
-    logs = -distances / epsilon - log_proposal
-    weights = np.exp(logs - logs.max(axis=1, keepdims=True))
-    weights /= weights.sum(axis=1, keepdims=True)
-    # The posterior probability below the optimum, which is at zero, by axis and data set.
-    below = np.stack([(weights * (column < 0)).sum(axis=1) for column in z.T])
-    return float(np.mean(np.abs(below - 0.5) < INTERVAL / 2))
-
-
-_log = logging.getLogger("prbayes")
 
 
 class Epsilon(dict[str, float]):
@@ -273,11 +244,7 @@ class Epsilon(dict[str, float]):
 def checked_epsilon(
     epsilon: Mapping[str, float], simulators: Sequence[AnySimulator], model: pm.Model, caller: str
 ) -> dict[str, float]:
-    """Return positive numbers by the names of simulators.
-
-    Raise KeyError, TypeError or ValueError if a name is unknown, a value is not a positive number,
-    or they were calibrated for another problem.
-    """
+    """Return positive numbers by the names of simulators; raise if they are no such numbers."""
     if not isinstance(epsilon, Mapping):
         raise TypeError(
             f"epsilon: got {called(epsilon)}, expected a mapping of names of simulators to "
@@ -292,13 +259,13 @@ def checked_epsilon(
     return {name: positive_number(value, f"{name}: epsilon") for name, value in epsilon.items()}
 
 
-def refuse_without_epsilon(model: pm.Model, caller: str, advice: str) -> None:
+def refuse_without_epsilon(model: pm.Model, caller: str) -> None:
     """Raise if all simulators of a model have a log-likelihood by specimen, without an epsilon."""
     if specimen_likelihoods(model) and not simulators(model):
         raise ValueError(
             f"{caller}: got a model whose simulators use prb.LogLikelihood(), which has no epsilon "
-            f"and whose draws have the width of the data, expected a metric of distributions; "
-            f"{advice}"
+            "and whose draws have the width of the data, expected a metric of distributions; "
+            "sample it with prb.sample_smc or pm.sample"
         )
 
 
@@ -331,8 +298,9 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
     >>> prb.set_epsilon(model, {"y": 0.1})
     """
-    refuse_without_epsilon(model, "set_epsilon", "sample it with prb.sample_smc or pm.sample")
-    by_metric = list(required_simulators(model).values())
+    refuse_without_epsilon(model, "set_epsilon")
+    require_simulator(model)
+    by_metric = list(simulators(model).values())
     values = checked_epsilon(epsilon, by_metric, model, "set_epsilon")
     for simulator in by_metric:
         if simulator.name in values:

@@ -62,29 +62,15 @@ class ImportanceSample:
     log_density: Floats  # (n,)
     pareto_k: float  # shape of the tail of the weights
     efficiency: float  # effective sample size for each point
-    n_points: int  # of all proposals
+    effective_size: float  # of the points of all proposals
     log_evidence: float  # logarithm of the integral of the density
-
-    @property
-    def effective_size(self) -> float:
-        """The effective sample size of the weighted points."""
-        return self.efficiency * self.n_points
-
-    def is_reliable(self, options: ImportanceOptions) -> bool:
-        """Return whether the weights are even enough."""
-        smallest = options.effective * len(self.draws)
-        return self.pareto_k <= options.pareto_k and self.effective_size >= smallest
+    is_reliable: bool  # whether the weights are even enough
 
 
 def laplace(
     log_density: LogDensity, starts: Floats, scale: Floats, steps: int = 20
 ) -> list[Laplace]:
-    """Return the modes near starts, (M, d), by damped Newton steps with finite differences.
-
-    ``scale``, (d,), are standard deviations of the prior; the curvature is at least a hundredth of
-    that of a normal prior. Raises ValueError if the log-density is not finite around a mode, as at
-    the end of a support.
-    """
+    """Return the modes near starts, (M, d), by damped Newton steps with finite differences."""
     modes = np.array(starts)
     count, d = modes.shape
     sd = np.tile(0.1 * scale, (count, 1))
@@ -152,10 +138,7 @@ def importance_sample(
     options: ImportanceOptions = ImportanceOptions(),
     prior: Prior | None = None,
 ) -> ImportanceSample:
-    """Return ``size`` draws of a density by importance sampling around its modes.
-
-    The prior is part of the proposals after the first.
-    """
+    """Return ``size`` draws by importance sampling around modes, later also from the prior."""
     masses = np.array([mode.log_mass for mode in modes])
     # A mode whose mass the approximation gets wrong still has points.
     shares = np.maximum(np.exp(masses - logsumexp(masses)), 0.1 / len(masses))
@@ -186,12 +169,12 @@ def importance_sample(
         if prior is not None and n_prior:
             terms.append(prior.log_density(points) + np.log(n_prior / len(points)))
         log_ratio = log_p - logsumexp(terms, axis=0)
-        sample = _resampled(points, log_p, log_ratio, size, seed)
+        sample = _resampled(points, log_p, log_ratio, size, seed, options)
         # Too few effective points have no moments.
         is_lost = round_ > 2 and sample.effective_size < 10 * points.shape[1]
         # Fitted proposals look better than they are until the points are in all regions.
         is_enough = round_ == 1 or sample.effective_size >= size
-        if (sample.is_reliable(options) and is_enough) or round_ == options.rounds or is_lost:
+        if (sample.is_reliable and is_enough) or round_ == options.rounds or is_lost:
             break
         proposal = _fitted_mixture(points, log_ratio, options, rng)
         count = round_ * size // 2
@@ -209,10 +192,7 @@ def importance_sample(
 def _fitted_mixture(
     points: Floats, log_ratio: Floats, options: ImportanceOptions, rng: np.random.Generator
 ) -> _Mixture:
-    """Return a mixture of t distributions fitted to weighted points by the EM algorithm.
-
-    Weights of few effective points are raised to a power below one until they have a hundred.
-    """
+    """Return a mixture of t distributions fitted to weighted points by the EM algorithm."""
     for power in np.linspace(1, 0, 20, endpoint=False):
         weights = np.exp(power * (log_ratio - log_ratio.max()))
         weights /= weights.sum()
@@ -255,7 +235,12 @@ def _fitted_mixture(
 
 
 def _resampled(
-    points: Floats, log_p: Floats, log_ratio: Floats, size: int, seed: int
+    points: Floats,
+    log_p: Floats,
+    log_ratio: Floats,
+    size: int,
+    seed: int,
+    options: ImportanceOptions,
 ) -> ImportanceSample:
     """Return draws by Pareto-smoothed weights and systematic resampling."""
     stats: Any = import_module("arviz_stats")
@@ -269,13 +254,16 @@ def _resampled(
     places = np.searchsorted(np.cumsum(weights[order]), positions)
     # In random order again: copies of a point are next to each other.
     rows = rng.permutation(order[places.clip(max=len(weights) - 1)])
+    efficiency = float(1 / (weights**2).sum() / len(weights))
+    effective = efficiency * len(points)
     return ImportanceSample(
         points[rows],
         log_p[rows],
         pareto_k=float(pareto_k),
-        efficiency=float(1 / (weights**2).sum() / len(weights)),
-        n_points=len(points),
+        efficiency=efficiency,
+        effective_size=effective,
         log_evidence=float(logsumexp(log_ratio) - np.log(len(log_ratio))),
+        is_reliable=pareto_k <= options.pareto_k and effective >= options.effective * size,
     )
 
 

@@ -10,7 +10,7 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -18,7 +18,6 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from scipy.special import logsumexp
 
@@ -27,13 +26,14 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, Level, as_text, differences, from_text
 from prbayes.model.parameters import Hyperparameters
 from prbayes.posterior.importance import LogDensity
+from prbayes.response.budget import BudgetError
 from prbayes.response.inputs import event_shape, model_on_context
 from prbayes.response.store import StoreError
 
 
 @dataclass(frozen=True)
 class KernelOptions:
-    """Limits of the mutation, which a study chose (docs/constants.md)."""
+    """Limits of the mutation, which a study chose."""
 
     # Mean absolute correlation with the previous particles, below which draws are new: .036 among
     # 500 independent ones. Half or twice moves a mean no more than another seed does.
@@ -46,6 +46,8 @@ class KernelOptions:
 
 _OPTIONS = KernelOptions()
 
+Stages = dict[str, list[float]]  # statistics of a chain by name, a value for each stage
+
 
 class Particles(NamedTuple):
     """Particles with their densities."""
@@ -55,15 +57,6 @@ class Particles(NamedTuple):
     log_likelihood: Floats  # (n,)
     discrepancies: Floats  # (n, k)
     lost: Floats  # (n, k): share of the population without response; NaN if not known
-
-    def at(self, index: Any) -> Particles:
-        """Return particles by an index."""
-        return Particles(*(array[index] for array in self))
-
-    def replaced(self, new: Particles, where: NDArray[np.bool_]) -> Particles:
-        """Return these particles, or new ones where (n,) is true."""
-        columns = [where.reshape(-1, *[1] * (array.ndim - 1)) for array in self]
-        return Particles(*map(np.where, columns, new, self))
 
 
 class BatchedKernel(SMC_KERNEL):
@@ -132,6 +125,7 @@ class BatchedKernel(SMC_KERNEL):
         self.var_info = {name: (shape, int(np.prod(shape, dtype=int))) for name, shape in shapes}
         self.rng = np.random.default_rng(random_seed)
         self.is_coarse = False  # whether `reweight` by a finer evaluator follows
+        self.stages: Stages = {}
         self._reset_state()
 
     def _take(self, particles: Particles) -> None:
@@ -166,6 +160,7 @@ class BatchedKernel(SMC_KERNEL):
             thetas = self.start
         else:
             thetas = starting_thetas(self.evaluator.hyperparameters, self.start, self.draws)
+        self.stages = {name: [] for name in self.stats_dtypes_shapes}
         self._take(self._evaluate(thetas))
         if not np.isfinite(self.particles.log_likelihood).any():
             raise ValueError(
@@ -177,7 +172,24 @@ class BatchedKernel(SMC_KERNEL):
     def resample(self) -> None:
         """Resample the particles in proportion to their weights."""
         self.resampling_indexes = systematic_resampling(self.weights, self.rng)
-        self._take(self.particles.at(self.resampling_indexes))
+        self._take(Particles(*(array[self.resampling_indexes] for array in self.particles)))
+
+    def tempered(self, evaluator: Evaluator, max_stages: int | None = None) -> Iterator[None]:
+        """Do the remaining stages, the last one with this evaluator, and yield after each."""
+        while self.beta < 1 or self.is_coarse:
+            if len(self.stages["beta"]) == max_stages:
+                raise BudgetError(
+                    f"max_stages = {max_stages} was reached (beta {self.beta:.3g}, of 1)"
+                )
+            if self.beta < 1:
+                self.update_beta_and_weights()
+            elif not self.reweight(evaluator):
+                # The coarse posterior differs: once more, on all points.
+                self.initialize(self.start, self.rng)
+                continue
+            for name, value in self.step().items():
+                self.stages[name].append(value)
+            yield
 
     def reweight(self, evaluator: Evaluator) -> bool:
         """Weigh the particles by another evaluator; return whether enough of them have weight."""
@@ -197,7 +209,11 @@ class BatchedKernel(SMC_KERNEL):
     def mutate(self) -> None:
         """Move all particles by Metropolis-Hastings steps that preserve the tempered posterior."""
         start = self.particles.thetas
-        mean, root = fitted_normal(start)
+        # The normal distribution fitted to the particles; identical ones have a covariance, too.
+        mean = start.mean(axis=0)
+        covariance = np.atleast_2d(np.cov(start, rowvar=False))
+        jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
+        root = np.linalg.cholesky(covariance + jitter)
         is_last = self.beta == 1 and not self.is_coarse
         limit = _OPTIONS.correlation if is_last else _OPTIONS.tempered_correlation
         # The best scale for normal targets, steered to an acceptance rate between those for many
@@ -207,10 +223,14 @@ class BatchedKernel(SMC_KERNEL):
         rates = []
         for step in range(1, _OPTIONS.steps + 1):
             noise = self.rng.standard_normal(start.shape)
-            if step % 2:
-                rates.append(self._independent_step(mean, root, noise))
+            if step % 2:  # independent proposals
+                standard = np.linalg.solve(root, (self.particles.thetas - mean).T)
+                log_ratio = 0.5 * ((noise**2).sum(axis=1) - (standard**2).sum(axis=0))
+                rates.append(self._accept(mean + noise @ root.T, log_ratio))
                 continue
-            rate = self._random_walk_step(root, scale * noise)
+            # Random-walk proposals, which are symmetric.
+            moved = self.particles.thetas + scale * noise @ root.T
+            rate = self._accept(moved, np.zeros(len(noise)))
             rates.append(rate)
             scale *= np.exp(rate - 0.3)
             previous = remaining
@@ -221,16 +241,6 @@ class BatchedKernel(SMC_KERNEL):
         self.accept_rate = float(np.mean(rates))
         self.n_steps = step
 
-    def _independent_step(self, mean: Floats, root: Floats, noise: Floats) -> float:
-        """Propose draws of a normal distribution; return the rate of acceptance."""
-        standard = np.linalg.solve(root, (self.particles.thetas - mean).T)
-        log_ratio = 0.5 * ((noise**2).sum(axis=1) - (standard**2).sum(axis=0))
-        return self._accept(mean + noise @ root.T, log_ratio)
-
-    def _random_walk_step(self, root: Floats, noise: Floats) -> float:
-        """Propose a step from each particle; return the rate of acceptance."""
-        return self._accept(self.particles.thetas + noise @ root.T, np.zeros(len(noise)))
-
     def _accept(self, thetas: Floats, log_ratio: Floats) -> float:
         """Accept or reject, given the log ratio of the proposal's densities there and back."""
         current, proposed = self.particles, self._evaluate(thetas)
@@ -239,7 +249,10 @@ class BatchedKernel(SMC_KERNEL):
             gain = proposed.log_prior - current.log_prior + tempered + log_ratio
         log_uniform = np.log(self.rng.random(len(thetas)))
         is_accepted = log_uniform < np.nan_to_num(gain, nan=-np.inf)
-        self._take(current.replaced(proposed, is_accepted))
+        merged = Particles(*(array.copy() for array in current))
+        for array, new in zip(merged, proposed, strict=True):
+            array[is_accepted] = new[is_accepted]
+        self._take(merged)
         return float(is_accepted.mean())
 
     def sample_stats(self) -> dict[str, Any]:
@@ -258,6 +271,7 @@ class BatchedKernel(SMC_KERNEL):
     def state(self) -> tuple[dict[str, Floats], dict[str, Any]]:
         """Return the state that the next stage depends on: arrays, and a note for JSON."""
         note = {
+            "stages": self.stages,
             "is_coarse": self.is_coarse,
             "beta": self.beta,
             "log_marginal_likelihood": self.log_marginal_likelihood,
@@ -269,20 +283,13 @@ class BatchedKernel(SMC_KERNEL):
     def restore(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
         """Take over a state."""
         self._take(Particles(**arrays))
+        self.stages = note["stages"]
         self.is_coarse = note["is_coarse"]
         self.beta = note["beta"]
         self.log_marginal_likelihood = note["log_marginal_likelihood"]
         self.iteration = note["iteration"]
         self.rng = np.random.default_rng()
         self.rng.bit_generator.state = note["generator"]
-
-
-def fitted_normal(particles: Floats) -> tuple[Floats, Floats]:
-    """Return mean, (d,), and Cholesky factor of the covariance, (d, d), of particles."""
-    covariance = np.atleast_2d(np.cov(particles, rowvar=False))
-    # Identical particles have a proper covariance, too.
-    jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
-    return particles.mean(axis=0), np.linalg.cholesky(covariance + jitter)
 
 
 def correlation(start: Floats, end: Floats) -> float:
@@ -295,43 +302,42 @@ def correlation(start: Floats, end: Floats) -> float:
 
 
 def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) -> Floats:
-    """Return thetas, (draws, d), of the particles that a user passes, as for `pymc.sample_smc`.
-
-    ``start`` has for each free variable values of shape (draws, *shape): by its own name in its own
-    units, as draws of `pymc.sample_prior_predictive` are, or transformed by the name that PyMC
-    gives its value, such as ``sigma_log__``. Raises KeyError, TypeError or ValueError if it is no
-    such mapping, or a value is outside the priors' support.
-    """
+    """Return thetas, (draws, d), of particles by names of variables or of transformed values."""
     if not isinstance(start, Mapping):
         raise TypeError(
             f"start: got {called(start)}, expected a dict of arrays by the names of variables, or "
             "a list of these, one for each chain"
         )
-    model = hyperparameters.model
-    values_to_rvs = zip(hyperparameters.shapes, model.value_vars, strict=True)
-    rv_names = {name: str(model.values_to_rvs[value].name) for name, value in values_to_rvs}
+    free_rvs = hyperparameters.model.free_RVs
+    rv_shapes = {str(rv.name): event_shape(rv) for rv in free_rvs}
+    rv_names = dict(zip(hyperparameters.shapes, rv_shapes, strict=True))
     is_complete = all(len({*pair} & set(start)) == 1 for pair in rv_names.items())
-    if not is_complete or not set(start) <= {*rv_names, *rv_names.values()}:
+    if not is_complete or not set(start) <= {*rv_names, *rv_shapes}:
         raise KeyError(
-            f"start: got {sorted(map(str, start))}, expected values for each of "
-            f"{sorted(rv_names.values())}"
+            f"start: got {sorted(map(str, start))}, expected values for each of {sorted(rv_shapes)}"
         )
+    shapes = rv_shapes | hyperparameters.shapes
+    values = {name: real_array(value, f"start: {name}") for name, value in start.items()}
+    for name, value in values.items():
+        expected = (draws, *shapes[name])
+        if value.shape != expected:
+            raise ValueError(
+                f"start: {name}: got shape {value.shape}, expected {expected}, a value for each "
+                "particle"
+            )
     # Variables in their own units first; the initial point stands for transformed ones.
     initial = hyperparameters.constrained(hyperparameters.initial[None])
-    own_units = []
-    for rv in model.free_RVs:
-        shape = (draws, *event_shape(rv))
-        value = start.get(rv.name)
-        value = initial[rv.name] if value is None else _particle_values(value, rv.name, shape)
-        own_units.append(np.broadcast_to(value, shape))
+    own_units = [
+        np.broadcast_to(values.get(name, initial[name]), (draws, *shape))
+        for name, shape in rv_shapes.items()
+    ]
     with np.errstate(all="ignore"):  # values outside the support are refused below
         thetas = hyperparameters.thetas_of(own_units)
     first = 0
     for name, shape in hyperparameters.shapes.items():
         size = int(np.prod(shape, dtype=int))
         if rv_names[name] not in start:
-            value = _particle_values(start[name], name, (draws, *shape))
-            thetas[:, first : first + size] = value.reshape(draws, size)
+            thetas[:, first : first + size] = values[name].reshape(draws, size)
         first += size
     finite = np.isfinite(thetas).all(axis=1)
     outside = ~(finite & hyperparameters.in_support(np.where(finite[:, None], thetas, 0.0)))
@@ -340,27 +346,19 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
             f"start: got {int(outside.sum())} of {draws} points outside the support of the priors, "
             "expected none; draw them from the prior"
         )
-    return np.asarray(thetas)
+    return thetas
 
 
-def _particle_values(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
-    """Return values of a variable, one for each particle."""
-    array = real_array(value, f"start: {name}")
-    if array.shape != shape:
-        raise ValueError(
-            f"start: {name}: got shape {array.shape}, expected {shape}, a value for each particle"
-        )
-    return array
-
-
-_FORMAT = 4  # of the content of a file; files of other formats are refused
+_FORMAT = 5  # of the content of a file; files of other formats are refused
+_DIGEST = hashlib.sha256
 
 
 class Checkpoint:
     """Arrays and a JSON note in one netCDF file, which each save replaces at once.
 
-    ``settings`` are what the draws depend on besides the problem. A file that cannot be read, or of
-    another problem or settings, raises StoreError and remains as it is.
+    ``settings`` are what the draws depend on besides the problem; an ``entropy`` of None is that of
+    the file, or a new one. A file that cannot be read, or of another problem or settings, raises
+    StoreError and remains as it is.
     """
 
     def __init__(
@@ -378,6 +376,8 @@ class Checkpoint:
             raise StoreError(
                 f"checkpoint: got {self.path}, whose folder does not exist, expected one that does"
             )
+        if self.settings.get("entropy", "") is None:
+            self.settings["entropy"] = str(np.random.SeedSequence().entropy)
 
     def arrays_of(self, prefix: str) -> dict[str, Floats]:
         """Return the arrays whose names begin with a prefix, by the rest of their names."""
@@ -400,13 +400,14 @@ class Checkpoint:
             "note": json.dumps(note),
         }
         data = xr.Dataset(variables, attrs=attributes)
+        # Made in memory: HDF5 may end the process where the disk is full.
+        content = bytes(data.to_netcdf(engine="h5netcdf"))
         # Written to another file and then renamed: the file is whole whenever the process ends.
         part = self.path.with_name(self.path.name + ".part")
-        # Made in memory: HDF5 may end the process where the disk is full.
-        content = _sealed(bytes(data.to_netcdf(engine="h5netcdf")))
         try:
             with part.open("wb") as file:
-                file.write(content)
+                # netCDF allows bytes after its end.
+                file.write(content + _DIGEST(content).digest())
                 file.flush()
                 os.fsync(file.fileno())
             part.replace(self.path)
@@ -421,18 +422,24 @@ class Checkpoint:
 
     def _read(self) -> None:
         try:
-            data = _loaded(self.path)
+            sealed = self.path.read_bytes()
+            size = len(sealed) - _DIGEST().digest_size
+            content = sealed[: max(size, 0)]
+            # HDF5 may hang on a damaged file.
+            if _DIGEST(content).digest() != sealed[len(content) :]:
+                raise ValueError("it is damaged, or of another version: no digest at its end")
+            with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as file:
+                data = file.load()
             written_in = int(data.attrs["prbayes_checkpoint"])
             problem = from_text(data.attrs["problem"])
             settings, note = (json.loads(data.attrs[key]) for key in ("settings", "note"))
-        except _UnsealedError:
-            reason = "is damaged, or no checkpoint of this version: it does not end with its digest"
-            raise StoreError(self._refusal(reason)) from None
         except Exception as error:
             reason = f"cannot be read ({type(error).__name__}: {error})"
             raise StoreError(self._refusal(reason)) from error
         if written_in != _FORMAT:
             raise StoreError(self._refusal("was written by another version of prbayes"))
+        if self.settings.get("entropy", "") is None:
+            self.settings["entropy"] = settings["entropy"]
         reasons = differences(problem, self.problem, Level.RUN)
         for key in sorted({*settings, *self.settings}):
             got, expected = settings.get(key), self.settings.get(key)
@@ -448,30 +455,3 @@ class Checkpoint:
             f"checkpoint: {self.path} {reason}; nothing was changed: move it away, "
             "or pass another path"
         )
-
-
-def stored_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the settings of a checkpoint's run; empty if there is none that can be read."""
-    try:
-        return dict(json.loads(_loaded(path).attrs["settings"]))
-    except Exception:  # `Checkpoint` reports the reason
-        return {}
-
-
-class _UnsealedError(ValueError):
-    """A file that does not end with the digest of its content."""
-
-
-def _sealed(payload: bytes) -> bytes:
-    """Return content followed by its digest; netCDF allows bytes after its end."""
-    return payload + hashlib.sha256(payload).digest()
-
-
-def _loaded(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Return a file's content; HDF5, which may hang on a damaged file, reads intact ones only."""
-    content = Path(path).read_bytes()
-    payload = content[: -hashlib.sha256().digest_size]
-    if _sealed(payload) != content:
-        raise _UnsealedError
-    with xr.open_dataset(io.BytesIO(payload), engine="h5netcdf") as data:
-        return data.load()

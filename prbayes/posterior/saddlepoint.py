@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,8 @@ from prbayes.metrics.score import (
     specimen_scores,
     tabulated_scores,
 )
-from prbayes.model.evaluator import Evaluator, coarse_where_sufficient
+from prbayes.model.evaluator import Evaluator, coarser_evaluator
+from prbayes.numerics.derivatives import cross
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.design_refinement import noise_floors
 from prbayes.optimize.optimum import Optimum, optima_of
@@ -78,7 +79,9 @@ class EstimateLikelihood:
     """The likelihood given the estimate."""
 
     evaluator: Evaluator
-    starts: Floats  # (M, d): the point of the score, and optima that are as good as the estimate
+    # (M, d): the point of the score, which is the estimate, or a point inside if it is at an edge;
+    # and optima that are as good.
+    starts: Floats
     # By set of simulators that share specimens.
     groups: tuple[StoredScores | ResimulatedScores, ...]
     combinations: Floats  # (d, r): combinations of the scores that vary
@@ -86,11 +89,6 @@ class EstimateLikelihood:
     # these are less. With a prior far wider than the population, its unit would miss all data.
     scale: Floats
     options: SaddlepointOptions
-
-    @property
-    def point(self) -> Floats:
-        """The point of the score, (d,): the estimate, or a point inside if it is at an edge."""
-        return np.asarray(self.starts[0])
 
     @one_thread()
     def log_likelihood(self, thetas: Floats) -> Floats:
@@ -113,12 +111,15 @@ class StoredScores:
 
     simulator: int  # one of them
     is_observable: NDArray[np.bool_]  # (M,): stored responses that all simulators can observe
-    scores: Scores  # of these
+    values: Floats  # (M', d): scores of these
+    size: int  # number of observed specimens
+    combinations: Floats  # (d, r)
+    rows: int  # populations whose weights stay in the cache of the processor
 
-    @property
-    def rows(self) -> int:
-        """Number of populations whose weights stay in the cache of the processor."""
-        return max(16, IN_CACHE // len(self.scores.values))
+    @cached_property
+    def scores(self) -> Scores:
+        """Combinations of the scores."""
+        return Scores(self.values @ self.combinations, self.size)
 
     def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
         """Return log weights of populations, (S, M'), and the scores of their responses."""
@@ -130,28 +131,24 @@ class StoredScores:
         with np.errstate(divide="ignore"):
             return np.log(weights), self.scores
 
-    def combined(self, combinations: Floats) -> StoredScores:
-        """Return combinations of the scores, (d, r)."""
-        return replace(self, scores=Scores(self.scores.values @ combinations, self.scores.size))
-
 
 @dataclass(frozen=True, eq=False)
 class ResimulatedScores:
     """Scores of responses computed at each theta, of simulators that share specimens."""
 
-    tables: tuple[tuple[int, Callable[[Floats], Floats]], ...]  # simulators: responses to scores
+    tables: tuple[tuple[int, Floats, Callable[[Floats], Floats]], ...]  # simulator, unit, scores
     mean: Floats  # (d,): of the observed specimens' scores
     size: int  # number of observed specimens
     combinations: Floats  # (d, r)
-    rows: ClassVar[int] = 1
+    rows: int = 1
 
     def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
         """Return log weights of one population, (1, M'), and the scores of its responses."""
         values: Any = -self.mean
         is_observable: Any = True
-        for k, table in self.tables:
+        for k, factor, table in self.tables:
             responses, _ = evaluator.populations(thetas, k)
-            values = values + table(responses[0])
+            values = values + factor * table(responses[0])
             is_observable &= observable(responses[0], evaluator.nodes[k].target)
         count = int(is_observable.sum())
         if not count:
@@ -160,22 +157,13 @@ class ResimulatedScores:
         log_weights = np.full((1, count), -np.log(count))
         return log_weights, Scores(values[is_observable] @ self.combinations, self.size)
 
-    def combined(self, combinations: Floats) -> ResimulatedScores:
-        """Return combinations of the scores, (d, r)."""
-        return replace(self, combinations=combinations)
-
 
 def estimate_likelihood(
     evaluator: Evaluator,
     optimum: Optimum,
     options: EstimateLikelihoodOptions = EstimateLikelihoodOptions(),
 ) -> EstimateLikelihood:
-    """Return the likelihood of the hyperparameters given the minimiser of their metrics.
-
-    Responses are stored, or computed at each theta from common random numbers. Simulators that
-    share specimens add the scores of a specimen; independent simulators add their cumulant
-    functions. Raises ValueError if the gradient of the objective is no mean over specimens.
-    """
+    """Return the likelihood of the hyperparameters given the minimiser of their metrics."""
     obstacle = score_obstacle(evaluator)
     if obstacle is not None:
         raise ValueError(f"metric: {obstacle}; expected a refit_likelihood")
@@ -190,7 +178,8 @@ def estimate_likelihood(
     if has_several_outputs or len(nodes) > 1 or fewest < options.few_specimens:
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
-    evaluator = coarse_where_sufficient(evaluator, point)
+    evaluator = coarser_evaluator(evaluator, point) or evaluator
+    # The combinations of the scores that vary, by the populations at the point.
     score_groups = [
         _group_scores(evaluator, members, point, scales, options)
         for members in groups(evaluator.nodes)
@@ -200,37 +189,30 @@ def estimate_likelihood(
     untilted = cumulants(log_weights, scores, np.zeros((1, len(point))))
     size = sum(score.size for score in scores)
     combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
+    # A hundred standard errors of each element, or the prior's spread if it is less.
+    hyperparameters = evaluator.hyperparameters
+    if all(node.bound.stored for node in evaluator.nodes):
+        n_observed = sum(len(node.observed) for node in evaluator.nodes)
+        precision = _likelihood_spread(evaluator, point, options) * np.sqrt(n_observed)
+        scale = 100 / np.maximum(precision, 100) * hyperparameters.prior_sd
+    else:
+        order = [optimum.names.index(name) for name in hyperparameters.names]
+        errors = np.sqrt(np.diag(optimum.covariance))[order]
+        scale = np.minimum(100 * errors, hyperparameters.prior_sd)
     return EstimateLikelihood(
         evaluator=evaluator,
         starts=np.vstack([point, optima[1:]]),
-        groups=tuple(group.combined(combinations) for group in score_groups),
+        groups=tuple(replace(group, combinations=combinations) for group in score_groups),
         combinations=combinations,
-        scale=_scale(evaluator, point, optimum, options),
+        scale=scale,
         options=options.saddlepoint,
     )
-
-
-def _scale(
-    evaluator: Evaluator, point: Floats, optimum: Optimum, options: EstimateLikelihoodOptions
-) -> Floats:
-    """Return a hundred standard errors of each element, or the prior's spread if it is less."""
-    hyperparameters = evaluator.hyperparameters
-    if all(node.bound.stored for node in evaluator.nodes):
-        size = sum(len(node.observed) for node in evaluator.nodes)
-        precision = _likelihood_spread(evaluator, point, options) * np.sqrt(size)
-        return np.asarray(100 / np.maximum(precision, 100) * hyperparameters.prior_sd)
-    order = [optimum.names.index(name) for name in hyperparameters.names]
-    errors = np.sqrt(np.diag(optimum.covariance))[order]
-    return np.asarray(np.minimum(100 * errors, hyperparameters.prior_sd))
 
 
 def _minimised_on_population(
     evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
 ) -> tuple[Evaluator, Floats, Floats]:
-    """Return metrics with whitening and bandwidths of the population, scales and minimiser.
-
-    A minimiser that stored responses do not support is not taken.
-    """
+    """Return metrics with whitening and bandwidths of the population, scales and minimiser."""
     from scipy.optimize import minimize as scipy_minimize
 
     targets = []
@@ -244,7 +226,7 @@ def _minimised_on_population(
     prior_sd = evaluator.hyperparameters.prior_sd
 
     def objective(shift: Floats) -> tuple[float, Floats]:
-        thetas = _stencil(point + shift * prior_sd, 1e-4 * prior_sd)
+        thetas = cross(point + shift * prior_sd, 1e-4 * prior_sd)
         totals = prepared.total(thetas, scales)
         value, up, down = np.split(totals, [1, 1 + len(shift)])
         return float(value[0]), (up - down) / 2e-4
@@ -268,28 +250,28 @@ def _group_scores(
     nodes = [evaluator.nodes[k] for k in members]
     n = len(nodes[0].observed)
     observed = np.zeros((n, len(point)))
-    functions = []
     populations: list[WeightSlopes | ShiftedResponses] = []
+    functions = []
     for k, node in zip(members, nodes, strict=True):
-        # The gradient of the objective is a sum of these over specimens, in units of the prior.
-        factor = evaluator.hyperparameters.prior_sd / (n * scales[k])
-        differences = _weight_slopes if node.bound.stored else _shifted_responses
-        population = differences(evaluator, k, point, options)
-        populations.append(population)
+        population = _derivatives(evaluator, k, point, options)
         score = partial(
             specimen_scores, node.target, population, options=options.score, total=total
         )
+        # The gradient of the objective is a sum of these over specimens, in units of the prior.
+        factor = evaluator.hyperparameters.prior_sd / (n * scales[k])
         observed += factor * score(node.observed[np.argsort(numbers[k])])
+        populations.append(population)
         functions.append((factor, score))
     mean = observed.mean(axis=0)
+    identity = np.eye(len(point))
     if not all(node.bound.stored for node in nodes):
         tables = []
         for k, (factor, _), population in zip(members, functions, populations, strict=True):
             assert isinstance(population, ShiftedResponses)
             node = evaluator.nodes[k]
             table = tabulated_scores(node.target, population, node.observed, options.score, total)
-            tables.append((k, partial(_scaled, table, factor)))
-        return ResimulatedScores(tuple(tables), mean, n, combinations=np.eye(len(point)))
+            tables.append((k, factor, table))
+        return ResimulatedScores(tuple(tables), mean, n, identity)
     is_observable = np.ones(len(populations[0].responses), dtype=bool)
     for node, population in zip(nodes, populations, strict=True):
         is_observable &= observable(population.responses, node.target)
@@ -297,38 +279,25 @@ def _group_scores(
         factor * score(population.responses[is_observable])
         for (factor, score), population in zip(functions, populations, strict=True)
     )
-    return StoredScores(members[0], is_observable, Scores(stored, n))
+    rows = max(16, IN_CACHE // len(stored))
+    return StoredScores(members[0], is_observable, stored, n, identity, rows)
 
 
-def _scaled(table: Callable[[Floats], Floats], factor: Floats, responses: Floats) -> Floats:
-    """Return scores in units of the objective."""
-    return factor * table(responses)
-
-
-def _stencil(theta: Floats, steps: Floats) -> Floats:
-    """Return theta, and theta plus and minus a step along each element, (1 + 2 d, d)."""
-    axes = np.diag(steps)
-    return np.vstack([theta, theta + axes, theta - axes])
-
-
-def _shifted_responses(
+def _derivatives(
     evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
-) -> ShiftedResponses:
-    """Return the k-th simulator's responses at theta and a step away along each element."""
-    steps = options.resimulated_step * evaluator.hyperparameters.prior_sd
-    responses, _ = evaluator.populations(_stencil(theta, steps), k)
-    center, upper, lower = np.split(responses, [1, 1 + len(theta)])
-    return ShiftedResponses(center[0], upper, lower, steps)
-
-
-def _weight_slopes(
-    evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
-) -> WeightSlopes:
-    """Return the k-th simulator's stored responses with weights, and their derivatives."""
-    moves = evaluator.nodes[k].bound.support_moves
-    steps = (options.wide_step if moves else options.step) * evaluator.hyperparameters.prior_sd
-    responses, weights = evaluator.populations(_stencil(theta, steps), k)
-    center, up, down = np.split(weights, [1, 1 + len(theta)])
+) -> WeightSlopes | ShiftedResponses:
+    """Return the k-th simulator's stored responses with slopes of weights, or shifted responses."""
+    bound = evaluator.nodes[k].bound
+    step = options.wide_step if bound.support_moves else options.step
+    steps = (
+        step if bound.stored else options.resimulated_step
+    ) * evaluator.hyperparameters.prior_sd
+    responses, weights = evaluator.populations(cross(theta, steps), k)
+    ends = [1, 1 + len(theta)]
+    if not bound.stored:
+        center, upper, lower = np.split(responses, ends)
+        return ShiftedResponses(center[0], upper, lower, steps)
+    center, up, down = np.split(weights, ends)
     # Log weights are nearly parabolas, whose differences are right at any step. A weight that
     # vanishes within the step has none.
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -338,12 +307,7 @@ def _weight_slopes(
 
 
 def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
-    """Return the estimate, (d,), or a point inside if it is at an edge.
-
-    At an edge the scores of an element vanish, or stored responses are too few for them. The score
-    at a point inside is as good a statistic. Elements at an edge are moved towards the middle of
-    their prior.
-    """
+    """Return the estimate, (d,), or a point towards the middle of the prior if it is at an edge."""
     if not all(node.bound.stored for node in evaluator.nodes):
         return theta
     hyperparameters = evaluator.hyperparameters
@@ -367,16 +331,14 @@ def _likelihood_spread(
     """Return standard deviations of the derivatives of log weights, in units of the prior, (d,)."""
     variance = np.zeros(len(theta))
     for k in range(len(evaluator.nodes)):
-        variance += _weight_slopes(evaluator, k, theta, options).spread ** 2
+        population = _derivatives(evaluator, k, theta, options)
+        assert isinstance(population, WeightSlopes)
+        variance += population.spread**2
     return np.asarray(np.sqrt(variance) * evaluator.hyperparameters.prior_sd)
 
 
 def score_obstacle(evaluator: Evaluator) -> str | None:
-    """Return why the gradient of the objective is no mean over specimens, or None.
-
-    Examples are the area metric, observed responses of unequal weights or with gaps, and
-    simulators that share specimens in part.
-    """
+    """Return why the gradient of the objective is no mean over specimens, or None."""
     for node in evaluator.nodes:
         if not is_additive(node.target):
             metric = type(node.metric).__name__
@@ -424,10 +386,7 @@ CumulantFunction = Callable[[Floats, NDArray[np.intp]], Cumulants]
 
 
 def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Floats) -> Cumulants:
-    """Return the sum of N_j K_j(a) over simulators at tilts, (S, r).
-
-    Log weights of the stored responses have shapes (S, M_j); the weights of a row sum to one.
-    """
+    """Return the sum of N_j K_j(a) over simulators at tilts, (S, r), given log weights (S, M_j)."""
     count, r = tilts.shape
     values = np.zeros(count)
     gradients = np.zeros((count, r))
@@ -450,13 +409,14 @@ def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Fl
     return Cumulants(values, gradients, hessians)
 
 
-def minimum(
+def saddlepoint_density(
     function: CumulantFunction, shape: tuple[int, int], size: int, options: SaddlepointOptions
-) -> tuple[Cumulants, NDArray[np.bool_]]:
-    """Minimise S convex cumulant functions of r tilts by Newton steps no longer than 1 + |a|.
+) -> Floats:
+    """Return the log-density of a mean of zero, up to a constant, (S,), from cumulant functions.
 
-    ``size`` is the number of observed specimens. Return the values at the minima, and which
-    converged.
+    The S convex functions of r tilts are minimised by Newton steps no longer than 1 + |a|. ``size``
+    is the number of observed specimens. The density is -inf without a saddlepoint: then zero is
+    outside of the convex hull of the scores.
     """
     count, r = shape
     ridge = 1e-8 * size * np.eye(r)
@@ -479,20 +439,8 @@ def minimum(
         state.gradients[rows] = new.gradients
         state.hessians[rows] = new.hessians
         converged[rows] = np.linalg.norm(new.gradients, axis=1) < limit
-    return state, converged
-
-
-def saddlepoint_density(
-    function: CumulantFunction, shape: tuple[int, int], size: int, options: SaddlepointOptions
-) -> Floats:
-    """Return the log-density of a mean of zero, up to a constant, (S,); arguments as `minimum`.
-
-    It is -inf without a saddlepoint: then zero is outside of the convex hull of the scores.
-    """
-    state, converged = minimum(function, shape, size, options)
     signs, log_dets = np.linalg.slogdet(state.hessians / size)
-    smallest = shape[1] * np.log(options.smallest_variance)
-    is_usable = converged & (signs > 0) & (log_dets > smallest)
+    is_usable = converged & (signs > 0) & (log_dets > r * np.log(options.smallest_variance))
     return np.where(is_usable, state.values - log_dets / 2, -np.inf)
 
 
@@ -501,11 +449,7 @@ def log_density(
     scores: Sequence[Scores],
     options: SaddlepointOptions = SaddlepointOptions(),
 ) -> Floats:
-    """Return the log-density of a mean score of zero, up to a constant, (S,).
-
-    Log weights have shapes (S, M_j); -inf or NaN throughout a row if no stored response supports
-    its population. Scores are in units in which their covariance is about one.
-    """
+    """Return the log-density of a mean score of zero, (S,), given log weights (S, M_j)."""
     result = np.full(len(log_weights[0]), -np.inf)
     is_supported = np.all([np.isfinite(logs.max(axis=1)) for logs in log_weights], axis=0)
     if not is_supported.any():
@@ -513,8 +457,6 @@ def log_density(
     supported = [logs[is_supported] for logs in log_weights]
 
     def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
-        if len(rows) == len(supported[0]):
-            return cumulants(supported, scores, tilts)
         return cumulants([logs[rows] for logs in supported], scores, tilts)
 
     shape = len(supported[0]), scores[0].values.shape[1]

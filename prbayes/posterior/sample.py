@@ -18,7 +18,8 @@ from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
-from prbayes.optimize.optimum import Optimum
+from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
+from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior import smc
 from prbayes.posterior.importance import (
     ImportanceOptions,
@@ -27,15 +28,14 @@ from prbayes.posterior.importance import (
     importance_sample,
     laplace,
 )
-from prbayes.posterior.results import Draws, require_idata_kwargs, require_names, selected
-from prbayes.posterior.smc import (
-    SamplingSettings,
-    estimate_of,
-    evaluator_of,
-    require_optimum,
-    result_of,
+from prbayes.posterior.results import Chains, require_selection, selected
+from prbayes.posterior.smc import SamplingSettings, evaluator_of, result_of
+from prbayes.posterior.target import (
+    Target,
+    estimate_target,
+    require_density,
+    specimen_target,
 )
-from prbayes.posterior.target import Target, estimate_target, specimen_target
 from prbayes.response.budget import limited
 from prbayes.response.inputs import model_on_context
 
@@ -124,9 +124,7 @@ def sample(
     positive_integer(draws, "draws", minimum=10)
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample")
-    require_optimum(optimum)
-    names = require_names(var_names, model)
-    keywords = require_idata_kwargs(idata_kwargs)
+    names, keywords = require_selection(var_names, idata_kwargs, model)
     settings = SamplingSettings(
         draws=draws,
         chains=chains,
@@ -145,16 +143,17 @@ def sample(
 
 
 def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
-    """Return draws of the posterior by importance sampling, or else by NUTS or SMC.
-
-    Responses are added to designs that do not support the draws.
-    """
+    """Return draws by importance sampling, else by NUTS or SMC; designs grow if needed."""
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    optimum = estimate_of(evaluator, settings, "sample")
-    settings = replace(settings, optimum=optimum)
+    optimum = settings.optimum
+    if evaluator.nodes:
+        require_density(evaluator)
+        if optimum is None:
+            optimum = require_finished(find_optimum(evaluator, Minimisation()))
+        settings = replace(settings, optimum=require_sampling(optimum, "sample"))
     with designs_as_before(evaluator):
-        draws = None
+        chains = None
         for _ in range(MAX_ROUNDS + 1):
             if evaluator.nodes:
                 assert optimum is not None
@@ -164,17 +163,17 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
             modes = modes_of(target)
             if modes is None:
                 break
-            draws = _importance_draws(target, modes, settings)
-            if draws is None:
+            chains = _importance_chains(target, modes, settings)
+            if chains is None:
                 if len(modes) == 1 and not evaluator.nodes:
-                    draws = _nuts_draws(evaluator, modes[0], settings)
+                    chains = _nuts_chains(evaluator, modes[0], settings)
                 break
-            thetas = draws.thetas.reshape(-1, evaluator.hyperparameters.size)
+            thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
             if not refine_at(evaluator, thetas[:THETAS]):
                 break
-        if draws is None:
+        if chains is None:
             return smc.sample(evaluator, settings)
-        return result_of(evaluator, draws, settings, optimum, n_before=n_before, clock=clock)
+        return result_of(evaluator, chains, settings, optimum, n_before=n_before, clock=clock)
 
 
 def modes_of(target: Target) -> list[Laplace] | None:
@@ -209,38 +208,39 @@ def _distinct(modes: list[Laplace]) -> list[Laplace]:
     return distinct
 
 
-def _importance_draws(
+def _importance_chains(
     target: Target, modes: list[Laplace], settings: SamplingSettings
-) -> Draws | None:
+) -> Chains | None:
     """Return draws by importance sampling, None if they are not reliable."""
-    evaluator, (chains, draws) = target.evaluator, (settings.chains, settings.draws)
-    hyperparameters = evaluator.hyperparameters
+    shape = settings.chains, settings.draws
+    hyperparameters = target.evaluator.hyperparameters
     prior = Prior(hyperparameters.prior_thetas, hyperparameters.log_prior)
     seed = seed_number(settings.random_seed)
+    size = settings.chains * settings.draws
     options = ImportanceOptions()
-    sample = importance_sample(target.log_posterior, modes, chains * draws, seed, options, prior)
-    if not sample.is_reliable(options):
+    sample = importance_sample(target.log_posterior, modes, size, seed, options, prior)
+    if not sample.is_reliable:
         return None
     log_likelihood = None
-    if evaluator.nodes:
-        log_likelihood = sample.log_density - hyperparameters.log_prior(sample.draws)
-        log_likelihood = log_likelihood.reshape(chains, draws)
-    lp = sample.log_density.reshape(chains, draws)
-    coords = {"chain": np.arange(chains), "draw": np.arange(draws)}
-    return Draws(
-        sample.draws.reshape(chains, draws, -1),
+    if target.evaluator.nodes:
+        log_prior = hyperparameters.log_prior(sample.draws)
+        log_likelihood = (sample.log_density - log_prior).reshape(shape)
+    coords = {"chain": np.arange(settings.chains), "draw": np.arange(settings.draws)}
+    lp = ["chain", "draw"], sample.log_density.reshape(shape)
+    return Chains(
+        sample.draws.reshape(*shape, -1),
         sampler={
             "sampler": "importance sampling",
             "pareto_k": sample.pareto_k,
             "efficiency": sample.efficiency,
             "log_marginal_likelihood": sample.log_evidence,
         },
+        sample_stats=xr.Dataset({"lp": lp}, coords=coords),
         log_likelihood=log_likelihood,
-        sample_stats=xr.Dataset({"lp": (["chain", "draw"], lp)}, coords=coords),
     )
 
 
-def _nuts_draws(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings) -> Draws:
+def _nuts_chains(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings) -> Chains:
     """Return draws by NUTS from the mode of the posterior."""
     hyperparameters = evaluator.hyperparameters
     values = hyperparameters.constrained(mode.mode[None])
@@ -260,7 +260,7 @@ def _nuts_draws(evaluator: Evaluator, mode: Laplace, settings: SamplingSettings)
     posterior = idata["posterior"].to_dataset()
     columns = [posterior[name].transpose("chain", "draw", ...).values for name in names]
     thetas = hyperparameters.thetas_of([x.reshape(-1, *x.shape[2:]) for x in columns])
-    return Draws(
+    return Chains(
         thetas.reshape(settings.chains, settings.draws, -1),
         sampler={"sampler": "NUTS"},
         sample_stats=idata["sample_stats"].to_dataset(),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, as_completed
-from dataclasses import dataclass
+from concurrent.futures import Executor, as_completed
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -17,7 +17,7 @@ from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
-from prbayes.model.evaluator import Evaluator, has_other_terms, specimen_params
+from prbayes.model.evaluator import Evaluator, specimen_params
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
 from prbayes.optimize.maximum_likelihood import (
@@ -121,20 +121,24 @@ def simulation_based_calibration(
             f"simulation_based_calibration: {obstacle}, so that data sets cannot be drawn; "
             "calibrate data of your own simulations with prb.sample_smc"
         )
-    if evaluator.nodes and has_other_terms(evaluator):
+    if evaluator.nodes and evaluator.has_other_terms:
         raise ValueError(
             "simulation_based_calibration: got a model with likelihood terms or potentials "
             "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"
         )
-    jobs = [
-        _Job(range(start, min(start + _CHUNK, n)), draws, adjustment, seed)
-        for start in range(0, n, _CHUNK)
-    ]
+    settings = SamplingSettings(draws=draws, adjustment=adjustment, random_seed=seed)
+    jobs = [range(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
     with shown(progressbar), progress("data sets", n) as advance:
         if executor is None:
-            parts = [_analyse(evaluator, job, lambda: advance(1, "")) for job in jobs]
+            parts = [_analyse(evaluator, job, settings, lambda: advance(1, "")) for job in jobs]
         else:
-            parts = _on_executor(executor, model, jobs, lambda size: advance(size, ""))
+            import cloudpickle
+
+            pickled = cloudpickle.dumps(model)
+            futures = [executor.submit(_analyse, pickled, job, settings) for job in jobs]
+            for future in as_completed(futures):
+                advance(len(future.result()), "")
+            parts = [future.result() for future in futures]
     results = list(chain.from_iterable(parts))
     rows = [result for result in results if isinstance(result, dict)]
     errors = [result for result in results if isinstance(result, str)]
@@ -194,55 +198,32 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
 _Result = dict[str, Floats] | str
 
 
-@dataclass(frozen=True)
-class _Job:
-    """Data sets by their numbers, and how they are analysed."""
-
-    numbers: range
-    draws: int
-    adjustment: Adjustment
-    random_seed: int
-
-
-def _on_executor(
-    executor: Executor, model: pm.Model, jobs: list[_Job], advance: Callable[[int], Any]
-) -> list[list[_Result]]:
-    """Return the results of each job."""
-    import cloudpickle
-
-    pickled = cloudpickle.dumps(model)
-    futures: list[Future[list[_Result]]] = [
-        executor.submit(_analyse_pickled, pickled, job) for job in jobs
-    ]
-    for future in as_completed(futures):
-        advance(len(future.result()))
-    return [future.result() for future in futures]
-
-
-def _analyse_pickled(pickled: bytes, job: _Job) -> list[_Result]:
-    import cloudpickle
-
-    return _analyse(Evaluator.of(cloudpickle.loads(pickled)), job)
-
-
 def _analyse(
-    evaluator: Evaluator, job: _Job, advance: Callable[[], Any] = lambda: None
+    problem: Evaluator | bytes,
+    numbers: range,
+    settings: SamplingSettings,
+    advance: Callable[[], Any] = lambda: None,
 ) -> list[_Result]:
-    """Analyse data sets, each on the original designs."""
+    """Analyse data sets of an evaluator, or a pickled model, each on the original designs."""
+    if isinstance(problem, bytes):
+        import cloudpickle
+
+        problem = Evaluator.of(cloudpickle.loads(problem))
     results: list[_Result] = []
-    for i in job.numbers:
-        rng = np.random.default_rng([job.random_seed, i])
-        with shown(False), designs_restored(evaluator.reweighted.values()):
+    for i in numbers:
+        with shown(False), designs_restored(problem.reweighted.values()):
             try:
-                results.append(_ranks(evaluator, job, rng))
+                results.append(_ranks(problem, settings, i))
             except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
                 results.append(f"{type(error).__name__}: {error}")
         advance()
     return results
 
 
-def _ranks(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str, Floats]:
+def _ranks(evaluator: Evaluator, settings: SamplingSettings, number: int) -> dict[str, Floats]:
     """Draw hyperparameters, and data from their population, and rank them among the draws."""
+    assert settings.random_seed is not None
+    rng = np.random.default_rng([settings.random_seed, number])
     hyperparameters = evaluator.hyperparameters
     theta = hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
     data = fresh_data(evaluator, theta[0], rng) if evaluator.nodes else {}
@@ -253,17 +234,15 @@ def _ranks(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[st
         )
         for k, likelihood in enumerate(evaluator.likelihoods)
     ]
-    settings = SamplingSettings(
-        draws=job.draws, adjustment=job.adjustment, random_seed=int(rng.integers(2**31))
-    )
-    draw = sample if job.adjustment is None else draw_posterior
-    with other_specimens(evaluator.likelihoods, [pool.data_set(rng) for pool in pools]):
+    settings = replace(settings, random_seed=int(rng.integers(2**31)))
+    draw = sample if settings.adjustment is None else draw_posterior
+    with other_specimens(evaluator.likelihoods, [pool(rng) for pool in pools]):
         posterior = draw(evaluator.observing(data), settings)["posterior"]
     row = {}
     for name, (truth,) in hyperparameters.constrained(theta).items():
         values = np.asarray(posterior[name])[0]
         below = (values < truth).sum(axis=0)
         # At random between the two neighbours: ranks are continuous.
-        rank = (below + rng.random(np.shape(below))) / (job.draws + 1)
+        rank = (below + rng.random(np.shape(below))) / (settings.draws + 1)
         row[name] = np.stack([rank, truth, values.std(axis=0)])
     return row

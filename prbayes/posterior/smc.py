@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any, Literal
@@ -17,7 +17,7 @@ import xarray as xr
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, as_json, report
 from prbayes._progress import CONSOLE, lines, live, shown
 from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes.model.cost import designs_as_before, explained
@@ -39,15 +39,13 @@ from prbayes.optimize.minimize import Minimisation, find_optimum, require_finish
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
 from prbayes.posterior.importance import LogDensity
-from prbayes.posterior.kernel import BatchedKernel, Checkpoint, starting_thetas, stored_settings
+from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, starting_thetas
 from prbayes.posterior.results import (
-    Draws,
-    Stages,
+    Chains,
     arviz_groups,
     as_multitrace,
     posterior_tree,
-    require_idata_kwargs,
-    require_names,
+    require_selection,
     selected,
     share_of_lossy,
 )
@@ -199,11 +197,9 @@ def sample_smc(
     share(threshold, "threshold")
     if checkpoint is not None:
         file_path(checkpoint, "checkpoint")
-    require_optimum(optimum)
     if max_stages is not None:
         positive_integer(max_stages, "max_stages")
-    names = require_names(var_names, model)
-    keywords = require_idata_kwargs(idata_kwargs)
+    names, keywords = require_selection(var_names, idata_kwargs, model)
     flag(return_inferencedata, "return_inferencedata")
     if cores is not None:
         positive_integer(cores, "cores")
@@ -264,17 +260,13 @@ def require_adjustment(adjustment: object) -> None:
         )
 
 
-def require_optimum(optimum: object) -> None:
-    """Raise unless it is an optimum or None."""
-    if optimum is not None and not isinstance(optimum, Optimum):
-        got = type(optimum).__name__
-        raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
-
-
 def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evaluator:
-    """Return the evaluator of a model; raise if the optimum is of another problem."""
+    """Return the evaluator of a model; raise if the optimum is none, or of another problem."""
     if optimum is None:
         return Evaluator.of(model)
+    if not isinstance(optimum, Optimum):
+        got = type(optimum).__name__
+        raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
     is_reusable = optimum.model is model and is_current(optimum.evaluator)
     evaluator = optimum.evaluator if is_reusable else Evaluator.of(model)
     require_same(optimum.identity, identity_of(evaluator), f"{caller}: optimum")
@@ -283,7 +275,7 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
 
 def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``."""
-    is_pseudo = _is_pseudo(evaluator, settings)
+    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
     if settings.epsilon is not None and not is_pseudo:
         raise ValueError(
             f"epsilon: got {settings.epsilon!r}, expected none: this posterior has no scale to "
@@ -291,79 +283,69 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
         )
     clock = time.perf_counter()
     n_before = evaluator.n_responses - n_design_runs(evaluator)
-    with _epsilons_restored(evaluator), designs_as_before(evaluator) as restore_designs:
-        if is_pseudo:
-            optimum = _set_epsilons(evaluator, settings)
-        else:
-            optimum = estimate_of(evaluator, settings, "sample_smc")
-        draws, log_likelihood = _draws_on_designs(evaluator, settings, optimum)
-        if is_pseudo:
-            draws = _with_errors(evaluator, draws)
-        elif log_likelihood is not None:
-            logs = log_likelihood(draws.thetas.reshape(-1, evaluator.hyperparameters.size))
-            draws = replace(draws, log_likelihood=logs.reshape(draws.thetas.shape[:2]))
-        tree = result_of(evaluator, draws, settings, optimum, n_before=n_before, clock=clock)
-        if draws.stopped:
-            restore_designs()
-        return tree
-
-
-def _is_pseudo(evaluator: Evaluator, settings: SamplingSettings) -> bool:
-    """Return whether the density is prior times exp(-sum of d_k / epsilon_k)."""
-    return bool(evaluator.nodes) and settings.adjustment is None
-
-
-def estimate_of(evaluator: Evaluator, settings: SamplingSettings, caller: str) -> Optimum | None:
-    """Return the estimate that the posterior is given, by a search if needed.
-
-    With a log-likelihood by specimen it is the optimum that was passed, if any. Raises ValueError
-    if the density of the estimate is not known, or the optimum is at an edge or a jump.
-    """
-    optimum = settings.optimum
-    if not evaluator.nodes:
-        return optimum
-    require_density(evaluator)
-    if optimum is None:
-        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=settings.refine)))
-    return require_sampling(optimum, caller)
+    epsilons = evaluator.epsilon
+    try:
+        with designs_as_before(evaluator) as restore_designs:
+            optimum = settings.optimum
+            if is_pseudo:
+                optimum = _set_epsilons(evaluator, settings)
+            elif evaluator.nodes:
+                require_density(evaluator)
+                if optimum is None:
+                    search = Minimisation(refine=settings.refine)
+                    optimum = require_finished(find_optimum(evaluator, search))
+                require_sampling(optimum, "sample_smc")
+            chains = _chains_on_designs(evaluator, settings, optimum)
+            if is_pseudo:
+                chains = _with_errors(evaluator, chains)
+            tree = result_of(evaluator, chains, settings, optimum, n_before=n_before, clock=clock)
+            if chains.stopped:
+                restore_designs()
+            return tree
+    finally:
+        for node, value in zip(evaluator.nodes, epsilons, strict=True):
+            node.epsilon.set_value(np.asarray(value))
 
 
 def result_of(
     evaluator: Evaluator,
-    draws: Draws,
+    chains: Chains,
     settings: SamplingSettings,
     optimum: Optimum | None,
     *,
     n_before: int,
     clock: float,
 ) -> xr.DataTree:
-    """Return the DataTree of draws.
-
-    Discrepancies are computed if that costs no response. ``n_before`` and ``clock`` are the number
-    of responses and the time at the start. Raises DesignError if too much of the populations of
-    most draws has no response.
-    """
-    findings = list(_budget_findings(draws, settings))
-    thetas, lost, discrepancies = draws.thetas, draws.lost, draws.discrepancies
+    """Return the DataTree of chains, with discrepancies if these cost no response."""
+    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
+    findings: list[Finding] = []
+    if chains.stopped:
+        again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
+        text = (
+            f"{chains.stopped}, so that {len(chains.thetas)} of {settings.chains} chains are here, "
+            "and what would have cost responses is left out; call prb.sample_smc with a larger "
+            f"budget{again}."
+        )
+        page = "expensive.md#a-night-is-not-enough"
+        findings += report(Finding("budget-spent", text, page))
+    thetas, lost, discrepancies = chains.thetas, chains.lost, chains.discrepancies
     rows = thetas.reshape(-1, evaluator.hyperparameters.size)
-    is_pseudo = _is_pseudo(evaluator, settings)
     if not is_pseudo:
         lost = _lost_of_some(evaluator, thetas)
-        _refuse_lost(evaluator, lost)
         discrepancies = np.full(lost.shape, np.nan)
     assert lost is not None
+    findings += _lost_findings(evaluator, lost, chains.missing)
     with unlimited():
         if is_pseudo and settings.with_groups:
             kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
             other_terms = evaluator.log_other(rows).reshape(thetas.shape[:2])
-            draws = replace(draws, log_likelihood=kernels.sum(axis=-1) + other_terms)
+            chains = replace(chains, log_likelihood=kernels.sum(axis=-1) + other_terms)
         elif not is_pseudo and evaluator.nodes and not evaluator.responses_per_theta:
             discrepancies = evaluator(rows).discrepancies.reshape(lost.shape)
-        draws = replace(draws, discrepancies=discrepancies, lost=lost)
+        chains = replace(chains, discrepancies=discrepancies, lost=lost)
         groups = {}
         if settings.with_groups:
-            groups = arviz_groups(evaluator, draws, settings.random_seed)
-        findings += _lost_findings(evaluator, lost)
+            groups = arviz_groups(evaluator, chains, settings.random_seed)
         if optimum is not None:
             findings += optimum.findings
             if evaluator.nodes and not is_pseudo:
@@ -371,39 +353,18 @@ def result_of(
         elif not is_pseudo:
             for likelihood in evaluator.likelihoods:
                 findings += prepared(likelihood).findings
-        return posterior_tree(
-            evaluator,
-            draws,
-            adjustment="estimate" if evaluator.nodes and not is_pseudo else "none",
-            findings=findings,
-            seed=settings.random_seed,
-            n_responses=evaluator.n_responses - n_before,
-            seconds=time.perf_counter() - clock,
-            groups=groups,
-        )
-
-
-def _budget_findings(draws: Draws, settings: SamplingSettings) -> tuple[Finding, ...]:
-    """Report that a budget was spent before all chains were finished."""
-    if not draws.stopped:
-        return ()
-    again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
-    finding = Finding(
-        "budget-spent",
-        f"{draws.stopped}, so that {len(draws.stages)} of {settings.chains} chains are here, and "
-        "what would have cost responses is left out; call prb.sample_smc with a larger "
-        f"budget{again}.",
-        "expensive.md#a-night-is-not-enough",
-    )
-    return report(finding)
+        attrs = {
+            "n_responses": evaluator.n_responses - n_before,
+            "seconds": time.perf_counter() - clock,
+            "random_seed": str(settings.random_seed),
+            "adjustment": "estimate" if evaluator.nodes and not is_pseudo else "none",
+            "findings": as_json(findings),
+        }
+        return posterior_tree(evaluator, chains, attrs, groups)
 
 
 def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floats:
-    """Return shares of populations without response, (chains, draws, k).
-
-    Responses that are not stored are computed at a sample of draws, within the budget. The shares
-    of other draws, and of stored responses, are NaN.
-    """
+    """Return the share without response, (chains, draws, k), at some draws; NaN at others."""
     chains, draws, _ = thetas.shape
     lost = np.full((chains, draws, len(evaluator.nodes)), np.nan)
     rows = np.linspace(0, chains * draws - 1, count).astype(np.intp)
@@ -419,28 +380,17 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floa
     return lost
 
 
-def _refuse_lost(
-    evaluator: Evaluator,
-    lost: Floats,
-    missing: Mapping[str, Mapping[str, float]] | None = None,
-) -> None:
-    """Raise if too much of the populations of most draws has no response.
-
-    ``lost``, (chains, draws, k), is NaN if not known; ``missing`` is that of the best draw, by
-    simulator.
-    """
+def _lost_findings(
+    evaluator: Evaluator, lost: Floats, missing: Mapping[str, Mapping[str, float]]
+) -> tuple[Finding, ...]:
+    """Report draws whose populations lack responses; raise if most draws, or the best, do."""
     shares = {}
-    for k, node in enumerate(evaluator.nodes):
-        shares[node.name] = 0.0 if missing is None else missing[node.name]["lost_mass"]
-        if not np.isnan(lost[:, :, k]).all():
-            shares[node.name] = max(shares[node.name], float(np.nanmedian(lost[:, :, k])))
-    refuse_lost(evaluator, shares)
-
-
-def _lost_findings(evaluator: Evaluator, lost: Floats) -> tuple[Finding, ...]:
-    """Report that the populations of many draws lack responses; `diagnose` does for designs."""
     findings = []
     for k, node in enumerate(evaluator.nodes):
+        shares[node.name] = missing.get(node.name, {}).get("lost_mass", 0.0)
+        if np.isnan(lost[:, :, k]).all():
+            continue
+        shares[node.name] = max(shares[node.name], float(np.nanmedian(lost[:, :, k])))
         limit = node.bound.max_lost
         share = share_of_lossy(lost[:, :, k], limit)
         if share > 0.05:  # a few draws may be far out
@@ -454,21 +404,11 @@ def _lost_findings(evaluator: Evaluator, lost: Floats) -> tuple[Finding, ...]:
                     "expensive.md#when-a-run-fails",
                 )
             )
+    refuse_lost(evaluator, shares)
     return report(*findings)
 
 
 # -- the pseudo-posterior --------------------------------------------------------------------------
-
-
-@contextmanager
-def _epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
-    """Restore the epsilons of the simulators afterwards."""
-    epsilons = evaluator.epsilon
-    try:
-        yield
-    finally:
-        for node, value in zip(evaluator.nodes, epsilons, strict=True):
-            node.epsilon.set_value(np.asarray(value))
 
 
 def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum | None:
@@ -500,12 +440,11 @@ def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum |
     return optimum
 
 
-def _with_errors(evaluator: Evaluator, draws: Draws) -> Draws:
-    """Return draws with errors of the discrepancies and missing responses at the best one."""
-    assert draws.discrepancies is not None
-    assert draws.lost is not None
-    total = (draws.discrepancies / evaluator.epsilon).sum(axis=-1)
-    best = draws.thetas[np.unravel_index(total.argmin(), total.shape)]
+def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
+    """Return chains with errors of the discrepancies and missing responses at the best draw."""
+    assert chains.discrepancies is not None
+    total = (chains.discrepancies / evaluator.epsilon).sum(axis=-1)
+    best = chains.thetas[np.unravel_index(total.argmin(), total.shape)]
     errors = []
     missing = {}
     try:
@@ -513,25 +452,30 @@ def _with_errors(evaluator: Evaluator, draws: Draws) -> Draws:
             errors.append(discrepancy_error(node.bound, evaluator.roots(best[None], k)))
             missing[node.name] = missing_mass(evaluator, best, k)
     except BudgetError as spent:
-        return replace(draws, stopped=draws.stopped or str(spent))
-    _refuse_lost(evaluator, draws.lost, missing)
-    return replace(draws, errors=np.array(errors), missing=missing)
+        return replace(chains, stopped=chains.stopped or str(spent))
+    return replace(chains, errors=np.array(errors), missing=missing)
 
 
 # -- chains ----------------------------------------------------------------------------------------
 
 
-def _draws_on_designs(
+def _chains_on_designs(
     evaluator: Evaluator, settings: SamplingSettings, optimum: Optimum | None
-) -> tuple[Draws, LogDensity | None]:
-    """Return draws that the designs support, after refinements, and their log-likelihood.
-
-    Raises DesignError if the refined designs do not support the draws, and BudgetError if a budget
-    is spent before.
-    """
+) -> Chains:
+    """Return chains that the designs support, after refinements, or raise."""
     starts = _starts(evaluator, settings)
-    checkpoint = _checkpoint(evaluator, settings, starts)
-    entropy = settings.random_seed if checkpoint is None else int(checkpoint.settings["entropy"])
+    checkpoint = None
+    entropy: int | None = settings.random_seed
+    if settings.checkpoint is not None:
+        names = ("draws", "chains", "threshold", "adjustment", "refine")
+        stored: dict[str, Any] = {name: getattr(settings, name) for name in names}
+        stored["entropy"] = None if entropy is None else str(entropy)
+        if starts is not None:
+            content = b"".join(np.ascontiguousarray(thetas).tobytes() for thetas in starts)
+            stored["start"] = hashlib.sha256(content).hexdigest()
+        checkpoint = Checkpoint(settings.checkpoint, identity_of(evaluator), stored)
+        # A run without a seed takes that of the run that it continues.
+        entropy = int(checkpoint.settings["entropy"])
     seeds = np.random.SeedSequence(entropy)
     refinements: list[Floats] = []
     for round_ in range(MAX_ROUNDS + 1):
@@ -541,17 +485,18 @@ def _draws_on_designs(
             refine_at(evaluator, refinements[-1])
             continue
         log_likelihood = None
-        if evaluator.nodes and not _is_pseudo(evaluator, settings):
+        if evaluator.nodes and settings.adjustment is not None:
             assert optimum is not None
             log_likelihood = estimate_target(evaluator, optimum).log_likelihood
-        chains = Chains(evaluator, settings, log_likelihood, starts, checkpoint, tuple(refinements))
-        draws = chains.run(children)
+        chains = run_chains(
+            evaluator, settings, children, log_likelihood, starts, checkpoint, refinements
+        )
+        rows = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
         if not (settings.refine and evaluator.reweighted):
             break
-        rows = draws.thetas.reshape(-1, evaluator.hyperparameters.size)
         thetas = np.random.default_rng(seeds).permutation(rows)[:THETAS]
-        if draws.stopped and shortcomings(evaluator, thetas):
-            raise BudgetError(draws.stopped)
+        if chains.stopped and shortcomings(evaluator, thetas):
+            raise BudgetError(chains.stopped)
         if round_ == MAX_ROUNDS:
             refuse(shortcomings(evaluator, thetas), evaluator)
             break
@@ -559,7 +504,9 @@ def _draws_on_designs(
             break
         refinements.append(thetas)
         _log.info("sampling again on the refined design")
-    return draws, log_likelihood
+    if log_likelihood is None:
+        return chains
+    return replace(chains, log_likelihood=log_likelihood(rows).reshape(chains.thetas.shape[:2]))
 
 
 def _starts(evaluator: Evaluator, settings: SamplingSettings) -> list[Floats] | None:
@@ -576,164 +523,145 @@ def _starts(evaluator: Evaluator, settings: SamplingSettings) -> list[Floats] | 
     return [starting_thetas(hyperparameters, values, settings.draws) for values in by_chain]
 
 
-def _checkpoint(
-    evaluator: Evaluator, settings: SamplingSettings, starts: list[Floats] | None
-) -> Checkpoint | None:
-    """Open the checkpoint; a run without a seed takes that of the run that it continues."""
-    path = settings.checkpoint
-    if path is None:
-        return None
-    entropy = str(np.random.SeedSequence(settings.random_seed).entropy)
-    if settings.random_seed is None:
-        entropy = stored_settings(path).get("entropy", entropy)
-    stored: dict[str, Any] = {
-        name: getattr(settings, name)
-        for name in ("draws", "chains", "threshold", "adjustment", "refine")
-    }
-    if starts is not None:
-        content = b"".join(np.ascontiguousarray(thetas).tobytes() for thetas in starts)
-        stored["start"] = hashlib.sha256(content).hexdigest()
-    return Checkpoint(path, identity_of(evaluator), stored | {"entropy": entropy})
+def run_chains(
+    evaluator: Evaluator,
+    settings: SamplingSettings,
+    seeds: Sequence[np.random.SeedSequence],
+    log_likelihood: LogDensity | None = None,
+    starts: Sequence[Floats] | None = None,
+    checkpoint: Checkpoint | None = None,
+    refinements: Sequence[Floats] = (),
+) -> Chains:
+    """Run a chain for each seed on the designs as they are, or as many as a budget allows.
 
-
-@dataclass(frozen=True, eq=False)
-class Chains:
-    """The chains of one round on the designs as they are, saved after each stage."""
-
-    evaluator: Evaluator
-    settings: SamplingSettings
-    log_likelihood: LogDensity | None = None  # in place of exp(-sum of d_k / epsilon_k)
-    starts: list[Floats] | None = None
-    checkpoint: Checkpoint | None = None
-    refinements: tuple[Floats, ...] = ()  # thetas, (n, d), of earlier rounds
-
-    def run(self, seeds: Sequence[np.random.SeedSequence]) -> Draws:
-        """Run a chain for each seed, or as many as a budget allows.
-
-        Raises BudgetError if it is spent before the first one is finished.
-        """
-        saved = {} if self.checkpoint is None else self.checkpoint.note
-        if saved.get("round") != len(self.refinements):
-            saved = {}
-        is_pseudo = _is_pseudo(self.evaluator, self.settings)
-        coarse = coarser_evaluator(self.evaluator) if self.log_likelihood is None else None
-        finished: list[dict[str, Floats]] = []
-        stages: list[Stages] = []
-        stopped = ""
-        columns = (
-            TextColumn("SMC chain {task.fields[chain]}"),
-            BarColumn(),
-            TextColumn("beta {task.completed:.4f}"),
-            TextColumn("acceptance {task.fields[rate]:.2f}"),
-            TimeElapsedColumn(),
-        )
-        with (
-            shown(self.settings.progressbar) as visible,
-            Progress(*columns, console=CONSOLE, disable=not (visible and live())) as progress,
-        ):
-            write = lines()
-            for chain, seed in enumerate(seeds):
-                task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
-                if self.checkpoint is not None and chain < saved.get("chain", 0):
-                    finished.append(self.checkpoint.arrays_of(f"chain{chain}_"))
-                    stages.append(saved["stats"][chain])
-                    continue
-                try:
-                    kernel, chain_stages = self._begin(chain, seed, coarse, saved)
-                    for _ in self._temper(kernel, chain_stages):
-                        self._save(finished, [*stages, chain_stages], kernel)
-                        progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
-                        write(f"SMC chain {chain + 1} of {len(seeds)}: beta {kernel.beta:.3g} of 1")
-                except BudgetError as spent:
-                    stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
-                    break
-                particles = kernel.particles._asdict()
-                finished.append({name: particles[name] for name in _SAVED})
-                stages.append(chain_stages)
-        if not finished:
-            raise BudgetError(stopped)
-        thetas, discrepancies, lost = (
-            np.array([arrays[name] for arrays in finished]) for name in _SAVED
-        )
-        return Draws(
-            thetas=thetas,
-            sampler={"sampler": "SMC-ABC" if is_pseudo else "SMC"},
-            discrepancies=discrepancies,
-            lost=lost,
-            stages=stages,
-            stopped=stopped,
-        )
-
-    def _begin(
-        self,
-        chain: int,
-        seed: np.random.SeedSequence,
-        coarse: Evaluator | None,
-        saved: Mapping[str, Any],
-    ) -> tuple[BatchedKernel, Stages]:
-        """Return a kernel at the prior, or in a saved state, and the statistics of its stages.
-
-        It begins on a coarser evaluator, if there is one.
-        """
-        (stream,) = seed.generate_state(1)
-        for node in self.evaluator.nodes:
-            node.bound.restart(int(stream))
-        is_resumed = chain == saved.get("chain")
-        is_coarse = saved["state"]["is_coarse"] if is_resumed else coarse is not None
-        kernel = BatchedKernel(
-            self.settings.draws,
-            model=self.evaluator.model,
-            threshold=self.settings.threshold,
-            evaluator=coarse if is_coarse and coarse is not None else self.evaluator,
-            log_likelihood=self.log_likelihood,
-        )
-        kernel.is_coarse = is_coarse
-        if self.checkpoint is None or not is_resumed:
-            start = None if self.starts is None else self.starts[chain]
-            kernel.initialize(start, np.random.default_rng(seed))
-            return kernel, {name: [] for name in kernel.stats_dtypes_shapes}
-        kernel.restore(self.checkpoint.arrays_of("now_"), saved["state"])
-        for node in self.evaluator.nodes:
-            if node.bound.random:
-                node.bound.draws = saved["generators"][node.name]
-        return kernel, saved["stats"][chain]
-
-    def _temper(self, kernel: BatchedKernel, stages: Stages) -> Iterator[None]:
-        """Do the remaining stages of a chain, and yield after each."""
-        while kernel.beta < 1 or kernel.is_coarse:
-            if len(stages["beta"]) == self.settings.max_stages:
-                raise BudgetError(
-                    f"max_stages = {self.settings.max_stages} was reached (beta {kernel.beta:.3g}, "
-                    "of 1)"
-                )
-            if kernel.beta < 1:
-                kernel.update_beta_and_weights()
-            elif not kernel.reweight(self.evaluator):
-                # The coarse posterior differs: once more, on all points.
-                kernel.initialize(kernel.start, kernel.rng)
-                for values in stages.values():
-                    values.clear()
+    ``log_likelihood`` replaces that of the evaluator. The checkpoint gets the state after each
+    stage, and ``refinements``, the thetas of earlier rounds. Raises BudgetError if a budget is
+    spent before the first chain is finished.
+    """
+    saved = {} if checkpoint is None else checkpoint.note
+    if saved.get("round") != len(refinements):
+        saved = {}
+    coarse = coarser_evaluator(evaluator) if log_likelihood is None else None
+    finished: list[dict[str, Floats]] = []
+    stages: list[Stages] = []
+    stopped = ""
+    columns = (
+        TextColumn("SMC chain {task.fields[chain]}"),
+        BarColumn(),
+        TextColumn("beta {task.completed:.4f}"),
+        TextColumn("acceptance {task.fields[rate]:.2f}"),
+        TimeElapsedColumn(),
+    )
+    with (
+        shown(settings.progressbar) as visible,
+        Progress(*columns, console=CONSOLE, disable=not (visible and live())) as progress,
+    ):
+        write = lines()
+        for chain, seed in enumerate(seeds):
+            task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
+            if checkpoint is not None and chain < saved.get("chain", 0):
+                finished.append(checkpoint.arrays_of(f"chain{chain}_"))
+                stages.append(saved["stages"][chain])
                 continue
-            for name, value in kernel.step().items():
-                stages[name].append(value)
-            yield
+            kernel = BatchedKernel(
+                settings.draws,
+                None if starts is None else starts[chain],
+                evaluator.model,
+                threshold=settings.threshold,
+                evaluator=coarse or evaluator,
+                log_likelihood=log_likelihood,
+            )
+            kernel.is_coarse = coarse is not None
+            try:
+                is_resumed = chain == saved.get("chain")
+                _begin(kernel, evaluator, seed, checkpoint if is_resumed else None)
+                for _ in kernel.tempered(evaluator, settings.max_stages):
+                    if checkpoint is not None:
+                        _save(checkpoint, kernel, evaluator, finished, stages, refinements)
+                    progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
+                    write(f"SMC chain {chain + 1} of {len(seeds)}: beta {kernel.beta:.3g} of 1")
+            except BudgetError as spent:
+                stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
+                break
+            finished.append({name: getattr(kernel.particles, name) for name in _SAVED})
+            stages.append(kernel.stages)
+    if not finished:
+        raise BudgetError(stopped)
+    thetas, discrepancies, lost = (
+        np.array([arrays[name] for arrays in finished]) for name in _SAVED
+    )
+    stats, evidence = _stage_statistics(stages)
+    is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
+    return Chains(
+        thetas=thetas,
+        sampler={"sampler": "SMC-ABC" if is_pseudo else "SMC", **evidence},
+        sample_stats=stats,
+        discrepancies=discrepancies,
+        lost=lost,
+        stopped=stopped,
+    )
 
-    def _save(
-        self, finished: list[dict[str, Floats]], stages: list[Stages], kernel: BatchedKernel
-    ) -> None:
-        if self.checkpoint is None:
-            return
-        now, state = kernel.state()
-        arrays = {f"now_{name}": array for name, array in now.items()}
-        for i, chain in enumerate(finished):
-            arrays |= {f"chain{i}_{name}": array for name, array in chain.items()}
-        arrays |= {f"refined{i}_thetas": thetas for i, thetas in enumerate(self.refinements)}
-        bounds = [node.bound for node in self.evaluator.nodes]
-        note = {
-            "round": len(self.refinements),
-            "chain": len(finished),
-            "stats": stages,
-            "state": state,
-            "generators": {bound.name: bound.draws for bound in bounds if bound.random},
-        }
-        self.checkpoint.save(arrays, note)
+
+def _begin(
+    kernel: BatchedKernel,
+    evaluator: Evaluator,
+    seed: np.random.SeedSequence,
+    checkpoint: Checkpoint | None,
+) -> None:
+    """Begin a chain at its start, or in the state of a checkpoint."""
+    (stream,) = seed.generate_state(1)
+    for node in evaluator.nodes:
+        node.bound.stream, node.bound.draws = int(stream), 0
+    if checkpoint is None:
+        kernel.initialize(kernel.start, np.random.default_rng(seed))
+        return
+    kernel.restore(checkpoint.arrays_of("now_"), checkpoint.note["state"])
+    if not kernel.is_coarse:
+        kernel.evaluator = evaluator
+    for node in evaluator.nodes:
+        if node.bound.random:
+            node.bound.draws = checkpoint.note["generators"][node.name]
+
+
+def _save(
+    checkpoint: Checkpoint,
+    kernel: BatchedKernel,
+    evaluator: Evaluator,
+    finished: Sequence[dict[str, Floats]],
+    stages: Sequence[Stages],
+    refinements: Sequence[Floats],
+) -> None:
+    """Save finished chains with their stages, the state of the next one, and refinements."""
+    now, state = kernel.state()
+    arrays = {f"now_{name}": array for name, array in now.items()}
+    for i, chain in enumerate(finished):
+        arrays |= {f"chain{i}_{name}": array for name, array in chain.items()}
+    arrays |= {f"refined{i}_thetas": thetas for i, thetas in enumerate(refinements)}
+    bounds = [node.bound for node in evaluator.nodes]
+    note = {
+        "round": len(refinements),
+        "chain": len(finished),
+        "stages": stages,
+        "state": state,
+        "generators": {bound.name: bound.draws for bound in bounds if bound.random},
+    }
+    checkpoint.save(arrays, note)
+
+
+def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, float]]:
+    """Return statistics by chain and stage, NaN after the last one, and the mean evidence."""
+    n_stages = max(len(stages["beta"]) for stages in chains)
+    variables = {}
+    for name in chains[0]:
+        table = np.full((len(chains), n_stages), np.nan)
+        for row, stages in zip(table, chains, strict=True):
+            row[: len(stages[name])] = stages[name]
+        variables[name] = (["chain", "stage"], table)
+    coords = {"chain": np.arange(len(chains)), "stage": np.arange(n_stages)}
+    logs = np.array([stages["log_marginal_likelihood"][-1] for stages in chains])
+    top = logs.max()
+    evidence = {
+        "log_marginal_likelihood": float(top + np.log(np.exp(logs - top).mean())),
+        "log_marginal_likelihood_sd": float(logs.std(ddof=1)) if logs.size > 1 else np.nan,
+    }
+    return xr.Dataset(variables, coords=coords), evidence

@@ -39,9 +39,9 @@ from prbayes.inference.resampling import (
     stored_populations,
 )
 from prbayes.metrics.score import prepared_on_population
-from prbayes.model.evaluator import TOLERABLE, Evaluator, coarse_where_sufficient, supports_each
+from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
 from prbayes.model.parameters import THETAS, log_posterior
-from prbayes.numerics.points import sobol
+from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.optimum import Optimum, optima_of
 from prbayes.posterior.importance import LogDensity, importance_sample, laplace
@@ -76,31 +76,14 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     if optimum is not None:
         return Target(evaluator, evaluator.log_other, optima_of(optimum, evaluator), prior_sd)
     target = Target(evaluator, evaluator.log_other, np.empty((0, len(prior_sd))), prior_sd)
-    return replace(target, starts=_prior_starts(target))
-
-
-def _prior_starts(target: Target) -> Floats:
-    """Return the best of 1024 prior points, and seven of the best quarter far from each other."""
-    prior_sd = target.evaluator.hyperparameters.prior_sd
-    thetas = target.evaluator.hyperparameters.prior_points(1024, 0)
+    thetas = evaluator.hyperparameters.prior_points(1024, 0)
     order = np.argsort(-target.log_posterior(thetas), kind="stable")
     candidates = thetas[order[: len(thetas) // 4]] / prior_sd
-    selected = [0]
-    distances = np.full(len(candidates), np.inf)
-    while len(selected) < 8:
-        squares = ((candidates - candidates[selected[-1]]) ** 2).sum(axis=1)
-        distances = np.minimum(distances, squares)
-        selected.append(int(np.argmax(distances)))
-    return np.asarray(candidates[selected] * prior_sd)
+    return replace(target, starts=candidates[farthest_rows(candidates, 8)] * prior_sd)
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
-    """Return the posterior given the metrics' own estimate; raise as `require_density`.
-
-    The estimate of metrics whose gradient is a mean over specimens is an M-estimator, and its
-    density follows from the scores of stored responses. The density of other estimates follows from
-    refits.
-    """
+    """Return the posterior given the metrics' own estimate, by scores or refits, or raise."""
     require_density(evaluator)
     is_mean = score_obstacle(evaluator) is None
     likelihood = (estimate_likelihood if is_mean else refit_likelihood)(evaluator, optimum)
@@ -112,10 +95,7 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
 
 
 def require_density(evaluator: Evaluator) -> None:
-    """Raise if the density of the metrics' estimate is not known.
-
-    Responses are random, or not stored although the density requires refits.
-    """
+    """Raise if the density of the metrics' estimate is not known."""
     obstacle = score_obstacle(evaluator)
     for node in evaluator.nodes:
         if node.bound.random:
@@ -136,11 +116,7 @@ def require_density(evaluator: Evaluator) -> None:
 def prior_conflicts(
     optimum: Optimum, evaluator: Evaluator, thetas: Floats, size: int = 4096
 ) -> tuple[Finding, ...]:
-    """Report hyperparameters whose prior pulls the posterior, thetas (..., d), from the estimate.
-
-    The predictive distribution of an estimate is that of draws of the prior with the standard
-    errors of the optimum.
-    """
+    """Report hyperparameters whose prior pulls the posterior thetas from the estimate."""
     if optimum.search.prior or any(rival["comparable"] for rival in optimum.rivals):
         return ()
     order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
@@ -192,15 +168,6 @@ class RefitLikelihoodOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class SyntheticSets:
-    """Synthetic data sets with their estimates, in coordinates of the sampling distribution."""
-
-    x: Floats  # (R, r): populations that they are drawn from
-    counts: tuple[csr_array, ...]  # (R, M_j): specimens at the stored responses, by group
-    estimates: Floats  # (R, r)
-
-
-@dataclass(frozen=True, eq=False)
 class RefitLikelihood:
     """The likelihood given the estimate, for `importance_sample` and `laplace`."""
 
@@ -210,53 +177,39 @@ class RefitLikelihood:
     continuation: Continuation
     starts: Floats  # (M, d): thetas of the centers, moved within the ends of the prior
     scale: Floats  # (d,): unit of each element for `laplace`
-    sets: SyntheticSets
-    log_mixture: Floats  # (R,): log-density of each data set in the mixture of all populations
     options: RefitLikelihoodOptions
-
-    @property
-    def point(self) -> Floats:
-        """Theta of the estimate, moved within the ends of the prior, (d,)."""
-        return np.asarray(self.starts[0])
-
-    @property
-    def sampling(self) -> SamplingDistribution:
-        """The sampling distribution of the estimate."""
-        return self.centers[0]
+    # Synthetic data sets, none if the data identify nothing: specimens at the stored responses, by
+    # group (R, M_j); estimates in coordinates of the first center, (R, r); and log-densities in the
+    # mixture of all populations, (R,).
+    counts: tuple[csr_array, ...] = ()
+    estimates: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    log_mixture: Floats = field(default_factory=lambda: np.empty(0))
 
     @one_thread()
     def log_likelihood(self, thetas: Floats) -> Floats:
         """Return the log-density of the observed estimate, (S, d) -> (S,)."""
-        if self.sets.estimates.shape[1] == 0:
-            return np.zeros(len(thetas))
-        x = self.sampling.coordinates(self.continuation.coordinates(thetas))
-        largest = max(count.shape[1] for count in self.sets.counts)
-        rows = max(16, AT_ONCE // max(largest, len(self.sets.estimates)))
-        blocks = [self._log_likelihood(x[first : first + rows]) for first in range(0, len(x), rows)]
-        return np.concatenate(blocks)
-
-    def _log_likelihood(self, x: Floats) -> Floats:
-        """Return the log-density at coordinates, (S, r) -> (S,)."""
-        result = np.full(len(x), -np.inf)
-        logs = self.log_weights(x)
-        is_supported = np.isfinite(logs).any(axis=1)
-        if is_supported.any():
-            shifts = nearest(self.centers, self.sampling.thetas(x[is_supported]))[1]
-            result[is_supported] = extended_log_density(
-                logs[is_supported], self.sets.estimates, shifts, self.options
-            )
+        result = np.zeros(len(thetas))
+        if not self.counts:
+            return result
+        sampling = self.centers[0]
+        x = sampling.coordinates(self.continuation.coordinates(thetas))
+        largest = max(count.shape[1] for count in self.counts)
+        rows = max(16, AT_ONCE // max(largest, len(self.estimates)))
+        for first in range(0, len(x), rows):
+            block = x[first : first + rows]
+            # Log weights of the data sets, which sum to one.
+            logs = _log_likelihoods(sampling, self.counts, block) - self.log_mixture
+            with np.errstate(invalid="ignore"):
+                logs -= logsumexp(logs, axis=1, keepdims=True)
+            is_supported = np.isfinite(logs).any(axis=1)
+            values = np.full(len(block), -np.inf)
+            if is_supported.any():
+                shifts = nearest(self.centers, sampling.thetas(block[is_supported]))[1]
+                values[is_supported] = extended_log_density(
+                    logs[is_supported], self.estimates, shifts, self.options
+                )
+            result[first : first + rows] = values
         return result
-
-    def log_weights(self, x: Floats) -> Floats:
-        """Return log weights of the data sets at coordinates, (S, r) -> (S, R); they sum to one."""
-        logs = _log_likelihoods(self.sampling, self.sets.counts, x) - self.log_mixture
-        with np.errstate(invalid="ignore"):
-            return np.asarray(logs - logsumexp(logs, axis=1, keepdims=True))
-
-    def with_sets(self, sets: SyntheticSets) -> RefitLikelihood:
-        """Return the likelihood from these data sets."""
-        logs = _log_likelihoods(self.sampling, sets.counts, sets.x)
-        return replace(self, sets=sets, log_mixture=logsumexp(logs, axis=0))
 
 
 def nearest(
@@ -318,59 +271,72 @@ def refit_likelihood(
     optimum: Optimum,
     options: RefitLikelihoodOptions = RefitLikelihoodOptions(),
 ) -> RefitLikelihood:
-    """Return the likelihood of the hyperparameters given the minimiser of any metrics.
-
-    Responses are stored. Raises ValueError if the estimate is at an edge, stored responses do not
-    support populations around it, or refits do not converge.
-    """
+    """Return the likelihood given the minimiser of any metrics, from refits, or raise."""
     if optimum.search.at_edge:
         raise ValueError(_at_edge(", ".join(optimum.search.at_edge)))
     thetas = optima_of(optimum, evaluator)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     continuation = continuation_of(evaluator, thetas[:1])
     start, *rest = continuation.coordinates(thetas)
-    for _ in range(options.whitenings):
-        evaluator, start = _whitened(evaluator, continuation, start, scales, options)
     continued = _continued(evaluator, continuation)
+    has_several_outputs = any(node.target.event for node in evaluator.nodes)
+    for _ in range(options.whitenings if has_several_outputs else 0):
+        # Metrics of several outputs are whitened by the population at the last minimiser.
+        targets = [node.target for node in evaluator.nodes]
+        for k, target in enumerate(targets):
+            if target.event:
+                responses, weights = continued.populations(start[None], k)
+                targets[k] = prepared_on_population(target, responses[0], weights[0])
+        evaluator = evaluator.with_targets(targets)
+        continued = _continued(evaluator, continuation)
+        start = _at_minimiser(continued, start, scales, options).theta
     sampling = _at_minimiser(continued, start, scales, options)
     _require_inside(sampling, options)
     local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
     # Identified directions are known from all stored responses; an eighth is enough for the rest.
-    evaluator = coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
+    theta = continuation.within(thetas[:1])[0]
+    evaluator = coarser_evaluator(evaluator, theta) or evaluator
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0])
-    places = np.array([center.theta for center in centers])
-    r = sampling.stderr.size
+    # Prior standard deviations, or a hundred standard errors if these are less.
+    errors = np.sqrt(((sampling.axes * sampling.stderr) ** 2).sum(axis=1))
+    is_known = ~continuation.is_continued & (errors > 0)
+    units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
     likelihood = RefitLikelihood(
         evaluator=evaluator,
         centers=tuple(centers),
         continuation=continuation,
-        starts=continuation.within(places, margin=0.05),
-        scale=_scale(evaluator, sampling, continuation),
-        sets=SyntheticSets(np.empty((0, r)), (), np.empty((0, r))),
-        log_mixture=np.empty(0),
+        starts=continuation.within(np.array([center.theta for center in centers]), margin=0.05),
+        scale=units * evaluator.hyperparameters.prior_sd,
         options=options,
     )
+    r = sampling.stderr.size
     if not r:
         return likelihood
+    # Data sets in balls around the centers, then around the posterior given these.
     number = options.n_sets // options.rounds
     balls = [
         sampling.coordinates(center.thetas(_ball(number // len(centers), r, options, i)))
         for i, center in enumerate(centers)
     ]
-    sets = _draw(centers, np.concatenate(balls), options, seed=0)
-    for i in range(1, options.rounds):
-        x = _posterior_points(likelihood.with_sets(sets), number)
-        new = _draw(centers, x, options, seed=i)
-        pairs = zip(sets.counts, new.counts, strict=True)
-        sets = SyntheticSets(
-            np.concatenate([sets.x, new.x]),
-            tuple(vstack(pair, format="csr") for pair in pairs),
-            np.concatenate([sets.estimates, new.estimates]),
+    x = np.concatenate(balls)
+    drawn = []
+    for i in range(options.rounds):
+        if i:
+            x = _posterior_points(likelihood, number)
+        drawn.append(_draw(centers, x, options, seed=i))
+        populations, counts, estimates = zip(*drawn, strict=True)
+        joined = tuple(vstack(parts, format="csr") for parts in zip(*counts, strict=True))
+        logs = _log_likelihoods(sampling, joined, np.concatenate(populations))
+        likelihood = replace(
+            likelihood,
+            counts=joined,
+            estimates=np.concatenate(estimates),
+            log_mixture=logsumexp(logs, axis=0),
         )
-    return likelihood.with_sets(sets)
+    return likelihood
 
 
 def _ball(number: int, r: int, options: RefitLikelihoodOptions, shift: int = 0) -> Floats:
@@ -392,7 +358,7 @@ def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
     modes = laplace(density, likelihood.starts, likelihood.scale)
     sample = importance_sample(density, modes, number, options.seed)
     thetas = likelihood.continuation.coordinates(sample.draws)
-    x = likelihood.sampling.coordinates(thetas)
+    x = likelihood.centers[0].coordinates(thetas)
     center_of, _ = nearest(likelihood.centers, thetas)
     for i in np.unique(center_of):
         members = center_of == i
@@ -406,8 +372,8 @@ def _draw(
     x: Floats,
     options: RefitLikelihoodOptions,
     seed: int,
-) -> SyntheticSets:
-    """Draw a data set at each of some coordinates, (R, r), and refit it."""
+) -> tuple[Floats, list[csr_array], Floats]:
+    """Draw and refit data sets at coordinates, (R, r); return these, counts and estimates."""
     sampling = centers[0]
     evaluator = sampling.evaluator
     thetas = sampling.thetas(x)
@@ -447,7 +413,7 @@ def _draw(
         count = csr_array((np.ones(places.size), places.ravel(), ends), shape=shape)
         count.sum_duplicates()
         counts.append(count)
-    return SyntheticSets(x[converged], tuple(counts), estimates[converged])
+    return x[converged], counts, estimates[converged]
 
 
 def _log_likelihoods(
@@ -472,10 +438,7 @@ def _log_likelihoods(
 def _best_starts(
     centers: Sequence[SamplingDistribution], data: DataSets, options: RefitLikelihoodOptions
 ) -> Floats:
-    """Return the best of some points around the estimate for each data set, (R, r).
-
-    Points nearer to another optimum are left out: all refits are minimisers near the estimate.
-    """
+    """Return the best of some points near the estimate for each data set, (R, r)."""
     sampling = centers[0]
     ball = _ball(options.n_starts, sampling.stderr.size, options)
     thetas = sampling.thetas(ball)
@@ -517,27 +480,6 @@ def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
     return replace(sampling, theta=sampling.thetas(x))
 
 
-def _whitened(
-    evaluator: Evaluator,
-    continuation: Continuation,
-    start: Floats,
-    scales: Floats,
-    options: RefitLikelihoodOptions,
-) -> tuple[Evaluator, Floats]:
-    """Return metrics of several outputs, whitened by the population, and their minimiser."""
-    targets = [node.target for node in evaluator.nodes]
-    if not any(target.event for target in targets):
-        return evaluator, start
-    continued = _continued(evaluator, continuation)
-    for k, target in enumerate(targets):
-        if target.event:
-            responses, weights = continued.populations(start[None], k)
-            targets[k] = prepared_on_population(target, responses[0], weights[0])
-    prepared = evaluator.with_targets(targets)
-    sampling = _at_minimiser(_continued(prepared, continuation), start, scales, options)
-    return prepared, sampling.theta
-
-
 def _require_inside(sampling: SamplingDistribution, options: RefitLikelihoodOptions) -> None:
     """Raise if the data identify more at the middle of the prior than at the estimate."""
     local = sampling.local
@@ -560,14 +502,3 @@ def _at_edge(subject: str) -> str:
         f"got {subject} at an edge, as where a standard deviation is about zero, where estimates "
         "pile up and have no density; use prb.LogLikelihood(), or prb.sample_smc"
     )
-
-
-def _scale(
-    evaluator: Evaluator, sampling: SamplingDistribution, continuation: Continuation
-) -> Floats:
-    """Return prior standard deviations, or a hundred standard errors if these are less, (d,)."""
-    axes = sampling.axes * sampling.stderr
-    errors = np.sqrt((axes**2).sum(axis=1))
-    is_known = ~continuation.is_continued & (errors > 0)
-    units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
-    return np.asarray(units * evaluator.hyperparameters.prior_sd)

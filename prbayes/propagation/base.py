@@ -12,7 +12,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from functools import cached_property
 from os import PathLike
 from typing import Any, ClassVar, Self
 
@@ -22,13 +21,13 @@ from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import Floats, flag, positive_number
+from prbayes._validate import Floats, flag, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.response.budget import RunCost
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import (
     PopulationSampler,
-    prior_draws,
+    PriorSampler,
     refuse_lopsided,
     valid,
 )
@@ -85,38 +84,20 @@ class Bound(ABC):
         Aleatory inputs, by input, at which responses were computed at the first use.
     first_responses : ndarray, shape (n,) or (n, m)
         The responses there.
-    n_per_theta : int
-        Number of responses that one evaluation of the discrepancy computes.
-    symbolic : bool
-        Whether the responses are part of the graph, where ``responses`` does not count them.
-    stored : bool
-        Whether the responses are stored, and theta moves their weights: a theta costs no response.
-    random : bool
-        Whether every evaluation draws specimens: the discrepancy is random and has no gradient.
-    support_moves : bool
-        Whether points are inside the population's support at some thetas and outside at others:
-        their weights change along an edge only.
-    is_line : bool
-        Whether the points are a quadrature rule of one dimension, whose error falls like 1 / n.
-    max_lost : float
-        Largest share of a population's weight, at an answer, on points without response.
-    draws : int
-        Number of evaluations so far, which determines the next draws of a random propagation.
-    lost : ndarray, shape (k,)
-        Share of the weight on points without response, of the populations evaluated last. NaN of
-        stored responses.
     """
 
-    n_per_theta: int = 0
-    symbolic: bool = False
-    stored: ClassVar[bool] = False
-    random: ClassVar[bool] = False
+    n_per_theta: int = 0  # responses that one evaluation of the discrepancy computes
+    symbolic: bool = False  # whether responses are part of the graph, which does not count them
+    stored: ClassVar[bool] = False  # whether responses are stored: a theta then costs none
+    random: ClassVar[bool] = False  # whether evaluations draw specimens: there is no gradient
+    # Whether points are inside the population's support at some thetas and outside at others.
     support_moves: bool = False
-    is_line: bool = False
-    max_lost: float = MAX_LOST
+    max_lost: float = MAX_LOST  # largest share, at an answer, of points without response
+    # Seed of the sampler at work, and evaluations since it began, which determine random draws.
+    stream: int = 0
     draws: int = 0
-    lost: Floats | float = np.nan
-    _missing: Missing | None = None  # of the populations evaluated last
+    # Of the populations evaluated last; NaN of invalid ones, and where responses are stored.
+    last_missing: Missing = Missing(np.array(np.nan), np.array(np.nan))
 
     def __init__(
         self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses
@@ -127,15 +108,15 @@ class Bound(ABC):
         self.responses = responses
         self.first_points: Sequence[Floats] = ()
         self.first_responses: Floats = np.empty(0)
+        symbols = inputs.placeholders()
+        dists, _ = inputs.rebuilt(symbols)
+        self._valid = compile_batched(symbols, [valid(inputs, dists)])
 
     def copied(self) -> Self:
         """Return the same propagation with its own count of responses, for a clone of the model."""
         copied = copy.copy(self)
         copied.responses = self.responses.copied()
         return copied
-
-    def restart(self, stream: int) -> None:  # noqa: B027 (of random ones alone)
-        """Begin a sampler's own stream of random draws."""
 
     @property
     def n_points(self) -> int:
@@ -151,10 +132,6 @@ class Bound(ABC):
     def blocks(self) -> NDArray[np.intp]:
         """Which of eight smaller sets of the same kind each point belongs to, shape (n_points,)."""
         return np.arange(self.n_points) * N_BLOCKS // self.n_points
-
-    def same_points(self, other: Bound) -> bool:
-        """Return whether another bound of the same settings and inputs has the same points."""
-        return True
 
     def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy as a scalar graph of the roots' values."""
@@ -182,17 +159,16 @@ class Bound(ABC):
 
         +inf where they are invalid.
         """
-        size = len(params[0]) if params else 1
+        size = len(params[0])
         result = np.full(size, np.inf)
+        self.last_missing = Missing(np.full(size, np.nan), np.full(size, np.nan))
         ok = self.valid(params)
-        lost = np.full(size, np.nan)
-        self._missing = None
         if ok.any():
             values, weights = self.populations([p[ok] for p in params])
-            self._missing = Missing.of(values, weights)
-            lost[ok] = self._missing.lost
+            missing = Missing.of(values, weights)
+            self.last_missing.lost[ok] = missing.lost
+            self.last_missing.failed[ok] = missing.failed
             result[ok] = target.of(values, weights)
-        self.lost = lost
         return result
 
     def missing(self, params: Sequence[Any]) -> Missing:
@@ -200,17 +176,13 @@ class Bound(ABC):
 
         The population that was evaluated last is not computed again.
         """
-        if self._missing is None or self._missing.lost.size != 1:
-            if not self.valid(params).all():
-                return Missing(np.ones(1), np.zeros(1))
-            self._missing = Missing.of(*self.populations(params))
-        return self._missing
-
-    @cached_property
-    def _valid(self) -> Any:
-        symbols = self.inputs.placeholders()
-        dists, _ = self.inputs.rebuilt(symbols)
-        return compile_batched(symbols, [valid(self.inputs, dists)])
+        last = self.last_missing
+        if last.lost.size == 1 and not np.isnan(last.lost).any():
+            return last
+        if not self.valid(params).all():
+            return Missing(np.ones(1), np.zeros(1))
+        self.last_missing = Missing.of(*self.populations(params))
+        return self.last_missing
 
     def valid(self, params: Sequence[Any]) -> Any:
         """Return which of a batch of roots give valid distributions (sigma > 0), shape (k,)."""
@@ -244,7 +216,7 @@ def discrepancy_error(bound: Bound, params: Sequence[Any]) -> float:
     if bound.n_points < 2 * N_BLOCKS:
         return np.nan
     values, weights = bound.populations(params)
-    bound._missing = Missing.of(values, weights)
+    bound.last_missing = Missing.of(values, weights)
     without_block = []
     for block in range(N_BLOCKS):
         is_used = bound.blocks != block
@@ -291,12 +263,6 @@ class Propagation(ABC):
     def check_likelihood(self, name: str) -> None:  # noqa: B027
         """Refuse options that the log-likelihood by specimen does not use."""
 
-    def check(self) -> None:
-        """Refuse arguments that are no executor, folder or policy."""
-        check_call_settings(self.executor, self.store, self.version, self.on_failure)
-        flag(self.retry_failed, "retry_failed")
-        refuse_timeout(self.timeout, self.executor)
-
     @property
     def cost(self) -> RunCost:
         """Runs that this propagation needs."""
@@ -310,6 +276,19 @@ class Propagation(ABC):
     @abstractmethod
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Return the moving part for one simulator, at its first use; may compute responses."""
+
+
+def check_arguments(propagation: Any, least: int) -> None:
+    """Refuse ``n`` below ``least``, and other arguments that are not as documented."""
+    name = type(propagation).__name__
+    check_call_settings(
+        propagation.executor, propagation.store, propagation.version, propagation.on_failure
+    )
+    flag(propagation.retry_failed, "retry_failed")
+    refuse_timeout(propagation.timeout, propagation.executor)
+    positive_integer(propagation.n, f"{name}: n", minimum=least)
+    positive_integer(propagation.random_seed, f"{name}: random_seed", minimum=0)
+    refuse_max_lost(propagation.max_lost, name)
 
 
 def refuse_max_lost(max_lost: object, name: str) -> None:
@@ -338,7 +317,7 @@ def cost_by_evaluation(n: int) -> RunCost:
 
 def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:
     """Return a trial of the response at points of the prior, (2, 8), and their inputs."""
-    draws = prior_draws(bound.inputs.roots, 64, seed)  # a few of them at least are valid
+    draws = PriorSampler(bound.inputs.roots)(64, seed)  # a few of them at least are valid
     two = [draw[:2] for draw in valid_roots(bound, draws)]
     aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import IN_CACHE, Floats
+from prbayes._validate import Floats
 from prbayes.propagation.base import N_BLOCKS
 from prbayes.propagation.importance import (
     SIZES,
@@ -27,11 +28,11 @@ from prbayes.propagation.importance import (
     spread_over,
 )
 from prbayes.propagation.moving_support import averaged_log_density, cells_around, moving_inputs
-from prbayes.propagation.population_density import PopulationDensity, normalise
+from prbayes.propagation.population_density import normalise
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import KnownPoints, Responses, deduplicated_responses
+from prbayes.response.response import Responses, deduplicated_responses
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,21 +60,6 @@ class Design:
     moving: tuple[int, ...] = ()
     # Whether a specimen is one continuous number, and the points a quadrature rule.
     on_line: bool = False
-
-    @property
-    def n_runs(self) -> int:
-        """Number of stored responses."""
-        return len(self.runs)
-
-    @property
-    def n_points(self) -> int:
-        """Number of points that have weights."""
-        return len(self.sample)
-
-    @property
-    def n_drawn(self) -> int:
-        """Number of times that points were drawn, of runs and of emulated samples."""
-        return len(self.batch_sizes) + self.n_emulated_samples
 
     @property
     def is_emulated(self) -> bool:
@@ -108,21 +94,18 @@ class Design:
         # A cell reaches 8 neighbours beside other inputs: points then pass an edge one by one, as
         # their weights differ. On a line, the cells of neighbours meet.
         reach = 1 if self.on_line else 8
-        arrays = [*self.sample.points, self.sample.log_density]
-        for i in self.moving:
-            cells = cells_around(self.sample.points[i], reach)
-            arrays += [cells.lower, cells.upper]
-        return arrays
+        cells = [cells_around(self.sample.points[i], reach) for i in self.moving]
+        return [*self.sample.points, self.sample.log_density, *chain.from_iterable(cells)]
 
     def summary(self, name: str) -> str:
         """Return the number of runs, and how responses between them are emulated, as a sentence."""
-        text = f"{name}: {self.n_runs} runs"
         if self.emulator is None:
-            return f"{text}."
-        text += (
-            f", between which {self.n_points} points are emulated: at runs that were left out the "
-            f"emulator is off by {self.emulator.error:.2g} of the response's spread, and "
-            f"{self.emulator.run_share:.0%} of a population are runs themselves."
+            return f"{name}: {len(self.runs)} runs."
+        text = (
+            f"{name}: {len(self.runs)} runs, between which {len(self.sample)} points are emulated: "
+            f"at runs that were left out the emulator is off by {self.emulator.error:.2g} of the "
+            f"response's spread, and {self.emulator.run_share:.0%} of a population are runs "
+            "themselves."
         )
         if self.coarse is None:
             return text
@@ -133,41 +116,42 @@ class Design:
         return f"{text} It follows the coarse response{share}."
 
 
+@dataclass(eq=False)
 class DesignSampler:
-    """Draws the points of designs: runs, and emulated points if there is an emulator."""
+    """Points of designs, and their weights: runs, and emulated points if there is an emulator."""
 
-    def __init__(
-        self,
-        name: str,
-        inputs: Inputs,
-        random_seed: int,
-        emulator: Any,
-        coarse: CoarseResponse | None,
-    ) -> None:
-        self.name = name
-        self.inputs = inputs
-        self.random_seed = random_seed
-        self.emulator = emulator
-        self.coarse = coarse
-        self.density = PopulationDensity(inputs)
-        self._mixtures = MixtureSampler(name, inputs, self.density)
+    mixtures: MixtureSampler
+    random_seed: int
+    emulator: Any
+    coarse: CoarseResponse | None
+    _log_weights: Any = None  # the compiled function, if the support of an input moves
 
     def with_runs(
         self, design: Design | None, components: Sequence[Floats], n: int, responses: Responses
     ) -> Design:
         """Return a design with n more runs at points from populations at roots, (k, *shape)."""
+        inputs = self.mixtures.inputs
         n_batches = 0 if design is None else len(design.batch_sizes)
         # A prime: seeds 0, 1, 2, ... of a user share no batch.
         seed = self.random_seed + 7919 * n_batches
-        on_line = is_line(self.inputs)
-        draw = self._mixtures.equal_mass if on_line else self._mixtures.draw
+        first = inputs.aleatory[0]
+        is_scalar = len(inputs.aleatory) == 1 and first.type.ndim == 0
+        on_line = is_scalar and first.dtype.startswith("float")
+        draw = self.mixtures.equal_mass if on_line else self.mixtures.draw
         points, mixture = draw(components, n, seed)
         # Before the runs: its errors then cost none.
         coarse = None if self.coarse is None else self.coarse(points)
-        values = _responses_at(points, responses, design)
+        # Responses that are known to this or another design are reused.
+        values = responses.runs.at(points)
+        if values is not None:
+            responses.count_reused(len(values))
+        else:
+            earlier = None if design is None else (design.runs.points, design.runs.values)
+            values = deduplicated_responses(responses, points, earlier)
+            responses.runs.stored.append((list(points), values))
         batch_sizes: tuple[int, ...] = (n,)
         if design is None:
-            moving = moving_inputs(self.name, self.inputs, components, points)
+            moving = moving_inputs(self.mixtures.name, inputs, components, points)
         else:
             moving = design.moving
             pairs = zip(design.runs.points, points, strict=True)
@@ -178,7 +162,7 @@ class DesignSampler:
             mixture = design.mixture.joined(mixture)
             batch_sizes = (*design.batch_sizes, n)
         # The mixture is that of all batches: its density changes at the old points, too.
-        log_g = self._mixtures.log_density(mixture, points)
+        log_g = self.mixtures.log_density(mixture, points)
         if on_line:
             blocks = np.arange(len(log_g)) % N_BLOCKS
         else:  # consecutive points of a Sobol sequence, each of whose stretches is a net
@@ -204,11 +188,11 @@ class DesignSampler:
         runs = design.runs
         # The prior, the populations before, and these.
         groups = (*design.groups[:1], *design.groups[1:][-1:], tuple(components))
-        design = replace(design.runs_alone(), groups=groups)
+        design = replace(design, groups=groups, sample=runs, emulated=None, emulator=None)
         if self.emulator is None:
             return design
         # 32 populations determine the mixing weight of the emulator.
-        weights = self._weights(runs, spread_over(components, 32))
+        weights = self.weights(runs, spread_over(components, 32))
         if emulator is None:
             emulator = fit_emulator(self.emulator, runs, weights, design.coarse)
         else:
@@ -218,8 +202,8 @@ class DesignSampler:
         # Another prime: no emulated sample shares points with a batch.
         seed = self.random_seed + 104_729 * (1 + design.n_emulated_samples)
         populations, shares = mixture_of(groups, design.emulated_size)
-        points, mixture = self._mixtures.draw(populations, design.emulated_size, seed, shares)
-        log_g = self._mixtures.log_density(mixture, points)
+        points, mixture = self.mixtures.draw(populations, design.emulated_size, seed, shares)
+        log_g = self.mixtures.log_density(mixture, points)
         coarse = None
         if self.coarse is not None and emulator.n_following:
             coarse = self.coarse(points)
@@ -232,86 +216,40 @@ class DesignSampler:
             n_emulated_samples=design.n_emulated_samples + 1,
         )
 
-    def _weights(self, sample: Sample, components: Sequence[Floats]) -> Floats:
+    def weights(self, sample: Sample, components: Sequence[Floats]) -> Floats:
         """Return weights of a sample's points in populations, (T, n): they sum to one."""
-        logs = self.density.at(components, sample.points)(slice(None))
+        logs = self.mixtures.density.at(components, sample.points)(slice(None))
         logs -= sample.log_density
         normalise(logs)
         return np.where(np.isnan(logs), 1 / logs.shape[1], logs)
 
-    def median_ess(self, sample: Sample, components: Sequence[Floats]) -> float:
-        """Return the median effective sample size of populations at roots, (k, *shape)."""
-        ess = []
-        step = max(1, IN_CACHE // len(sample))
-        for first in range(0, len(components[0]), step):
-            weights = self._weights(sample, [root[first : first + step] for root in components])
-            ess.append(1 / (weights**2).sum(axis=1))
-        return float(np.median(np.concatenate(ess)))
-
-
-def _responses_at(points: Sequence[Floats], responses: Responses, design: Design | None) -> Floats:
-    """Return the responses at points; those known to this or another design are reused."""
-    values = responses.runs.at(points)
-    if values is not None:
-        responses.count_reused(len(values))
-        return values
-    runs = None if design is None else KnownPoints(design.runs.points, design.runs.values)
-    values = deduplicated_responses(responses, points, runs)
-    responses.runs.stored.append((list(points), values))
-    return values
-
-
-class WeightFunction:
-    """Log weights log p(x given theta) - log g(x) of a design's points, compiled once."""
-
-    def __init__(self, inputs: Inputs, density: PopulationDensity) -> None:
-        self.inputs = inputs
-        self._density = density
-        self._function: Any = None
-
-    def __call__(self, params: Sequence[Any], design: Design) -> Floats:
-        """Return log weights at roots, shapes (k, *shape) -> (k, n)."""
-        if design.moving:
-            (logs,) = self._compiled(design)(*params, *design.weight_arrays)
-            return np.array(logs)
-        logs = self._density.at(params, design.sample.points)(slice(None))
-        logs -= design.sample.log_density
-        return logs
-
-    def graph(
-        self, params: Sequence[Any], arrays: Sequence[Any], moving: Sequence[int]
-    ) -> TensorVariable:
-        """Return log weights of symbols of the roots and of `Design.weight_arrays`, shape (n,)."""
-        k = len(self.inputs.aleatory)
-        dists, _ = self.inputs.rebuilt(params)
-        averaged = {}
-        for place, i in enumerate(moving):
-            lower, upper = arrays[k + 1 + 2 * place : k + 3 + 2 * place]
-            averaged[i] = partial(averaged_log_density, lower=lower, upper=upper)
-        return log_density(self.inputs, dists, arrays[:k], averaged) - arrays[k]
-
-    def _compiled(self, design: Design) -> Any:
-        """Return the compiled log weights of inputs whose support moves."""
-        if self._function is None:
-            symbols = self.inputs.placeholders()
+    def log_weights(self, params: Sequence[Any], design: Design) -> Floats:
+        """Return log p(x given theta) - log g(x) at roots, shapes (k, *shape) -> (k, n)."""
+        if not design.moving:
+            logs = self.mixtures.density.at(params, design.sample.points)(slice(None))
+            logs -= design.sample.log_density
+            return logs
+        if self._log_weights is None:
+            inputs = self.mixtures.inputs
+            symbols = inputs.placeholders()
             arrays = [
                 pt.tensor(dtype=a.dtype, shape=(None,) * a.ndim) for a in design.weight_arrays
             ]
-            graph = self.graph(symbols, arrays, design.moving)
-            self._function = compile_batched(symbols, [graph], arrays)
-        return self._function
+            graph = log_weight_graph(inputs, symbols, arrays, design.moving)
+            self._log_weights = compile_batched(symbols, [graph], arrays)
+        (logs,) = self._log_weights(*params, *design.weight_arrays)
+        return np.array(logs)
 
 
-def is_line(inputs: Inputs) -> bool:
-    """Return whether a specimen is one continuous number."""
-    x = inputs.aleatory[0]
-    return len(inputs.aleatory) == 1 and x.type.ndim == 0 and x.dtype.startswith("float")
-
-
-def common_rows(first: Sequence[Floats], second: Sequence[Floats]) -> int:
-    """Return how many points two samples have in common at their beginning."""
-    n = min(len(first[0]), len(second[0]))
-    equal = np.ones(n, dtype=bool)
-    for x, y in zip(first, second, strict=True):
-        equal &= (x[:n] == y[:n]).reshape(n, -1).all(axis=1)
-    return n if equal.all() else int(equal.argmin())
+def log_weight_graph(
+    inputs: Inputs, params: Sequence[Any], arrays: Sequence[Any], moving: Sequence[int]
+) -> TensorVariable:
+    """Return log weights of symbols of the roots and of `Design.weight_arrays`, shape (n,)."""
+    k = len(inputs.aleatory)
+    points, log_g, ends = arrays[:k], arrays[k], arrays[k + 1 :]
+    dists, _ = inputs.rebuilt(params)
+    averaged = {
+        i: partial(averaged_log_density, lower=lower, upper=upper)
+        for i, lower, upper in zip(moving, ends[::2], ends[1::2], strict=True)
+    }
+    return log_density(inputs, dists, points, averaged) - log_g

@@ -62,11 +62,7 @@ class MixtureSampler:
     def draw(
         self, components: Sequence[Floats], n: int, seed: int, shares: Floats | None = None
     ) -> tuple[tuple[Floats, ...], Mixture]:
-        """Return n points of populations with ``shares``, (k,), equal by default.
-
-        Scrambled Sobol points go through the inverse distribution functions where they exist. One
-        of their axes selects the population: populations are stratified.
-        """
+        """Return n points of populations with ``shares``, (k,), equal by default."""
         points, mixture = self._drawn(components, n, seed, shares)
         return self._off_the_edges(points, mixture), mixture
 
@@ -88,9 +84,20 @@ class MixtureSampler:
         is_frequent = n_equal > 2 * n_draft / n
         if np.any(is_frequent & np.isfinite(log_density)):
             ranks = (levels * finite.size).astype(int)
-            points = np.sort(finite)[ranks]
+            return self._off_the_edges([np.sort(finite)[ranks]], mixture), mixture
+        cumulated = (np.arange(grid.size) + 0.5) / grid.size
+        density = np.exp(log_density)
+        with np.errstate(invalid="ignore", over="ignore"):
+            trapezoids = 0.5 * (density[1:] + density[:-1]) * np.diff(grid)
+            mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
+            difference = np.abs(mass / mass[-1] - cumulated).max()
+        # Trapezoids are finer than the empirical distribution function of the grid, unless the
+        # density is infinite at an edge, or has peaks between points: both then differ more than
+        # random points.
+        if difference < 1 / np.sqrt(grid.size):
+            points = np.interp(levels * mass[-1], mass, grid)
         else:
-            points = _inverted(levels, grid, np.exp(log_density))
+            points = np.interp(levels, cumulated, grid)
         return self._off_the_edges([points], mixture), mixture
 
     def log_density(self, mixture: Mixture, points: Sequence[Floats]) -> Floats:
@@ -114,7 +121,11 @@ class MixtureSampler:
     def _drawn(
         self, components: Sequence[Floats], n: int, seed: int, shares: Floats | None
     ) -> tuple[list[Floats], Mixture]:
-        """Return points and their mixture."""
+        """Return points and their mixture.
+
+        Scrambled Sobol points go through the inverse distribution functions where they exist. One
+        of their axes selects the population: populations are stratified.
+        """
         k = len(components[0])
         selector, uniforms = base_points(self.inputs.event_shapes, n, seed)
         if shares is None:
@@ -155,24 +166,9 @@ class MixtureSampler:
         symbols = self.inputs.placeholders()
         shapes = [x.type.shape for x in self.inputs.aleatory]
         uniforms = [pt.tensor(dtype="float64", shape=shape) for shape in shapes]
-        dists, _ = self.inputs.rebuilt(symbols)
-        pairs = zip(dists, uniforms, strict=True)
-        points = [quantiles(self.name, dist, uniform[None])[0] for dist, uniform in pairs]
-        return compile_batched([*symbols, *uniforms], points)
-
-
-def _inverted(levels: Floats, grid: Floats, density: Floats) -> Floats:
-    """Return the quantiles of some levels, (n,), from a density on an ascending grid, (m,)."""
-    cumulated = (np.arange(grid.size) + 0.5) / grid.size
-    with np.errstate(invalid="ignore", over="ignore"):
-        trapezoids = 0.5 * (density[1:] + density[:-1]) * np.diff(grid)
-        mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
-        difference = np.abs(mass / mass[-1] - cumulated).max()
-    # Trapezoids are finer than the empirical distribution function of the grid, unless the density
-    # is infinite at an edge, or has peaks between points: both then differ more than random points.
-    if difference < 1 / np.sqrt(grid.size):
-        return np.asarray(np.interp(levels * mass[-1], mass, grid))
-    return np.asarray(np.interp(levels, cumulated, grid))
+        batched = [u[None] for u in uniforms]
+        placed, _ = through_inverses(self.name, self.inputs, symbols, batched)
+        return compile_batched([*symbols, *uniforms], [x[0] for x in placed])
 
 
 def new_specimens(
@@ -207,10 +203,7 @@ def through_inverses(
 ) -> tuple[list[Any], list[Any]]:
     """Return aleatory inputs as inverse distribution functions of uniforms, and epistemic ones.
 
-    Raises
-    ------
-    TypeError
-        If a distribution has no inverse, or depends on another one.
+    Raise TypeError if a distribution has no inverse, or depends on another one.
     """
     if inputs.nested:
         raise TypeError("no inverse of a conditional distribution")
@@ -223,8 +216,7 @@ def through_inverses(
 class EmulatedSizes:
     """Sizes of emulated samples, whose points cost no run.
 
-    The mixture that a sample is drawn from has few populations beside the prior: each fills its
-    space evenly.
+    The mixture of a sample has few populations beside the prior: each fills its space evenly.
     """
 
     first: int = 8192  # points
@@ -286,7 +278,7 @@ class DesignEmulator:
 
     def for_populations(self, weights: Floats) -> DesignEmulator | None:
         """Return the same surfaces for other populations; None where runs alone are as good."""
-        return _weighed(self.runs, self.surfaces, self.left_out, weights, self.event)
+        return _for_populations(self.runs, self.surfaces, self.left_out, weights, self.event)
 
     @property
     def n_following(self) -> int:
@@ -344,10 +336,10 @@ def fit_emulator(
         best, left_out = select_surfaces(surfaces, fitted)
     except np.linalg.LinAlgError:
         return None
-    return _weighed(fitted, best, left_out, weights, runs.values.shape[1:])
+    return _for_populations(fitted, best, left_out, weights, runs.values.shape[1:])
 
 
-def _weighed(
+def _for_populations(
     runs: Runs,
     surfaces: tuple[Any, ...],
     left_out: Floats,
@@ -359,22 +351,18 @@ def _weighed(
     if share > SIZES.runs_alone:
         return None
     share = 0.0 if share < SIZES.runs_negligible else share
-    error = _relative_error(runs, left_out, weights.mean(axis=0))
-    return DesignEmulator(runs, surfaces, left_out, weights, share, error, event)
-
-
-def _relative_error(runs: Runs, left_out: Floats, importance: Floats) -> float:
-    """Return the error of the worst output at runs that were left out, in its spreads."""
-    is_known = runs.good & np.isfinite(left_out).all(axis=1)
-    y = runs.y[is_known]
-    importance = importance[is_known]
+    # The error of the worst output at runs that were left out, in its spreads.
+    has_prediction = runs.good & np.isfinite(left_out).all(axis=1)
+    importance = weights.mean(axis=0)[has_prediction]
     total = importance.sum()
-    if not total > 0:
-        return np.nan
-    importance = importance / total
-    spread = np.sqrt(importance @ (y - importance @ y) ** 2)
-    error = np.sqrt(importance @ (left_out[is_known] - y) ** 2)
-    return float((error / np.where(spread > 0, spread, 1.0)).max())
+    worst = np.nan
+    if total > 0:
+        y = runs.y[has_prediction]
+        importance = importance / total
+        spread = np.sqrt(importance @ (y - importance @ y) ** 2)
+        error = np.sqrt(importance @ (left_out[has_prediction] - y) ** 2)
+        worst = float((error / np.where(spread > 0, spread, 1.0)).max())
+    return DesignEmulator(runs, surfaces, left_out, weights, share, worst, event)
 
 
 class CoarseResponse:
@@ -397,11 +385,8 @@ class CoarseResponse:
     def __call__(self, points: Sequence[Floats]) -> Floats:
         """Return the outputs at points, (n, m).
 
-        Raises
-        ------
-        ResponseError
-            If they are no real numbers, have another shape than those of the expensive response, or
-            are not finite at any of the points of the first call.
+        Raise ResponseError if they have another shape than those of the expensive response, or are
+        not finite at any of the points of the first call.
         """
         with unlimited():  # the user limits the expensive response
             values = self._responses(points, [])
@@ -417,16 +402,16 @@ class CoarseResponse:
 
 def columns(points: Sequence[Floats]) -> Floats:
     """Return inputs as columns, (n, d)."""
-    flat = [x.reshape(len(x), -1).astype(float) for x in points]
-    return np.concatenate(flat, axis=1)
+    return np.concatenate([x.reshape(len(x), -1).astype(float) for x in points], axis=1)
 
 
 def spread_over(group: Sequence[Floats], count: int) -> list[Floats]:
     """Return ``count`` populations, spread evenly over a group; those of a small one repeat."""
     size = len(group[0])
-    rows = np.linspace(0, size - 1, count).astype(int)
     if size < count:
         rows = np.arange(count) * size // count
+    else:
+        rows = np.linspace(0, size - 1, count).astype(int)
     return [values[rows] for values in group]
 
 

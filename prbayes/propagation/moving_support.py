@@ -8,7 +8,6 @@ around the point, a difference of the distribution function, changes while the e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,16 +19,8 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.response.compile import compile_batched, with_leading_axis
-from prbayes.response.distributions import is_elliptical
+from prbayes.response.distributions import ELLIPTICAL
 from prbayes.response.inputs import Inputs
-
-
-@dataclass(frozen=True)
-class Cells:
-    """Cells around points of an input, one for each point."""
-
-    lower: Floats  # (n, *event)
-    upper: Floats  # (n, *event)
 
 
 def moving_inputs(
@@ -38,45 +29,33 @@ def moving_inputs(
     """Return the positions of the aleatory inputs whose support moves with the hyperparameters.
 
     Their density is zero at a point (n, *event) for some roots, (k, *shape), and not for others.
-
-    Raises
-    ------
-    TypeError
-        If one is discrete or has atoms, or PyMC does not know its distribution function.
+    Raise TypeError if one is discrete, has atoms, or has no distribution function in PyMC.
     """
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     values = with_leading_axis(inputs.aleatory)
+    k = len(components[0])
     moving = []
     for i, (dist, x) in enumerate(zip(dists, values, strict=True)):
-        if is_elliptical(dist):  # positive everywhere
+        if isinstance(dist.owner.op, ELLIPTICAL):  # positive everywhere
             continue
         outside = pt.isneginf(pm.logp(dist, x, warn_rvs=False))
         compiled = compile_batched(symbols, [outside], [x])
-        if _support_moves(compiled, outside.type.ndim, components, points[i]):
-            _require_distribution_function(name, dist)
-            if isinstance(dist.owner.op, CensoredRV):
-                raise TypeError(_moving_atoms(name, dist, "bounds"))
-            moving.append(i)
+        step = max(1, AT_ONCE // (k * max(1, points[i][0].size)))
+        for start in range(0, len(points[i]), step):
+            block = points[i][start : start + step]
+            (result,) = compiled(*components, block)
+            # By element, or for a vector that is drawn as a whole.
+            is_outside = np.broadcast_to(result, (k, *block.shape[: outside.type.ndim]))
+            if np.any(is_outside.any(axis=0) & ~is_outside.all(axis=0)):
+                _refuse_unaverageable(name, dist)
+                moving.append(i)
+                break
     return tuple(moving)
 
 
-def _support_moves(compiled: Any, ndim: int, components: Sequence[Floats], points: Floats) -> bool:
-    """Return whether a point is outside the support of some populations, and inside of others."""
-    k = len(components[0])
-    step = max(1, AT_ONCE // (k * max(1, points[0].size)))
-    for start in range(0, len(points), step):
-        block = points[start : start + step]
-        (outside,) = compiled(*components, block)
-        # By element, or for a vector that is drawn as a whole.
-        is_outside = np.broadcast_to(outside, (k, *block.shape[:ndim]))
-        if np.any(is_outside.any(axis=0) & ~is_outside.all(axis=0)):
-            return True
-    return False
-
-
-def _require_distribution_function(name: str, dist: TensorVariable) -> None:
-    """Raise if a distribution is discrete, or PyMC does not know its distribution function."""
+def _refuse_unaverageable(name: str, dist: TensorVariable) -> None:
+    """Raise if a distribution is discrete or has atoms, or has no known distribution function."""
     refused = (
         f"{name}: got {dist.owner.op} with a support that moves with its hyperparameters, expected "
         "one that stays, or "
@@ -91,6 +70,8 @@ def _require_distribution_function(name: str, dist: TensorVariable) -> None:
             "responses jump where an edge passes them; use propagation=prb.Resimulated() or "
             "prb.Fresh()"
         ) from None
+    if isinstance(dist.owner.op, CensoredRV):
+        raise TypeError(_moving_atoms(name, dist, "bounds"))
 
 
 def _moving_atoms(name: str, dist: TensorVariable, what: str) -> str:
@@ -108,29 +89,22 @@ def refuse_moving_atoms(
 
     Such a value repeats among the points, (n, *event), of a single population, numbers (n,).
     """
+    number = population.max() + 1
     for dist, x in zip(inputs.aleatory, points, strict=True):
         if not dist.dtype.startswith("float"):
             continue  # one whose support moves is refused, and in others no value does
         for column in x.reshape(len(x), -1).T:
+            _, value, repeated = np.unique(column, return_inverse=True, return_counts=True)
+            pairs = np.unique(value * number + population)
+            n_populations = np.bincount(pairs // number)
+            is_atom = (repeated > 1) & (n_populations == 1)
             # Continuous values repeat by rounding, far out: in less than 1 % of the points.
-            if _share_of_atoms(column, population) > 0.01:
+            if is_atom.sum() >= 8 and repeated[is_atom].sum() > 0.01 * column.size:
                 raise TypeError(_moving_atoms(name, dist, "values"))
 
 
-def _share_of_atoms(column: Floats, population: NDArray[np.intp]) -> float:
-    """Return the share of points whose value repeats in one population only; zero if few do."""
-    _, value, repeated = np.unique(column, return_inverse=True, return_counts=True)
-    number = population.max() + 1
-    pairs = np.unique(value * number + population)
-    n_populations = np.bincount(pairs // number)
-    is_atom = (repeated > 1) & (n_populations == 1)
-    if is_atom.sum() < 8:
-        return 0.0
-    return float(repeated[is_atom].sum() / column.size)
-
-
-def cells_around(points: Floats, reach: int) -> Cells:
-    """Return a cell around each point, (n, *event), by element.
+def cells_around(points: Floats, reach: int) -> tuple[Floats, Floats]:
+    """Return the lower and upper ends of a cell around each point, (n, *event), by element.
 
     A cell reaches ``reach`` neighbours on either side: with one it ends half way to the next.
     """
@@ -152,8 +126,7 @@ def cells_around(points: Floats, reach: int) -> Cells:
         high = np.where(above > last, 2 * ordered - low, high)
         lower[order, k] = low
         upper[order, k] = high
-    shape = points.shape
-    return Cells(lower.reshape(shape), upper.reshape(shape))
+    return lower.reshape(points.shape), upper.reshape(points.shape)
 
 
 def averaged_log_density(dist: TensorVariable, x: Any, lower: Any, upper: Any) -> TensorVariable:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
@@ -16,7 +16,7 @@ from pytensor.graph.replace import _vectorize_node
 from prbayes.metrics.base import Basis, Discrepancy
 from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy, DensitySum
 from prbayes.metrics.grid import Cells
-from prbayes.response.inputs import batch_shape, broadcast_batch
+from prbayes.response.inputs import broadcast_batch
 from prbayes.response.response import Responses
 
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every
@@ -24,27 +24,36 @@ from prbayes.response.response import Responses
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
-    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|Binned|OpaqueOp|abc_d)",
+    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|AdjointOp|Binned|OpaqueOp|abc_d)",
 )
 
 
 class OwnOp(Op):
     """An operation on arrays (..., *event), which takes leading axes itself.
 
-    Operations are equal if the objects that ``__props__`` names are the same. A subclass repeats
-    ``__str__``: PyTensor's own would show cells, values and functions.
+    Operations are equal if the objects that ``__props__`` names are the same.
     """
 
     __props__: tuple[str, ...] = ()
     event_ndims: Sequence[int] = (1, 1)  # of the inputs: a sample and its weights
     event_shape: tuple[int | None, ...] = ()  # of the result
+    supported: ClassVar[str] = "prb.Reweighted alone; use that,"  # by JAX
+    no_gradient: str = ""  # why there is none, and what to do
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.__str__ = OwnOp.__str__  # type: ignore[method-assign]  # PyTensor's shows all values
 
     def __str__(self) -> str:
         """Return the name, and what to do where a backend has no form of it."""
         return (
             f"{type(self).__name__}, which is computed by NumPy: PyTensor's JAX mode and NumPyro "
-            "take prb.Reweighted alone; use that, or nuts_sampler='nutpie' or 'pymc'"
+            f"take {self.supported} or nuts_sampler='nutpie' or 'pymc'"
         )
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Refuse, unless a subclass has derivatives."""
+        raise NotImplementedError(self.no_gradient)
 
     def make_node(self, *inputs: Any) -> Apply[Any, Any]:
         """Apply to arrays; the result has their leading axes before its own event."""
@@ -67,15 +76,18 @@ class ResponseOp(OwnOp):
     """The response, which has no gradient, in one call for a whole batch."""
 
     __props__ = ("responses",)
-    __str__ = OwnOp.__str__
+    event_shape: tuple[int, ...] = ()
 
     def __init__(self, responses: Responses) -> None:
         self.responses = responses
-        self.event_shape: tuple[int, ...] = ()
         if responses.outputs is not None:
             self.event_shape = responses.outputs.event
-        inputs = responses.inputs
-        self.event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
+        self.event_ndims = responses.inputs.event_ndims
+        self.no_gradient = (
+            f"{responses.name}: the response does not accept PyTensor variables, so it has no "
+            "gradient under prb.Resimulated; use propagation=prb.Reweighted(), or prb.sample_smc, "
+            "which needs none"
+        )
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Call the response for populations that are valid.
@@ -83,8 +95,7 @@ class ResponseOp(OwnOp):
         Others have an input that is finite at none of their specimens.
         """
         k = len(self.responses.inputs.aleatory)
-        batch = batch_shape(inputs, self.event_ndims)
-        full = broadcast_batch(inputs, self.event_ndims, batch)
+        batch, full = broadcast_batch(inputs, self.event_ndims)
         valid = np.ones(batch[:-1], dtype=bool)
         for x in full[:k]:
             event_axes = tuple(range(len(batch), x.ndim))
@@ -98,20 +109,11 @@ class ResponseOp(OwnOp):
             values[valid] = self.responses(rows[:k], rows[k:])
         outputs[0][0] = values
 
-    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Refuse: the response is a black box."""
-        raise NotImplementedError(
-            f"{self.responses.name}: the response does not accept PyTensor variables, so it has no "
-            "gradient under prb.Resimulated; use propagation=prb.Reweighted(), or prb.sample_smc, "
-            "which needs none"
-        )
-
 
 class DensityOp(OwnOp):
     """The density of a weighted sample on cells, (..., n), (..., n) -> (..., m)."""
 
     __props__ = ("cells",)
-    __str__ = OwnOp.__str__
 
     def __init__(self, cells: Cells) -> None:
         self.cells = cells
@@ -130,35 +132,25 @@ class DensityOp(OwnOp):
                 "use GaussianKDE, or prb.Reweighted"
             )
         sample, weights = inputs
-        slope = CotangentOp(self.cells, 1)(sample, *cotangents)
-        value = CotangentOp(self.cells, 0)(sample, *cotangents)
+        slope = AdjointOp(self.cells, for_sample=True)(sample, *cotangents)
+        value = AdjointOp(self.cells, for_sample=False)(sample, *cotangents)
         return [weights * slope, value]
 
 
-class CotangentOp(OwnOp):
-    """A cotangent of a density on cells at the sample, or its derivative.
+class AdjointOp(OwnOp):
+    """A cotangent of a density at its sample, or its derivative: (..., n), (..., m) -> (..., n)."""
 
-    (..., n), (..., m) -> (..., n).
-    """
-
-    __props__ = ("cells", "order")
-    __str__ = OwnOp.__str__
+    __props__ = ("cells", "for_sample")
     event_shape = (None,)
+    no_gradient = "second derivatives of densities of simulated values are not implemented"
 
-    def __init__(self, cells: Cells, order: int) -> None:
+    def __init__(self, cells: Cells, for_sample: bool) -> None:
         self.cells = cells
-        self.order = order
+        self.for_sample = for_sample
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
-        gather = self.cells.slope if self.order else self.cells.value
-        outputs[0][0] = gather(*inputs)
-
-    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Refuse second derivatives."""
-        raise NotImplementedError(
-            "second derivatives of a density of simulated values are not implemented as a graph"
-        )
+        outputs[0][0] = self.cells.adjoint(*inputs, for_sample=self.for_sample)
 
 
 class BinnedOp(OwnOp):
@@ -166,18 +158,11 @@ class BinnedOp(OwnOp):
 
     __props__ = ("densities",)
     event_ndims = (2, 1)
+    supported = "several outputs of smaller designs alone; pass prb.Reweighted(max_points=...),"
 
     def __init__(self, densities: DensitySum) -> None:
         self.densities = densities
         self.event_shape = (densities.n_cells,)
-
-    def __str__(self) -> str:
-        """Return the name, and what to do where a backend has no form of it."""
-        return (
-            f"{type(self).__name__}, which is computed by NumPy: PyTensor's JAX mode and NumPyro "
-            "take several outputs of smaller designs alone; pass prb.Reweighted(max_points=...), "
-            "or nuts_sampler='nutpie' or 'pymc'"
-        )
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Bin and smooth."""
@@ -186,37 +171,35 @@ class BinnedOp(OwnOp):
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Return the derivatives for the weights by another operation; values are stored."""
         projections, _ = inputs
-        (cotangent,) = cotangents
         constant = grad_undefined(self, 0, projections, "stored values do not change")
-        return [constant, BinnedAdjointOp(self.densities)(projections, cotangent)]
+        return [constant, BinnedAdjointOp(self.densities)(projections, *cotangents)]
 
 
-class BinnedAdjointOp(BinnedOp):
+class BinnedAdjointOp(OwnOp):
     """The adjoint of such densities, (n, K), (..., cells) -> (..., n)."""
 
     __props__ = ("densities",)
-    __str__ = BinnedOp.__str__
+    event_ndims = (2, 1)
+    event_shape = (None,)
+    supported = BinnedOp.supported
+    no_gradient = AdjointOp.no_gradient
 
     def __init__(self, densities: DensitySum) -> None:
         self.densities = densities
-        self.event_shape = (None,)
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
         outputs[0][0] = self.densities.adjoint(*inputs)
-
-    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Refuse second derivatives."""
-        raise NotImplementedError(
-            "second derivatives are not implemented as a graph for so many stored responses"
-        )
 
 
 class OpaqueOp(OwnOp):
     """A user's metric on weighted responses, (..., n), (..., n) -> (...); it has no gradient."""
 
     __props__ = ("target",)
-    __str__ = OwnOp.__str__
+    no_gradient = (
+        "a FunctionMetric has no gradient; use prb.sample_smc, "
+        "prb.minimize(method='Nelder-Mead') or pm.Slice"
+    )
 
     def __init__(self, target: Discrepancy) -> None:
         self.target = target
@@ -229,13 +212,6 @@ class OpaqueOp(OwnOp):
         shape = np.broadcast_shapes(sample.shape[: sample.ndim - len(event)], weights.shape)
         full = np.broadcast_to(sample, shape + event)
         outputs[0][0] = np.asarray(self.target.of(full, np.broadcast_to(weights, shape)))
-
-    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Refuse: nothing is known about the function."""
-        raise NotImplementedError(
-            "a FunctionMetric has no gradient; use prb.sample_smc, "
-            "prb.minimize(method='Nelder-Mead') or pm.Slice"
-        )
 
 
 def stored_discrepancy(target: Discrepancy, basis: Basis, weights: Any) -> Any:
@@ -256,12 +232,10 @@ def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
         return OpaqueOp(target)(sample, weights)
     parts = target.parts
     if parts[0].target is not target:
-        values = [part.of(sample, pt) for part in parts]
-        graphs = [
-            part.share * symbolic_discrepancy(part.target, own, weights)
-            for part, own in zip(parts, values, strict=True)
-        ]
-        return sum(graphs[1:], start=graphs[0])
+        return sum(
+            part.share * symbolic_discrepancy(part.target, part.of(sample, pt), weights)
+            for part in parts
+        )
     if isinstance(target, DensityDiscrepancy):
         density = DensityOp(target.cells)(sample, weights)
         return target.outer(density, xp=pt)

@@ -30,16 +30,12 @@ from scipy.linalg import qr
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.numerics.threads import one_thread
-from prbayes.response.distributions import PopulationSampler, compiled_log_density, is_mvnormal
+from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs
 
 
 def _non_negative(x: Floats) -> Floats:
     return np.where(x >= 0, x, np.nan)
-
-
-def _log_of_rest(x: Floats) -> Floats:
-    return np.asarray(np.log1p(-x))
 
 
 # Coordinates of an element, (n,) -> (n,), not finite outside of the support, and whether their
@@ -52,7 +48,7 @@ _FAMILIES: dict[type, tuple[tuple[Callable[[Floats], Floats], ...], bool]] = {
     type(pm.LogNormal.rv_op): ((np.log,), True),
     type(pm.Gamma.rv_op): ((np.positive, np.log), False),
     type(pm.InverseGamma.rv_op): ((np.reciprocal, np.log), False),
-    type(pm.Beta.rv_op): ((np.log, _log_of_rest), False),
+    type(pm.Beta.rv_op): ((np.log, lambda x: np.log1p(-x)), False),
     type(pm.Exponential.rv_op): ((_non_negative,), False),
 }
 
@@ -62,7 +58,7 @@ def _coordinates(dist: pt.TensorVariable, values: Floats) -> list[tuple[Floats, 
 
     None if the distribution is no exponential family with a fixed support.
     """
-    if is_mvnormal(dist):
+    if isinstance(dist.owner.op, MVNORMAL):
         return [(values.T, True)]
     op = dist.owner.op
     if type(op) not in _FAMILIES:
@@ -125,7 +121,7 @@ class ExponentialForm:
                 return None
             coordinates += of_input
         with np.errstate(invalid="ignore"):
-            is_inside = np.isfinite(sum(u.sum(axis=0) for u, _ in coordinates))
+            is_inside = np.isfinite(sum([u.sum(axis=0) for u, _ in coordinates]))
         inside = np.flatnonzero(is_inside)
         if not inside.size:
             return None
@@ -149,22 +145,15 @@ class ExponentialForm:
         anchors = tuple(values[inside[pivots]] for values in points)
         return cls(statistics, is_inside, anchors, np.linalg.inv(at_anchors))
 
-    def natural_parameters(self, at_anchors: Floats) -> Floats:
-        """Return H from log-densities at the anchors, (S, q + 1) -> (S, q + 1).
+    def natural_parameters(self, at_anchors: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return H from log-densities at the anchors, (S, q + 1), and which rows are rounded, (S,).
 
-        Its last column is minus the log-normaliser.
+        The last column of H is minus the log-normaliser. Log-densities at points would be off by
+        more than 1e-12 in rounded rows, which are zero: they are small differences of large
+        numbers, of populations far narrower than the points, or far from them, or invalid.
         """
-        with np.errstate(invalid="ignore"):
-            return np.asarray(at_anchors @ self.inverse)
-
-
-def _is_rounded(at_anchors: Floats) -> NDArray[np.bool_]:
-    """Return which log-densities at points would be off by more than 1e-12, (S, q + 1) -> (S,).
-
-    Those of populations far narrower than the points, or far from them, and of invalid ones: they
-    are small differences of large numbers.
-    """
-    return ~(np.abs(at_anchors).max(axis=1) < 1000.0)
+        is_rounded = ~(np.abs(at_anchors).max(axis=1) < 1000.0)
+        return np.where(is_rounded[:, None], 0.0, at_anchors) @ self.inverse, is_rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,13 +174,13 @@ class WeightedPoints:
         return cls(x, log_a, ExponentialForm.of(inputs.aleatory, flat))
 
 
+@dataclass(eq=False)
 class PopulationDensity:
     """Populations of some inputs, compiled once: log-densities and draws."""
 
-    def __init__(self, inputs: Inputs) -> None:
-        self.inputs = inputs
-        # The last points with the form of their log-density.
-        self._form: tuple[Any, ExponentialForm | None] = (None, None)
+    inputs: Inputs
+    # The last points with the form of their log-density.
+    _form: tuple[Any, ExponentialForm | None] = (None, None)
 
     @cached_property
     def _log_density(self) -> Any:
@@ -214,28 +203,23 @@ class PopulationDensity:
             if form is not None and not form.is_inside.all():
                 form = None
             self._form = points[0], form
-        if form is None:
+        if form is not None:
+            (at_anchors,) = self._log_density(*params, *form.anchors)
+            natural, is_rounded = form.natural_parameters(at_anchors)
+            narrow = [param[is_rounded] for param in params]
 
-            def by_graph(rows: slice) -> Floats:
-                (logs,) = self._log_density(*params, *(x[rows] for x in points))
+        def log_densities(rows: slice) -> Floats:
+            if form is None:
+                (logs,) = self._log_density(*params, *[x[rows] for x in points])
                 return np.array(logs)
-
-            return by_graph
-
-        (at_anchors,) = self._log_density(*params, *form.anchors)
-        parameters = form.natural_parameters(at_anchors)
-        is_rounded = _is_rounded(at_anchors)
-        narrow = [param[is_rounded] for param in params]
-
-        def by_product(rows: slice) -> Floats:
             # In one thread: the points of a design do not depend on the number of threads.
             with one_thread():
-                logs = parameters @ form.statistics[:, rows]
+                logs = natural @ form.statistics[:, rows]
             if is_rounded.any():
-                (logs[is_rounded],) = self._log_density(*narrow, *(x[rows] for x in points))
+                (logs[is_rounded],) = self._log_density(*narrow, *[x[rows] for x in points])
             return np.asarray(logs)
 
-        return by_product
+        return log_densities
 
     @one_thread()
     def log_likelihoods(self, roots: Sequence[Floats], points: WeightedPoints) -> Floats:
@@ -246,8 +230,7 @@ class PopulationDensity:
             return self._by_graph(roots, points)
         with np.errstate(all="ignore"):
             (at_anchors,) = self._log_density(*roots, *form.anchors)
-        is_rounded = _is_rounded(at_anchors)
-        natural = form.natural_parameters(np.where(is_rounded[:, None], 0.0, at_anchors))
+        natural, is_rounded = form.natural_parameters(at_anchors)
         # A is a statistic whose parameter is one; -inf in a product may become NaN.
         base = np.where(form.is_inside, log_a.T.ravel(), -np.inf)
         terms = np.vstack([form.statistics, np.maximum(base, -1e300)]).T

@@ -18,23 +18,23 @@ from pytensor.compile import function
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, report
-from prbayes._validate import AT_ONCE, Floats, positive_integer
+from prbayes._validate import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy
 from prbayes.numerics.points import base_points, points_from
 from prbayes.propagation.base import (
     MAX_LOST,
     Bound,
     Propagation,
+    check_arguments,
     cost_by_evaluation,
     probe,
-    refuse_max_lost,
     refuse_nested,
 )
 from prbayes.propagation.ops import OwnOp, ResponseOp, symbolic_discrepancy
 from prbayes.response.budget import RunCost
 from prbayes.response.compile import PLAIN, compile_batched, ninf_for_invalid
 from prbayes.response.distributions import PopulationSampler, quantiles, valid
-from prbayes.response.inputs import Inputs, batch_shape, broadcast_batch
+from prbayes.response.inputs import Inputs, broadcast_batch
 from prbayes.response.response import Responses
 
 
@@ -71,11 +71,8 @@ class Resimulated(Propagation):
     max_lost: float = field(default=MAX_LOST, repr=False)
 
     def __post_init__(self) -> None:
-        self.check()
-        positive_integer(self.n, "Resimulated: n", minimum=2)
+        check_arguments(self, 2)
         points_from(self.points)
-        refuse_max_lost(self.max_lost, "Resimulated")
-        positive_integer(self.random_seed, "Resimulated: random_seed", minimum=0)
 
     @property
     def cost(self) -> RunCost:
@@ -129,8 +126,8 @@ class ResimulatedBound(Bound):
         # large.
         is_small = config.n <= AT_ONCE
         self._points: list[Any] = points if is_small else [shared(u) for u in points]
-        trial = probe(self, PopulationSampler(inputs), config.random_seed)
-        self.symbolic = self._accepts_tensors(*trial)
+        values, aleatory, epistemic = probe(self, PopulationSampler(inputs), config.random_seed)
+        self.symbolic = responses.is_batched and self._is_a_graph(values, aleatory, epistemic)
 
     def copied(self) -> Self:
         """Return the same propagation with its own count, which its compiled function updates."""
@@ -138,12 +135,10 @@ class ResimulatedBound(Bound):
         copied.__dict__.pop("_values", None)
         return copied
 
-    def _accepts_tensors(
+    def _is_a_graph(
         self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]
     ) -> bool:
         """Return whether the response of PyTensor variables is a graph with the same numbers."""
-        if not self.responses.is_batched:
-            return False
         values = [*aleatory, *epistemic]
         symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in values]
         k = len(aleatory)
@@ -226,10 +221,7 @@ class Fresh(Propagation):
     max_lost: float = field(default=MAX_LOST, repr=False)
 
     def __post_init__(self) -> None:
-        self.check()
-        positive_integer(self.n, "Fresh: n", minimum=1)
-        positive_integer(self.random_seed, "Fresh: random_seed", minimum=0)
-        refuse_max_lost(self.max_lost, "Fresh")
+        check_arguments(self, 1)
 
     @property
     def cost(self) -> RunCost:
@@ -253,14 +245,8 @@ class FreshBound(Bound):
         self.n_per_theta = config.n
         self.max_lost = config.max_lost
         self._seed = config.random_seed
-        self._stream = 0  # seed of the sampler at work
         self._sampler = PopulationSampler(inputs)
         probe(self, self._sampler, config.random_seed)
-
-    def restart(self, stream: int) -> None:
-        """Begin a sampler's own stream of random draws."""
-        self._stream = stream
-        self.draws = 0
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return an operation that draws and evaluates."""
@@ -273,7 +259,7 @@ class FreshBound(Bound):
         for values in params:
             digest.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
         number = int.from_bytes(digest.digest(), "little")
-        rng = np.random.default_rng([self._seed, self._stream, self.draws, number])
+        rng = np.random.default_rng([self._seed, self.stream, self.draws, number])
         aleatory, epistemic = self._sampler(params, self.n_per_theta, rng)
         responses = self.responses(aleatory, epistemic)
         shape = len(responses), self.n_per_theta
@@ -292,7 +278,6 @@ class FreshOp(OwnOp):
     """Draws a population and returns its discrepancy, () ... -> ()."""
 
     __props__ = ("bound",)
-    __str__ = OwnOp.__str__
 
     def __init__(self, bound: FreshBound) -> None:
         self.bound = bound
@@ -300,8 +285,7 @@ class FreshOp(OwnOp):
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Draw, call the response, compare."""
-        batch = batch_shape(inputs, self.event_ndims)
-        full = broadcast_batch(inputs, self.event_ndims, batch)
+        batch, full = broadcast_batch(inputs, self.event_ndims)
         params = [values.reshape(-1, *values.shape[len(batch) :]) for values in full]
         discrepancies = self.bound.discrepancies(params, self.bound.target)
         outputs[0][0] = discrepancies.reshape(batch)

@@ -15,14 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp, stdtrit
 
 from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats
-from prbayes.numerics.points import sobol
+from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions, first_runs
@@ -61,25 +61,15 @@ class ResponseShare:
 
 def _log_share(inside: Floats, outside: Floats) -> Floats:
     """Return log S of the logs of both integrals, zero where the first one is zero."""
-    is_known = np.isfinite(inside)
-    return np.where(is_known, -np.logaddexp(0.0, outside - np.where(is_known, inside, 0)), 0.0)
-
-
-class SharedDraws(Protocol):
-    """Draws of the hyperparameters given the specimens, without or with a share."""
-
-    def log_share(self, share: ResponseShare) -> Floats:
-        """Return the sum of log S over the specimens, (S,)."""
-
-    def specimens(self) -> Floats:
-        """Return coordinates of specimens, (n, d)."""
+    is_finite = np.isfinite(inside)
+    return np.where(is_finite, -np.logaddexp(0.0, outside - np.where(is_finite, inside, 0)), 0.0)
 
 
 def response_share(
     run: Callable[[Floats], Floats],
     emulation: Emulation,
     prior_specimens: Callable[[], Floats],
-    posterior: Callable[[ResponseShare | None], SharedDraws],
+    posterior: Callable[[ResponseShare | None], Any],
     options: PointOptions,
     *,
     count: int = 1024,
@@ -91,14 +81,11 @@ def response_share(
 
     None where the share changes the log-likelihood of no plausible population by more than the
     error of the points of the specimens. ``run`` maps coordinates (n, d) to outputs (n, m), NaN
-    where there is no response; ``posterior`` maps a share to draws of the hyperparameters. Each
-    half has ``count`` points at first, and there are at most ``batches`` batches of runs at the
-    boundary.
+    where there is no response. ``posterior`` maps a share to draws of the hyperparameters, with
+    ``log_share(share)``, (S,), and ``specimens()``, (n, d). Each half has ``count`` points at
+    first, and there are at most ``batches`` batches of runs at the boundary.
 
-    Raises
-    ------
-    DesignError
-        If boundary or points do not determine the share.
+    Raise DesignError if boundary or points do not determine the share.
     """
     if not np.isnan(emulation.y).any():
         return emulation, None
@@ -136,20 +123,17 @@ def response_share(
         halves = [draw(count, half) for half in (0, 1)]
         logs = [draws.log_share(half) for half in halves]
         difference = float(np.std(logs[0] - logs[1]) / 2)
-        if difference <= largest or 2 * count > 2**16:
+        if difference <= largest:
             break
         count *= 2
-    if difference > largest:
-        raise DesignError(
-            f"{name}: got two halves of {count} points whose shares without response change the "
-            f"log-likelihood by {difference:.2g} nats, expected at most {largest}; narrow the "
-            "priors, or use metric=prb.ProbabilityResidual()"
-        )
-    return emulation, _sorted(
-        np.concatenate([half.z for half in halves]),
-        np.concatenate([half.log_b for half in halves]),
-        emulation,
-    )
+        if count > 2**16:
+            raise DesignError(
+                f"{name}: got two halves of {count // 2} points whose shares without response "
+                f"change the log-likelihood by {difference:.2g} nats, expected at most {largest}; "
+                "narrow the priors, or use metric=prb.ProbabilityResidual()"
+            )
+    z = np.concatenate([half.z for half in halves])
+    return emulation, _sorted(z, np.concatenate([half.log_b for half in halves]), emulation)
 
 
 def _points(
@@ -158,17 +142,17 @@ def _points(
     """Draw Sobol points from a mixture around samples: whitened, t distributed elements."""
     size = count // len(samples)
     d = samples[0].shape[1]
-    means = [sample.mean(axis=0) for sample in samples]
-    covariances = [np.cov(sample.T).reshape(d, d) for sample in samples]
-    roots = [np.linalg.cholesky(1.5 * covariance) for covariance in covariances]
-    z = np.concatenate(
-        [
-            mean + stdtrit(degrees, sobol(size, d, 1009 * seed + k)) @ root.T
-            for k, (mean, root) in enumerate(zip(means, roots, strict=True))
-        ]
-    )
+    # By sample: a mean, and the root of an inflated covariance.
+    normals = [
+        (sample.mean(axis=0), np.linalg.cholesky(1.5 * np.cov(sample.T).reshape(d, d)))
+        for sample in samples
+    ]
+    parts = []
+    for k, (mean, root) in enumerate(normals):
+        parts.append(mean + stdtrit(degrees, sobol(size, d, 1009 * seed + k)) @ root.T)
+    z = np.concatenate(parts)
     log_q = []
-    for mean, root in zip(means, roots, strict=True):
+    for mean, root in normals:
         standard = np.linalg.solve(root, (z - mean).T)
         log_t = -(degrees + 1) / 2 * np.log1p(standard**2 / degrees)
         log_q.append(log_t.sum(axis=0) - np.log(np.diag(root)).sum())
@@ -200,10 +184,5 @@ def boundary_points(emulation: Emulation, z: Floats, count: int, seed: int = 0) 
     near = np.flatnonzero(np.maximum(with_response, without) < 2 * distance)
     # A sample: the population decides where on the boundary the runs are.
     near = np.random.default_rng(seed).permutation(near)[: 4 * count]
-    candidates, distance = z[near] / width, distance[near]
-    rows: list[int] = []
-    while len(rows) < min(count, len(near)):
-        rows.append(int(np.argmax(distance)))
-        to_last = np.sqrt(((candidates - candidates[rows[-1]]) ** 2).sum(axis=1))
-        distance = np.minimum(distance, to_last)
+    rows = farthest_rows(z[near] / width, min(count, len(near)), distance[near] ** 2)
     return z[near[rows]]

@@ -18,7 +18,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, report
-from prbayes._validate import Floats, positive_integer
+from prbayes._validate import IN_CACHE, Floats, positive_integer
 from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
 from prbayes.metrics.base import Basis, Discrepancy
@@ -28,32 +28,32 @@ from prbayes.propagation.base import (
     Bound,
     DesignError,
     Propagation,
+    check_arguments,
     refuse_all_nan,
-    refuse_max_lost,
     refuse_nested,
     valid_roots,
 )
-from prbayes.propagation.design import Design, DesignSampler, WeightFunction, common_rows, is_line
+from prbayes.propagation.design import Design, DesignSampler, log_weight_graph
 from prbayes.propagation.importance import (
     SIZES,
     CoarseResponse,
     DesignEmulator,
     EmulatedPoints,
+    MixtureSampler,
     Sample,
     fit_emulator,
 )
 from prbayes.propagation.ops import stored_discrepancy
-from prbayes.propagation.population_density import normalise
+from prbayes.propagation.population_density import PopulationDensity, normalise
 from prbayes.response.budget import RunCost
-from prbayes.response.distributions import prior_draws, refuse_without_density
+from prbayes.response.distributions import PriorSampler, refuse_without_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import is_missing
 from prbayes.response.response import (
-    KnownPoints,
     Responses,
     deduplicated_responses,
-    refuse_coarse,
-    refuse_wrong_arity,
+    refuse_misfit,
+    refuse_uncallable,
 )
 
 # Largest basis in a compiled graph, 1 GiB, for the largest design. Graphs without a basis are as
@@ -137,25 +137,29 @@ class Reweighted(Propagation):
     coarse: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
-        self.check()
-        positive_integer(self.n, "Reweighted: n", minimum=16)
-        positive_integer(self.random_seed, "Reweighted: random_seed", minimum=0)
-        refuse_max_lost(self.max_lost, "Reweighted")
-        _refuse_emulator(self.emulator)
+        check_arguments(self, 16)
+        expected = (
+            'expected "auto", None, a surface such as prb.surrogate.RadialBasis(), or a regressor '
+            "with fit(X, y) and predict(X)"
+        )
+        emulator = self.emulator
+        if isinstance(emulator, str):
+            if emulator != "auto":
+                raise ValueError(f"Reweighted: emulator: got {emulator!r}, {expected}")
+        elif emulator is not None and not isinstance(emulator, Surface):
+            is_regressor = callable(getattr(emulator, "fit", None)) and hasattr(emulator, "predict")
+            if not is_regressor:
+                got = type(emulator).__name__
+                raise TypeError(f"Reweighted: emulator: got {got}, {expected}")
         if self.coarse is not None:
-            refuse_coarse("Reweighted: coarse", self.coarse)
-            if self.emulator is None:
+            refuse_uncallable("Reweighted", self.coarse, "coarse")
+            if emulator is None:
                 raise ValueError(
                     "Reweighted: coarse: got a coarse response and no emulator to follow it, "
                     'expected emulator="auto", or a surface, beside it'
                 )
-        if (
-            self.max_points is not None
-            and positive_integer(self.max_points, "Reweighted: max_points") < self.n
-        ):
-            raise ValueError(
-                f"Reweighted: max_points: got {self.max_points}, expected n = {self.n} or more"
-            )
+        if self.max_points is not None:
+            positive_integer(self.max_points, "Reweighted: max_points", minimum=self.n)
 
     @property
     def cost(self) -> RunCost:
@@ -200,7 +204,7 @@ class Reweighted(Propagation):
                 "weighted=True, or use propagation=prb.Resimulated()"
             )
         is_custom = self.emulator is not None and not isinstance(self.emulator, str)
-        if is_custom and not has_points_between_runs(inputs):
+        if is_custom and not self.emulates(inputs):
             kinds = ", ".join(f"{x.dtype}, {x.type.ndim} dimensions" for x in inputs.aleatory)
             raise TypeError(
                 f"{name}: emulator: got {type(self.emulator).__name__} for aleatory inputs "
@@ -216,7 +220,7 @@ class Reweighted(Propagation):
                     f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
                     "leave coarse= out"
                 )
-            refuse_wrong_arity(f"{name}: coarse", self.coarse, inputs)
+            refuse_misfit(f"{name}: coarse", self.coarse, inputs.sizes)
 
     def check_likelihood(self, name: str) -> None:
         """Refuse options that the log-likelihood by specimen, with its own emulator, lacks."""
@@ -231,40 +235,14 @@ class Reweighted(Propagation):
 
     def emulates(self, inputs: Inputs) -> bool:
         """Return whether responses between the runs are emulated."""
-        if self.emulator is None:
+        # With more runs the response is cheap, and of one number they are a quadrature rule.
+        if self.emulator is None or (isinstance(self.emulator, str) and self.n > MOST_RUNS):
             return False
-        # With more runs the response is cheap.
-        is_worthwhile = not isinstance(self.emulator, str) or self.n <= MOST_RUNS
-        return is_worthwhile and has_points_between_runs(inputs)
+        return inputs.dimensions > 1 and {np.dtype(x.dtype).kind for x in inputs.aleatory} == {"f"}
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Compute the responses at the first design points."""
         return ReweightedBound(name, inputs, target, responses, self)
-
-
-def has_points_between_runs(inputs: Inputs) -> bool:
-    """Return whether there are points between runs that need an emulator."""
-    continuous = all(x.dtype.startswith("float") for x in inputs.aleatory)
-    return continuous and inputs.dimensions > 1
-
-
-def _refuse_emulator(emulator: Any) -> None:
-    """Raise if it is no emulator."""
-    if emulator is None or isinstance(emulator, Surface):
-        return
-    if isinstance(emulator, str):
-        if emulator == "auto":
-            return
-        raise ValueError(
-            f'Reweighted: emulator: got {emulator!r}, expected "auto", None, or a surface such as '
-            "prb.surrogate.RadialBasis()"
-        )
-    if not (callable(getattr(emulator, "fit", None)) and hasattr(emulator, "predict")):
-        raise TypeError(
-            f'Reweighted: emulator: got {type(emulator).__name__}, expected "auto", None, a '
-            "surface such as prb.surrogate.RadialBasis(), or a regressor with fit(X, y) and "
-            "predict(X)"
-        )
 
 
 class PoorEmulatorError(DesignError):
@@ -277,13 +255,6 @@ class ReweightedBound(Bound):
     The points of a batch are stratified over a finite list of roots' values. The list is kept, and
     g is exactly the mixture, over all batches, of the densities at the listed values (balance
     heuristic).
-
-    Attributes
-    ----------
-    config : Reweighted
-    design : Design
-        The stored runs, and the points that have weights. To undo a step, assign the record that
-        was there before it.
     """
 
     stored: ClassVar[bool] = True
@@ -300,13 +271,12 @@ class ReweightedBound(Bound):
         super().__init__(name, inputs, target, responses)
         self.config = config
         self.max_lost = config.max_lost
-        self.is_line = is_line(inputs)
         coarse = None
         if config.coarse is not None:
             coarse = CoarseResponse(config.coarse, responses, config.executor)
         emulator = config.emulator if config.emulates(inputs) else None
-        self._sampler = DesignSampler(name, inputs, config.random_seed, emulator, coarse)
-        self._log_weights = WeightFunction(inputs, self._sampler.density)
+        mixtures = MixtureSampler(name, inputs, PopulationDensity(inputs))
+        self._sampler = DesignSampler(mixtures, config.random_seed, emulator, coarse)
         self._data = {key: np.array(data.get_value()) for key, data in inputs.data.items()}
         # Arrays of PyMC's graphs, once there is one.
         self._shared: list[Any] = []
@@ -315,7 +285,7 @@ class ReweightedBound(Bound):
         # Other responses at runs: more conditions than a study has, fewer than fill the memory.
         self._other_responses: deque[tuple[Responses, Sample]] = deque(maxlen=32)
         # As many components as points would be as good, and cost their square.
-        components = prior_draws(inputs.roots, min(config.n, 512), config.random_seed)
+        components = PriorSampler(inputs.roots)(min(config.n, 512), config.random_seed)
         components = valid_roots(self, components)
         self._design = self._sampler.with_runs(None, components, config.n, responses)
         self.support_moves = bool(self._design.moving)
@@ -323,20 +293,19 @@ class ReweightedBound(Bound):
         self.first_points, self.first_responses = runs.points, runs.values
         refuse_all_nan(name, runs.values)
         if not self._design.is_emulated:
-            ess = self._sampler.median_ess(runs, components)
-            if ess < self.required_ess:
-                _warn_of_low_ess(self, ess)
+            _report_low_ess(self, components)
 
     @property
     def design(self) -> Design:
-        """The stored runs, and the points that have weights."""
+        """The stored runs, and the points that have weights; an earlier record may be assigned."""
         return self._design
 
     @design.setter
     def design(self, design: Design) -> None:
         self._design = design
         if self._shared:
-            for shared, array in zip(self._shared, self._graph_arrays(), strict=True):
+            arrays = [*design.weight_arrays, *self._graph_basis().arrays]
+            for shared, array in zip(self._shared, arrays, strict=True):
                 shared.set_value(array, borrow=True)
 
     def copied(self, design: Design | None = None) -> Self:
@@ -350,31 +319,17 @@ class ReweightedBound(Bound):
     @property
     def n_points(self) -> int:
         """Number of points that have weights."""
-        return self._design.n_points
+        return len(self._design.sample)
 
     @property
     def n_runs(self) -> int:
         """Number of stored responses."""
-        return self._design.n_runs
+        return len(self._design.runs)
 
     @property
     def blocks(self) -> NDArray[np.intp]:
         """Which of eight coarser designs each point belongs to, shape (n,)."""
         return self._design.sample.blocks
-
-    def same_points(self, other: Bound) -> bool:
-        """Return whether another design has the same points, whose responses belong together."""
-        if not isinstance(other, ReweightedBound):
-            return False
-        pairs = zip(self._design.sample.points, other._design.sample.points, strict=True)
-        return all(np.array_equal(a, b) for a, b in pairs)
-
-    @property
-    def batch_size(self) -> int:
-        """The smallest number of runs that are added at a time."""
-        if not self._design.is_emulated:
-            return self.config.n
-        return max(self.config.n // 4, self.responses.workers)
 
     @property
     def required_ess(self) -> float:
@@ -391,10 +346,7 @@ class ReweightedBound(Bound):
     def add(self, components: Sequence[Floats], n: int | None = None) -> None:
         """Compute more responses, at points from populations at roots, shapes (k, *shape).
 
-        Raises
-        ------
-        DesignError
-            If data above the inputs are others than at the beginning.
+        Raise DesignError if data above the inputs have changed since the design was begun.
         """
         now = {name: np.array(shared.get_value()) for name, shared in self.inputs.data.items()}
         changed = [name for name in now if not np.array_equal(self._data[name], now[name])]
@@ -409,22 +361,16 @@ class ReweightedBound(Bound):
         components = valid_roots(self, components)
         self.design = self._sampler.with_runs(self._design, components, n, self.responses)
 
-    def reach(self, components: Sequence[Floats], *, same_surfaces: bool = False) -> None:
-        """Draw emulated points for populations at roots, shapes (k, *shape), without a run.
+    def reach(
+        self, components: Sequence[Floats], *, same_surfaces: bool = False, growth: int = 1
+    ) -> None:
+        """Draw ``growth`` times as many emulated points for populations at roots, without a run.
 
         To select surfaces for these populations takes most of the time.
         """
-        emulator = self._design.emulator if same_surfaces else None
-        components = valid_roots(self, components)
-        self.design = self._sampler.resampled(self._design, components, emulator)
-
-    def widen(self, components: Sequence[Floats], *, same_surfaces: bool = False) -> bool:
-        """Draw twice as many emulated points for populations; return whether they may grow."""
-        if self._design.emulated_size >= SIZES.largest:
-            return False
-        self._design = replace(self._design, emulated_size=2 * self._design.emulated_size)
-        self.reach(components, same_surfaces=same_surfaces)
-        return True
+        design = replace(self._design, emulated_size=growth * self._design.emulated_size)
+        emulator = design.emulator if same_surfaces else None
+        self.design = self._sampler.resampled(design, valid_roots(self, components), emulator)
 
     def points_of(self, inputs: Inputs, points: Sequence[Floats] | None = None) -> list[Floats]:
         """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
@@ -435,12 +381,8 @@ class ReweightedBound(Bound):
     def values_of(self, responses: Responses) -> Floats:
         """Return another response of the design's specimens, (n,) or (n, m).
 
-        Runs that are known are reused.
-
-        Raises
-        ------
-        PoorEmulatorError
-            If the response is emulated poorly between the runs. Runs alone need no emulator.
+        Known runs are reused. Raise PoorEmulatorError if the response is emulated poorly between
+        the runs; runs alone need no emulator.
         """
         if responses.same_as(self.responses):
             return self._design.sample.values
@@ -474,12 +416,17 @@ class ReweightedBound(Bound):
         pairs = [pair for pair in self._other_responses if responses.same_as(pair[0])]
         values = np.empty(0)
         if pairs:
+            # The design may have other runs, after the first ones in common.
             _, earlier = pairs[0]
-            values = earlier.values[: common_rows(earlier.points, runs.points)]
+            n = min(len(earlier), len(runs))
+            equal = np.ones(n, dtype=bool)
+            for x, y in zip(earlier.points, runs.points, strict=True):
+                equal &= (x[:n] == y[:n]).reshape(n, -1).all(axis=1)
+            values = earlier.values[: n if equal.all() else int(equal.argmin())]
         if len(values) < len(runs):
             points = self.points_of(responses.inputs, runs.points)
             missing = [x[len(values) :] for x in points]
-            more = deduplicated_responses(responses, missing, KnownPoints(points, values))
+            more = deduplicated_responses(responses, missing, (points, values))
             values = np.concatenate([values.reshape(-1, *more.shape[1:]), more])
             if pairs:
                 self._other_responses.remove(pairs[0])
@@ -506,41 +453,35 @@ class ReweightedBound(Bound):
             )
         return emulator
 
-    def _graph_arrays(self) -> list[Any]:
-        """Return what compiled graphs read: arrays of weights, and the basis of the metric."""
-        basis = self._graph_basis(self._design.sample.values)
-        return [*self._design.weight_arrays, *basis.arrays]
-
-    def _graph_basis(self, values: Floats) -> Basis:
+    def _graph_basis(self) -> Basis:
         """Return the basis for compiled graphs; its form stays the same while the design grows."""
         most = self.config.most
         if self._sampler.emulator is not None:
             most = max(most, SIZES.largest)
-        return self.target.basis(values, _MAX_BASIS * len(values) / most)
+        return self.target.basis(self._design.sample.values, _MAX_BASIS * self.n_points / most)
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the reweighted responses, +inf where no point has weight."""
+        design, basis = self._design, self._graph_basis()
+        n_arrays = len(design.weight_arrays)
         if not self._shared:
-            for i, array in enumerate(self._graph_arrays()):
+            for i, array in enumerate([*design.weight_arrays, *basis.arrays]):
                 # Some samplers know shared variables by their names. Designs may grow.
                 name, shape = f"{self.name}_design_{i}", (None,) * array.ndim
                 self._shared.append(pytensor.shared(array, name=name, borrow=True, shape=shape))
-        n_arrays = len(self._design.weight_arrays)
-        basis = tuple(self._shared[n_arrays:])
-        logs = self._log_weights.graph(params, self._shared[:n_arrays], self._design.moving)
+        logs = log_weight_graph(self.inputs, params, self._shared[:n_arrays], design.moving)
         largest = pt.max(logs)
         supported = largest > -np.inf
         # PyTensor's softmax has a backend of its own; the largest only guards against overflow.
         centred = logs - disconnected_grad(largest)
         raw = pt.exp(pt.switch(supported, centred, 0.0))
         weights = raw / raw.sum()
-        form = replace(self._graph_basis(self._design.sample.values[:1]), arrays=basis)
-        value = stored_discrepancy(self.target, form, weights)
-        return pt.switch(supported, value, np.inf)
+        form = replace(basis, arrays=tuple(self._shared[n_arrays:]))
+        return pt.switch(supported, stored_discrepancy(self.target, form, weights), np.inf)
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return the stored responses and their weights at given roots."""
-        weights = self._log_weights(params, self._design)
+        weights = self._sampler.log_weights(params, self._design)
         normalise(weights)
         values = self._design.sample.values
         return np.broadcast_to(values, weights.shape + values.shape[1:]), weights
@@ -555,15 +496,15 @@ class ReweightedBound(Bound):
             self._basis = (target, sample, target.basis(sample.values))
         basis = self._basis[2]
         size = len(params[0])
-        step = max(_MIN_POPULATIONS, _BLOCK // self.n_points)
+        step = max(_MIN_POPULATIONS, _BLOCK // len(sample))
         parts = []
         # A single population leaves little to linear algebra.
         with one_thread() if size > 1 else nullcontext():
             for first in range(0, max(1, size), step):
                 roots = [p[first : first + step] for p in params]
-                weights = self._log_weights(roots, self._design)
+                weights = self._sampler.log_weights(roots, self._design)
                 is_supported = np.isfinite(normalise(weights))
-                weights[~is_supported] = 1 / self.n_points
+                weights[~is_supported] = 1 / len(sample)
                 features = basis.features(weights)
                 values = target.outer(*features, xp=np)
                 parts.append(np.where(is_supported, values, np.inf))
@@ -581,7 +522,7 @@ class ReweightedBound(Bound):
             share of specimens that failed (+inf) in the rest.
         """
         values = self._design.sample.values
-        weights = self._log_weights(params, self._design)
+        weights = self._sampler.log_weights(params, self._design)
         log_totals = normalise(weights)
         is_lost = is_missing(values)
         has_failed = np.isposinf(values).reshape(self.n_points, -1).any(axis=1)
@@ -597,8 +538,17 @@ class ReweightedBound(Bound):
         }
 
 
-def _warn_of_low_ess(bound: ReweightedBound, ess: float) -> None:
+def _report_low_ess(bound: ReweightedBound, components: Sequence[Floats]) -> None:
     """Report a design with a small effective sample size in populations of the prior."""
+    runs = bound._design.runs
+    step = max(1, IN_CACHE // len(runs))
+    sizes = []
+    for first in range(0, len(components[0]), step):
+        block = [root[first : first + step] for root in components]
+        sizes.append(1 / (bound._sampler.weights(runs, block) ** 2).sum(axis=1))
+    ess = float(np.median(np.concatenate(sizes)))
+    if ess >= bound.required_ess:
+        return
     dimensions = bound.inputs.dimensions
     # With more inputs weights become very uneven, and another propagation is better.
     level = logging.WARNING
@@ -609,19 +559,26 @@ def _warn_of_low_ess(bound: ReweightedBound, ess: float) -> None:
             "before pm.sample call prb.refine(model)"
         )
     else:
-        between = has_points_between_runs(bound.inputs)
-        leave = "leave out emulator=None, or " if between else ""
+        by_default = replace(bound.config, emulator="auto")
+        is_alone = bound.config.emulator is None and by_default.emulates(bound.inputs)
+        leave = "leave out emulator=None, or " if is_alone else ""
         advice = (
             f"{dimensions} inputs are many for stored responses alone: {leave}use "
             "propagation=prb.Resimulated(n), which has no design"
         )
-    finding = Finding(
-        "thin-design",
+    text = (
         f"{bound.name}: the design of {bound.config.n} runs supports a typical population of the "
         f"prior with a weight effective sample size of {ess:.0f}, where {bound.required_ess:.0f} "
-        f"make its error small; {advice}.",
+        f"make its error small; {advice}."
     )
-    report(finding, level=level)
+    report(Finding("thin-design", text), level=level)
+
+
+def same_points(first: Bound, second: Bound) -> bool:
+    """Return whether bounds of the same settings and inputs have the same points."""
+    if not isinstance(first, ReweightedBound) or not isinstance(second, ReweightedBound):
+        return type(first) is type(second)
+    return all(map(np.array_equal, first.design.sample.points, second.design.sample.points))
 
 
 @contextmanager

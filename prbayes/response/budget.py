@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from functools import partial
 
 from prbayes._validate import positive_integer, positive_number
 
@@ -50,13 +51,8 @@ class Budget:
         return granted
 
 
-_current: ContextVar[Budget] = ContextVar("budget")
-_UNLIMITED = Budget()
-
-
-def budget() -> Budget:
-    """Return the current budget, by default one without limits."""
-    return _current.get(_UNLIMITED)
+_current: ContextVar[Budget] = ContextVar("budget", default=Budget())  # noqa: B039 (no limits)
+budget = _current.get  # returns the current budget
 
 
 @contextmanager
@@ -73,11 +69,8 @@ def limited(max_seconds: float | None, max_runs: int | None) -> Iterator[None]:
         _current.reset(token)
 
 
-@contextmanager
-def unlimited() -> Iterator[None]:
-    """Suspend the budget in the block, for work that costs no response."""
-    with limited(None, None):
-        yield
+# Suspends the budget in a block, for work that costs no response.
+unlimited = partial(limited, None, None)
 
 
 @dataclass(frozen=True)

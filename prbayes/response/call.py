@@ -29,7 +29,7 @@ from prbayes.response.executors import (
     is_loss,
     time_limit,
 )
-from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
+from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, is_missing, outputs_of_result
 from prbayes.response.store import Store, StoreError
 
@@ -87,8 +87,8 @@ class scalar:  # noqa: N801 (reads as a function in a model)
                     "multivariate, call response.function(...) with the inputs of one specimen"
                 )
                 raise
-            outputs = _outputs_from(result, 0, outputs)
-            values.append(_specimen_response(result, outputs))
+            response, outputs = _specimen_response(result, outputs)
+            values.append(response)
         event = np.shape(values[0]) if values else ()
         batch = np.array(values).reshape(arrays[0].shape + event)
         return batch if outputs is None else outputs.by_key(batch)
@@ -110,10 +110,6 @@ class Points:
         pairs = zip(self.arguments, self.varying, strict=True)
         return Points([a[rows] if varies else a for a, varies in pairs], self.varying)
 
-    def copied_arguments(self) -> list[Any]:
-        """Return the arguments for a response, which may change them in place."""
-        return [a.copy() if isinstance(a, np.ndarray) else a for a in self.arguments]
-
     def keys(self) -> Floats:
         """Return all numbers that a response depends on, constants included, shape (n, columns)."""
         n = len(self)
@@ -123,29 +119,19 @@ class Points:
             columns.append(values.reshape(n, int(np.prod(values.shape[1:], dtype=int))))
         return np.concatenate(columns, axis=1).astype(np.float64)
 
-    def from_keys(self, keys: Floats) -> Points:
-        """Return the points of keys with the same constants."""
+    def read_keys(self, keys: Floats) -> tuple[Points, NDArray[np.bool_]]:
+        """Return the points of keys (n, columns), and which have the constants of these, (n,)."""
+        have_same_constants = np.ones(len(keys), dtype=bool)
         arguments = []
-        for a, event, columns in self._columns():
-            is_constant = event is None
-            arguments.append(a if is_constant else keys[:, columns].reshape(len(keys), *event))
-        return Points(arguments, self.varying)
-
-    def have_same_constants(self, keys: Floats) -> NDArray[np.bool_]:
-        """Return which keys have the same constants as these points, shape (n,)."""
-        same = np.ones(len(keys), dtype=bool)
-        for a, event, columns in self._columns():
-            if event is None:
-                same &= (keys[:, columns] == np.ravel(a)).all(axis=1)
-        return same
-
-    def _columns(self) -> Iterator[tuple[Any, Any, slice]]:
-        """Yield each argument, its event shape (None of a constant), and its columns in keys."""
         stop = 0
         for a, varies in zip(self.arguments, self.varying, strict=True):
             event = np.shape(a)[1:] if varies else np.shape(a)
             start, stop = stop, stop + int(np.prod(event, dtype=int))
-            yield a, event if varies else None, slice(start, stop)
+            values = keys[:, start:stop]
+            if not varies:
+                have_same_constants &= (values == np.ravel(a)).all(axis=1)
+            arguments.append(values.reshape(len(keys), *event) if varies else a)
+        return Points(arguments, self.varying), have_same_constants
 
 
 @dataclass(frozen=True)
@@ -160,73 +146,50 @@ class Chunk:
 
 
 def compute(
-    function: Callable[..., Any],
+    function: Callable[..., Any] | bytes,
     points: Points,
     tolerant: bool,
     timeout: float | None = None,
     outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> Chunk:
-    """Return the responses at points; unless failures are tolerated, up to the first one."""
+    """Return the responses at points; unless failures are tolerated, up to the first one.
+
+    A `scalar` is called for each point, another function for all, bisected if it raises. Bytes are
+    a function that was `packed` in another process.
+    """
+    if isinstance(function, bytes):
+        function = _unpacked(function)
     clock = time.perf_counter()
-    evaluate = _one_by_one if isinstance(function, scalar) else _as_batch
-    values, raised, known = evaluate(function, points, tolerant, timeout, outputs)
-    named = known if outputs is None else None
-    return Chunk(values, raised, time.perf_counter() - clock, named)
-
-
-type _Computed = tuple[Floats, dict[int, str], Outputs | None]
-
-
-def _one_by_one(
-    function: Callable[..., Any],
-    points: Points,
-    tolerant: bool,
-    timeout: float | None,
-    outputs: Outputs | None,
-) -> _Computed:
-    event = () if outputs is None else outputs.event
-    values = np.full((len(points), *event), np.nan)
+    stated, n = outputs, len(points)
+    values = np.full((n, *(() if outputs is None else outputs.event)), np.nan)
     raised = {}
-    specimen_function = function.function  # type: ignore[attr-defined]
-    for i in range(len(points)):
+    is_scalar = isinstance(function, scalar)
+    call = function.function if isinstance(function, scalar) else function
+    waiting = [np.array([i]) for i in reversed(range(n))] if is_scalar else [np.arange(n)]
+    while waiting:
+        rows = waiting.pop()
+        arguments = points.at(int(rows[0]) if is_scalar else rows).arguments
+        # Copies, which the function may change in place.
+        copies = [a.copy() if isinstance(a, np.ndarray) else a for a in arguments]
         try:
-            with np.errstate(all="ignore"), time_limit(timeout):
-                result = specimen_function(*points.at(i).copied_arguments())
-            outputs = _outputs_from(result, 0, outputs)
-            values = assign_rows(values, np.array([i]), _specimen_response(result, outputs)[None])
+            with np.errstate(all="ignore"), time_limit(timeout and timeout * rows.size):
+                result = call(*copies)
+            if is_scalar:
+                response, outputs = _specimen_response(result, outputs)
+                responses = response[None]
         except (Exception, SystemExit) as error:
-            raised[i] = _reason(error)
+            if rows.size == 1 or not tolerant:
+                raised[int(rows[0])] = _reason(error)
+            else:
+                waiting += [rows[rows.size // 2 :], rows[: rows.size // 2]]
             if not tolerant:
                 break
-    return values, raised, outputs
-
-
-def _as_batch(
-    function: Callable[..., Any],
-    points: Points,
-    tolerant: bool,
-    timeout: float | None,
-    outputs: Outputs | None,
-) -> _Computed:
-    size = len(points)
-    try:
-        with np.errstate(all="ignore"), time_limit(timeout and timeout * size):
-            result = function(*points.copied_arguments())
-    except (Exception, SystemExit) as error:
-        if not tolerant or size == 1:
-            event = () if outputs is None else outputs.event
-            return np.full((size, *event), np.nan), {0: _reason(error)}, outputs
-    else:
-        outputs = _outputs_from(result, 1, outputs)
-        return checked(result, (size,), points.arguments, outputs), {}, outputs
-    # Bisect until the points that fail are alone.
-    values = np.full(size, np.nan)
-    raised = {}
-    for rows in (np.arange(size // 2), np.arange(size // 2, size)):
-        half, reasons, outputs = _as_batch(function, points.at(rows), tolerant, timeout, outputs)
-        values = assign_rows(values, rows, half)
-        raised.update({int(rows[i]): reason for i, reason in reasons.items()})
-    return values, raised, outputs
+            continue
+        if not is_scalar:
+            responses, outputs = checked(result, (rows.size,), arguments, outputs)
+        values = assign_rows(values, rows, responses)
+    named = outputs if stated is None else None
+    return Chunk(values, raised, time.perf_counter() - clock, named)
 
 
 def assign_rows(values: Floats, rows: Rows, responses: Floats) -> Floats:
@@ -261,18 +224,11 @@ def _reason(error: BaseException) -> str:
     return f"it raised {type(error).__name__}: {text:.1000}"
 
 
-def _outputs_from(result: Any, batch_ndim: int, outputs: Outputs | None) -> Outputs | None:
-    """Return the outputs, those of the result's mapping if they are not known."""
-    if outputs is None and isinstance(result, Mapping):
-        return outputs_of_result(result, batch_ndim)
-    return outputs
-
-
-def _specimen_response(result: Any, outputs: Outputs | None) -> Floats:
-    """Return the response of one specimen, shape (*event)."""
+def _specimen_response(result: Any, outputs: Outputs | None) -> tuple[Floats, Outputs | None]:
+    """Return the response of one specimen, shape (*event), and its outputs."""
     is_number = np.ndim(result) == 0 if outputs is None else not outputs.event
     if is_number and not isinstance(result, Mapping):
-        return np.asarray(float(result))
+        return np.asarray(float(result)), outputs
     try:
         return checked(result, (), (), outputs)
     except ResponseError as error:
@@ -284,21 +240,23 @@ def checked(
     batch: tuple[int, ...],
     arguments: Sequence[Any],
     outputs: Outputs | None = SINGLE_OUTPUT,
-) -> Floats:
+) -> tuple[Floats, Outputs | None]:
     """Return a response's result as floats, shape (*batch, *event), or raise `ResponseError`.
 
-    If one output of a point is NaN, all of its outputs are.
+    If one output of a point is NaN, all of its outputs are. Outputs that are not known are those of
+    the result, if it is a mapping.
     """
     try:
         if isinstance(result, Mapping):
-            result = (outputs or outputs_of_result(result, len(batch))).assembled(result)
+            outputs = outputs or outputs_of_result(result, len(batch))
+            result = outputs.assembled(result)
         array = np.asarray(result)
     except KeyError as error:
         raise ResponseError(str(error.args[0])) from None
     except Exception as error:
         raise ResponseError(
-            f"the response returned {type(result).__name__} of which no array can be made "
-            f"({_reason(error)}), expected an array of real numbers"
+            f"the response returned {type(result).__name__} that is no array ({_reason(error)}), "
+            "expected an array of real numbers"
         ) from None
     if array.dtype.kind not in "fiub":
         got = f"{type(result).__name__} of dtype {array.dtype}"
@@ -329,7 +287,7 @@ def checked(
     values = array.astype(np.float64)
     if expected:
         values[np.isnan(values).any(axis=-1)] = np.nan
-    return values
+    return values, outputs
 
 
 def shapes(arguments: Sequence[Any]) -> str:
@@ -349,17 +307,6 @@ def _unpacked(payload: bytes) -> Callable[..., Any]:
     import cloudpickle
 
     return cloudpickle.loads(payload)  # type: ignore[no-any-return]
-
-
-def compute_packed(
-    payload: bytes,
-    points: Points,
-    tolerant: bool,
-    timeout: float | None = None,
-    outputs: Outputs | None = SINGLE_OUTPUT,
-) -> Chunk:
-    """Unpack the function, once for all chunks of a worker, and compute."""
-    return compute(_unpacked(payload), points, tolerant, timeout, outputs)
 
 
 # A finished chunk, with the rows of its points.
@@ -442,7 +389,7 @@ def respond(
     raised: dict[int, str] = {}
     for attempt in range(policy.tries):
         is_last = attempt == policy.tries - 1
-        tolerant = policy.final.goes_on or not is_last
+        tolerant = isinstance(policy.final, Replace) or not is_last
         raised = {}
         for finished in chunks(settings, points, missing, tolerant, tally):
             if on_start is not None:
@@ -476,37 +423,29 @@ def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
         return
     keys, values = store.known()
     columns = values if values.ndim > 1 else values[:, None]
-    finite = np.isfinite(columns).all(axis=1)
-    usable = np.flatnonzero(finite & points.have_same_constants(keys))
+    stored_points, have_same_constants = points.read_keys(keys)
+    usable = np.flatnonzero(np.isfinite(columns).all(axis=1) & have_same_constants)
     if usable.size:
-        first = usable[:1]
-        expected = columns[first[0]]
+        point = stored_points.at(usable[:1])
+        for _ in range(settings.on_failure.tries):
+            [[(_, chunk)]] = chunks(settings, point, np.arange(1), True, tally)
+            if not chunk.raised:
+                break
+        response, expected = tally.aligned(chunk).ravel(), columns[usable[0]]
         scale = np.maximum(np.abs(expected), np.median(np.abs(columns[usable]), axis=0))
-        response, text = _recomputed(settings, points.from_keys(keys[first]), tally)
         # More than the rounding of another machine or version of a library.
-        tolerance = 1e-6 * scale
         same_number = response.size == expected.size
-        if not same_number or not (np.abs(response - expected) <= tolerance).all():
-            at = ", ".join(f"{x:.6g}" for x in keys[first[0]])
+        if not same_number or not (np.abs(response - expected) <= 1e-6 * scale).all():
+            text = f"nothing ({chunk.raised[0]})" if chunk.raised else _numbers_text(response)
             raise StoreError(
-                f"{settings.name}: store: got a response that gives {text} at ({at}), expected "
+                f"{settings.name}: store: got a response that gives {text} at "
+                f"({', '.join(f'{x:.6g}' for x in keys[usable[0]])}), expected "
                 f"{_numbers_text(expected)}, which is stored in {store.path}: it is of another "
                 "function, or its variables have changed; nothing was changed: pass another "
                 "folder, or version= with a name for the response as it is now, whose runs are "
                 "then kept apart"
             )
     store.verified = True
-
-
-def _recomputed(settings: CallSettings, point: Points, tally: Tally) -> tuple[Floats, str]:
-    """Return the response at one point, NaN if it fails, and the result in words."""
-    chunk = Chunk(np.array([np.nan]), {}, 0.0)
-    for _ in range(settings.on_failure.tries):
-        for ((_, chunk),) in chunks(settings, point, np.arange(1), True, tally):
-            if not chunk.raised:
-                response = tally.aligned(chunk).ravel()
-                return response, _numbers_text(response)
-    return np.array([np.nan]), f"nothing ({next(iter(chunk.raised.values()), 'it was lost')})"
 
 
 def _numbers_text(values: Floats, digits: int = 10) -> str:
@@ -526,7 +465,7 @@ def _stored(settings: CallSettings, keys: Floats) -> tuple[Floats, Rows, dict[in
     if settings.outputs is not None:
         values = values.reshape(len(keys), *settings.outputs.event)
     failed = settings.store.failed(keys)
-    if settings.retry_failed or not settings.on_failure.final.goes_on:
+    if settings.retry_failed or not isinstance(settings.on_failure.final, Replace):
         is_stored[list(failed)] = False
         failed = {}
     return values, np.flatnonzero(~is_stored), failed
@@ -561,15 +500,15 @@ def _apply_policy(
     if not is_nan.any():
         return values
     first = next(iter(raised.values()), "it is NaN")
-    if policy.refuses_nan:
+    if policy == Abort(on_nan=True):
         raise _failure_error(settings, points, raised or {int(np.flatnonzero(is_nan)[0]): first})
-    if policy.replacement is not None:
+    if isinstance(policy, Replace):
         n_nan = int(is_nan.sum())
         tally.failures += n_nan
-        text = f"{n_nan} of {is_nan.size} responses failed, replaced by {policy.replacement}"
+        text = f"{n_nan} of {is_nan.size} responses failed, replaced by {policy.value}"
         report(Finding("responses-replaced", f"{settings.name}: {text}; the first: {first}"))
         tally.record_failures(points, dict.fromkeys(map(int, np.flatnonzero(is_nan)), "it is NaN"))
-        values[is_nan] = policy.replacement
+        values[is_nan] = policy.value
     return values
 
 
@@ -621,8 +560,13 @@ def chunks(
     After a failure that is not tolerated, a lost worker, or a spent budget, no chunk begins; those
     that have begun are yielded before the error is raised.
     """
-    work = _work(settings)
-    limits = capacity(settings.executor)
+    # Other processes get the function as bytes.
+    options: dict[str, Any] = {"outputs": settings.outputs}
+    function: Callable[..., Any] | bytes = settings.function
+    if settings.executor is not None and not isinstance(settings.executor, ThreadPoolExecutor):
+        function, options["timeout"] = packed(settings.function), settings.timeout
+    work = partial(compute, function, **options)
+    workers, most_chunks = capacity(settings.executor)
     pool = Pool(settings.name, settings.executor)
     suspects: list[Rows] = []  # chunks at work when a worker was lost
     loss: BaseException | None = None
@@ -637,8 +581,8 @@ def chunks(
                     report(chunk_rows.size, "")
                     yield [(chunk_rows, chunk)]
                 suspects = []
-            while waiting.size and not suspects and len(begun) < limits.chunks:
-                size = chunk_size(settings, tally, waiting.size, limits.workers)
+            while waiting.size and not suspects and len(begun) < most_chunks:
+                size = chunk_size(settings, tally, waiting.size, workers)
                 try:
                     size = budget().grant(size, least=1)
                 except BudgetError as spent:
@@ -664,7 +608,7 @@ def chunks(
                     if chunk.raised and not tolerant:
                         waiting = waiting[:0]
                     tally.count(chunk_rows.size, chunk.seconds)
-                    report(chunk_rows.size, f"{limits.workers / max(tally.seconds, 1e-9):.3g}/s")
+                    report(chunk_rows.size, f"{workers / max(tally.seconds, 1e-9):.3g}/s")
                     finished.append((chunk_rows, chunk))
             if finished:
                 yield finished
@@ -715,12 +659,3 @@ def _raise_lost(name: str, error: BaseException) -> None:
         f"{name}: {failure_text(error)}; {cause}run again: with store= nothing that was computed "
         "is computed again"
     ) from error
-
-
-def _work(settings: CallSettings) -> Callable[[Points, bool], Chunk]:
-    """Return the work on points; other processes get the function as bytes."""
-    outputs = settings.outputs
-    if settings.executor is None or isinstance(settings.executor, ThreadPoolExecutor):
-        return partial(compute, settings.function, outputs=outputs)
-    payload = packed(settings.function)
-    return partial(compute_packed, payload, timeout=settings.timeout, outputs=outputs)

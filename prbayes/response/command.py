@@ -98,7 +98,13 @@ def command(
         folder=None if folder is None else folder_path(folder, "command: folder"),
         keep=flag(keep, "command: keep"),
     )
-    program.refuse_unused_inputs()
+    for name in program.inputs:
+        texts = [*program.arguments[1:], *program.templates.values()]
+        if [_filled(text, {name: 1.0}) for text in texts] == texts:
+            raise ValueError(
+                f"command: inputs: got {name!r}, which occurs neither in the arguments nor in a "
+                f"template, expected {{{name}}} in one of them: the response would not depend on it"
+            )
     return scalar(program)
 
 
@@ -109,20 +115,19 @@ def _checked_arguments(arguments: object) -> tuple[str, ...]:
             f"command: arguments: got {called(arguments)}, expected a list of the program and its "
             'arguments, such as ["solver", "input.txt"]'
         )
-    texts = []
     for argument in arguments:
         if not isinstance(argument, str | PathLike):
             raise TypeError(
                 f"command: arguments: got {called(argument)} among them, expected texts and paths"
             )
-        texts.append(os.fspath(argument))
-    path = shutil.which(texts[0])
+    program, *rest = map(os.fspath, arguments)
+    path = shutil.which(program)
     if path is None:
         raise FileNotFoundError(
-            f"command: got the program {texts[0]!r}, which is not there or cannot be run, expected "
+            f"command: got the program {program!r}, which is not there or cannot be run, expected "
             "one on the path, or its whole path"
         )
-    return (os.path.abspath(path), *texts[1:])  # it runs in another folder
+    return (os.path.abspath(path), *rest)  # it runs in another folder
 
 
 def _checked_names(inputs: object) -> tuple[str, ...]:
@@ -131,13 +136,12 @@ def _checked_names(inputs: object) -> tuple[str, ...]:
             f"command: inputs: got {called(inputs)}, expected a list of the simulator's inputs, "
             'such as ["modulus", "force"]'
         )
-    names = tuple(inputs)
-    for name in names:
-        if not isinstance(name, str) or not name.isidentifier() or names.count(name) > 1:
+    for name in inputs:
+        if not isinstance(name, str) or not name.isidentifier() or inputs.count(name) > 1:
             raise ValueError(
                 f"command: inputs: got {name!r}, expected names of letters and digits, each once"
             )
-    return names
+    return tuple(inputs)
 
 
 def _read_templates(write: object) -> dict[str, str]:
@@ -180,26 +184,6 @@ class Program:
     def __name__(self) -> str:
         """The name of the program."""
         return Path(self.arguments[0]).name
-
-    def refuse_unused_inputs(self) -> None:
-        """Raise if an input occurs nowhere, or with a format that is not of a number."""
-        texts = [*self.arguments[1:], *self.templates.values()]
-        for name in self.inputs:
-            fields = [field for text in texts for field in _fields(name, text)]
-            if not fields:
-                raise ValueError(
-                    f"command: inputs: got {name!r}, which occurs neither in the arguments nor in "
-                    f"a template, expected {{{name}}} in one of them: the response would not "
-                    "depend on it"
-                )
-            for field in fields:
-                try:
-                    _formatted(1.0, field)
-                except ValueError:
-                    raise ValueError(
-                        f"command: got the field {field[0]}, expected the format of a number, such "
-                        f"as {{{name}:.6e}}"
-                    ) from None
 
     def __call__(self, *values: float) -> float | Floats | dict[str, float | Floats]:
         """Run the program for one specimen, and read the response."""
@@ -291,27 +275,22 @@ class Program:
         return printed if self.folder is None else f"{printed}\nfolder: {folder}"
 
 
-def _fields(name: str, text: str) -> list[re.Match[str]]:
-    """Return the places of an input in a text, with its format if it has one."""
-    return list(re.finditer(r"\{" + re.escape(name) + r"(?P<format>:[^{}]*)?\}", text))
-
-
-def _formatted(value: float, field: re.Match[str]) -> str:
-    """Return a number in the format of a field, by default with all digits."""
-    layout = field["format"]
-    return repr(float(value)) if layout is None else format(float(value), layout[1:])
-
-
 def _filled(text: str, values: Mapping[str, float]) -> str:
-    """Return a text with values in place of their names."""
-    for name, value in values.items():
-        parts = []
-        end = 0
-        for field in _fields(name, text):
-            parts += [text[end : field.start()], _formatted(value, field)]
-            end = field.end()
-        text = "".join([*parts, text[end:]])
-    return text
+    """Return a text with values in place of fields, such as {force} or {force:.6e}."""
+
+    def formatted(field: re.Match[str]) -> str:
+        if field[1] not in values:
+            return field[0]
+        value = float(values[field[1]])
+        try:
+            return repr(value) if field[2] is None else format(value, field[2][1:])
+        except ValueError:
+            raise ValueError(
+                f"command: got the field {field[0]}, expected the format of a number, such as "
+                f"{{{field[1]}:.6e}}"
+            ) from None
+
+    return re.sub(r"\{(\w+)(:[^{}]*)?\}", formatted, text)
 
 
 def _numbers(result: object) -> float | Floats:

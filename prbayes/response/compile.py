@@ -24,14 +24,15 @@ from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.variable import TensorVariable
 
 
-def _split_long_sums(fgraph: Any, node: Any) -> Any:
-    """Split a sum or product of many terms, which PyTensor makes one operation.
-
-    NumPy takes 32 operands, the result among them.
-    """
-    op = node.op
-    terms = node.inputs
-    most = 30
+def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
+    """Rewrite what NumPy does faster, or not at all, in the form that PyTensor has."""
+    op, terms = node.op, node.inputs
+    if op.scalar_op == pt.switch.scalar_op:
+        return [_where(*terms)]
+    if op.scalar_op == pt.softplus.scalar_op:  # PyTensor would loop over numbers
+        (x,) = terms
+        return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
+    most = 30  # NumPy takes 32 operands, the result among them
     if len(terms) <= most or not op.scalar_op.associative:
         return False
     parts = []
@@ -39,14 +40,6 @@ def _split_long_sums(fgraph: Any, node: Any) -> Any:
         part = terms[first : first + most]
         parts.append(op(*part) if len(part) > 1 else part[0])
     return [op(*parts)]
-
-
-def _softplus_by_ufuncs(fgraph: Any, node: Any) -> Any:
-    """Return log(1 + exp(x)) by NumPy's functions: PyTensor's would loop over numbers."""
-    if node.op.scalar_op != pt.softplus.scalar_op:
-        return False
-    (x,) = node.inputs
-    return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
 
 
 def _index_batches(fgraph: Any, node: Any) -> Any:
@@ -92,22 +85,14 @@ class _Where(Op):
 _where = _Where()
 
 
-def _switch_to_where(fgraph: Any, node: Any) -> Any:
-    if node.op.scalar_op != pt.switch.scalar_op:
-        return False
-    return [_where(*node.inputs)]
-
-
 # Batched NumPy calls: a heavy compilation does not pay. Without fusion every elementwise operation
 # is one NumPy ufunc; with it, the Python linker would loop over scalars. Sums are split last, as
 # other rewrites would merge them.
 PLAIN = (
     Mode(linker="py", optimizer="fast_run")
     .excluding("fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition")
-    .register((out2in(node_rewriter([Elemwise])(_softplus_by_ufuncs)), 1000))
     .register((out2in(node_rewriter([Blockwise])(_index_batches)), 1000))
-    .register((out2in(node_rewriter([Elemwise])(_split_long_sums)), 1001))
-    .register((out2in(node_rewriter([Elemwise])(_switch_to_where)), 1001))
+    .register((out2in(node_rewriter([Elemwise])(_numpy_elementwise)), 1001))
 )
 
 _flags_lock = RLock()
@@ -115,20 +100,13 @@ _flags_lock = RLock()
 
 @contextmanager
 def interpreted() -> Iterator[None]:
-    """Compile in the block without a C++ compiler, loops of PyTensor's too.
+    """Build and compile graphs in the block without a C++ compiler and traces of source lines.
 
     PyTensor compiles the inside of a loop whatever the mode: ten seconds for a prior of
-    correlations, and a warning where there is no BLAS.
+    correlations, and a warning where there is no BLAS. Traces take a tenth of a short calibration.
     """
-    with untraced(), pytensor.config.change_flags(cxx=""):
-        yield
-
-
-@contextmanager
-def untraced() -> Iterator[None]:
-    """Build graphs in the block without traces of source lines, a tenth of a short calibration."""
     # The flags are global: one thread at a time may change them.
-    with _flags_lock, pytensor.config.change_flags(traceback__limit=0):
+    with _flags_lock, pytensor.config.change_flags(traceback__limit=0, cxx=""):
         yield
 
 
@@ -137,10 +115,6 @@ def untraced() -> Iterator[None]:
 # Compiled functions by the structure of their graphs, the latest last.
 _cache: OrderedDict[Hashable, Any] = OrderedDict()
 _cache_lock = Lock()
-
-
-class _NotCacheableError(Exception):
-    """A graph has something of a user's, which must not be kept alive."""
 
 
 def compiled(
@@ -159,94 +133,82 @@ def compiled(
         for v in ancestors(outputs)
         if isinstance(v, TensorSharedVariable) and v.default_update is None
     ]
-    try:
-        key = (allow_input_downcast, _structure([*inputs, *shared], outputs))
-    except _NotCacheableError:
-        return _function(inputs, outputs, allow_input_downcast)
+    key = _structure([*inputs, *shared], outputs, allow_input_downcast)
     with _cache_lock:
-        cached = _cache.get(key)
-        if cached is not None:
-            _cache.move_to_end(key)
+        cached = None if key is None else _cache.get(key)
     if cached is None:
         empty: dict[Any, Any] = {}
-        for variable in shared:
+        for variable in shared if key is not None else ():
             shape = variable.type.shape
             values = np.zeros([size or 0 for size in shape], dtype=variable.dtype)
             empty[variable] = pytensor.shared(values, shape=shape)
-        graphs = graph_replace(list(outputs), empty, strict=False) if empty else outputs
-        cached = _function(inputs, graphs, allow_input_downcast), list(empty.values())
+        graphs = graph_replace(list(outputs), empty, strict=False) if empty else list(outputs)
+        with interpreted():
+            function = pytensor.function(
+                list(inputs),
+                graphs,
+                mode=PLAIN,
+                on_unused_input="ignore",
+                allow_input_downcast=allow_input_downcast,
+            )
+        if key is None:
+            return function
+        cached = function, list(empty.values())
     function, empty_shared = cached
     with _cache_lock:
         _cache[key] = cached
+        _cache.move_to_end(key)
         while len(_cache) > 64:  # a model has about ten functions, with 4 MB of constants at most
             _cache.popitem(last=False)
         return function.copy(swap=dict(zip(empty_shared, shared, strict=True)))
 
 
-def _function(
-    inputs: Sequence[TensorVariable],
-    outputs: Sequence[TensorVariable],
-    allow_input_downcast: bool | None,
-) -> Any:
-    with interpreted():
-        return pytensor.function(
-            list(inputs),
-            list(outputs),
-            mode=PLAIN,
-            on_unused_input="ignore",
-            allow_input_downcast=allow_input_downcast,
-        )
-
-
 def _structure(
-    inputs: Sequence[TensorVariable], outputs: Sequence[TensorVariable]
-) -> tuple[Hashable, ...]:
-    """Return the operations, constants and connections of a graph, without names.
+    inputs: Sequence[TensorVariable], outputs: Sequence[TensorVariable], *options: Hashable
+) -> tuple[Hashable, ...] | None:
+    """Return options, operations, constants and connections of a graph, without names.
 
-    Graphs with random numbers, operations outside PyTensor or many constants are not cacheable.
+    None for graphs that must not be kept: with random numbers, operations outside PyTensor, or
+    many constants.
     """
     number: dict[Variable, int] = {}
-    structure: list[Hashable] = []
-    size = 0
+    structure: list[Hashable] = [*options]
+    n_bytes = 0  # of constants
     for variable in inputs:
         number.setdefault(variable, len(number))
         structure.append(variable.type)
-
-    def numbered(variable: Variable) -> int:
-        nonlocal size
-        if variable in number:
-            return number[variable]
-        if not isinstance(variable, Constant):
-            raise _NotCacheableError
-        if isinstance(variable.data, np.ndarray | np.generic):
-            size += variable.data.nbytes
-            data: Hashable = (variable.data.shape, variable.data.tobytes())
-        elif isinstance(variable.data, slice | int | float | None):
-            data = repr(variable.data)
-        else:
-            raise _NotCacheableError
-        if size > 1 << 16:  # bytes of constants
-            raise _NotCacheableError
-        number[variable] = len(number)
-        structure.append((variable.type, data))
-        return number[variable]
-
-    for node in toposort(list(outputs), blockers=list(inputs)):
-        if not _is_stateless(node.op):
-            raise _NotCacheableError
-        structure.append((node.op, *map(numbered, node.inputs)))
-        for variable in node.outputs:
+    nodes = toposort(list(outputs), blockers=list(inputs))
+    operations: list[Any] = [(node.op, node.inputs, node.outputs) for node in nodes]
+    for op, arguments, results in [*operations, ("outputs", outputs, ())]:
+        if isinstance(op, Op) and not _is_stateless(op):
+            return None
+        for variable in arguments:
+            if variable in number:
+                continue
+            data = variable.data if isinstance(variable, Constant) else variable
+            if isinstance(data, np.ndarray | np.generic):
+                n_bytes += data.nbytes
+                data = (data.shape, data.tobytes())
+            elif isinstance(data, slice | int | float | None):
+                data = repr(data)
+            else:
+                return None
             number[variable] = len(number)
-    structure.append(tuple(map(numbered, outputs)))
+            structure.append((variable.type, data))
+        if n_bytes > 1 << 16:
+            return None
+        structure.append((op, *[number[variable] for variable in arguments]))
+        for variable in results:
+            number[variable] = len(number)
     return tuple(structure)
 
 
 def _is_stateless(op: Op) -> bool:
     """Return whether an operation, with those inside it, is one of PyTensor's, without state."""
-    names = getattr(op, "__props__", None) or ()
-    inner = [getattr(op, name, None) for name in names]
-    is_pytensor = type(op).__module__.startswith("pytensor.")
-    return is_pytensor and all(_is_stateless(part) for part in inner if isinstance(part, Op))
+    if not type(op).__module__.startswith("pytensor."):
+        return False
+    parts = [getattr(op, name, None) for name in getattr(op, "__props__", None) or ()]
+    return all(map(_is_stateless, [part for part in parts if isinstance(part, Op)]))
 
 
 # -- batches ---------------------------------------------------------------------------------------
@@ -278,7 +240,7 @@ def compile_batched(
     extra: Sequence[TensorVariable] = (),
 ) -> Any:
     """Compile a graph for a batch: core inputs get a leading axis, ``extra`` ones do not."""
-    with untraced():
+    with interpreted():
         outputs = ninf_for_invalid(core_outputs)
         batched = with_leading_axis(core_inputs)
         vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))

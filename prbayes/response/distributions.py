@@ -18,14 +18,13 @@ from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
-from prbayes.response.compile import (
-    PLAIN,
-    compile_batched,
-    interpreted,
-    untraced,
-    with_leading_axis,
-)
+from prbayes.response.compile import PLAIN, compile_batched, interpreted, with_leading_axis
 from prbayes.response.inputs import Inputs, event_shape, is_random, quiet_logp
+
+# Operations of distributions, for `isinstance`.
+MVNORMAL = type(MvNormal.rv_op)
+ELLIPTICAL = (MVNORMAL, MvStudentT.rv_type)
+RANDOM_WALK = pm.RandomWalk.rv_type
 
 
 def log_density(
@@ -43,9 +42,9 @@ def log_density(
     for i, (dist, x, shape) in enumerate(triples):
         if instead and i in instead:
             logp = instead[i](dist, x)
-        elif is_elliptical(dist):
+        elif isinstance(dist.owner.op, ELLIPTICAL):
             logp = _elliptical_logp(dist, x, shape[-1])
-        elif _is_random_walk(dist):  # PyMC's density takes one value at a time
+        elif isinstance(dist.owner.op, RANDOM_WALK):  # PyMC's density takes one value at a time
             value = dist.type()
             logp = vectorize_graph(quiet_logp(dist, value), {value: x})
         else:
@@ -57,27 +56,13 @@ def log_density(
     return total
 
 
-@untraced()
+@interpreted()
 def compiled_log_density(inputs: Inputs) -> Any:
     """Return log p(x) as a function of roots (k, *shape), then points (n, *event): (k, n)."""
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     points = [pt.tensor(dtype=x.dtype, shape=(None,) * (x.type.ndim + 1)) for x in inputs.aleatory]
     return compile_batched(symbols, [log_density(inputs, dists, points)], points)
-
-
-def _is_random_walk(dist: TensorVariable) -> bool:
-    return isinstance(dist.owner.op, pm.RandomWalk.rv_type)
-
-
-def is_mvnormal(dist: TensorVariable) -> bool:
-    """Return whether a distribution is a multivariate normal."""
-    return isinstance(dist.owner.op, type(MvNormal.rv_op))
-
-
-def is_elliptical(dist: TensorVariable) -> bool:
-    """Return whether a distribution is a multivariate normal or Student's t."""
-    return is_mvnormal(dist) or isinstance(dist.owner.op, MvStudentT.rv_type)
 
 
 def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
@@ -136,7 +121,9 @@ def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None
     """
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
-    covariances = [d.owner.op.dist_params(d.owner)[-1] for d in dists if is_elliptical(d)]
+    covariances = [
+        d.owner.op.dist_params(d.owner)[-1] for d in dists if isinstance(d.owner.op, ELLIPTICAL)
+    ]
     if not covariances:
         return
     for covariance in compile_batched(symbols, covariances)(*params):
@@ -157,10 +144,10 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     Discrete distributions and those without one in PyMC are refused.
     """
     op = dist.owner.op
-    other = "use propagation=prb.Reweighted() or prb.Fresh()"
+    advice = "use propagation=prb.Reweighted() or prb.Fresh()"
     if dist.dtype.startswith(("int", "uint", "bool")):
-        raise TypeError(f"{name}: got {op}, which is discrete, expected a continuous one; {other}")
-    if is_mvnormal(dist):
+        raise TypeError(f"{name}: got {op}, which is discrete, expected a continuous one; {advice}")
+    if isinstance(op, MVNORMAL):
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
         return mean + z @ pt.linalg.cholesky(covariance).T
@@ -169,7 +156,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     except NotImplementedError:
         raise TypeError(
             f"{name}: got {op}, which has no inverse distribution function in PyMC, expected one "
-            f"that has; {other}"
+            f"that has; {advice}"
         ) from None
 
 
@@ -179,7 +166,7 @@ def _density(dist: TensorVariable) -> TensorVariable | None:
         density = quiet_logp(dist, pt.zeros_like(dist))
     except NotImplementedError:
         return None
-    if _is_random_walk(dist):
+    if isinstance(dist.owner.op, RANDOM_WALK):
         return density  # which uses only the shapes of its parts
     # Zero takes its shape from the distribution.
     parts = set(ancestors([density], blockers=[dist])) - {dist}
@@ -191,11 +178,11 @@ def refuse_without_density(name: str, inputs: Inputs) -> None:
     # With symbols for the roots: a sum of two random variables has no density that PyMC knows.
     dists, _ = inputs.rebuilt(inputs.placeholders())
     for dist in dists:
-        if not is_elliptical(dist) and _density(dist) is None:
+        if not isinstance(dist.owner.op, ELLIPTICAL) and _density(dist) is None:
             raise TypeError(
-                f"{name}: got {dist.owner.op}, of which PyMC has no density, expected one that it "
-                "has, since responses are stored and weighed by it; give a pm.CustomDist its "
-                "logp=, or use propagation=prb.Fresh()"
+                f"{name}: got {dist.owner.op}, for which PyMC has no density, expected one, since "
+                "stored responses are weighted by it; give a pm.CustomDist its logp=, or use "
+                "propagation=prb.Fresh()"
             )
 
 
@@ -227,28 +214,26 @@ def _seed(function: Any, rng: np.random.Generator) -> None:
 class PriorSampler:
     """Draws of variables from the prior, all in one call of a compiled function."""
 
-    @untraced()
+    @interpreted()
     def __init__(self, roots: Sequence[TensorVariable]) -> None:
-        self._names = ", ".join(str(r.name) for r in roots)
+        self._names = ", ".join([str(r.name) for r in roots])
         self._shapes = [event_shape(r) for r in roots]
         # PyMC gives a `str_repr` to the variables of a model.
         parents = [v for v in ancestors(roots) if hasattr(v, "str_repr") and is_random(v)]
-        variables = [*roots, *(v for v in parents if v not in roots)]
+        variables = dict.fromkeys([*roots, *parents])
         n = pt.iscalar("n")
         try:
             # Variables that depend on no other are drawn n times; the others follow.
             batches = {}
             for v in variables:
-                if not any(a in variables for a in ancestors([v]) if a is not v):
+                if variables.keys() & set(ancestors([v])) == {v}:
                     batches[v] = change_dist_size(v, (n,), expand=True)
             outputs = vectorize_graph(list(roots), batches)
-            with interpreted():
-                self._function = pm.compile([n], outputs, mode=PLAIN)
+            self._function = pm.compile([n], outputs, mode=PLAIN)
             self._is_batched = True
         except (NotImplementedError, ValueError, MissingInputError):
             # Not vectorized, or not resized: one draw at a time.
-            with interpreted():
-                self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
+            self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
             self._is_batched = False
 
     def __call__(self, k: int, seed: int) -> list[Floats]:
@@ -262,22 +247,17 @@ class PriorSampler:
             draws = [self._function(k) for _ in range(k)]
         except NotImplementedError as error:
             raise TypeError(
-                f"priors: got {self._names}, of which one cannot be drawn ({error}), expected "
+                f"priors: got {self._names}, one of which cannot be drawn ({error}), expected "
                 "proper priors; replace pm.Flat and pm.HalfFlat by a wide pm.Normal or "
                 "pm.HalfNormal"
             ) from None
         return [np.array(column) for column in zip(*draws, strict=True)]
 
 
-def prior_draws(roots: Sequence[TensorVariable], k: int, seed: int) -> list[Floats]:
-    """Draw the roots k times from the prior; arrays of shape (k, *shape)."""
-    return PriorSampler(roots)(k, seed)
-
-
 class PriorPoints:
     """Points of the unit cube mapped to the prior, each variable given those that it depends on."""
 
-    @untraced()
+    @interpreted()
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
         self._shapes = [event_shape(v) for v in variables]
         self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
@@ -287,7 +267,7 @@ class PriorPoints:
         for v, u in zip(variables, symbols, strict=True):
             (conditional,) = graph_replace([v], values, strict=False)
             values[v] = quantiles("priors", conditional, u)
-        if any(is_random(v) for v in ancestors(list(values.values()))):
+        if any(map(is_random, ancestors(list(values.values())))):
             raise TypeError(
                 "priors: got one that depends on a random variable which is not in the model"
             )
@@ -304,15 +284,26 @@ class PriorPoints:
 class PopulationSampler:
     """Random draws of n specimens from the populations at given roots."""
 
-    @untraced()
+    @interpreted()
     def __init__(self, inputs: Inputs) -> None:
         self._names = ", ".join(str(x.owner.op) for x in inputs.aleatory)
         symbols = inputs.placeholders()
         aleatory, epistemic = inputs.rebuilt(symbols)
         n = pt.iscalar("n")
         batched = with_leading_axis(symbols)
-        per_specimen = _per_specimen(aleatory, symbols, batched, n)
         common = epistemic
+
+        # n specimens of each theta. Distributions that depend on no root are not batched by their
+        # parameters: resize them.
+        size = (batched[0].shape[0], n)
+        per_specimen: dict[Variable, Variable] = {}
+        for symbol, batch in zip(symbols, batched, strict=True):
+            shape = [batch.shape[i] for i in range(1, batch.ndim)]
+            per_specimen[symbol] = pt.broadcast_to(batch[:, None], (*size, *shape))
+        for v in filter(is_random, ancestors(aleatory)):
+            parents = [a for a in ancestors([v]) if a is not v]
+            if not any(a in symbols or is_random(a) for a in parents):
+                per_specimen[v] = change_dist_size(v, size, expand=True)
         self._is_batched = True
         try:
             specimens = vectorize_graph(aleatory, per_specimen)
@@ -328,14 +319,13 @@ class PopulationSampler:
             specimens = graph_replace(resized, replaced, strict=False)
         self._event_shapes = inputs.event_shapes
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
-        with interpreted():
-            self._function = pm.compile(
-                [n, *batched],
-                [*specimens, *common],
-                mode=PLAIN,
-                on_unused_input="ignore",
-                allow_input_downcast=True,
-            )
+        self._function = pm.compile(
+            [n, *batched],
+            [*specimens, *common],
+            mode=PLAIN,
+            on_unused_input="ignore",
+            allow_input_downcast=True,
+        )
 
     def __call__(
         self, params: Sequence[Any], n: int, rng: np.random.Generator
@@ -355,7 +345,7 @@ class PopulationSampler:
         except (NotImplementedError, RuntimeError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise TypeError(
-                f"inputs: got {self._names}, of which one cannot be drawn ({reason}), expected "
+                f"inputs: got {self._names}, one of which cannot be drawn ({reason}), expected "
                 "distributions from which specimens can be drawn; give a pm.CustomDist its random="
             ) from None
         n_aleatory = len(self._event_shapes)
@@ -369,24 +359,3 @@ class PopulationSampler:
             for v, ndim in zip(values[n_aleatory:], self._epistemic_ndims, strict=True)
         ]
         return aleatory, epistemic
-
-
-def _per_specimen(
-    aleatory: Sequence[TensorVariable],
-    symbols: Sequence[TensorVariable],
-    batched: Sequence[TensorVariable],
-    n: TensorVariable,
-) -> dict[Variable, Variable]:
-    """Return replacements of roots and distributions for n specimens of each theta."""
-    size = (batched[0].shape[0], n)
-    replaced: dict[Variable, Variable] = {}
-    for symbol, batch in zip(symbols, batched, strict=True):
-        shape = [batch.shape[i] for i in range(1, batch.ndim)]
-        replaced[symbol] = pt.broadcast_to(batch[:, None], (*size, *shape))
-    # Distributions that depend on no root are not batched by their parameters: resize them.
-    for v in ancestors(aleatory):
-        if is_random(v):
-            parents = [a for a in ancestors([v]) if a is not v]
-            if not any(a in symbols or is_random(a) for a in parents):
-                replaced[v] = change_dist_size(v, size, expand=True)
-    return replaced

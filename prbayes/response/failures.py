@@ -34,21 +34,6 @@ class OnFailure:
         """The policy after the last try."""
         return self
 
-    @property
-    def refuses_nan(self) -> bool:
-        """Whether a response that is NaN after the last try ends the run."""
-        return False
-
-    @property
-    def replacement(self) -> float | None:
-        """Value in place of a response that failed; without one NaN stays, as a result."""
-        return None
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether the run goes on when a response raises at the last try."""
-        return self.replacement is not None
-
 
 @dataclass(frozen=True)
 class Abort(OnFailure):
@@ -72,11 +57,6 @@ class Abort(OnFailure):
 
     def __post_init__(self) -> None:
         flag(self.on_nan, "Abort: on_nan")
-
-    @property
-    def refuses_nan(self) -> bool:
-        """Whether NaN ends the run."""
-        return self.on_nan
 
 
 @dataclass(frozen=True)
@@ -110,11 +90,6 @@ class Replace(OnFailure):
                 "Replace: value: got -inf, expected a number, NaN (no response) or +inf (the "
                 "specimen failed)"
             )
-
-    @property
-    def replacement(self) -> float:
-        """The value."""
-        return self.value
 
 
 @dataclass(frozen=True)

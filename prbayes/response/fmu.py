@@ -16,12 +16,11 @@ import tempfile
 import threading
 import time
 import zipfile
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import cache, partial
+from functools import cache
 from multiprocessing.util import Finalize
 from os import PathLike
 from pathlib import Path
@@ -31,7 +30,15 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import ArrayLike
 
-from prbayes._validate import Floats, called, file_path, flag, positive_number, real_array
+from prbayes._validate import (
+    Floats,
+    called,
+    file_path,
+    finite_number,
+    flag,
+    positive_number,
+    real_array,
+)
 from prbayes.response.call import scalar
 from prbayes.response.outputs import Outputs
 
@@ -120,7 +127,7 @@ def fmu(
     file = file_path(path, "fmu: path")
     if not file.is_file():
         raise FileNotFoundError(f"fmu: path: got {file}, which is not there, expected an FMU")
-    input_names, output_names = _input_names(inputs), _output_names(outputs)
+    input_names, output_names = _names("inputs", inputs), _names("outputs", outputs)
     values = _parameter_values(parameters)
     repeated = set(input_names) & set(values)
     if repeated:
@@ -132,15 +139,14 @@ def fmu(
     flag(reset, "fmu: reset")
     unit, description = _read_unit(file)
     grid = _time_grid(description, times, start_time, stop_time, step)
-    variable = partial(_variable, description)
     parameter_values = []
     for name, value in values.items():
-        parameter = variable(name, "parameters")
+        parameter = _variable(description, name, "parameters")
         parameter_values.append((parameter, parameter.converted(value, "fmu: parameters")))
     model = Simulation(
         unit,
-        tuple(variable(name, "inputs") for name in input_names),
-        {label: variable(name, "outputs") for label, name in output_names.items()},
+        tuple([_variable(description, name, "inputs") for name in input_names]),
+        {key: _variable(description, name, "outputs") for key, name in output_names.items()},
         tuple(parameter_values),
         grid,
         limit,
@@ -154,36 +160,19 @@ def fmu(
 # -- arguments -------------------------------------------------------------------------------------
 
 
-def _are_names(names: object) -> bool:
-    """Return whether an object is a sequence of different texts."""
-    return (
-        isinstance(names, Sequence)
-        and not isinstance(names, str)
-        and bool(names)
-        and all(isinstance(n, str) and names.count(n) == 1 for n in names)
-    )
-
-
-def _input_names(inputs: Any) -> tuple[str, ...]:
-    if not _are_names(inputs):
-        raise TypeError(
-            f"fmu: inputs: got {called(inputs)}, expected a list of the unit's variables, each "
-            'once, such as ["stiffness", "damping"]'
-        )
-    return tuple(inputs)
-
-
-def _output_names(outputs: Any) -> dict[str, str]:
-    """Return variables by the names of the outputs."""
-    is_mapping = isinstance(outputs, Mapping)
-    labels = list(outputs) if is_mapping else outputs
-    names = list(outputs.values()) if is_mapping else outputs
-    if not _are_names(labels) or not all(isinstance(name, str) for name in names):
-        raise TypeError(
-            f"fmu: outputs: got {called(outputs)}, expected a list of the unit's variables, each "
-            'once, such as ["mass.s"], or a mapping of names to these'
-        )
-    return dict(zip(labels, names, strict=True))
+def _names(argument: str, given: object) -> dict[str, str]:
+    """Return variables of the unit by the user's names for them: the same ones in a list."""
+    pairs: list[tuple[Any, Any]] = []
+    expected = 'a list of the unit\'s variables, each once, such as ["stiffness", "damping"]'
+    if isinstance(given, Mapping) and argument == "outputs":
+        pairs = list(given.items())
+        expected += ", or a mapping of names to these"
+    elif isinstance(given, Sequence) and not isinstance(given, str):
+        pairs = [(name, name) for name in given]
+    are_texts = all(isinstance(text, str) for pair in pairs for text in pair)
+    if not pairs or not are_texts or len(dict(pairs)) < len(pairs):
+        raise TypeError(f"fmu: {argument}: got {called(given)}, expected {expected}")
+    return dict(pairs)
 
 
 def _parameter_values(parameters: object) -> dict[str, Value]:
@@ -354,8 +343,8 @@ def _is_settable(variable: Any) -> bool:
 
 def _listed(names: Sequence[str]) -> str:
     """Return the first ten names as a text."""
-    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
-    return ", ".join(map(repr, names[:10])) + more if names else "none"
+    rest = f" and {len(names) - 10} more" if len(names) > 10 else ""
+    return ", ".join(map(repr, names[:10])) + rest if names else "none"
 
 
 # -- points of communication -----------------------------------------------------------------------
@@ -396,18 +385,29 @@ def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -
         value = getattr(description.defaultExperiment, key, None)
         return None if value is None else float(value)
 
-    begin = default("startTime") if start is None else _finite(start, "start_time")
+    begin = default("startTime") if start is None else finite_number(start, "fmu: start_time")
     begin = begin or 0.0
-    end = default("stopTime") if stop is None else _finite(stop, "stop_time")
+    end = default("stopTime") if stop is None else finite_number(stop, "fmu: stop_time")
     if times is not None:
-        marks = _increasing_times(times, begin, end if stop is not None else None)
+        marks = real_array(times, "fmu: times")
+        is_list = marks.ndim == 1 and marks.size > 0 and np.isfinite(marks).all()
+        if not is_list or marks[0] <= begin or (np.diff(marks) <= 0).any():
+            raise ValueError(
+                f"fmu: times: got {times!r:.60}, expected increasing times after start_time = "
+                f"{begin:g}, (T,)"
+            )
+        if stop is not None and marks[-1] > end:
+            raise ValueError(
+                f"fmu: times: got {marks[-1]:g} as the last, expected none after stop_time = "
+                f"{end:g}; leave stop_time out"
+            )
     elif end is None or end <= begin:
         got = "none, and the unit states none" if end is None else f"{end:g}"
         raise ValueError(f"fmu: stop_time: got {got}, expected a time after start_time = {begin:g}")
     else:
-        marks = (end,)
+        marks = np.array([end])
     # 500 steps where neither the user nor the unit states a step, as FMPy does.
-    longest = (marks[-1] - begin) / 500
+    longest = float(marks[-1] - begin) / 500
     size = default("stepSize") if step is None else float(positive_number(step, "fmu: step"))
     internal = getattr(interface, "fixedInternalStepSize", None)
     is_even = not interface.canHandleVariableCommunicationStepSize
@@ -419,7 +419,7 @@ def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -
             "does not say which, expected a number"
         )
     size = longest if size is None else size
-    counts = (np.array(marks) - begin) / size
+    counts = (marks - begin) / size
     is_off = (np.abs(counts - np.round(counts)) > 1e-6) | (np.round(counts) < 1)
     if is_even and is_off.any():
         raise ValueError(
@@ -427,30 +427,8 @@ def _time_grid(description: Any, times: Any, start: Any, stop: Any, step: Any) -
             f"{begin:g} do not reach, expected multiples of the step, as {description.modelName} "
             "takes steps of one size only; pass other times, or step="
         )
-    return _TimeGrid(begin, marks, times is not None, size, is_even, default("tolerance"))
-
-
-def _finite(value: Any, name: str) -> float:
-    array = real_array(value, f"fmu: {name}")
-    if array.ndim or not np.isfinite(array):
-        raise ValueError(f"fmu: {name}: got {value!r:.60}, expected a finite number")
-    return float(array)
-
-
-def _increasing_times(times: Any, begin: float, end: float | None) -> tuple[float, ...]:
-    marks = real_array(times, "fmu: times")
-    is_list = marks.ndim == 1 and marks.size > 0 and np.isfinite(marks).all()
-    if not is_list or marks[0] <= begin or (np.diff(marks) <= 0).any():
-        raise ValueError(
-            f"fmu: times: got {times!r:.60}, expected increasing times after start_time = "
-            f"{begin:g}, (T,)"
-        )
-    if end is not None and marks[-1] > end:
-        raise ValueError(
-            f"fmu: times: got {marks[-1]:g} as the last, expected none after stop_time = {end:g}; "
-            "leave stop_time out"
-        )
-    return tuple(marks.tolist())
+    ends = tuple(marks.tolist())
+    return _TimeGrid(begin, ends, times is not None, size, is_even, default("tolerance"))
 
 
 # -- simulation ------------------------------------------------------------------------------------
@@ -558,26 +536,21 @@ class Simulation:
 # -- instances in a process ------------------------------------------------------------------------
 
 
-class _Log(threading.local):
-    """The last five messages of the unit at work in a thread."""
-
-    def __init__(self) -> None:
-        self.lines: deque[bytes] = deque(maxlen=5)
-
-
-_log = _Log()
+# The last five messages of the unit at work in a thread.
+_messages = threading.local()
 
 
 def _record_message(*arguments: Any) -> None:
     """Keep a warning or error of a unit of FMI 2 or 3."""
     status, _, message = arguments[-3:]
     if status != 0 and message:
-        _log.lines.append(message)
+        _messages.lines = [*getattr(_messages, "lines", ())[-4:], message]
 
 
 def _log_text() -> str:
     """Return the last messages of the unit at work in this thread, to add to an error."""
-    lines = [" ".join(line.decode("utf-8", "replace").split()) for line in _log.lines]
+    messages = getattr(_messages, "lines", ())
+    lines = [" ".join(message.decode("utf-8", "replace").split()) for message in messages]
     return f"; it logged: {' | '.join(lines)}" if lines else "; it logged nothing"
 
 
@@ -617,7 +590,7 @@ class _OpenUnit:
         except Exception as error:
             raise ValueError(
                 f"{unit.name}: got {unit.path}, which cannot be unzipped ({error!s:.200}), "
-                "expected a sound archive; copy it anew"
+                "expected a sound archive; copy it again"
             ) from None
         self.idle: list[Any] = []
         self.n_loaded = 0
@@ -631,7 +604,7 @@ class _OpenUnit:
         from fmpy.fmi1 import FMICallException
 
         with self.lock:
-            _log.lines.clear()
+            _messages.lines = []
             slave = self._at_start(reset)
             try:
                 yield slave
@@ -647,8 +620,9 @@ class _OpenUnit:
 
     def _at_start(self, reset: bool) -> Any:
         """Return an idle instance, reset or instantiated again, or a new one."""
+        unit = self.unit
         try:
-            slave = self.idle.pop()
+            slave = self.idle.pop()  # which another thread may have taken
         except IndexError:
             slave = self._loaded()
         else:
@@ -657,7 +631,16 @@ class _OpenUnit:
                     slave.reset()
                     return slave
             _free(slave)
-        self._instantiate(slave)
+        try:
+            if unit.version == 2:
+                slave.instantiate(callbacks=_callbacks(), loggingOn=True)
+            else:
+                slave.instantiate(logMessage=_record_message, loggingOn=True)
+        except Exception as error:
+            raise RuntimeError(
+                f"{unit.name}: got no instance of {unit.path} ({error!s:.200}){_log_text()}, "
+                "expected one; look at its licence, and at what it needs"
+            ) from None
         return slave
 
     def _loaded(self) -> Any:
@@ -684,18 +667,6 @@ class _OpenUnit:
                 ) from None
             finally:
                 os.chdir(folder)
-
-    def _instantiate(self, slave: Any) -> None:
-        try:
-            if self.unit.version == 2:
-                slave.instantiate(callbacks=_callbacks(), loggingOn=True)
-            else:
-                slave.instantiate(logMessage=_record_message, loggingOn=True)
-        except Exception as error:
-            raise RuntimeError(
-                f"{self.unit.name}: got no instance of {self.unit.path} ({error!s:.200})"
-                f"{_log_text()}, expected one; look at its licence, and at what it needs"
-            ) from None
 
 
 def _free(slave: Any) -> None:

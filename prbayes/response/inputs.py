@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import inspect
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence, Set
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace
-from pytensor.graph.traversal import ancestors, walk
+from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
@@ -23,36 +23,45 @@ from prbayes._validate import plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
 
 
-@dataclass(frozen=True, eq=False)
 class Inputs:
     """The inputs of one response, in the order of its arguments."""
 
-    # An entry for each argument: an int (position in ``aleatory``), a variable (epistemic), or an
-    # array.
-    arguments: tuple[Any, ...]
-    aleatory: tuple[TensorVariable, ...]  # the distinct ``.dist()`` objects
-    roots: tuple[TensorVariable, ...]  # model variables that the inputs depend on
-    nested: bool  # whether a ``.dist()`` depends on another one
-
-    @property
-    def epistemic(self) -> tuple[TensorVariable, ...]:
-        """The arguments that are model variables, or functions of them."""
-        return tuple(a for a in self.arguments if isinstance(a, Variable))
-
-    @cached_property
-    def data(self) -> dict[str, Any]:
-        """The data that the inputs depend on and that can be changed, as `pymc.Data`, by name."""
-        ancestry = _ancestry([*self.aleatory, *self.epistemic])
-        return {
+    def __init__(
+        self,
+        arguments: Sequence[Any],
+        aleatory: Sequence[TensorVariable],
+        roots: Sequence[TensorVariable],
+        nested: bool,
+    ) -> None:
+        # For each argument an int (position in ``aleatory``), a variable (epistemic) or an array.
+        self.arguments = tuple(arguments)
+        self.aleatory = tuple(aleatory)  # the distinct ``.dist()`` objects
+        self.epistemic: tuple[TensorVariable, ...] = tuple(
+            [a for a in self.arguments if isinstance(a, Variable)]
+        )
+        self.roots = tuple(roots)  # model variables that the inputs depend on
+        self.nested = nested  # whether a ``.dist()`` depends on another one
+        self.groups = groups_of("", self.roots)
+        self.event_shapes = tuple([event_shape(x) for x in self.aleatory])
+        self.event_ndims = [x.type.ndim for x in (*self.aleatory, *self.epistemic)]
+        # Numbers of one specimen in each argument, and those that are aleatory.
+        self.sizes = []
+        for argument in self.arguments:
+            if isinstance(argument, int):
+                shape = self.event_shapes[argument]
+            elif isinstance(argument, Variable):
+                is_static = None not in argument.type.shape
+                shape = argument.type.shape if is_static else argument.shape.eval()
+            else:
+                shape = np.shape(argument)
+            self.sizes.append(int(np.prod(shape, dtype=int)))
+        self.dimensions = sum([int(np.prod(shape)) for shape in self.event_shapes])
+        # Data that can be changed, as `pymc.Data`, by name.
+        self.data: dict[str, Any] = {
             str(variable.name or f"shared variable {i}"): variable
-            for i, variable in enumerate(ancestry)
+            for i, variable in enumerate(_ancestry([*self.aleatory, *self.epistemic]))
             if hasattr(variable, "get_value") and isinstance(variable, TensorVariable)
         }
-
-    @property
-    def groups(self) -> Groups | None:
-        """The groups of specimens that the inputs depend on."""
-        return groups_of("", self.roots)
 
     def roots_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
         """Return the roots of the arguments at some positions; constants have none."""
@@ -65,11 +74,11 @@ class Inputs:
                 roots.update((v, None) for v in _ancestry([x], ends) if v in ends)
         return tuple(roots)
 
-    def ordered_as(self, other: Inputs) -> Inputs:
-        """Return the same arguments with the aleatory inputs in the order of equal ones."""
-        places = [other.aleatory.index(x) for x in self.aleatory]
-        arguments = tuple(places[a] if isinstance(a, int) else a for a in self.arguments)
-        return replace(self, arguments=arguments, aleatory=other.aleatory, roots=other.roots)
+    def ordered_as(self, reference: Inputs) -> Inputs:
+        """Return the same arguments with the aleatory inputs in the order of a reference."""
+        places = [reference.aleatory.index(x) for x in self.aleatory]
+        arguments = [places[a] if isinstance(a, int) else a for a in self.arguments]
+        return Inputs(arguments, reference.aleatory, reference.roots, self.nested)
 
     def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
         """Return the aleatory and epistemic inputs with the roots replaced by ``params``."""
@@ -91,21 +100,6 @@ class Inputs:
             else:
                 filled.append(aleatory[a] if isinstance(a, int) else a)
         return filled
-
-    @cached_property
-    def event_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Event shape of each aleatory input, evaluated where it is not static."""
-        return tuple(event_shape(x) for x in self.aleatory)
-
-    @property
-    def dimensions(self) -> int:
-        """Number of aleatory numbers that make one specimen."""
-        return sum(int(np.prod(shape)) for shape in self.event_shapes)
-
-    @property
-    def event_ndims(self) -> tuple[int, ...]:
-        """Number of event axes of each aleatory input."""
-        return tuple(x.type.ndim for x in self.aleatory)
 
     def core(self, params: Sequence[Any]) -> list[Any]:
         """Drop the leading axes of length one that PyMC adds to a node's parameters."""
@@ -136,7 +130,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             continue
         model_variables.update(filter(is_group, _ancestry([x], model_variables)))
         ancestry = _ancestry([x], model_variables)
-        roots.update((v, None) for v in ancestry if v in model_variables)
+        roots.update(dict.fromkeys([v for v in ancestry if v in model_variables]))
         latent = [v for v in ancestry if v not in model_variables and is_random(v)]
         _refuse_foreign_variables(x, ancestry, latent, label)
         if x in model_variables or not latent:
@@ -159,22 +153,26 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             "varies between specimens; pass a distribution made with `.dist()`, such as "
             "pm.Normal.dist(mu, sigma)"
         )
-    if all(map(is_group, roots)):
+    if all(map(is_group, roots)):  # also if there are none
         raise ValueError(
             f"{name}: got inputs that depend on no variable of the model, expected hyperparameters "
             "to calibrate; give the `.dist()` parameters that are model variables, such as "
             "mu = pm.Normal('mu', 0, 1)"
         )
-    return Inputs(tuple(arguments), tuple(aleatory), tuple(roots), is_nested)
+    return Inputs(arguments, aleatory, list(roots), is_nested)
 
 
 def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) -> list[Variable]:
-    """Return variables and their ancestors, without those of the ends."""
-
-    def parents(variable: Variable) -> Any:
-        return None if variable in ends or variable.owner is None else variable.owner.inputs
-
-    return list(walk(variables, parents))
+    """Return variables and their ancestors, the nearest first, without those of the ends."""
+    ancestry: dict[Variable, None] = {}
+    queue = deque(variables)
+    while queue:
+        variable = queue.popleft()
+        if variable not in ancestry:
+            ancestry[variable] = None
+            if variable not in ends and variable.owner is not None:
+                queue += variable.owner.inputs
+    return list(ancestry)
 
 
 def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:
@@ -191,7 +189,7 @@ def _refuse_foreign_variables(
 ) -> None:
     """Refuse variables of `pymc.dims`, loose symbols, and variables of another model."""
     for variable in ancestry:
-        if is_labelled(variable):
+        if hasattr(variable.type, "dims"):
             raise TypeError(
                 f"{label}: got {variable} of pymc.dims, expected variables of PyMC itself, since "
                 "populations are evaluated in batches of plain arrays; write "
@@ -244,11 +242,6 @@ def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
         return pm.logp(dist, x, warn_rvs=False)
-
-
-def is_labelled(variable: object) -> bool:
-    """Return whether a variable is one of `pymc.dims`."""
-    return isinstance(variable, Variable) and hasattr(variable.type, "dims")
 
 
 def is_random(variable: Variable) -> bool:
@@ -306,18 +299,13 @@ def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
 # -- batches ---------------------------------------------------------------------------------------
 
 
-def batch_shape(values: Sequence[Any], event_ndims: Sequence[int]) -> tuple[int, ...]:
-    """Return the shape that the leading axes of arrays (..., *event) broadcast to."""
-    leading = [v.shape[: v.ndim - k] for v, k in zip(values, event_ndims, strict=True)]
-    return np.broadcast_shapes(*leading)
-
-
 def broadcast_batch(
-    values: Sequence[Any], event_ndims: Sequence[int], batch: tuple[int, ...]
-) -> list[Any]:
-    """Return arrays (..., *event) with their leading axes broadcast to ``batch``."""
-    pairs = zip(values, event_ndims, strict=True)
-    return [np.broadcast_to(v, batch + v.shape[v.ndim - k :]) for v, k in pairs]
+    values: Sequence[Any], event_ndims: Sequence[int]
+) -> tuple[tuple[int, ...], list[Any]]:
+    """Broadcast the leading axes of arrays (..., *event); return their shape, and the arrays."""
+    pairs = list(zip(values, event_ndims, strict=True))
+    batch = np.broadcast_shapes(*[v.shape[: v.ndim - k] for v, k in pairs])
+    return batch, [np.broadcast_to(v, batch + v.shape[v.ndim - k :]) for v, k in pairs]
 
 
 class GroupRV(RandomVariable):  # type: ignore[misc]
@@ -410,9 +398,9 @@ def group(dim: str) -> TensorVariable:
         raise TypeError(f"{caller}: got no model on the context, expected `with pm.Model():`")
     labels = model.coords.get(dim)
     if labels is None:
-        known = [name for name, values in model.coords.items() if values is not None]
+        dims = [name for name, values in model.coords.items() if values is not None]
         raise ValueError(
-            f"{caller}: dim: got {dim!r}, expected a dimension with a coordinate, of {known}; "
+            f"{caller}: dim: got {dim!r}, expected a dimension with a coordinate, of {dims}; "
             f"write pm.Model(coords={{{dim!r}: ['Adler', 'Busch']}}), with the names of the groups"
         )
     names = [str(label) for label in labels]

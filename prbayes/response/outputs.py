@@ -32,7 +32,7 @@ class Outputs:
     @property
     def names(self) -> tuple[str, ...]:
         """The labels as text."""
-        return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
+        return tuple([f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels])
 
     def by_key(self, values: Floats) -> dict[str, Floats]:
         """Return outputs in the last axis, (..., m), as a mapping with the response's keys."""
@@ -94,7 +94,19 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     label = f"{name}: observed"
     if isinstance(observed, Mapping):
         return _from_mapping(label, observed)
-    _refuse_texts(label, observed)
+    if hasattr(observed, "columns") and hasattr(observed, "dtypes"):
+        # Columns that are no numbers, such as names of groups.
+        texts = []
+        for place, (column, kind) in enumerate(zip(observed, observed.dtypes, strict=True)):
+            if kind.kind not in "biufO" or any(isinstance(v, str) for v in observed.iloc[:, place]):
+                texts.append(column)
+        if texts:
+            raise TypeError(
+                f"{label}: got a DataFrame whose columns {texts} are no numbers, expected a "
+                "column of measured responses for each output; leave others out, as in "
+                "df['life'], and where one names groups, such as suppliers, index hyperparameters "
+                f"by prb.response.group({str(texts[0])!r})"
+            )
     if np.ma.is_masked(observed) and np.ndim(observed) == 2:
         observed = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
     values = observed if np.ma.is_masked(observed) else real_array(observed, label)
@@ -106,45 +118,26 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     return values, Outputs(units=(str(unit),)) if unit else SINGLE_OUTPUT
 
 
-def _refuse_texts(label: str, observed: Any) -> None:
-    """Raise if columns of a DataFrame are no numbers, such as names of groups."""
-    if not hasattr(observed, "columns") or not hasattr(observed, "dtypes"):
-        return
-    texts = []
-    for place, (name, kind) in enumerate(zip(observed.columns, observed.dtypes, strict=True)):
-        if kind.kind not in "biufO" or any(isinstance(v, str) for v in observed.iloc[:, place]):
-            texts.append(name)
-    if texts:
-        raise TypeError(
-            f"{label}: got a DataFrame whose columns {texts} hold no numbers, expected a column "
-            "of measured responses for each output; leave others out, as in df['life'], and where "
-            "one names groups, such as suppliers, index hyperparameters by "
-            f"prb.response.group({str(texts[0])!r})"
-        )
-
-
 def _labelled_columns(observed: Any, m: int) -> Outputs:
     """Return the outputs of an array, DataFrame or DataArray of m columns."""
     labels: tuple[Any, ...] = tuple(range(m))
     units: tuple[str, ...] = ()
+    dim = "output"
     if hasattr(observed, "dims") and hasattr(observed, "coords"):
         dim = str(observed.dims[1])
         if dim in observed.coords:
             labels = tuple(observed.coords[dim].values.tolist())
-        # One unit for all, or a coordinate of units.
-        unit = observed.attrs.get("units")
-        if "units" in observed.coords:
-            stated: NDArray[Any] = np.broadcast_to(observed.coords["units"].values, m)
-            units = tuple(map(str, stated.tolist()))
-        elif unit:
-            units = (str(unit),) * m
+        # A coordinate of units, or one unit for all.
+        unit: Any = observed.coords.get("units", observed.attrs.get("units"))
+        if unit is not None:
+            units = tuple(map(str, np.broadcast_to(np.asarray(unit), m).tolist()))
     elif hasattr(observed, "columns"):
         labels = tuple(np.asarray(observed.columns).tolist())
-        dim = str(getattr(observed.columns, "name", None) or "output")
+        dim = str(getattr(observed.columns, "name", None) or dim)
     else:
         return Outputs(labels)
     are_names = all(isinstance(label, str) for label in labels)
-    return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else (), units)
+    return Outputs(labels, dim, tuple([(x, None) for x in labels]) if are_names else (), units)
 
 
 def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:

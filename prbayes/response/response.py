@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
@@ -22,57 +20,46 @@ from prbayes.response.budget import budget
 from prbayes.response.call import CallSettings, Points, Tally, checked, respond, scalar, shapes
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
-from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
-from prbayes.response.inputs import Inputs, batch_shape, broadcast_batch
-from prbayes.response.outputs import SINGLE_OUTPUT, Outputs, outputs_of_result
+from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
+from prbayes.response.inputs import Inputs, broadcast_batch
+from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.store import Store
 
 
-def refuse_uncallable(name: str, function: object) -> None:
+def refuse_uncallable(name: str, function: object, argument: str = "response") -> None:
     """Raise if a response is no function: often the inputs were passed first."""
     if not callable(function) or isinstance(function, type):
-        got = called(function) if isinstance(function, type) else type(function).__name__
         raise TypeError(
-            f"{name}: response: got {got}, expected a function of the inputs, such as "
-            "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., "
+            f"{name}: {argument}: got {called(function)}, expected a function of the inputs, such "
+            "as lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., "
             "observed=...)"
         )
 
 
-def refuse_coarse(label: str, function: object) -> None:
-    """Raise if a coarse response is no function."""
-    if not callable(function) or isinstance(function, type):
-        raise TypeError(
-            f"{label}: got {called(function)}, expected a function of the same inputs as the "
-            "response"
-        )
-
-
 def refuse_misfit(
-    name: str, function: object, sizes: Callable[[], list[int]], outputs: Outputs | None
+    name: str, function: Any, sizes: Sequence[int], outputs: Outputs | None = None
 ) -> None:
-    """Raise if a function of one specimen declares other inputs or outputs, by a method of it."""
-    refuse = getattr(getattr(function, "function", None), "refuse_misfit", None)
-    if refuse is not None:
-        refuse(name, sizes(), outputs)
+    """Raise if a function takes other arguments than there are inputs, of these sizes.
 
-
-def refuse_wrong_arity(name: str, function: object, inputs: Inputs) -> None:
-    """Raise if the signature of a function has more or fewer arguments than there are inputs."""
+    A function of one specimen may have a method of this name, which compares the outputs, too.
+    """
     inner: Any = function.function if isinstance(function, scalar) else function
     try:
         # Of a decorated function its own signature, not that of the function inside.
         signature = inspect.signature(inner, follow_wrapped=False)
     except (TypeError, ValueError):
-        return
+        signature = None
     try:
-        signature.bind(*inputs.arguments)
+        if signature is not None:
+            signature.bind(*sizes)
     except TypeError as error:
         raise TypeError(
-            f"{name}: response: got inputs of {_sizes(inputs)} numbers for "
-            f"a function of {signature} ({error}), expected an input for each argument; a "
-            "multivariate input is one argument, an array with an axis for its elements"
+            f"{name}: response: got inputs of {list(sizes)} numbers for a function of {signature} "
+            f"({error}), expected an input for each argument; a multivariate input is one "
+            "argument, an array with an axis for its elements"
         ) from None
+    if hasattr(inner, "refuse_misfit"):
+        inner.refuse_misfit(name, sizes, outputs)
 
 
 def check_call_settings(
@@ -84,8 +71,8 @@ def check_call_settings(
         folder_path(store, "store")
     if version is not None and (not isinstance(version, str) or not version):
         raise TypeError(
-            f"version: got {type(version).__name__} {version!r:.60}, expected a text that names "
-            "the response as it is, such as '2' or 'mesh 3, solver 1.4'"
+            f"version: got {called(version)}, expected a text that names the response as it is, "
+            "such as '2' or 'mesh 3, solver 1.4'"
         )
     if not isinstance(on_failure, OnFailure):
         raise TypeError(
@@ -109,23 +96,10 @@ class Runs:
 
     def at(self, points: Sequence[Floats]) -> Floats | None:
         """Return the responses of a stored batch, (n,) or (n, m), None if it is not stored."""
-        return next((values for known, values in self.stored if _equal(known, points)), None)
-
-    def repeated(self, inputs: list[Floats]) -> Floats | None:
-        """Return the responses of the last call if a shared one had the same inputs, else None."""
-        if not self.is_shared or self.last is None or not _equal(self.last[0], inputs):
-            return None
-        return self.last[1].copy()
-
-    def record(self, inputs: list[Floats], responses: Floats) -> None:
-        """Keep a call for the next simulator; before there is one, only a small call.
-
-        That is the trial at some points of the prior, which all of them make.
-        """
-        if self.is_shared or responses.size <= 64:
-            self.last = [x.copy() for x in inputs], responses.copy()
-        else:
-            self.last = None
+        for stored_points, values in self.stored:
+            if _equal(stored_points, points):
+                return values
+        return None
 
 
 class Responses:
@@ -151,19 +125,21 @@ class Responses:
         outputs: Outputs | None = SINGLE_OUTPUT,
     ) -> None:
         refuse_uncallable(name, function)
-        refuse_wrong_arity(name, function, inputs)
-        refuse_misfit(name, function, partial(_sizes, inputs), outputs)
+        refuse_misfit(name, function, inputs.sizes, outputs)
         report(*findings_of(function))
         policy = Abort() if on_failure is None else on_failure
-        opened = None
+        database, self.folder = None, None
         if store is not None:
-            columns, n_outputs = sum(_sizes(inputs)), None
+            n_outputs = None
             if outputs is not None:
                 n_outputs = max(1, len(outputs.labels))
                 if version is not None and outputs.keys:
                     # In another order they are other numbers.
                     version = f"{version} ({', '.join(outputs.names)})"
-            opened = Store(store, name, columns=columns, version=version, outputs=n_outputs)
+            database = Store(
+                store, name, columns=sum(inputs.sizes), version=version, outputs=n_outputs
+            )
+            self.folder = database.folder
         self.name = name
         self.outputs = outputs
         self.function = function
@@ -183,10 +159,9 @@ class Responses:
         self._checks_batches = self.is_batched
         self._n_reused = 0
         self._settings = CallSettings(
-            name, function, executor, opened, policy, retry_failed, timeout, outputs
+            name, function, executor, database, policy, retry_failed, timeout, outputs
         )
         self._tally = Tally()
-        self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
 
     def copied(self) -> Responses:
         """Return the same function with its own counts, and the same executor and store."""
@@ -211,36 +186,29 @@ class Responses:
         return self._tally.failures
 
     @property
-    def replacement(self) -> float:
-        """Value in place of a response that failed; NaN if nothing is."""
-        value = self._settings.on_failure.final.replacement
-        return np.nan if value is None else float(value)
-
-    @property
     def failed(self) -> tuple[Failure, ...]:
         """The points that failed, each once, with their reasons; the first ten thousand."""
         return tuple(self._tally.failed.values())
 
     @property
-    def workers(self) -> int:
-        """Number of workers."""
-        return capacity(self._settings.executor).workers
+    def replacement(self) -> float:
+        """Value in place of a response that failed; NaN if nothing is."""
+        final = self._settings.on_failure.final
+        return float(final.value) if isinstance(final, Replace) else np.nan
 
     @property
-    def folder(self) -> Path | None:
-        """Folder of the store."""
-        return None if self._settings.store is None else self._settings.store.folder
+    def workers(self) -> int:
+        """Number of workers."""
+        return capacity(self._settings.executor)[0]
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, inputs and constants, and output order."""
-        if self.function is not other.function:
-            return False
-        arguments, other_arguments = self.inputs.arguments, other.inputs.arguments
-        if len(arguments) != len(other_arguments):
-            return False
         # A mapping's arrays are concatenated in the order of what was observed.
         keys = {r.outputs.keys for r in (self, other) if r.outputs is not None}
-        if len(keys) > 1:
+        arguments, other_arguments = self.inputs.arguments, other.inputs.arguments
+        if self.function is not other.function or len(keys) > 1:
+            return False
+        if len(arguments) != len(other_arguments):
             return False
         for x, y in zip(arguments, other_arguments, strict=True):
             if isinstance(x, int) and isinstance(y, int):
@@ -255,12 +223,34 @@ class Responses:
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
         """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event)."""
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
-        responses = self.runs.repeated(values)
-        if responses is not None:
-            self.count_reused(responses.size)
-            return responses
-        responses = self._as_batch(values) if self.is_batched else self._as_points(values)
-        self.runs.record(values, responses)
+        batch, full = broadcast_batch(values, self.inputs.event_ndims)
+        size = int(np.prod(batch, dtype=int))
+        runs = self.runs
+        if runs.is_shared and runs.last is not None and _equal(runs.last[0], values):
+            self.count_reused(size)
+            return runs.last[1].copy()
+        if self.is_batched:
+            if self.on_start is not None:
+                self.on_start(size, np.nan)
+            clock = time.perf_counter()
+            responses = self._called(full, batch)
+            if self.on_start is not None:
+                self.on_start(size, (time.perf_counter() - clock) / max(1, size))
+            if self._checks_batches and size > 1:
+                self._checks_batches = False
+                self._refuse_mixing(full, batch, responses)
+        else:
+            self.count += size
+            responses = respond(
+                self._settings, self._points(full, batch), self._tally, self.on_start
+            )
+            if self.outputs is None:
+                self.outputs = self._tally.named
+            responses = responses.reshape(batch + responses.shape[1:])
+        # For the next simulator. Before there is one, only the trial at some points of the prior,
+        # which all simulators make.
+        is_kept = runs.is_shared or responses.size <= 64
+        runs.last = ([x.copy() for x in values], responses.copy()) if is_kept else None
         return responses
 
     def alone(self, aleatory: Sequence[Floats]) -> Floats:
@@ -268,8 +258,8 @@ class Responses:
         values = [np.asarray(v, dtype=np.float64) for v in aleatory]
         if self.is_batched:
             return self._called(values, (1,), is_run=False)
-        _, points = self._points(values)
-        return respond(replace(self._settings, store=None), points, self._tally.copied())
+        settings = replace(self._settings, store=None)
+        return respond(settings, self._points(values, (1,)), self._tally.copied())
 
     def count_symbolic(self, size: int) -> None:
         """Count responses that are computed in a graph."""
@@ -281,50 +271,20 @@ class Responses:
         self.count += size
         self._n_reused += size
 
-    def _as_batch(self, values: list[Floats]) -> Floats:
-        """Return the responses of one call of the function."""
-        batch = batch_shape(values, self._event_ndims)
-        values = broadcast_batch(values, self._event_ndims, batch)
-        size = int(np.prod(batch, dtype=int))
-        if self.on_start is not None:
-            self.on_start(size, np.nan)
-        clock = time.perf_counter()
-        responses = self._called(values, batch)
-        if self.on_start is not None:
-            self.on_start(size, (time.perf_counter() - clock) / max(1, size))
-        if self._checks_batches and size > 1:
-            self._checks_batches = False
-            self._refuse_mixing(values, batch, responses)
-        return responses
-
-    def _as_points(self, values: list[Floats]) -> Floats:
-        """Return the responses by `respond`, each specimen a point."""
-        batch, points = self._points(values)
-        self.count += len(points)
-        responses = respond(self._settings, points, self._tally, self.on_start)
-        if self.outputs is None:
-            self.outputs = self._tally.named
-        return responses.reshape(batch + responses.shape[1:])
-
-    def _points(self, values: list[Floats]) -> tuple[tuple[int, ...], Points]:
-        """Return the batch shape of values of the inputs, and their points, each a row."""
-        batch = batch_shape(values, self._event_ndims)
+    def _points(self, full: Sequence[Floats], batch: tuple[int, ...]) -> Points:
+        """Return the points of a batch, each a row, from values of all inputs."""
         n = int(np.prod(batch, dtype=int))
-        full = broadcast_batch(values, self._event_ndims, batch)
+        k = len(self.inputs.aleatory)
         rows = [v.reshape(n, *v.shape[len(batch) :]) for v in full]
         varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
-        return batch, Points(self._arguments(rows), varying)
-
-    def _arguments(self, values: Sequence[Floats]) -> list[Any]:
-        """Return the function's arguments from values of aleatory, then epistemic inputs."""
-        k = len(self.inputs.aleatory)
-        return self.inputs.fill(values[:k], values[k:])
+        return Points(self.inputs.fill(rows[:k], rows[k:]), varying)
 
     def _called(
         self, values: Sequence[Floats], batch: tuple[int, ...], *, is_run: bool = True
     ) -> Floats:
         """Call the function once for a batch of any shape."""
-        arguments = self._arguments(values)
+        k = len(self.inputs.aleatory)
+        arguments = self.inputs.fill(values[:k], values[k:])
         size = int(np.prod(batch, dtype=int)) if is_run else 0
         budget().grant(size, least=size)
         try:
@@ -337,12 +297,11 @@ class Responses:
                 "leading shape, or to be wrapped in prb.scalar"
             ) from error
         self.count += size
-        if self.outputs is None and isinstance(result, Mapping):
-            self.outputs = outputs_of_result(result, len(batch))
         try:
-            return checked(result, batch, arguments, self.outputs)
+            responses, self.outputs = checked(result, batch, arguments, self.outputs)
         except ResponseError as error:
             raise ResponseError(f"{self.name}: {error}") from None
+        return responses
 
     def _refuse_mixing(
         self, values: Sequence[Floats], batch: tuple[int, ...], responses: Floats
@@ -355,20 +314,17 @@ class Responses:
             return
         first = int(np.flatnonzero(finite)[0])
         place = np.unravel_index(first, batch)
-
-        def alone() -> Floats:
-            # Copies, which the function may change in place.
-            specimen = [np.array(v[place])[None] for v in values]
-            return self._called(specimen, (1,), is_run=False).ravel()
-
+        specimen = [v[place][None] for v in values]
         try:
-            single = alone()
+            # Copies, which the function may change in place.
+            single = self._called([x.copy() for x in specimen], (1,), is_run=False).ravel()
             # A solver that steps a batch as one system differs by up to .01 spreads; a mean, a sum
             # or another order over specimens by about one.
             if not (np.abs(rows[first] - single) > 0.01 * rows[finite].std(axis=0)).any():
                 return
             # A random response does not mix its specimens.
-            if (np.abs(alone() - single) > 1e-6 * np.abs(single)).any():
+            again = self._called([x.copy() for x in specimen], (1,), is_run=False).ravel()
+            if (np.abs(again - single) > 1e-6 * np.abs(single)).any():
                 return
         except ResponseError:  # it takes no batch of one
             return
@@ -381,72 +337,59 @@ class Responses:
         )
 
 
-def _sizes(inputs: Inputs) -> list[int]:
-    """Return how many numbers each argument of one point has."""
-    sizes = []
-    for argument in inputs.arguments:
-        if isinstance(argument, int):
-            shape = inputs.event_shapes[argument]
-        elif isinstance(argument, Variable):
-            shape = argument.shape.eval() if argument.type.ndim else ()
-        else:
-            shape = np.shape(argument)
-        sizes.append(int(np.prod(shape, dtype=int)))
-    return sizes
-
-
 def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:
     pairs = zip(arrays, others, strict=True)
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
-# -- points that repeat ----------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class KnownPoints:
-    """Points whose responses are known."""
-
-    points: Sequence[Floats]  # (m, *event) for each aleatory input
-    values: Floats  # (m,), or (m, outputs)
-
-
 def deduplicated_responses(
-    responses: Responses, points: Sequence[Floats], known: KnownPoints | None
+    responses: Responses,
+    points: Sequence[Floats],
+    known: tuple[Sequence[Floats], Floats] | None = None,
 ) -> Floats:
     """Return the responses at points (n, *event), (n,) or (n, m), each different point once.
 
-    Discrete inputs have few values, and a censored input repeats its bounds. If four points that
-    are computed again differ, the response is random and is computed at all points.
+    ``known`` has points and responses. Discrete inputs have few values, and a censored input
+    repeats its bounds. If four points that are computed again differ, the response is random and is
+    computed at all points.
     """
     n = len(points[0])
-    known_values = np.empty(0) if known is None else known.values
+    known_points, known_values = ([x[:0] for x in points], np.empty(0)) if known is None else known
     m = len(known_values)
-    keys = _keys(points)
-    if known is not None:
-        keys = np.concatenate([_keys([x[:m] for x in known.points]), keys])
+    # The bits of all numbers of each point as one item; -0.0 becomes 0.0.
+    columns = [np.concatenate([x[:m], y]) for x, y in zip(known_points, points, strict=True)]
+    columns = [x.reshape(m + n, math.prod(x.shape[1:])) for x in columns]
+    bits = np.concatenate(columns, axis=1, dtype=np.float64) + 0.0
+    keys = bits.view(np.dtype((np.void, bits.dtype.itemsize * bits.shape[1]))).ravel()
     _, first, which = np.unique(keys, return_index=True, return_inverse=True)
     earliest = first[which]
     is_new = earliest[m:] == np.arange(m, m + n)
     if is_new.all() or responses.is_random:
         return responses(points, [])
 
+    # Compute the new points, and up to four different ones again.
     new, repeated = np.flatnonzero(is_new), np.flatnonzero(~is_new)
     again = repeated[:0]
     if responses.is_random is not False:
-        # Different points; a response that is zero or one by chance passes four once in 16 times.
+        # A response that is zero or one by chance passes four once in 16 times.
         _, place = np.unique(earliest[m:][repeated], return_index=True)
         again = repeated[np.sort(place)[:4]]
-    rows = np.concatenate([new, again])
     rest = np.setdiff1d(repeated, again)
-    computed = responses([x[rows] for x in points], []) if rows.size else known_values[:0]
+    selected = np.concatenate([new, again])
+    computed = responses([x[selected] for x in points], []) if selected.size else known_values[:0]
     event = computed.shape[1:]
     values = np.full((m + n, *event), np.nan)
     values[:m] = known_values.reshape(m, *event)
     values[m + new] = computed[: new.size]
     second = computed[new.size :]
     if again.size:
-        responses.is_random = not _equal_up_to_rounding(values[earliest[m + again]], second)
+        # Equal up to rounding, by output, as units may differ.
+        earlier = values[earliest[m + again]]
+        finite = np.where(np.isfinite(earlier), np.abs(earlier), 0.0)
+        scale = finite.max(axis=0, initial=0.0)
+        responses.is_random = not np.allclose(
+            earlier, second, rtol=1e-6, atol=1e-6 * scale, equal_nan=True
+        )
     if responses.is_random:
         values[m + again] = second
         if rest.size:
@@ -454,21 +397,3 @@ def deduplicated_responses(
         return values[m:]
     responses.count_reused(rest.size)
     return values[earliest[m:]]
-
-
-def _keys(points: Sequence[Floats]) -> NDArray[np.void]:
-    """Return the bits of all numbers of each point as one item, shape (n,)."""
-    columns = []
-    for x in points:
-        size = int(np.prod(x.shape[1:], dtype=int))
-        columns.append(np.asarray(x, dtype=np.float64).reshape(len(x), size))
-    rows = np.concatenate(columns, axis=1)
-    bits = np.ascontiguousarray(rows + 0.0)  # -0.0 becomes 0.0
-    return bits.view(np.dtype((np.void, bits.dtype.itemsize * bits.shape[1]))).ravel()
-
-
-def _equal_up_to_rounding(values: Floats, again: Floats) -> bool:
-    # By output, as units may differ.
-    finite = np.where(np.isfinite(values), np.abs(values), 0.0)
-    scale = finite.max(axis=0, initial=0.0)
-    return np.allclose(values, again, rtol=1e-6, atol=1e-6 * scale, equal_nan=True)

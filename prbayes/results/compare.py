@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -16,13 +15,12 @@ from prbayes._display import view
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called
 from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.multivariate import Joint
 from prbayes.model.description import labelled
-from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator, shortcomings, specimen_log_likelihoods
 from prbayes.model.fingerprint import as_attributes, require_together
 from prbayes.model.locking import locked
@@ -36,7 +34,6 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
     variable_of,
-    with_coordinates,
 )
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
@@ -46,8 +43,13 @@ from prbayes.response.inputs import event_shape
 
 # Variables by result that are no scores.
 COSTS = ("n_responses", "seconds")
-_KERNEL = LogLikelihood(density=GaussianKDE())
-_METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), _KERNEL)
+_ESTIMATE = ("estimate", "sd", "lower", "upper")  # variables by result and element
+_METRICS = (
+    ProbabilityResidual(),
+    KullbackLeibler(),
+    AreaMetric(),
+    LogLikelihood(density=GaussianKDE()),
+)
 
 
 @locked
@@ -127,32 +129,36 @@ def compare(
     optima = [result for result in results.values() if isinstance(result, Optimum)]
     # Draws without coordinates have those of the model.
     naming = model or next((optimum.model for optimum in optima), None)
-    columns = {label: _column(label, result, naming) for label, result in results.items()}
-    shared = _shared_elements(list(columns.values()), model)
-    in_table = set.intersection(*(column.in_table for column in columns.values()))
+    read = [_estimates(label, result, naming) for label, result in results.items()]
+    columns, shown, costs = zip(*read, strict=True)
+    shared = [name for name in columns[0] if all(name in column for column in columns)]
+    if model is not None:
+        variables = {variable.name for variable in model.unobserved_RVs}
+        shared = [name for name in shared if variable_of(name) in variables]
+    in_table = set.intersection(*shown)
     names = readable_elements(name for name in shared if name in in_table)
     if not names:
         raise ValueError(
             f"compare: got results {list(results)} that share no hyperparameter, "
             "expected the same model"
         )
-    table = _table(columns, names)
+    table = np.array([[column[name] for name in names] for column in columns])
     estimates, sds = table[..., 0], table[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):  # a result without spread
         shift = (estimates - estimates[0]) / sds
     shift[0] = 0.0
     dims = ["result", "hyperparameter"]
-    data: dict[str, Any] = {key: (dims, table[..., i]) for i, key in enumerate(_Estimate._fields)}
+    data: dict[str, Any] = {key: (dims, table[..., i]) for i, key in enumerate(_ESTIMATE)}
     data["shift"] = (dims, shift)
-    for key in COSTS:
-        data[key] = ("result", [getattr(column, key) for column in columns.values()])
+    for i, key in enumerate(COSTS):
+        data[key] = ("result", [cost[i] for cost in costs])
     if model is not None and (simulators(model) or specimen_likelihoods(model)):
         # The designs of a model cover its own optimum.
         is_covered = any(optimum.model is model for optimum in optima)
-        values = _table(columns, shared)[..., 0]
+        values = np.array([[column[name][0] for name in shared] for column in columns])
         for key, scores in _scores(model, shared, values, metrics, is_covered=is_covered).items():
             data[key] = ("result", scores)
-    coords = {"result": list(columns), "hyperparameter": names}
+    coords = {"result": list(results), "hyperparameter": names}
     attrs = {"interval": INTERVAL, **as_attributes(identity)}
     return Comparison(data, coords=coords, attrs=attrs)
 
@@ -165,13 +171,13 @@ class Comparison(xr.Dataset):  # type: ignore[no-untyped-call]
     def _repr_html_(self) -> str:
         """Show estimates as a table, and scores as sentences; a selection as xarray does."""
         is_whole = set(self.dims) == {"result", "hyperparameter"}
-        if not (is_whole and set(_Estimate._fields) <= set(self.data_vars)):
+        if not (is_whole and set(_ESTIMATE) <= set(self.data_vars)):
             return super()._repr_html_()
         rows = []
         for name in self["hyperparameter"].values:
             for label in self["result"].values:
                 row = self.sel(hyperparameter=name, result=label)
-                estimate, sd, lower, upper = (f"{float(row[key]):.4g}" for key in _Estimate._fields)
+                estimate, sd, lower, upper = (f"{float(row[key]):.4g}" for key in _ESTIMATE)
                 rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}"])
         sentences = []
         for key, scores in self.data_vars.items():
@@ -183,89 +189,41 @@ class Comparison(xr.Dataset):  # type: ignore[no-untyped-call]
         return view("Comparison", header=header, rows=rows, sentences=sentences)
 
 
-# -- estimates -------------------------------------------------------------------------------------
-
-
-class _Estimate(NamedTuple):
-    """The estimate of one element by one result."""
-
-    estimate: float
-    sd: float
-    lower: float
-    upper: float
-
-
-@dataclass(frozen=True)
-class _Column:
-    """Estimates of a result by element, and its cost."""
-
-    elements: dict[str, _Estimate]
-    in_table: set[str]  # elements that a table shows
-    n_responses: float
-    seconds: float
-
-
-def _table(columns: Mapping[str, _Column], names: Sequence[str]) -> Floats:
-    """Return estimate, sd, lower and upper, shape (results, elements, 4)."""
-    return np.array([[column.elements[name] for name in names] for column in columns.values()])
-
-
-def _column(label: str, result: Any, naming: pm.Model | None) -> _Column:
-    """Read a result of any kind; draws without coordinates have those of a model."""
-    if isinstance(result, Optimum):
-        point, stderr = (
-            labelled(result.evaluator, values, {}).data_vars
-            for values in (result.point, result.stderr)
-        )
-        return _optimum_column(point, stderr, (float(result.n_responses), result.search.seconds))
+def _estimates(
+    label: str, result: Any, naming: pm.Model | None
+) -> tuple[dict[str, tuple[float, ...]], set[str], tuple[float, ...]]:
+    """Return estimate, sd and interval of each element, elements that a table shows, and costs."""
     groups = result.children if isinstance(result, xr.DataTree) else {}
+    estimates: dict[str, tuple[float, ...]] = {}
     if "posterior" in groups:
-        draws = stacked_draws(result["posterior"])
-        if naming is not None:
-            draws = with_coordinates(draws, naming)
+        attrs = result["posterior"].attrs
+        draws = stacked_draws(result["posterior"], model=naming)
         tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
-        estimates = {}
         for element, x in split_elements(draws).items():
-            lower, upper = np.quantile(x, tails)
-            estimates[element] = _Estimate(float(x.mean()), float(x.std(ddof=1)), lower, upper)
-        cost = _cost(result["posterior"].attrs)
-        return _Column(estimates, set(table_elements(draws)), *cost)
-    if "optimum" in groups:
-        optimum, stderr = result["optimum"], result["stderr"].data_vars
-        return _optimum_column(optimum.data_vars, stderr, _cost(optimum.attrs))
-    raise TypeError(
-        f"compare: results: {label}: got {type(result).__name__}, "
-        "expected an Optimum or a DataTree with a posterior group"
-    )
-
-
-def _optimum_column(
-    point: Mapping[Any, Any], stderr: Mapping[Any, Any], cost: tuple[float, float]
-) -> _Column:
-    """Return estimates, standard errors and normal intervals of an optimum."""
-    z = ndtri((1 + INTERVAL) / 2)
-    errors = single_elements(stderr)
-    estimates = {}
-    for element, value in single_elements(point).items():
-        sd = errors[element]
-        estimates[element] = _Estimate(value, sd, value - z * sd, value + z * sd)
-    return _Column(estimates, set(optimum_elements(point, stderr)), *cost)
-
-
-def _cost(attrs: Mapping[Any, Any]) -> tuple[float, float]:
-    return float(attrs.get("n_responses", np.nan)), float(attrs.get("seconds", np.nan))
-
-
-def _shared_elements(columns: list[_Column], model: pm.Model | None) -> list[str]:
-    """Return the elements that all results have, of the model's variables if it is passed."""
-    names = [name for name in columns[0].elements if all(name in c.elements for c in columns)]
-    if model is None:
-        return names
-    variables = {variable.name for variable in model.unobserved_RVs}
-    return [name for name in names if variable_of(name) in variables]
-
-
-# -- scores ----------------------------------------------------------------------------------------
+            estimates[element] = (x.mean(), x.std(ddof=1), *np.quantile(x, tails))
+        shown = table_elements(draws)
+    else:
+        if isinstance(result, Optimum):
+            attrs = {"n_responses": result.n_responses, "seconds": result.search.seconds}
+            point, stderr = (
+                labelled(result.evaluator, values, {}).data_vars
+                for values in (result.point, result.stderr)
+            )
+        elif "optimum" in groups:
+            attrs = result["optimum"].attrs
+            point, stderr = result["optimum"].data_vars, result["stderr"].data_vars
+        else:
+            raise TypeError(
+                f"compare: results: {label}: got {type(result).__name__}, "
+                "expected an Optimum or a DataTree with a posterior group"
+            )
+        z = ndtri((1 + INTERVAL) / 2)
+        errors = single_elements(stderr)
+        for element, value in single_elements(point).items():
+            sd = errors[element]
+            estimates[element] = (value, sd, value - z * sd, value + z * sd)
+        shown = optimum_elements(point, stderr)
+    return estimates, set(shown), tuple(float(attrs.get(key, np.nan)) for key in COSTS)
 
 
 def _scores(
@@ -276,10 +234,7 @@ def _scores(
     *,
     is_covered: bool,
 ) -> dict[str, Floats]:
-    """Return discrepancies of estimates, shape (results, elements), by simulator and metric.
-
-    Designs that do not cover the estimates grow temporarily, unless ``is_covered``.
-    """
+    """Return discrepancies of estimates, shape (results, elements), by simulator and metric."""
     evaluator = Evaluator.of(model)
     if metrics is None and evaluator.responses_per_theta:
         return {}  # scores that were not requested compute no response
@@ -293,40 +248,29 @@ def _scores(
         for k, simulator in enumerate(evaluator.simulators):
             is_supported = np.array([simulator.name not in short for short in lacking])
             prefix = f"{simulator.name} " if several else ""
-            for metric in _default_metrics(simulator) if metrics is None else metrics:
+            default: Sequence[Metric] = _METRICS
+            if simulator.is_emulated:  # its log-likelihood replaces the kernel form
+                default = _METRICS[:-1]
+            if simulator.observed.ndim > 1:
+                default = [Joint(metric) for metric in default]  # the same in all directions
+            for metric in default if metrics is None else metrics:
                 target = metric.against(simulator.observed, simulator.weights)
-                values = _discrepancies(evaluator, thetas, k, target)
-                scores[f"{prefix}{_class_name(metric)}"] = np.where(is_supported, values, np.nan)
+                if simulator.is_emulated:
+                    values, weights = evaluator.populations(thetas, k)
+                    rows = range(len(thetas))
+                    totals = np.array([target.of(values[[i]], weights[[i]])[0] for i in rows])
+                else:
+                    totals = simulator.bound.discrepancies(evaluator.roots(thetas, k), target)
+                inner = getattr(metric, "metric", None)
+                name = type(metric).__name__
+                if isinstance(inner, Metric):
+                    name = f"{name}({type(inner).__name__})"
+                scores[f"{prefix}{name}"] = np.where(is_supported, totals, np.nan)
         for name, values in specimen_log_likelihoods(evaluator, thetas).items():
             prefix = f"{name} " if several else ""
             if values.size:
                 scores[f"{prefix}LogLikelihood by specimen"] = -values.mean(axis=1)
         return scores
-
-
-def _discrepancies(evaluator: Evaluator, thetas: Floats, k: int, target: Discrepancy) -> Floats:
-    """Return the discrepancies of the k-th simulator's populations from a target, (results,)."""
-    simulator = evaluator.simulators[k]
-    if not simulator.is_emulated:
-        return simulator.bound.discrepancies(evaluator.roots(thetas, k), target)
-    values, weights = evaluator.populations(thetas, k)
-    return np.array([target.of(values[[i]], weights[[i]])[0] for i in range(len(thetas))])
-
-
-def _default_metrics(simulator: PopulationSimulator) -> Sequence[Metric]:
-    """Return the metrics of all, or of several outputs the same in all directions.
-
-    A log-likelihood by specimen replaces the kernel form.
-    """
-    metrics = [m for m in _METRICS if not (simulator.is_emulated and m is _KERNEL)]
-    return [Joint(m) for m in metrics] if simulator.observed.ndim > 1 else metrics
-
-
-def _class_name(metric: Metric) -> str:
-    """Return the class of a metric, with that of its inner metric."""
-    inner = getattr(metric, "metric", None)
-    name = type(metric).__name__
-    return f"{name}({type(inner).__name__})" if isinstance(inner, Metric) else name
 
 
 def _thetas(evaluator: Evaluator, names: list[str], estimates: Floats) -> Floats | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
@@ -162,62 +162,98 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     >>> print(prb.diagnose(prb.minimize(model)))
     No problem was found.
     """
-    groups = set(result.children) if isinstance(result, xr.DataTree) else set()
-    if not isinstance(result, Optimum) and not groups & {"posterior", "optimum"}:
+    optimum = result if isinstance(result, Optimum) else None
+    tree = result.to_datatree() if isinstance(result, Optimum) else result
+    groups = set(tree.children) if isinstance(tree, xr.DataTree) else set()
+    if not groups & {"posterior", "optimum"}:
         raise TypeError(
             f"diagnose: result: got {type(result).__name__}, expected an Optimum from "
             "prb.minimize, or a DataTree with a posterior group, such as prb.sample_smc returns"
         )
+    has_draws = "posterior" in groups
+    calibration = tree["calibration"].to_dataset() if "calibration" in groups else xr.Dataset()
+    if has_draws and not calibration:
+        model = model_on_context(model, "prb.diagnose")
     if model is not None:
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
-    if isinstance(result, Optimum):
-        return _diagnose_optimum(result)
-    if "posterior" not in groups:
-        return _diagnose_stored_optimum(result)
-    return _diagnose_draws(result, model)
+    by_specimen = "is_likelihood" in calibration and bool(calibration["is_likelihood"].all())
+    evaluator = None if optimum is None else optimum.evaluator
+    thetas = None if optimum is None else optimum.theta[None]
+    # A model that was built again does not have the designs of draws with their calibration.
+    if has_draws and model is not None and (by_specimen or not calibration):
+        evaluator = Evaluator.of(model)
+        by_specimen = not evaluator.nodes
+        thetas = _thetas(tree["posterior"], evaluator)
+    coverage: _Coverage = {}
+    if has_draws and calibration:
+        coverage = _stored_coverage(calibration)
+    elif evaluator is not None and thetas is not None:
+        coverage = _computed_coverage(evaluator, thetas)
+    attrs = tree["posterior" if has_draws else "optimum"].attrs
+    findings = from_json(str(attrs.get("findings", "[]")))  # of the run that made the result
+    if has_draws:
+        checked = _check_sampler(tree, model, by_specimen=by_specimen)
+        reason = "refits need an optimum; look at prb.diagnose of prb.minimize"
+    else:
+        checked = _check_convergence(attrs, findings)
+        reason = "refits need the model; pass the Optimum itself"
+    if not by_specimen:
+        checked += _not_tested(reason) if optimum is None else _check_family(optimum)
+    elif optimum is not None:
+        checked += check_optimum(optimum)
+    elif has_draws:
+        maximum = None
+        if evaluator is not None and thetas is not None:
+            sizes = tree["posterior"].sizes
+            thetas = thetas.reshape(sizes["chain"], sizes["draw"], -1)
+            if simulation_obstacle(evaluator) is None:
+                maximum = find_optimum(evaluator, Minimisation())
+        checked += check_draws(evaluator, tree, thetas, maximum)
+    else:
+        text = "The family of the population was not tested: that needs the model; pass the "
+        checked += Checked(untested=(f"{text}Optimum itself.",))
+    lost = _stored_shares(calibration, "lost_mass") or {
+        name: float(support["lost_mass"].mean()) for name, (support, _) in coverage.items()
+    }
+    failures, harmless = _failure_findings(tree, lost, _stored_shares(calibration, "failed_mass"))
+    compared = [Finding("outputs-compared", sentence) for sentence in compared_in(calibration)]
+    return Diagnosis(
+        (*findings, *checked.findings, *failures, *_unsupported(coverage)),
+        _as_dataset(coverage),
+        (*compared, *_specimens_left_out(lost), *harmless, *checked.remarks),
+        checked.untested,
+    )
 
 
 # -- optima ----------------------------------------------------------------------------------
 
 
-def _diagnose_optimum(optimum: Optimum) -> Diagnosis:
-    evaluator = optimum.evaluator
-    checked = Checked()
-    misfit: list[Finding] = []
-    if evaluator.nodes:
-        misfit, remarks = _check_family(optimum)
-    else:
-        checked = check_optimum(optimum)
-        remarks = checked.remarks
-    findings = [*optimum.findings, *small_simulators(evaluator), *misfit]
-    if not (optimum.converged or optimum.search.at_edge or optimum.search.stopped):
-        findings.append(_not_converged(optimum.message))
-    designs = _computed_coverage(evaluator, optimum.theta[None])
-    lost, failed = (
-        {name: support[key] for name, support in optimum.support.items()}
-        for key in ("lost_mass", "failed_mass")
-    )
-    failures, harmless = _failure_findings(optimum.failures, lost, failed)
-    findings += [*checked.findings, *failures, *_unsupported(designs)]
-    remarks = (
-        *_compared_outputs(optimum.to_datatree()),
-        *_specimens_left_out(lost),
-        *harmless,
-        *remarks,
-    )
-    return Diagnosis(tuple(findings), designs.support, remarks, checked.untested)
+def _check_convergence(attrs: Mapping[Any, Any], findings: Sequence[Finding]) -> Checked:
+    """Report an optimiser that did not converge, unless a finding explains it."""
+    is_at_edge = any(finding.code == "flat-edge" for finding in findings)
+    if attrs.get("converged", True) or attrs.get("stopped") or is_at_edge:
+        return Checked()
+    reason = str(attrs.get("message", "")).removesuffix(".")
+    text = f"The optimiser did not converge ({reason}); try another start or method."
+    return Checked((Finding("not-converged", text, "choose.md#optimiser-or-sampler"),))
 
 
-def _check_family(optimum: Optimum) -> tuple[list[Finding], tuple[Finding, ...]]:
-    """Test whether the data can come from the best population, or return why it was not tested."""
+def _not_tested(reason: str) -> Checked:
+    text = f"Whether the inputs have the right family was not looked at: {reason}."
+    return Checked(remarks=(Finding("population-not-tested", text),))
+
+
+def _check_family(optimum: Optimum) -> Checked:
+    """Test whether the data can come from the best population, or report why it was not tested."""
     evaluator = optimum.evaluator
+    checked = Checked(tuple(small_simulators(evaluator)))
     obstacle = refit_obstacle(evaluator)
     if not optimum.converged or optimum.search.at_edge or optimum.search.at_jump:
-        return [], _not_tested("nothing is known of the sampling distribution of this optimum")
+        obstacle = "nothing is known of the sampling distribution of this optimum"
+    elif obstacle is None and evaluator.responses_per_theta:
+        obstacle = "it would take responses"
     if obstacle is not None:
-        return [], _not_tested(obstacle)
-    if evaluator.responses_per_theta:
-        return [], _not_tested("it would take responses")
+        return checked + _not_tested(obstacle)
     fitted: FittedSets | None
     if optimum.search.prior:
         scales = np.array(list(optimum.scales.values()))
@@ -227,76 +263,37 @@ def _check_family(optimum: Optimum) -> tuple[list[Finding], tuple[Finding, ...]]
         fitted = FittedSets.of(optimum.sampling(), SETS, 0)
     p_value = np.nan if fitted is None else fitted.p_value
     if fitted is None or np.isnan(p_value):
-        return [], _not_tested("the data tell too little, or too few refits converge")
+        return checked + _not_tested("the data tell too little, or too few refits converge")
     misfits = tuple(output_misfits(fitted)) if p_value < UNLIKELY else ()
-    return population_misfit(p_value, with_prior=optimum.search.prior), misfits
+    misfit = population_misfit(p_value, with_prior=optimum.search.prior)
+    return checked + Checked(tuple(misfit), misfits)
 
 
-def _compared_outputs(result: xr.DataTree) -> tuple[Finding, ...]:
-    """Report outputs that are compared by components or projections."""
-    if "calibration" not in result:
-        return ()
-    sentences = compared_in(result["calibration"].to_dataset())
-    return tuple(Finding("outputs-compared", sentence) for sentence in sentences)
+# -- responses -------------------------------------------------------------------------------
 
 
-def _not_tested(reason: str) -> tuple[Finding, ...]:
-    return (
-        Finding(
-            "population-not-tested",
-            f"Whether the inputs have the right family was not looked at: {reason}.",
-        ),
-    )
-
-
-def _diagnose_stored_optimum(result: xr.DataTree) -> Diagnosis:
-    attrs = result["optimum"].attrs
-    findings = [*_stored_findings(attrs)]
-    if not attrs.get("converged", True) and not attrs.get("stopped"):
-        findings.append(_not_converged(str(attrs.get("message", ""))))
-    failures, harmless = _stored_failures(result)
-    findings += failures
-    remarks = (*_compared_outputs(result), *_specimens_left_out(_stored_share(result)), *harmless)
-    untested: tuple[str, ...] = ()
-    if _is_by_specimen(result):
-        untested = (
-            "The family of the population was not tested: that needs the model; pass the Optimum "
-            "itself.",
-        )
-    else:
-        remarks += _not_tested("refits need the model; pass the Optimum itself")
-    return Diagnosis(tuple(findings), xr.Dataset(), remarks, untested)
-
-
-def _is_by_specimen(result: xr.DataTree) -> bool:
-    """Return whether all simulators of a result have the log-likelihood by specimen."""
-    if "calibration" not in result or "is_likelihood" not in result["calibration"]:
-        return False
-    return bool(result["calibration"].to_dataset()["is_likelihood"].values.all())
-
-
-def _stored_findings(attrs: Mapping[Any, Any]) -> tuple[Finding, ...]:
-    """Return the findings of the run that made a result."""
-    return from_json(str(attrs.get("findings", "[]")))
-
-
-def _stored_failures(result: xr.DataTree) -> tuple[list[Finding], list[Finding]]:
-    if "failures" not in result.children:
-        return [], []
-    failures = result["failures"].to_dataset()
-    return _failure_findings(failures, _stored_share(result), _stored_share(result, "failed_mass"))
+def _stored_shares(calibration: xr.Dataset, key: str) -> dict[str, float]:
+    """Return the share without response, or that fails, at the optimum or over the draws."""
+    if key not in calibration:
+        return {}
+    shares = calibration[key].transpose("simulator", ...).values
+    rows = [row[~np.isnan(row)] for row in shares.reshape(len(shares), -1)]
+    means = np.array([row.mean() if row.size else np.nan for row in rows])
+    if f"{key}_at_best" in calibration:
+        means = np.where(np.isnan(means), calibration[f"{key}_at_best"].values, means)
+    names = calibration["simulator"].values.tolist()
+    return dict(zip(names, means.tolist(), strict=True))
 
 
 def _failure_findings(
-    failures: xr.Dataset, lost: Mapping[str, float], failed: Mapping[str, float]
+    tree: xr.DataTree, lost: Mapping[str, float], failed: Mapping[str, float]
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return findings about failed responses by simulator: those that matter, and harmless ones.
-
-    Failures are harmless if they have next to no weight in the populations of the answer, by the
-    shares without response, ``lost``, and of specimens that fail, ``failed``.
-    """
+    """Return findings about failed responses that matter to the answer, and harmless ones."""
     findings: list[Finding] = []
     harmless: list[Finding] = []
+    if "failures" not in tree.children:
+        return findings, harmless
+    failures = tree["failures"].to_dataset()
     names = failures["simulator"].values
     for name in dict.fromkeys(names.tolist()):
         rows = failures.isel(failure=np.flatnonzero(names == name))
@@ -316,175 +313,93 @@ def _failure_findings(
             text += "the populations of the answer have next to no specimens there."
             harmless.append(Finding("harmless-failures", text))
             continue
-        findings.append(
-            Finding(
-                "failed-responses",
-                f"{text}what took its place is no result. Look at optimum.failures, or the group "
-                "failures of a result, and repair the response.",
-                "expensive.md#when-a-run-fails",
-            )
+        text += (
+            "what took its place is no result. Look at optimum.failures, or the group failures of "
+            "a result, and repair the response."
         )
+        page = "expensive.md#when-a-run-fails"
+        findings.append(Finding("failed-responses", text, page))
     return findings, harmless
 
 
-def _specimens_left_out(lost: Mapping[str, float]) -> tuple[Finding, ...]:
+def _specimens_left_out(lost: Mapping[str, float]) -> list[Finding]:
     """Report the share of the populations without response, and its consequence."""
-    return tuple(
+    page = "distributed.md#when-a-response-fails"
+    return [
         Finding(
             "specimens-left-out",
             f"{name}: {share:.1%} of specimens {NO_RESPONSE}: the population compared is that of "
             "the others. A response that returns +inf counts as a specimen that failed, and "
             "on_failure=prb.response.Abort(on_nan=True) refuses NaN.",
-            "distributed.md#when-a-response-fails",
+            page,
         )
         for name, share in lost.items()
         if share >= SMALLEST_SHARE
-    )
-
-
-def _stored_share(result: xr.DataTree, key: str = "lost_mass") -> dict[str, float]:
-    """Return the share without response, or that fails, at the optimum or over the draws."""
-    if "calibration" not in result or key not in result["calibration"]:
-        return {}
-    calibration = result["calibration"].to_dataset()
-    shares = calibration[key].transpose("simulator", ...).values
-    rows = [row[~np.isnan(row)] for row in shares.reshape(len(shares), -1)]
-    means = np.array([row.mean() if row.size else np.nan for row in rows])
-    if f"{key}_at_best" in calibration:
-        means = np.where(np.isnan(means), calibration[f"{key}_at_best"].values, means)
-    names = calibration["simulator"].values.tolist()
-    return dict(zip(names, means.tolist(), strict=True))
-
-
-def _not_converged(message: str) -> Finding:
-    reason = message.removesuffix(".")
-    return Finding(
-        "not-converged",
-        f"The optimiser did not converge ({reason}); try another start or method.",
-        "choose.md#optimiser-or-sampler",
-    )
+    ]
 
 
 # -- draws -----------------------------------------------------------------------------------
 
 
-def _diagnose_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
-    posterior = result["posterior"]
+def _check_sampler(tree: xr.DataTree, model: pm.Model | None, *, by_specimen: bool) -> Checked:
+    """Report chains that disagree, dependent or repeated draws, and particles that are stuck."""
+    posterior = tree["posterior"]
     variables = posterior.to_dataset()
-    evaluator, thetas = None, None
-    if "calibration" in result:
-        # A model that was built again does not have the designs of these draws yet.
-        designs = _stored_coverage(result["calibration"].to_dataset())
-        is_by_specimen = _is_by_specimen(result)
-        if model is not None and is_by_specimen:
-            evaluator = Evaluator.of(model)
-            thetas = _thetas(posterior, evaluator)
-    else:
-        model = model_on_context(model, "prb.diagnose")
-        require_of_model(result, model, "diagnose", Level.OPTIMUM)
-        evaluator = Evaluator.of(model)
-        thetas = _thetas(posterior, evaluator)
-        designs = _computed_coverage(evaluator, thetas)
-        is_by_specimen = not evaluator.nodes
     if model is not None:
         variables = variables[[str(rv.name) for rv in model.free_RVs]]
-    checked = Checked()
     modes: tuple[Finding, ...] = ()
-    if is_by_specimen:
-        shape = (posterior.sizes["chain"], posterior.sizes["draw"], -1)
-        optimum = None
-        if evaluator is not None and thetas is not None:
-            thetas = thetas.reshape(shape)
-            if simulation_obstacle(evaluator) is None:
-                optimum = find_optimum(evaluator, Minimisation())
-        checked = check_draws(evaluator, result, thetas, optimum)
-        columns = _columns(variables)
+    if by_specimen:
+        columns = {}
+        for name, values in variables.data_vars.items():
+            table = values.transpose("chain", "draw", ...).values
+            flat = table.reshape(*table.shape[:2], -1)
+            for j in range(flat.shape[-1]):
+                columns[f"{name}[{j}]" if values.ndim > 2 else str(name)] = flat[..., j]
         modes = separate_modes(np.stack(list(columns.values()), axis=-1), list(columns))
-    failures, harmless = _stored_failures(result)
-    findings = [*_stored_findings(posterior.attrs), *modes]
+    findings = list(modes)
     # Chains in different modes have a large R-hat; ArviZ gives NaN for shorter chains.
     if not modes and posterior.sizes["draw"] >= 4:
         findings += _convergence(variables)
-    findings += [
-        *_repeated_draws(variables),
-        *_particles_stuck(result),
-        *failures,
-        *_unsupported(designs),
-        *checked.findings,
-    ]
-    lost = _stored_share(result) or {
-        name: float(designs.support["lost_mass"].sel(simulator=name).mean())
-        for name in designs.needs
-    }
-    remarks = (
-        *_compared_outputs(result),
-        *_specimens_left_out(lost),
-        *harmless,
-        *checked.remarks,
-    )
-    if not is_by_specimen:
-        remarks += _kernel_width(posterior.attrs)
-        remarks += _not_tested("refits need an optimum; look at prb.diagnose of prb.minimize")
-    return Diagnosis(tuple(findings), designs.support, remarks, checked.untested)
-
-
-def _columns(variables: xr.Dataset) -> dict[str, Floats]:
-    """Return the draws of each element, (chains, draws)."""
-    columns = {}
-    for name, values in variables.data_vars.items():
-        table = values.transpose("chain", "draw", ...).values
-        flat = table.reshape(*table.shape[:2], -1)
-        for j in range(flat.shape[-1]):
-            columns[f"{name}[{j}]" if values.ndim > 2 else str(name)] = flat[..., j]
-    return columns
-
-
-def _kernel_width(attrs: Mapping[Any, Any]) -> tuple[Finding, ...]:
-    """Report that epsilon sets the width of the draws."""
-    # A bootstrap has no epsilon.
-    if str(attrs.get("adjustment", "none")) != "none" or "converged" in attrs:
-        return ()
-    return (
-        Finding(
-            "width-of-epsilon",
+    findings += [*_repeated_draws(variables), *_particles_stuck(tree)]
+    remarks: tuple[Finding, ...] = ()
+    is_adjusted = posterior.attrs.get("adjustment", "none") != "none"
+    is_bootstrap = "converged" in posterior.attrs  # without an epsilon
+    if not (by_specimen or is_adjusted or is_bootstrap):
+        text = (
             "The draws are those of exp(-discrepancy / epsilon), as wide as epsilon makes them; "
-            "prb.sample draws the posterior given the estimate.",
-            "choose.md#epsilon-and-the-width-of-the-posterior",
-        ),
-    )
+            "prb.sample draws the posterior given the estimate."
+        )
+        page = "choose.md#epsilon-and-the-width-of-the-posterior"
+        remarks = (Finding("width-of-epsilon", text, page),)
+    return Checked(tuple(findings), remarks)
 
 
 def _convergence(posterior: xr.Dataset) -> list[Finding]:
     """Report large R-hat and small effective sample sizes (Vehtari et al. 2021)."""
     chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    page = "validity.md#diagnostics-of-the-sampler"
     findings = []
     limit = max(1.01, 1 + _NOISE / (chains * draws))
     rhats = _by_element("rhat", posterior) if chains > 1 else {}
     listed = ", ".join(f"{rhat:.2f} for {name}" for name, rhat in rhats.items() if rhat > limit)
     if listed:
-        findings.append(
-            Finding(
-                "chains-disagree",
-                f"R-hat is {listed}, expected at most {limit:.2f}: the chains disagree, look at "
-                "az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; "
-                "if the chains sit in separate modes, state a prior that excludes one.",
-                "validity.md#diagnostics-of-the-sampler",
-            )
+        text = (
+            f"R-hat is {listed}, expected at most {limit:.2f}: the chains disagree, look at "
+            "az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; if "
+            "the chains sit in separate modes, state a prior that excludes one."
         )
+        findings.append(Finding("chains-disagree", text, page))
     total = chains * draws
     # For R-hat and ESS themselves to be reliable; of few draws a quarter.
     needed = min(400, 0.25 * total)
     sizes = _by_element("ess", posterior)
     listed = ", ".join(f"{size:.0f} for {name}" for name, size in sizes.items() if size < needed)
     if listed:
-        findings.append(
-            Finding(
-                "few-independent-draws",
-                f"The effective sample size is {listed} of {total} draws: "
-                "too few for means and intervals. Pass more draws.",
-                "validity.md#diagnostics-of-the-sampler",
-            )
+        text = (
+            f"The effective sample size is {listed} of {total} draws: too few for means and "
+            "intervals. Pass more draws."
         )
+        findings.append(Finding("few-independent-draws", text, page))
     return findings
 
 
@@ -513,16 +428,12 @@ def _repeated_draws(draws: xr.Dataset) -> list[Finding]:
     if not few:
         return []
     chains = "chains" if len(few) > 1 else "chain"
-    return [
-        Finding(
-            "repeated-draws",
-            f"Of {draws.sizes['draw']} draws only {min(counts)} differ in {chains} "
-            f"{', '.join(few)}, expected at least {expected}: few particles, or one, survived, and "
-            "the width of the draws means nothing. Pass more draws, priors nearer to the data, or "
-            "a larger epsilon.",
-            "validity.md#diagnostics-of-the-sampler",
-        )
-    ]
+    text = (
+        f"Of {draws.sizes['draw']} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
+        f"expected at least {expected}: few particles, or one, survived, and the width of the "
+        "draws means nothing. Pass more draws, priors nearer to the data, or a larger epsilon."
+    )
+    return [Finding("repeated-draws", text, "validity.md#diagnostics-of-the-sampler")]
 
 
 def _particles_stuck(result: xr.DataTree) -> list[Finding]:
@@ -547,15 +458,12 @@ def _particles_stuck(result: xr.DataTree) -> list[Finding]:
             f"The discrepancy is too noisy{reason}, or epsilon too small: use prb.Reweighted or "
             "prb.Resimulated instead of prb.Fresh, or pass a larger n or epsilon"
         )
-    return [
-        Finding(
-            "particles-stuck",
-            f"Particles hardly moved in the last stage of {chains} {', '.join(stuck)} "
-            f"({min(last):.2f} accepted steps per particle, expected at least 1), "
-            f"so that many draws are the same. {cure}.",
-            "validity.md#diagnostics-of-the-sampler",
-        )
-    ]
+    text = (
+        f"Particles hardly moved in the last stage of {chains} {', '.join(stuck)} ({min(last):.2f} "
+        "accepted steps per particle, expected at least 1), so that many draws are the same. "
+        f"{cure}."
+    )
+    return [Finding("particles-stuck", text, "validity.md#diagnostics-of-the-sampler")]
 
 
 def _thetas(posterior: Any, evaluator: Evaluator) -> Floats:
@@ -569,60 +477,51 @@ def _thetas(posterior: Any, evaluator: Evaluator) -> Floats:
 
 # -- designs ---------------------------------------------------------------------------------
 
-
-@dataclass(frozen=True, eq=False)
-class _Coverage:
-    """How designs cover the populations of a result, and what they need."""
-
-    support: xr.Dataset  # with the dimensions simulator and sample
-    needs: dict[str, tuple[float, float, int]]  # weight ESS, largest lost mass, number of points
-
-    @classmethod
-    def of(
-        cls, values: Mapping[str, Mapping[str, Floats]], needs: dict[str, tuple[float, float, int]]
-    ) -> _Coverage:
-        """Return the record of values by simulator and key."""
-        variables = {}
-        if values:
-            for key in _SUPPORT:
-                stacked = np.array([support[key] for support in values.values()])
-                variables[key] = (["simulator", "sample"], stacked)
-        return cls(xr.Dataset(variables, coords={"simulator": list(values)}), needs)
+# By simulator with a design: its support of the populations of a result, arrays of one shape; and
+# what it needs, weight ESS, largest lost mass and number of points.
+_Coverage = dict[str, tuple[dict[str, Floats], tuple[float, float, int]]]
 
 
 def _computed_coverage(evaluator: Evaluator, thetas: Floats) -> _Coverage:
     """Return the coverage by the designs as they are now."""
-    needs = {
-        name: (bound.required_ess, bound.max_lost, bound.n_points)
+    support = evaluator.support(thetas)
+    return {
+        name: (support[name], (bound.required_ess, bound.max_lost, bound.n_points))
         for name, bound in evaluator.reweighted.items()
     }
-    return _Coverage.of(evaluator.support(thetas), needs)
 
 
 def _stored_coverage(calibration: xr.Dataset) -> _Coverage:
     """Return the coverage by the designs when the sampler ran."""
-    needs, values = {}, {}
+    coverage = {}
     for k, name in enumerate(map(str, calibration["simulator"].values.tolist())):
         row = calibration.isel(simulator=k)
         if not np.isnan(row["required_ess"]):
             ess, lost, n = (float(row[key]) for key in ("required_ess", "max_lost", "n_points"))
-            needs[name] = (ess, lost, int(n))
-            values[name] = {
-                key: row[key].transpose("chain", "draw").values.ravel() for key in _SUPPORT
-            }
-    return _Coverage.of(values, needs)
+            support = {key: row[key].transpose("chain", "draw").values.ravel() for key in _SUPPORT}
+            coverage[name] = (support, (ess, lost, int(n)))
+    return coverage
 
 
-def _unsupported(designs: _Coverage) -> list[Finding]:
+def _as_dataset(coverage: _Coverage) -> xr.Dataset:
+    """Return the support of the populations with the dimensions simulator and sample."""
+    variables = {}
+    if coverage:
+        for key in _SUPPORT:
+            values = np.array([support[key] for support, _ in coverage.values()])
+            variables[key] = (["simulator", "sample"], values)
+    return xr.Dataset(variables, coords={"simulator": list(coverage)})
+
+
+def _unsupported(coverage: _Coverage) -> list[Finding]:
     """Report designs that do not support the answer."""
     findings = []
-    for name, needs in designs.needs.items():
-        support = {key: designs.support[key].sel(simulator=name).values for key in _SUPPORT}
+    for name, (support, needs) in coverage.items():
         lacking = shortcoming(support, *needs, ENOUGH)
         if not lacking:
             continue
         text = f"{name}: the design does not support the answer: {lacking}. "
-        if lacking.lost is not None:
+        if lacking.is_lost:
             # More points would have no more responses.
             text += (
                 "Repair the response there, return +inf for specimens that fail, narrow the "

@@ -21,7 +21,6 @@ from prbayes._validate import Floats, Seed, flag, plain_text, positive_integer, 
 from prbayes.model.description import versions
 from prbayes.model.emulated import (
     EmulatedResponse,
-    EmulatedSimulator,
     PopulationSimulator,
     population_simulators,
 )
@@ -41,7 +40,7 @@ from prbayes.propagation.importance import new_specimens
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.failures import Abort, ResponseError
-from prbayes.response.inputs import Inputs, is_group, model_on_context, read_inputs
+from prbayes.response.inputs import is_group, model_on_context, read_inputs
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
 
@@ -187,9 +186,9 @@ def predict(
     simulator = serving(simulators, responses) if stored else None
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, np.random.default_rng(seed))
-    allowed = [s.max_lost for s in simulators] if max_lost is None else [max_lost]
-    missing = _count_missing(label, drawn.values, max(allowed, default=MAX_LOST))
-    _report_rough_emulator(label, drawn)
+    if max_lost is None:
+        max_lost = max((s.max_lost for s in simulators), default=MAX_LOST)
+    missing = _check_responses(label, drawn, max_lost)
     n_computed = responses.count - n_stored + sum(s.responses.count for s in simulators)
     attrs = {
         "source": drawn.source,
@@ -242,32 +241,29 @@ def populations_of(
 ) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
     """Return the free variables, (k, *shape), at evenly thinned draws, and their coordinates."""
     names = [str(rv.name) for rv in model.free_RVs]
+    values: Any
     if isinstance(result, Optimum):
-        _require_variables(result.point, names, caller)
-        points = {n: np.asarray(result.point[n], dtype=np.float64)[None] for n in names}
-        return points, {"chain": np.arange(1), "draw": np.arange(1)}
-    if not isinstance(result, xr.DataTree) or "posterior" not in result:
+        values = result.point
+    elif not isinstance(result, xr.DataTree) or "posterior" not in result:
         raise TypeError(
             f"{caller}: got {type(result).__name__}, expected an Optimum from prb.minimize, or a "
             "DataTree with a posterior group, such as prb.sample_smc returns"
         )
-    posterior = result["posterior"].to_dataset()
-    size = posterior.sizes["draw"]
-    by_chain = max(1, draws // posterior.sizes["chain"])
-    rows = np.linspace(0, size - 1, min(size, by_chain)).round().astype(int)
-    thinned = posterior.isel(draw=np.unique(rows))
-    _require_variables(thinned, names, caller)
-    coords = {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
-    return finite_draws(thinned, names), coords
-
-
-def _require_variables(values: Any, names: list[str], caller: str) -> None:
-    """Raise if a result lacks a free variable of the model."""
+    else:
+        posterior = result["posterior"].to_dataset()
+        size = posterior.sizes["draw"]
+        by_chain = max(1, draws // posterior.sizes["chain"])
+        rows = np.linspace(0, size - 1, min(size, by_chain)).round().astype(int)
+        values = posterior.isel(draw=np.unique(rows))
     missing = [name for name in names if name not in values]
     if missing:
         raise KeyError(
             f"{caller}: got a result without {missing}, expected the model's free variables {names}"
         )
+    if isinstance(result, Optimum):
+        points = {name: np.asarray(values[name], dtype=np.float64)[None] for name in names}
+        return points, {"chain": np.arange(1), "draw": np.arange(1)}
+    return finite_draws(values, names), {dim: np.asarray(values[dim]) for dim in ("chain", "draw")}
 
 
 # -- responses -------------------------------------------------------------------------------------
@@ -302,17 +298,23 @@ def _predicted(
     results: list[_Predicted] = []
     emulated: EmulatedResponse | None = None
     for group_points in by_group:
+        if simulator is not None and not simulator.is_emulated:
+            results.append(_resampled_responses(simulator, responses, group_points, n, rng))
+            continue
+        roots = [group_points[str(rv.name)] for rv in inputs.roots]
+        specimens, epistemic = new_specimens(responses.name, inputs, roots, n, rng)
         if simulator is None:
-            roots = [group_points[str(rv.name)] for rv in inputs.roots]
-            specimens, epistemic = new_specimens(responses.name, inputs, roots, n, rng)
             values = responses(specimens, epistemic)
             results.append(_Predicted(values, specimens, "new specimens"))
-        elif simulator.is_emulated:
-            roots = [group_points[str(rv.name)] for rv in inputs.roots]
-            emulated = emulated or simulator.emulator(responses)
-            results.append(_emulated_responses(simulator, emulated, responses, roots, n, rng))
-        else:
-            results.append(_resampled_responses(simulator, responses, group_points, n, rng))
+            continue
+        emulated = emulated or simulator.emulator(responses)
+        values = emulated([x.reshape(-1, *x.shape[2:]) for x in specimens])
+        values = values.reshape(len(roots[0]), n, *emulated.event)
+        runs = len(emulated.z)
+        source = f"an interpolant through {runs} runs at those of {simulator.name}"
+        if responses.same_as(simulator.responses):
+            source = f"the emulator of {simulator.name} ({runs} runs)"
+        results.append(_Predicted(values, specimens, f"new specimens, by {source}", emulated.error))
     if len(results) == 1:
         return results[0]
     specimens = [x for result in results for x in result.specimens]
@@ -320,8 +322,9 @@ def _predicted(
     return replace(results[0], values=values, specimens=specimens)
 
 
-def _count_missing(label: str, values: Floats, max_lost: float) -> int:
-    """Return and report the number of responses that are NaN; raise if there are too many."""
+def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
+    """Report a rough emulator; return and report the number of NaN, or raise if it is large."""
+    values, error = drawn.values, drawn.error
     is_nan = is_missing(values.reshape(-1, *values.shape[2:]))
     missing = int(is_nan.sum())
     if missing == is_nan.size:
@@ -339,6 +342,18 @@ def _count_missing(label: str, values: Floats, max_lost: float) -> int:
     if missing:
         text = f"{label}: {missing} of {is_nan.size} predicted responses are NaN."
         report(Finding("missing-predictions", text))
+    if error is not None:
+        flat = values.reshape(-1, error.size)
+        is_finite = np.isfinite(flat).all(axis=1)
+        spread = flat[is_finite].std(axis=0) if is_finite.any() else np.full(error.shape, np.nan)
+        share = float(np.max(error / np.where(spread > 0, spread, np.inf)))
+        if share > 0.05:
+            text = (
+                f"{label}: the interpolant between runs has an error of {share:.0%} of the "
+                "standard deviation of the predicted responses; pass stored=False, which computes "
+                "the response at new specimens."
+            )
+            report(Finding("rough-prediction", text, "likelihood.md#predictions"))
     return missing
 
 
@@ -353,64 +368,18 @@ def known_outputs(
 def serving(
     simulators: Sequence[PopulationSimulator], responses: Responses
 ) -> PopulationSimulator | None:
-    """Return the simulator with specimens of these inputs, if any, best with this response."""
-    able = [simulator for simulator in simulators if _serves(simulator, responses.inputs)]
-    for simulator in able:
-        if responses.same_as(simulator.responses):
-            return simulator
-    return able[0] if able else None
-
-
-def _serves(simulator: PopulationSimulator, inputs: Inputs) -> bool:
-    """Return whether a simulator has stored or emulated specimens with all of these inputs."""
-    if not simulator.has_specimens or inputs.epistemic:
-        return False
-    aleatory = simulator.inputs.aleatory
-    return all(any(x is y for y in aleatory) for x in inputs.aleatory)
-
-
-def _emulated_responses(
-    simulator: EmulatedSimulator,
-    emulated: EmulatedResponse,
-    responses: Responses,
-    roots: list[Floats],
-    n: int,
-    rng: np.random.Generator,
-) -> _Predicted:
-    """Return emulated responses of n new specimens for each population."""
-    specimens, _ = new_specimens(responses.name, responses.inputs, roots, n, rng)
-    flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
-    values = emulated(flat).reshape(len(roots[0]), n, *emulated.event)
-    runs = len(emulated.z)
-    if responses.same_as(simulator.responses):
-        source = f"new specimens, by the emulator of {simulator.name} ({runs} runs)"
-    else:
-        source = (
-            f"new specimens, by an interpolant through {runs} runs at those of {simulator.name}"
-        )
-    return _Predicted(values, specimens, source, emulated.error)
-
-
-def _report_rough_emulator(label: str, drawn: _Predicted) -> None:
-    """Report an emulator with an error above 5 % of the scatter of the predicted responses."""
-    if drawn.error is None:
-        return
-    flat = drawn.values.reshape(-1, drawn.error.size)
-    is_finite = np.isfinite(flat).all(axis=1)
-    spread = np.full(drawn.error.shape, np.nan)
-    if is_finite.any():
-        spread = flat[is_finite].std(axis=0)
-    share = float(np.max(drawn.error / np.where(spread > 0, spread, np.inf)))
-    if share > 0.05:
-        report(
-            Finding(
-                "rough-prediction",
-                f"{label}: the interpolant between runs has an error of {share:.0%} of the "
-                "standard deviation of the predicted responses; pass stored=False, which "
-                "computes the response at new specimens.",
-                "likelihood.md#predictions",
-            )
-        )
+    """Return the simulator with specimens of all these inputs, if any, best with this response."""
+    inputs = responses.inputs
+    if inputs.epistemic:
+        return None
+    able = []
+    for simulator in simulators:
+        aleatory = simulator.inputs.aleatory
+        has_inputs = all(any(x is y for y in aleatory) for x in inputs.aleatory)
+        if simulator.has_specimens and has_inputs:
+            able.append(simulator)
+    same = [simulator for simulator in able if responses.same_as(simulator.responses)]
+    return next(iter([*same, *able]), None)
 
 
 def _resampled_responses(
@@ -420,10 +389,7 @@ def _resampled_responses(
     n: int,
     rng: np.random.Generator,
 ) -> _Predicted:
-    """Return responses of n design points for each population, in random order.
-
-    Systematic resampling: the number of copies of a point is its weight times n, to one.
-    """
+    """Return responses of n design points for each population, by systematic resampling."""
     bound = node.reweighted
     assert bound is not None
     roots = [points[str(rv.name)] for rv in bound.inputs.roots]

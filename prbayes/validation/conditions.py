@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from prbayes._stats import cumulated
 from prbayes._validate import Floats, Seed, called, flag, real_array, sample_labels, seed_number
-from prbayes.metrics.base import Centered, Projection, View
+from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
 from prbayes.metrics.whitening import whitening
 from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
-from prbayes.response.outputs import Outputs, read_observed
+from prbayes.response.outputs import read_observed
 from prbayes.results.predict import specimen_names
 
 Predicted = xr.DataArray | NDArray[Any]
@@ -42,8 +42,12 @@ class Condition:
     labels: tuple[str, ...] | None  # of the specimens
     numbers: NDArray[np.intp]  # (n,): the specimens, counted over all conditions
     attributes: Mapping[Any, Any] = field(default_factory=dict)  # of the prediction
-    projection: View = field(default_factory=View)
+    projection: Projection | None = None
     group: int = 0  # values of a group have one ECDF; the number of a projection, else 0
+
+    def projected(self, responses: Any) -> Any:
+        """Return the projection of responses, (..., n) or (..., n, m) -> (..., n)."""
+        return responses if self.projection is None else self.projection.of(responses)
 
     @property
     def base_name(self) -> str:
@@ -156,7 +160,19 @@ def read_case(
             numbers=np.array([numbers.setdefault(key, len(numbers)) for key in keys], np.intp),
             attributes=simulated.attrs if isinstance(simulated, xr.DataArray) else {},
         )
-        conditions += [condition] if y.ndim == 1 else _projected(condition)
+        if y.ndim == 1:
+            conditions.append(condition)
+            continue
+        for k, projection in enumerate(projections(condition.predicted), start=1):
+            projected = replace(
+                condition,
+                name=f"{name}{DIRECTION}{k}",
+                observed=projection.of(y),
+                predicted=projection.of(condition.predicted),
+                projection=projection,
+                group=k,
+            )
+            conditions.append(projected)
     draws = [len(c.predicted) for c in conditions]
     if len(set(draws)) > 1:
         raise ValueError(
@@ -178,21 +194,6 @@ def read_case(
     )
 
 
-def _projected(condition: Condition) -> list[Condition]:
-    """Return a condition of one output for each projection of several."""
-    return [
-        replace(
-            condition,
-            name=f"{condition.name}{DIRECTION}{k}",
-            observed=projection.of(condition.measured),
-            predicted=projection.of(condition.predicted),
-            projection=projection,
-            group=k,
-        )
-        for k, projection in enumerate(projections(condition.predicted), start=1)
-    ]
-
-
 def projections(pool: Floats) -> list[Projection]:
     """Return projections of predicted outputs of all draws, shape (D, S, m).
 
@@ -206,51 +207,52 @@ def projections(pool: Floats) -> list[Projection]:
     # 4096 specimens determine correlations to .02; any directions give a test of the right size.
     sample = finite[:: -(-len(finite) // 4096)]
     outputs = np.arange(m)
-    white = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
-    centered = Centered(outputs, failure_caps(rows), white.center)
-    return [
-        Projection(centered, white.axes @ u)
-        for u in directions(m, max(1, sufficient_directions(m)), 0)
-    ]
+    center, axes = whitening(sample, np.full(len(sample), 1 / len(sample)), outputs)
+    caps, number = failure_caps(rows), max(1, sufficient_directions(m))
+    return [Projection(outputs, caps, center, axes @ u) for u in directions(m, number, 0)]
+
+
+def _names(values: Any) -> list[Any] | None:
+    """Return the names of the conditions in a mapping, or their numbers in a list."""
+    if isinstance(values, Mapping):
+        return list(values)
+    return list(range(len(values))) if isinstance(values, list | tuple) else None
 
 
 def _by_condition(observed: Any, predicted: Any, specimens: Any) -> list[tuple[str, Any, Any, Any]]:
     """Return name, observed, predicted and specimens of each condition."""
-    if isinstance(predicted, Mapping):
-        labels = {} if specimens is None else specimens  # some conditions may have none
-        for argument, given in (("observed", observed), ("specimens", labels)):
-            keys = set(given) if isinstance(given, Mapping) else None
-            is_right = keys is not None and keys <= set(predicted)
-            if not is_right or (argument == "observed" and keys != set(predicted)):
-                got = type(given).__name__ if keys is None else sorted(map(str, keys))
-                raise ValueError(
-                    f"{argument}: got {got}, expected a mapping with the conditions of predicted, "
-                    f"{[str(name) for name in predicted]}"
-                )
-        return [(str(k), observed[k], predicted[k], labels.get(k)) for k in predicted]
-    if isinstance(predicted, list | tuple):
-        n = len(predicted)
-        labels = [None] * n if specimens is None else specimens
-        for argument, given in (("observed", observed), ("specimens", labels)):
-            is_list = isinstance(given, list | tuple)
-            if not is_list or len(given) != n or not n:
-                got = f"{len(given)} conditions" if is_list else type(given).__name__
-                raise ValueError(
-                    f"{argument}: got {got}, expected a list with the {n} conditions of predicted; "
-                    "one prediction alone is an array"
-                )
-        return [(str(i), observed[i], predicted[i], labels[i]) for i in range(n)]
-    if isinstance(observed, Mapping):
-        raise ValueError(
-            f"predicted: got {type(predicted).__name__}, expected a mapping with the conditions of "
-            "observed"
-        )
-    name = getattr(predicted, "name", None)
-    return [(str(name) if name else "observed", observed, predicted, specimens)]
+    expected = _names(predicted)
+    is_mapping = isinstance(predicted, Mapping)
+    if expected is None:
+        if isinstance(observed, Mapping):
+            raise ValueError(
+                f"predicted: got {type(predicted).__name__}, expected a mapping with the "
+                "conditions of observed"
+            )
+        name = getattr(predicted, "name", None)
+        return [(str(name) if name else "observed", observed, predicted, specimens)]
+    for argument, given in (("observed", observed), ("specimens", specimens)):
+        if given is None and argument == "specimens":
+            continue
+        names = _names(given) if isinstance(given, Mapping) == is_mapping else None
+        # Some conditions of a mapping may have no labels.
+        is_partial = argument == "specimens" and is_mapping
+        keys = set(names or ())
+        if not keys or not keys <= set(expected) or (keys != set(expected) and not is_partial):
+            got = type(given).__name__
+            if names is not None:
+                got = str(sorted(map(str, names))) if is_mapping else f"{len(names)} conditions"
+            kind = "mapping" if is_mapping else "list"
+            raise ValueError(
+                f"{argument}: got {got}, expected a {kind} with the conditions of predicted, "
+                f"{list(map(str, expected))}; one prediction alone is an array"
+            )
+    labels = {} if specimens is None else specimens if is_mapping else dict(enumerate(specimens))
+    return [(str(k), observed[k], predicted[k], labels.get(k)) for k in expected]
 
 
 def _measured(name: str, values: Any, simulated: Any) -> Floats:
-    """Return measured values, shape (n,), or (n, m) of several outputs."""
+    """Return measured values, (n,), or (n, m) of several outputs in the order of predicted ones."""
     y, outputs = read_observed(name, values)
     if y.ndim not in (1, 2) or y.size == 0:
         raise ValueError(
@@ -263,12 +265,7 @@ def _measured(name: str, values: Any, simulated: Any) -> Floats:
             f"{name}: observed: got {n_bad} NaN or -inf among {y.size} values, expected numbers; "
             "leave missing specimens out, and give those that had failed as +inf"
         )
-    return _in_order_of(name, y, outputs, simulated) if y.ndim > 1 else y
-
-
-def _in_order_of(name: str, y: Floats, outputs: Outputs, simulated: Any) -> Floats:
-    """Return measured outputs, (n, m), in the order of predicted ones, if both have names."""
-    if not isinstance(simulated, xr.DataArray):
+    if y.ndim == 1 or not isinstance(simulated, xr.DataArray):
         return y
     dims = [dim for dim in simulated.dims if dim not in _SAMPLE_DIMS]
     if len(dims) != 1 or dims[0] not in simulated.coords:
@@ -357,21 +354,16 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
                 f"{caller}: {name}: observed: got shape {values.shape}, expected ({expected}): a "
                 "value for each specimen and output"
             )
-        samples = prediction.values.reshape(-1, prediction.sizes["sample"], *event)
-        if not event:
-            pairs.append(_comparable(str(name), values, samples))
-            continue
-        (dim,) = dims
-        labels = prediction[dim].values.tolist()
-        for j in map(round, np.linspace(0, event[0] - 1, min(event[0], 8)).tolist()):
-            pairs.append(_comparable(f"{name}[{labels[j]}]", values[:, j], samples[..., j]))
+        m = event[0] if event else 1
+        columns = values.reshape(-1, m)
+        samples = prediction.values.reshape(-1, prediction.sizes["sample"], m)
+        for j in map(round, np.linspace(0, m - 1, min(m, 8)).tolist()):
+            label = f"{name}[{prediction[dims[0]].values.tolist()[j]}]" if event else str(name)
+            # Panels are places in a tree, whose levels a slash separates.
+            label = label.replace("/", "\u2215")
+            measured = columns[~np.isnan(columns[:, j]), j]
+            pairs.append(Comparable(label, measured, samples[..., j]))
     return pairs
-
-
-def _comparable(name: str, measured: Floats, predicted: Floats) -> Comparable:
-    """Return an output without the values that were not measured."""
-    # Panels are places in a tree, whose levels a slash separates.
-    return Comparable(name.replace("/", "\u2215"), measured[~np.isnan(measured)], predicted)
 
 
 class Predictive:

@@ -240,9 +240,6 @@ def _digest(simulator: PopulationSimulator) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
-_CALLER = "rank"
-
-
 def rank(
     candidates: Mapping[str, Optimum | xr.Dataset],
     *,
@@ -343,7 +340,7 @@ def rank(
         n_missing = int(np.isnan(table["score"].values).sum())
         if n_missing:
             raise ValueError(
-                f"{_CALLER}: got {label} without a score of {n_missing} of "
+                f"rank: got {label} without a score of {n_missing} of "
                 f"{table.sizes['specimen']} specimens, expected one of each: the observed values "
                 "have no density, as where all are equal, or the population of a fold has no "
                 "response; compare the discrepancies of prb.cross_validate instead"
@@ -355,22 +352,22 @@ def _require_candidates(candidates: object) -> None:
     """Raise unless these are two optima or cross-validations or more, by label."""
     if not isinstance(candidates, Mapping):
         raise TypeError(
-            f"{_CALLER}: candidates: got {called(candidates)}, expected a mapping such as "
+            f"rank: candidates: got {called(candidates)}, expected a mapping such as "
             "{'normal': optimum, 'lognormal': other}"
         )
     if len(candidates) < 2:
         raise ValueError(
-            f"{_CALLER}: candidates: got {list(candidates)}, expected at least two to compare"
+            f"rank: candidates: got {list(candidates)}, expected at least two to compare"
         )
     for label, candidate in candidates.items():
         if not isinstance(label, str):
-            raise TypeError(f"{_CALLER}: candidates: got label {label!r:.60}, expected a text")
+            raise TypeError(f"rank: candidates: got label {label!r:.60}, expected a text")
         is_table = isinstance(candidate, xr.Dataset) and {"score", "weight", "data"} <= set(
             candidate
         )
         if not is_table and not isinstance(candidate, Optimum):
             raise TypeError(
-                f"{_CALLER}: candidates: {label}: got {called(candidate)}, expected an Optimum or "
+                f"rank: candidates: {label}: got {called(candidate)}, expected an Optimum or "
                 "what prb.cross_validate returned"
             )
 
@@ -380,14 +377,14 @@ def _require_same(table: xr.Dataset, reference: xr.Dataset, label: str, first: s
     names, expected = (t["simulator"].values.tolist() for t in (table, reference))
     if names != expected:
         raise ValueError(
-            f"{_CALLER}: got {label} with simulators {names} and {first} with "
+            f"rank: got {label} with simulators {names} and {first} with "
             f"{expected}, expected the same names in the same order"
         )
     is_same = table["data"].values == reference["data"].values
     if not is_same.all():
         differing = ", ".join(table["simulator"].values[~is_same].tolist())
         raise ValueError(
-            f"{_CALLER}: got {label} and {first} with different observed values, weights or "
+            f"rank: got {label} and {first} with different observed values, weights or "
             f"labels of {differing}, or in another order, expected the same data; build the models "
             "of one array"
         )
@@ -397,7 +394,7 @@ def _require_same(table: xr.Dataset, reference: xr.Dataset, label: str, first: s
     ):
         if a != b:
             raise ValueError(
-                f"{_CALLER}: got {label} with {argument} {a} and {first} with {b}, expected the "
+                f"rank: got {label} with {argument} {a} and {first} with {b}, expected the "
                 "same; pass the optima, which are then cross-validated alike"
             )
 
@@ -407,10 +404,14 @@ def _comparison(tables: Mapping[str, xr.Dataset]) -> xr.Dataset:
     labels = sorted(tables, key=lambda label: -float(tables[label]["score"].sum()))
     scores = np.array([tables[label]["score"].values for label in labels])
     weights = tables[labels[0]]["weight"].values
-    differences = (scores[0] - scores).sum(axis=-1)
-    errors = np.array([_stderr(scores[0] - row, weights) for row in scores])
-    alpha = 0.05
     n = weights.size
+    gaps = scores[0] - scores
+    differences = gaps.sum(axis=-1)
+    # Standard errors of sums of differences of weighted specimens.
+    means = differences / weights.sum()
+    variances = ((gaps - weights * means[:, None]) ** 2).sum(axis=-1) * n / (n - 1)
+    errors = np.sqrt(variances)
+    alpha = 0.05
     n_pairs = len(labels) * (len(labels) - 1) / 2
     critical = student.ppf(1 - alpha / 2 / n_pairs, n - 1)
     is_apart = differences > critical * errors
@@ -445,14 +446,6 @@ def _comparison(tables: Mapping[str, xr.Dataset]) -> xr.Dataset:
             "random_seed": tables[best].attrs["random_seed"],
         },
     )
-
-
-def _stderr(differences: Floats, weights: Floats) -> float:
-    """Return the standard error of a sum of differences of weighted specimens."""
-    n = weights.size
-    mean = differences.sum() / weights.sum()
-    variance = ((differences - weights * mean) ** 2).sum() * n / (n - 1)
-    return float(np.sqrt(variance))
 
 
 def scoring_target(observed: Floats, weights: Floats) -> Discrepancy:

@@ -134,8 +134,17 @@ class PosteriorNull(Null):
         """Draw u-values of replicates, in blocks of shapes (r, n)."""
         rng = np.random.default_rng(self.random_seed)
         rng_of_ties = case.rng(1)
-        pools = _pools(case)
-        draws = np.flatnonzero(np.min([pool.counts for pool in pools], axis=0) > 0)
+        # By condition, arrays (D, S): whether samples have a response, and P(Y < y) and
+        # P(Y <= y) of each in the pool of all draws.
+        usable = [~np.isnan(c.predicted) for c in case.conditions]
+        if case.shares_specimens:
+            # A specimen has a response under all conditions.
+            usable = [np.logical_and.reduce(usable)] * len(usable)
+        steps = [Predictive(c.predicted).steps(c.predicted) for c in case.conditions]
+        # Samples of each draw, those with a response first, and their number.
+        orders = [np.argsort(~is_usable, axis=1, kind="stable") for is_usable in usable]
+        counts = [np.count_nonzero(is_usable, axis=1) for is_usable in usable]
+        draws = np.flatnonzero(np.min(counts, axis=0) > 0)
         if not draws.size:
             raise ValueError(
                 "predicted: got NaN in every draw, expected specimens whose responses are numbers"
@@ -150,10 +159,11 @@ class PosteriorNull(Null):
             # condition is the same sample, hence the same specimen.
             place = rng.random((draw.size, case.n_specimens))
             u = []
-            for pool in pools:
-                rank = (place[:, pool.numbers] * pool.counts[draw]).astype(int)
-                sample = pool.order[draw, rank]
-                u.append(between(pool.lower[draw, sample], pool.upper[draw, sample], rng_of_ties))
+            by_condition = zip(case.conditions, steps, orders, counts, strict=True)
+            for condition, (lower, upper), order, count in by_condition:
+                rank = (place[:, condition.numbers] * count[draw]).astype(int)
+                sample = order[draw, rank]
+                u.append(between(lower[draw, sample], upper[draw, sample], rng_of_ties))
             yield np.concatenate(u, axis=1)
 
     def describe(self, case: Case) -> str:
@@ -167,56 +177,24 @@ class PosteriorNull(Null):
         return f"all specimens come from {source}{repeated}"
 
 
-@dataclass(frozen=True, eq=False)
-class _Pool:
-    """The predicted samples of one condition."""
-
-    numbers: NDArray[np.intp]  # (n,): the specimen of each observation
-    lower: Floats  # (D, S): P(Y < y) of each sample in the pool of all draws
-    upper: Floats  # (D, S): P(Y <= y)
-    order: NDArray[np.intp]  # (D, S): samples of each draw, those with a response first
-    counts: NDArray[np.intp]  # (D,): number of samples with a response
-
-
-def _pools(case: Case) -> list[_Pool]:
-    """Return the samples of each condition."""
-    usable = [~np.isnan(c.predicted) for c in case.conditions]
-    if case.shares_specimens:
-        # A specimen has a response under all conditions.
-        usable = [np.logical_and.reduce(usable)] * len(usable)
-    return [
-        _Pool(
-            c.numbers,
-            *Predictive(c.predicted).steps(c.predicted),
-            order=np.argsort(~is_usable, axis=1, kind="stable"),
-            counts=np.count_nonzero(is_usable, axis=1),
-        )
-        for c, is_usable in zip(case.conditions, usable, strict=True)
-    ]
-
-
-@dataclass(frozen=True, eq=False)
-class _Table:
-    """Quantiles of sqrt(n) A for k sizes n and m tail probabilities."""
-
-    sizes: Floats  # (k,)
-    logs: Floats  # (m,): minus the logarithms of tail probabilities, increasing
-    quantiles: Floats  # (k, m)
-
-    def at(self, n: int) -> Floats:
-        """Return quantiles for n values, (m,), interpolated in 1 / sqrt(n)."""
-        sizes = -1 / np.sqrt(self.sizes)
-        return np.array([np.interp(-1 / np.sqrt(n), sizes, column) for column in self.quantiles.T])
-
-
 @cache
-def table() -> _Table:
-    """Return the table that ships, made by ``benchmarks/area_null.py``."""
+def table() -> tuple[Floats, Floats, Floats]:
+    """Return k sizes n, minus the logs of m tail probabilities, and quantiles of sqrt(n) A, (k, m).
+
+    The table ships; ``benchmarks/area_null.py`` makes it.
+    """
     with files(__package__).joinpath("area_null.csv").open(encoding="utf-8") as file:
         _, *header = file.readline().split(",")
         rows = np.loadtxt(file, delimiter=",")
     tails = np.array(header, dtype=np.float64)
-    return _Table(sizes=rows[:, 0], logs=-np.log(tails), quantiles=rows[:, 1:])
+    return rows[:, 0], -np.log(tails), rows[:, 1:]
+
+
+def _area_quantiles(n: int) -> tuple[Floats, Floats]:
+    """Return minus the logs of tail probabilities and the quantiles of sqrt(n) A, (m,) each."""
+    sizes, logs, quantiles = table()
+    at, ends = -1 / np.sqrt(n), -1 / np.sqrt(sizes)
+    return logs, np.array([np.interp(at, ends, column) for column in quantiles.T])
 
 
 @dataclass(frozen=True)
@@ -241,7 +219,7 @@ class ExactModel(Null):
         """Return the area that is exceeded with probability ``alpha`` by n uniform numbers."""
         n = positive_integer(n, "n")
         alpha = share(alpha, "alpha")
-        scaled = np.interp(-np.log(alpha), table().logs, table().at(n))
+        scaled = np.interp(-np.log(alpha), *_area_quantiles(n))
         return float(scaled / np.sqrt(n))
 
     def p_value(self, statistic: float, n: int) -> float:
@@ -250,7 +228,7 @@ class ExactModel(Null):
         if statistic != 0:
             positive_number(statistic, "statistic")
         scaled = np.sqrt(n) * statistic
-        quantiles, logs = table().at(n), table().logs
+        logs, quantiles = _area_quantiles(n)
         if scaled <= quantiles[-1]:
             return float(np.exp(-np.interp(scaled, quantiles, logs)))
         # Farther out the logarithm falls like the square (Brownian bridge: exp(-6 x^2)). From
@@ -350,9 +328,17 @@ class JointNull(Null):
     random_seed: int = 0
 
     def __post_init__(self) -> None:
-        advice = "; the model cannot be calibrated anew: use prb.validation.PosteriorNull()"
+        advice = "; the model cannot be recalibrated: use prb.validation.PosteriorNull()"
         require_refits(self.optimum, "JointNull", advice)
-        _require_responses(self.responses)
+        if self.responses is not None:
+            tested: list[Any] = [self.responses]
+            if isinstance(self.responses, Mapping):
+                tested = list(self.responses.values())
+            if not tested or not all(isinstance(t, tuple) and t and callable(t[0]) for t in tested):
+                raise TypeError(
+                    f"JointNull: responses: got {called(self.responses)}, expected a tuple "
+                    "(response, *inputs), or a mapping of conditions to such"
+                )
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)
 
@@ -363,7 +349,7 @@ class JointNull(Null):
     def describe(self, case: Case) -> str:
         """Return the null hypothesis in a phrase."""
         return (
-            "calibration and test data come from the calibrated model, which is calibrated anew in "
+            "calibration and test data come from the calibrated model, which is recalibrated in "
             "each replicate"
         )
 
@@ -417,7 +403,7 @@ class JointNull(Null):
         u = []
         for t, number in zip(tested, numbers, strict=True):
             drawn = points[t.simulator][converged][:, number]
-            project = t.condition.projection.of
+            project = t.condition.projected
             measured = project(t.values_or(populations[t.simulator][0][0])[drawn])
             refitted, weights = evaluator.populations(thetas, t.simulator)
             values = np.broadcast_to(project(t.values_or(refitted)), weights.shape)
@@ -434,7 +420,7 @@ class JointNull(Null):
         if condition.predicted.shape[0] > 1:
             raise ValueError(
                 f"{condition.name}: predicted: got {len(condition.predicted)} draws, expected the "
-                "one population at the optimum, which JointNull calibrates anew; pass "
+                "one population at the optimum, which JointNull recalibrates; pass "
                 "prb.predict(optimum, ...)"
             )
         name = condition.base_name
@@ -457,12 +443,13 @@ class JointNull(Null):
         roots = read_inputs(condition.name, inputs, self.optimum.model)
         responses = Responses(condition.name, response, roots, outputs=None)
         labels = set(condition.labels or ())
-
-        def lacks_specimens(node: Node) -> bool:
-            return node.specimens is None or not labels & set(specimen_names(node.specimens))
-
-        measuring_first = sorted(nodes, key=lacks_specimens)
-        node = serving(measuring_first, responses)
+        # Simulators that measured these specimens come first.
+        shared = [
+            node.specimens is not None and bool(labels & set(specimen_names(node.specimens)))
+            for node in nodes
+        ]
+        ordered = [nodes[k] for k in np.argsort(np.logical_not(shared), kind="stable")]
+        node = serving(ordered, responses)
         if node is None:
             raise ValueError(
                 f"{condition.name}: responses: got inputs that no simulator with prb.Reweighted "
@@ -471,18 +458,6 @@ class JointNull(Null):
             )
         assert node.reweighted is not None
         return _Tested(condition, nodes.index(node), node.reweighted.values_of(responses))
-
-
-def _require_responses(responses: object) -> None:
-    """Raise if they are neither a tuple of a response and its inputs, nor several by condition."""
-    if responses is None:
-        return
-    pairs = list(responses.values()) if isinstance(responses, Mapping) else [responses]
-    if not pairs or not all(isinstance(p, tuple) and p and callable(p[0]) for p in pairs):
-        raise TypeError(
-            f"JointNull: responses: got {called(responses)}, expected a tuple (response, *inputs), "
-            "or a mapping of conditions to such"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -503,7 +478,7 @@ class _Tested:
         predicted = condition.predicted[~np.isnan(condition.predicted)]
         # Between these a distribution function moves by .05, half of the smallest difference.
         at = np.quantile(predicted, np.linspace(0.05, 0.95, 19), method="nearest")
-        values = condition.projection.of(self.values_or(responses))
+        values = condition.projected(self.values_or(responses))
         expected = Predictive(values, weights).transform(at, None)
         got = Predictive(condition.predicted).transform(at, None)
         largest = np.abs(expected - got).max()

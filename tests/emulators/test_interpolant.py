@@ -20,22 +20,19 @@ def design(n: int, d: int, seed: int = 0) -> Floats:
 
 def smooth(z: Floats) -> Floats:
     """Return two outputs of any number of inputs, (n, d) -> (n, 2)."""
-    direction = 1 / np.arange(1, z.shape[1] + 1)
-    projected = z @ direction
+    projected = z @ (1 / np.arange(1, z.shape[1] + 1))
     return np.stack([np.exp(0.7 * projected), np.sin(1.5 * projected) + z[:, 0] ** 2], axis=1)
 
 
 RUNS = {1: 24, 2: 48, 3: 96, 6: 200}
+ELSEWHERE = design(16, 2, seed=5)
 
 
 @pytest.mark.parametrize("d", RUNS)
 def test_polynomials_of_degree_two_are_reproduced(d: int) -> None:
     rng = np.random.default_rng(d)
-    constant, slope, curvature = (
-        rng.normal(size=3),
-        rng.normal(size=(d, 3)),
-        rng.normal(size=(d, d, 3)),
-    )
+    constant, slope = rng.normal(size=3), rng.normal(size=(d, 3))
+    curvature = rng.normal(size=(d, d, 3))
 
     def quadratic(z: Floats) -> Floats:
         return constant + z @ slope + np.einsum("na,abm,nb->nm", z, curvature, z)
@@ -44,76 +41,61 @@ def test_polynomials_of_degree_two_are_reproduced(d: int) -> None:
     surface = fit_interpolant(z, quadratic(z))
     elsewhere = rng.uniform(-1, 1, (50, d))
     values, jacobian = surface(elsewhere)
-    assert np.allclose(values, quadratic(elsewhere), atol=1e-8)
+    np.testing.assert_allclose(values, quadratic(elsewhere), atol=1e-8)
     exact = slope.T + np.einsum("abm,nb->nma", curvature + curvature.swapaxes(0, 1), elsewhere)
-    assert np.allclose(jacobian, exact, atol=1e-6)
+    np.testing.assert_allclose(jacobian, exact, atol=1e-6)
     assert np.abs(surface.left_out).max() < 1e-7
 
 
 def test_a_polynomial_of_degree_five_of_two_inputs_is_reproduced() -> None:
+    def response(z: Floats) -> Floats:
+        return z[:, :1] ** 3 * z[:, 1:] ** 2
+
     z = design(80, 2)
-    surface = fit_interpolant(z, (z[:, :1] ** 3 * z[:, 1:] ** 2))
+    surface = fit_interpolant(z, response(z))
     assert surface.powers.sum(axis=1).max() >= 5
-    elsewhere = design(30, 2, seed=4)
-    assert np.allclose(
-        surface(elsewhere)[0], elsewhere[:, :1] ** 3 * elsewhere[:, 1:] ** 2, atol=1e-8
-    )
+    np.testing.assert_allclose(surface.values(ELSEWHERE), response(ELSEWHERE), atol=1e-8)
 
 
 @pytest.mark.parametrize("d", RUNS)
-def test_runs_are_interpolated(d: int) -> None:
-    z = design(RUNS[d], d)
-    values, _ = fit_interpolant(z, smooth(z))(z)
-    assert np.allclose(values, smooth(z), atol=1e-6)
-
-
-@pytest.mark.parametrize("d", RUNS)
-def test_the_jacobian_is_the_derivative(d: int) -> None:
+def test_runs_are_interpolated_and_the_jacobian_is_the_derivative(d: int) -> None:
     z = design(RUNS[d], d)
     surface = fit_interpolant(z, smooth(z))
+    np.testing.assert_allclose(surface.values(z), smooth(z), atol=1e-6)
     # Beside runs too, where the radial functions have their centers
     points = np.concatenate([np.random.default_rng(0).uniform(-1.2, 1.2, (20, d)), z[:5]])
-    _, jacobian = surface(points)
-    step = 1e-5
+    values, jacobian = surface(points)
+    np.testing.assert_allclose(values, surface.values(points), rtol=1e-10, atol=1e-12)
     for a in range(d):
-        shift = step * np.eye(d)[a]
-        difference = (surface(points + shift)[0] - surface(points - shift)[0]) / (2 * step)
-        assert np.allclose(jacobian[:, :, a], difference, rtol=1e-5, atol=1e-6)
-
-
-def fixed(monkeypatch: pytest.MonkeyPatch, degree: int, z: Floats, y: Floats) -> Any:
-    """Return an interpolant of one degree, so that refits have the same one."""
-    monkeypatch.setattr(interpolant, "_degrees", lambda n, d: [degree])
-    return fit_interpolant(z, y)
+        shift = 1e-5 * np.eye(d)[a]
+        difference = (surface.values(points + shift) - surface.values(points - shift)) / 2e-5
+        np.testing.assert_allclose(jacobian[:, :, a], difference, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_left_out_errors_are_those_of_refits(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interpolant, "_degrees", lambda n, d: [2])  # the same one in refits
     z = design(RUNS[d], d)
     y = smooth(z) + 0.1 * np.sin(20 * z[:, :1])
-    surface = fixed(monkeypatch, 2, z, y)
+    surface = fit_interpolant(z, y)
     for i in (0, 7, RUNS[d] - 1):
         others = np.delete(np.arange(len(z)), i)
-        refit = fixed(monkeypatch, 2, z[others], y[others])
+        error = y[i] - fit_interpolant(z[others], y[others]).values(z[i : i + 1])[0]
         # To the nugget, 1e-16 to 1e-8 of the kernel.
-        error = y[i] - refit(z[i : i + 1])[0][0]
-        assert np.allclose(surface.left_out[i], error, rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(surface.left_out[i], error, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_nearly_equal_runs_leave_the_surface_smooth(d: int) -> None:
     z = design(RUNS[d], d)
     close = np.concatenate([z, z[:8] + 1e-7])
-    surface = fit_interpolant(close, smooth(close))
     elsewhere = np.random.default_rng(1).uniform(-0.9, 0.9, (50, d))
-    reference = fit_interpolant(z, smooth(z))
+    surface, reference = (fit_interpolant(x, smooth(x)) for x in (close, z))
     error, usual = (
-        np.abs(fit(elsewhere)[0] - smooth(elsewhere)).max() for fit in (surface, reference)
+        np.abs(fit.values(elsewhere) - smooth(elsewhere)).max() for fit in (surface, reference)
     )
     assert error < 5 * usual + 1e-6
-    _, jacobian = surface(close[:8])
-    assert np.isfinite(jacobian).all()
-    assert np.abs(jacobian).max() < 20
+    assert np.abs(surface(close[:8])[1]).max() < 20
 
 
 def test_contradicting_close_runs_are_smoothed() -> None:
@@ -126,16 +108,14 @@ def test_contradicting_close_runs_are_smoothed() -> None:
     assert np.abs(jacobian).max() < 10
 
 
-def largest_error(n: int, d: int) -> float:
-    z = design(n, d)
-    elsewhere = np.random.default_rng(2).uniform(-0.8, 0.8, (100, d))
-    values, _ = fit_interpolant(z, smooth(z))(elsewhere)
-    return float(np.abs(values - smooth(elsewhere)).max())
-
-
 @pytest.mark.parametrize(("d", "sizes"), [(1, (8, 12, 24)), (2, (24, 48, 96)), (3, (32, 96, 256))])
 def test_the_error_falls_with_the_number_of_runs(d: int, sizes: tuple[int, ...]) -> None:
-    errors = [largest_error(n, d) for n in sizes]
+    errors: list[Any] = []
+    elsewhere = np.random.default_rng(2).uniform(-0.8, 0.8, (100, d))
+    for n in sizes:
+        z = design(n, d)
+        off = fit_interpolant(z, smooth(z)).values(elsewhere) - smooth(elsewhere)
+        errors.append(np.abs(off).max())
     assert errors[0] > 3 * errors[1] > 9 * errors[2]
 
 
@@ -143,48 +123,33 @@ def test_left_out_errors_are_of_the_size_of_true_errors() -> None:
     z = design(64, 2)
     surface = fit_interpolant(z, smooth(z))
     elsewhere = np.random.default_rng(3).uniform(-1, 1, (400, 2))
-    true = np.sqrt(((surface(elsewhere)[0] - smooth(elsewhere)) ** 2).mean(axis=0))
+    true = np.sqrt(((surface.values(elsewhere) - smooth(elsewhere)) ** 2).mean(axis=0))
     left_out = np.sqrt((surface.left_out**2).mean(axis=0))
-    assert np.all(left_out > true / 2)
-    assert np.all(left_out < 30 * true)
+    assert np.all((true / 2 < left_out) & (left_out < 30 * true))
 
 
-def test_the_values_do_not_depend_on_the_order_of_runs() -> None:
+def test_neither_order_nor_units_nor_a_constant_output_matter() -> None:
     z = design(48, 2)
+    y = np.column_stack([smooth(z), np.full(48, 3.5)])
+    values, jacobian = fit_interpolant(z, y)(ELSEWHERE)
+    np.testing.assert_allclose(values[:, 2], 3.5, atol=1e-9)
+    np.testing.assert_allclose(jacobian[:, 2], 0.0, atol=1e-8)
     rows = np.random.default_rng(0).permutation(len(z))
-    elsewhere = design(16, 2, seed=5)
-    first, second = (fit_interpolant(z[r], smooth(z[r]))(elsewhere) for r in (slice(None), rows))
-    assert np.allclose(first[0], second[0], atol=1e-8)
-    assert np.allclose(first[1], second[1], atol=1e-6)
+    unit, offset = np.array([1e6, 1e-6, 1.0]), np.array([-3e6, 2e-6, 0.0])
+    other_values, other_jacobian = fit_interpolant(z[rows], (unit * y + offset)[rows])(ELSEWHERE)
+    np.testing.assert_allclose((other_values - offset) / unit, values, atol=1e-8)
+    np.testing.assert_allclose(other_jacobian / unit[:, None], jacobian, atol=1e-6)
 
 
-def test_outputs_in_other_units_give_the_same_surface() -> None:
-    z = design(48, 2)
-    unit, offset = np.array([1e6, 1e-6]), np.array([-3e6, 2e-6])
-    elsewhere = design(16, 2, seed=5)
-    values, jacobian = fit_interpolant(z, smooth(z))(elsewhere)
-    other_values, other_jacobian = fit_interpolant(z, unit * smooth(z) + offset)(elsewhere)
-    assert np.allclose((other_values - offset) / unit, values, atol=1e-8)
-    assert np.allclose(other_jacobian / unit[:, None], jacobian, atol=1e-6)
-
-
-def test_a_constant_output_stays_constant() -> None:
-    z = design(48, 2)
-    y = np.stack([np.full(48, 3.5), z[:, 0] ** 2], axis=1)
-    values, jacobian = fit_interpolant(z, y)(design(16, 2, seed=5))
-    assert np.allclose(values[:, 0], 3.5, atol=1e-9)
-    assert np.allclose(jacobian[:, 0], 0.0, atol=1e-8)
-
-
-def test_points_in_parts_have_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_in_blocks_have_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
     z = design(48, 2)
     surface = fit_interpolant(z, smooth(z))
-    elsewhere = design(64, 2, seed=5)
-    whole = surface(elsewhere)
+    points = design(64, 2, seed=5)
+    values, jacobian = surface(points)
     monkeypatch.setattr(interpolant, "IN_CACHE", 48 * 5)
-    parts = surface(elsewhere)
-    assert np.allclose(whole[0], parts[0], rtol=1e-13)
-    assert np.allclose(whole[1], parts[1], rtol=1e-10, atol=1e-12)
+    values_in_blocks, jacobian_in_blocks = surface(points)
+    np.testing.assert_allclose(values_in_blocks, values, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(jacobian_in_blocks, jacobian, rtol=1e-10, atol=1e-12)
 
 
 def test_runs_nearby_select_the_degree() -> None:
@@ -192,8 +157,8 @@ def test_runs_nearby_select_the_degree() -> None:
     z = np.linspace(-1, 1, 60)[:, None]
     y = np.where(z > 0.5, np.abs(np.sin(25 * z)), 0.0) + z**5
     near = z[:, 0] < 0.2
-    chosen = fit_interpolant(z, y, near)
-    assert np.abs(chosen.left_out[near]).max() <= np.abs(fit_interpolant(z, y).left_out[near]).max()
+    errors = [np.abs(fit_interpolant(z, y, rows).left_out[near]).max() for rows in (near, None)]
+    assert errors[0] <= errors[1]
 
 
 def test_too_few_points_are_refused() -> None:
@@ -202,13 +167,10 @@ def test_too_few_points_are_refused() -> None:
         fit_interpolant(np.stack([line, np.zeros(10)], axis=1), line[:, None])
 
 
-@pytest.mark.parametrize("d", [1, 2, 3, 5])
+@pytest.mark.parametrize("d", [1, 2, 5])
 def test_the_terms_are_all_of_a_total_degree(d: int) -> None:
-    degree = 3
-    expected = {row for row in product(range(degree + 1), repeat=d) if sum(row) <= degree}
-    powers = interpolant._powers(d, degree)
-    assert {tuple(row) for row in powers.tolist()} == expected
-    assert len(powers) == len(expected)
+    expected = [row for row in product(range(4), repeat=d) if sum(row) <= 3]
+    assert sorted(map(tuple, interpolant._powers(d, 3).tolist())) == sorted(expected)
 
 
 def test_pieces_of_one_input_are_the_radial_functions() -> None:
@@ -219,8 +181,4 @@ def test_pieces_of_one_input_are_the_radial_functions() -> None:
     u = (points[:, 0] - surface.center) / surface.half_width
     vander = np.polynomial.legendre.legvander(u, surface.powers.max())
     expected = radial + vander[:, surface.powers[:, 0]] @ surface.coefficients
-    assert np.allclose(surface.values(points), expected, rtol=1e-10, atol=1e-11)
-    values, jacobian = surface(points)
-    assert np.array_equal(values, surface.values(points))
-    steps = (surface.values(points + 1e-5) - surface.values(points - 1e-5)) / 2e-5
-    assert np.allclose(jacobian[..., 0], steps, atol=1e-6)
+    np.testing.assert_allclose(surface.values(points), expected, rtol=1e-10, atol=1e-11)

@@ -21,7 +21,7 @@ from um_server import Real
 import prbayes as prb
 from prbayes.model.random_variable import nodes
 from prbayes.response.call import CallSettings, Points, Tally, respond
-from prbayes.response.executors import Capacity, capacity
+from prbayes.response.executors import capacity
 from prbayes.response.outputs import Outputs
 from prbayes.response.store import Store
 
@@ -68,7 +68,7 @@ def test_a_worker_that_leaves_while_it_computes_loses_nothing(tmp_path: Path) ->
     )
     with cluster, distributed.Client(cluster) as client:
         executor = client.get_executor(pure=False)
-        assert capacity(executor) == Capacity(2, 4)
+        assert capacity(executor) == (2, 4)
         leaving = threading.Timer(0.6, cluster.scale, (1,))
         leaving.start()
         begun = time.perf_counter()
@@ -90,7 +90,7 @@ def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
     )
     with cluster, distributed.Client(cluster) as client:
         # That of the cluster, not of this machine.
-        assert capacity(client.get_executor(pure=False)) == Capacity(2, 4)
+        assert capacity(client.get_executor(pure=False)) == (2, 4)
         pids = list(client.run(os.getpid).values())
         killer = threading.Timer(0.6, os.kill, (pids[0], signal.SIGKILL))
         killer.start()

@@ -1,4 +1,4 @@
-"""Metrics and samples that the identities are asked of."""
+"""Metrics and samples of the identities that all metrics have."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from prbayes.metrics.density import GaussianKDE, Histogram
 from prbayes.metrics.divergence import KullbackLeibler, ProbabilityResidual
 from prbayes.metrics.likelihood import LogLikelihood
 
-BANDWIDTH = 0.4
 
-
-def _metrics(h: float = BANDWIDTH) -> dict[str, Metric]:
+def _metrics(h: float = 0.4) -> dict[str, Metric]:
     return {
         "area": AreaMetric(),
         "pr": ProbabilityResidual(GaussianKDE(h)),
@@ -43,7 +41,7 @@ def _draw(seed: int, n: int = 23, n_observed: int = 17) -> tuple[Floats, Floats,
 
 @pytest.fixture
 def make() -> Callable[..., dict[str, Metric]]:
-    """All metrics by name, those with kernels for a bandwidth of one's choice."""
+    """All metrics by name, for a given bandwidth."""
     return _metrics
 
 

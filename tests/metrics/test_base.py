@@ -1,20 +1,21 @@
-"""Identities that hold for every metric, and the contract of a metric of one's own."""
+"""Identities that hold for every metric, and the contract of a user's own metric."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import FrozenInstanceError, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytensor
-import pytensor.tensor as pt
 import pytest
 from scipy.optimize import minimize
+from scipy.stats import norm
 
 from prbayes._validate import Floats
-from prbayes.metrics import base, density
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics import density
+from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.base import Discrepancy, Metric, Minimum
 from prbayes.metrics.density import DensityDiscrepancy, DensityEstimator, GaussianKDE, overlap
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
@@ -22,10 +23,14 @@ from prbayes.metrics.likelihood import LogLikelihood
 INF, NAN = np.inf, np.nan
 PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
 Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
-Make = Callable[..., dict[str, Any]]
 
 
-@pytest.mark.parametrize("seed", range(5))
+def by_basis(d: Discrepancy, values: Floats, weights: Floats) -> Floats:
+    """Return discrepancies from the map of weights to features."""
+    return np.asarray(d.outer(*d.basis(values).features(weights), xp=np))
+
+
+@pytest.mark.parametrize("seed", range(2))
 def test_zero_on_itself_and_positive_elsewhere(
     name: str, metric: Metric, draw: Draw, seed: int
 ) -> None:
@@ -33,15 +38,20 @@ def test_zero_on_itself_and_positive_elsewhere(
     d = metric.against(z, u)
     at_itself = d(z[::-1], u[::-1])
     assert at_itself < d(z + 4, u)
-    if not name.startswith("ll"):
+    if metric.distance:
         assert at_itself == pytest.approx(0, abs=1e-13)
         assert min(d(x, w), d(z + 0.3, u)) > 1e-4
+    at, apart = overlap(d, z, u), overlap(d, np.stack([x + 1e3, np.full(x.size, INF)]), w)
+    assert at == pytest.approx(1)
+    np.testing.assert_allclose(apart, [1, 1] if name == "area" else [0, 0], atol=1e-12)
+    if name != "area":
+        assert 0.2 < overlap(d, x, w) < 0.999
 
 
 @pytest.mark.parametrize("shift", [-3.3, 250.0])
-@pytest.mark.parametrize("a", [1.0, 0.01, 37.0, -1.0, -2.0])
+@pytest.mark.parametrize("a", [0.01, 37.0, -1.0])
 def test_shift_scale_sign_and_order(
-    name: str, make: Make, draw: Draw, shift: float, a: float
+    name: str, make: Any, draw: Draw, shift: float, a: float
 ) -> None:
     x, w, z, u = draw(2)
     x /= 2  # well inside the grid, whose ends depend on the sign
@@ -61,22 +71,19 @@ def test_shift_scale_sign_and_order(
     np.testing.assert_allclose(after(a * x[i] + shift, w[i]), expected, rtol=rtol)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_integer_weights_are_repetitions(metric: Metric, draw: Draw, seed: int) -> None:
-    x, _, z, _ = draw(seed)
+def test_integer_weights_are_repetitions(metric: Metric, draw: Draw) -> None:
+    x, _, z, _ = draw(0)
     k, j = np.arange(x.size) % 4, 1 + np.arange(z.size) % 3
     weighted, repeated = metric.against(z, j), metric.against(np.repeat(z, j))
     expected = repeated(np.repeat(x, k))
-    np.testing.assert_allclose(weighted(x, k), expected, rtol=1e-9)
-    np.testing.assert_allclose(weighted(np.repeat(x, k)), expected, rtol=1e-9)
-    np.testing.assert_allclose(repeated(x, k), expected, rtol=1e-9)
-    np.testing.assert_allclose(weighted(np.full(50, 0.5)), weighted([0.5]), rtol=1e-11)
+    found = [weighted(x, k), weighted(np.repeat(x, k)), repeated(x, k)]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
     assert repeated.n_effective == pytest.approx(j.sum())
     assert weighted.n_effective == pytest.approx(j.sum() ** 2 / (j**2).sum())
 
 
 def test_other_observed_values_keep_the_metric_and_additive_ones_are_means_over_them(
-    name: str, make: Make, draw: Draw
+    name: str, make: Any, draw: Draw
 ) -> None:
     x, w, z, u = draw(14)
     d = make(0.3)[name].against(z, u)
@@ -85,78 +92,6 @@ def test_other_observed_values_keep_the_metric_and_additive_ones_are_means_over_
     means = [u @ [e(x, v) for e in single] for v in (w, None)]
     additive = np.isclose(means[0] - means[1], d(x, w) - d(x), rtol=1e-9)
     assert additive == d.metric.additive == (name not in ("area", "kl-reverse"))
-
-
-def test_rows_of_weights_are_as_many_data_sets(metric: Metric, draw: Draw) -> None:
-    x, w, z, u = draw(15)
-    sets = np.random.default_rng(16).dirichlet(np.ones(z.size), (5, 1))
-    several = metric.against(z, u).with_observed(z, sets)
-    some = several.rows([3, 1])
-    basis = some.basis(x)
-    found = some.outer(*basis.features(np.stack([[w], [w[::-1]]])), xp=np)
-    one_by_one = [
-        several.with_observed(z, sets[3, 0])(x, w),
-        several.with_observed(z, sets[1, 0])(x, w[::-1]),
-    ]
-    np.testing.assert_allclose(found[:, 0], one_by_one, rtol=1e-9)
-    np.testing.assert_array_equal(some.weights, several.weights[[3, 1]])
-    assert several.weights.shape == (5, 1, z.size), "the record itself is as it was"
-
-
-def test_a_discrepancy_cannot_be_changed(metric: Metric, draw: Draw) -> None:
-    d = metric.against(draw(17)[2])
-    with pytest.raises(FrozenInstanceError):
-        d.weights = np.ones(3)  # type: ignore[misc]
-
-
-@pytest.mark.parametrize("batch", [(1,), (4,), (2, 3), (0,)])
-def test_batches_equal_a_loop(metric: Metric, draw: Draw, batch: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(4)
-    x, w = rng.normal(size=(*batch, 9)), rng.dirichlet(np.ones(9), batch)
-    d = metric.against(draw(5)[2])
-    one = rng.normal(size=9)
-    for values, weights in ((x, np.ones(9)), (x, w), (one, w), (x, np.arange(1.0, 10.0))):
-        result = d(values, weights)
-        xs, ws = np.broadcast_arrays(values, weights)
-        assert result.shape == batch
-        expected = [d(xs[i], ws[i]) for i in np.ndindex(*batch)]
-        np.testing.assert_allclose(result.ravel(), expected, rtol=1e-10)
-    assert type(d(one)) is float
-
-
-def test_basis_gives_the_same_discrepancy_in_numpy_and_pytensor_with_its_gradient(
-    metric: Metric, draw: Draw
-) -> None:
-    y, w, z, u = draw(6)
-    y[:2] = -30, 40
-    d = metric.against(z, u)
-    basis = d.basis(y)
-
-    def value(weights: Floats) -> Any:
-        return d.outer(*basis.features(weights), xp=np)
-
-    rows = np.random.default_rng(7).dirichlet(np.ones(y.size), (2, 3))
-    np.testing.assert_allclose(value(rows), d(y, rows), rtol=1e-10)
-    direct = d.outer(*d.features(y, 0.9 * w, np), xp=np)
-    np.testing.assert_allclose(value(0.9 * w), direct, rtol=1e-10)
-    v = pt.vector("v")
-    graph = d.outer(*basis.features(v, pt), xp=pt)
-    function = pytensor.function([v], [graph, pytensor.grad(graph, v)], mode=PYTHON)
-    result, gradient = function(w)
-    np.testing.assert_allclose(result, d(y, w), rtol=1e-10)
-    e = 1e-7 * np.eye(w.size)
-    by_differences = (value(w + e) - value(w - e)) / 2e-7
-    np.testing.assert_allclose(gradient, by_differences, rtol=1e-5, atol=1e-6)
-
-
-def test_a_point_without_a_response_counts_in_no_feature(metric: Metric, draw: Draw) -> None:
-    x, w, z, u = draw(18)
-    d = metric.against(z, u)
-    with_nan = np.append(x, NAN)
-    some = np.append(0.8 * w, 0.2)
-    stored = d.outer(*d.basis(with_nan).features(some), xp=np)
-    expected = d.outer(*d.basis(x).features(0.8 * w), xp=np)
-    np.testing.assert_allclose(stored, expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("away", [1e3, -1e3, 1e300, INF])
@@ -173,90 +108,6 @@ def test_disjoint_supports_are_finite_bounded_and_worse(
         assert far <= np.log(max(1, d.density.max()) * d.cells.widths.sum() / 1e-9)
 
 
-def test_overlap_is_one_at_the_data_and_zero_away_from_them(
-    name: str, metric: Metric, draw: Draw
-) -> None:
-    x, w, z, u = draw(19)
-    d = metric.against(z, u)
-    at, apart = overlap(d, z, u), overlap(d, np.stack([x + 1e3, np.full(x.size, INF)]), w)
-    assert at == pytest.approx(1)
-    np.testing.assert_allclose(apart, [1, 1] if name == "area" else [0, 0], atol=1e-12)
-    assert apart.shape == (2,)
-    if name != "area":
-        assert 0.2 < overlap(d, x, w) < 0.999
-
-
-OK = [0.0, 1.0, 3.0]
-BAD: dict[str, tuple[str, Any, type[Exception]]] = {
-    "observed: got 1 NaN or infinite among 3": ("observed", [0.0, NAN, 1.0], ValueError),
-    "observed: got no values": ("observed", [], ValueError),
-    r"observed: got an array of shape \(2, 2\)": ("observed", np.ones((2, 2)), ValueError),
-    "observed: got an array of dtype <U1": ("observed", ["a", "b"], TypeError),
-    r"observed weights: got shape \(2, 3\), expected \(3,\)": (
-        "observed_weights",
-        [OK, OK],
-        ValueError,
-    ),
-    "simulated: got NaN or -inf": ("simulated", [0.0, -INF], ValueError),
-    r"weights: got shape \(2,\), expected \(..., 3\)": ("weights", [1, 1], ValueError),
-    "weights: got weights that sum to zero": ("weights", [0, 0, 0], ValueError),
-}
-
-
-@pytest.mark.parametrize("match", BAD)
-def test_bad_inputs(metric: Metric, match: str) -> None:
-    argument, value, error = BAD[match]
-    with pytest.raises(error, match=f"^{match}"):
-        metric(**{"simulated": OK, "observed": OK, argument: value})
-
-
-# -- the floor of logarithms
-# ------------------------------------------------------------------------
-
-
-def fit(metric: Metric, observed: Floats, quantiles: Floats) -> Floats:
-    """Return mean and log standard deviation of the best normal population."""
-    d = metric.against(observed)
-
-    def discrepancy(theta: Floats) -> float:
-        return float(d(theta[0] + np.exp(theta[1]) * quantiles))
-
-    start = [observed.mean(), np.log(observed.std())]
-    options = {"xatol": 1e-5, "fatol": 1e-10}
-    return np.asarray(minimize(discrepancy, start, method="Nelder-Mead", options=options).x)
-
-
-@pytest.mark.parametrize(
-    "metric",
-    [KullbackLeibler(), KullbackLeibler(reverse=True), LogLikelihood(density=GaussianKDE())],
-)
-def test_the_floor_does_not_move_the_minimum_on_normal_data(
-    metric: Metric, normal: Callable[..., Floats], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    observed = np.random.default_rng(1).normal(size=50)
-    found = []
-    for floor in (1e-12, 1e-9, 1e-6):
-        monkeypatch.setattr(density, "_FLOOR", floor)
-        found.append(fit(metric, observed, normal(0, 1, 1024)))
-    np.testing.assert_allclose(found, [found[1]] * 3, atol=1e-3 / np.sqrt(50))
-
-
-def test_the_floor_keeps_an_outlier_in_the_forward_divergence(
-    normal: Callable[..., Floats], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    observed = np.random.default_rng(1).standard_t(3, 50)
-    sd = []
-    for floor in (1e-12, 1e-9, 1e-7):
-        monkeypatch.setattr(density, "_FLOOR", floor)
-        sd.append(np.exp(fit(KullbackLeibler(), observed, normal(0, 1, 1024))[1]))
-    assert sd[0] == pytest.approx(sd[1], rel=0.02)
-    assert sd[2] < 0.6 * sd[1]
-
-
-# -- a metric of one's own
-# --------------------------------------------------------------------------
-
-
 def test_observed_specimens_that_failed_count_as_simulated_ones(metric: Metric, draw: Draw) -> None:
     x, w, z, u = draw(12)
     failed = np.append(z, INF)
@@ -267,13 +118,77 @@ def test_observed_specimens_that_failed_count_as_simulated_ones(metric: Metric, 
     right, few, many = d(failed, rows)
     if metric.distance:
         assert right == pytest.approx(0, abs=1e-12)
-    assert right < few
-    assert right < many
-    # Weights of stored values, and other observed ones.
-    stored = d.outer(*d.basis(failed).features(rows), xp=np)
-    np.testing.assert_allclose(stored, d(failed, rows), rtol=1e-9, atol=1e-12)
+    assert right < min(few, many)
+    np.testing.assert_allclose(by_basis(d, failed, rows), d(failed, rows), rtol=1e-9, atol=1e-12)
     other = d.with_observed(np.append(x, INF), np.append(0.8 * w, 0.2))
     assert np.isfinite(other(failed, rows)).all()
+
+
+OK = [0.0, 1.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "error"),
+    [
+        ("observed", [0.0, NAN, 1.0], ValueError),
+        ("observed", [], ValueError),
+        ("observed", np.ones((2, 2)), ValueError),
+        ("observed", ["a", "b"], TypeError),
+        ("observed_weights", [OK, OK], ValueError),
+        ("simulated", [0.0, -INF], ValueError),
+        ("weights", [1, 1], ValueError),
+        ("weights", [0, 0, 0], ValueError),
+    ],
+)
+def test_bad_inputs(argument: str, value: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match=f"^{argument.replace('_', ' ')}: got"):
+        AreaMetric()(**{"simulated": OK, "observed": OK, argument: value})
+
+
+# -- the floor of logarithms -----------------------------------------------------------------------
+
+
+def fits(metric: Metric, observed: Floats, floors: tuple[float, ...], monkeypatch: Any) -> Floats:
+    """Return mean and log standard deviation of the best normal population for each floor."""
+    quantiles = norm.ppf((np.arange(1024) + 0.5) / 1024)
+    start = [observed.mean(), np.log(observed.std())]
+    options = {"xatol": 1e-5, "fatol": 1e-10}
+    results = []
+    for floor in floors:
+        monkeypatch.setattr(density, "_FLOOR", floor)
+        d = metric.against(observed)
+        fit = minimize(
+            lambda t, d=d: d(t[0] + np.exp(t[1]) * quantiles),
+            start,
+            method="Nelder-Mead",
+            options=options,
+        )
+        results.append(fit.x)
+    return np.array(results)
+
+
+@pytest.mark.parametrize(
+    "metric",
+    [KullbackLeibler(), KullbackLeibler(reverse=True), LogLikelihood(density=GaussianKDE())],
+)
+def test_the_floor_does_not_move_the_minimum_on_normal_data(
+    metric: Metric, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    observed = np.random.default_rng(1).normal(size=50)
+    found = fits(metric, observed, (1e-12, 1e-9, 1e-6), monkeypatch)
+    np.testing.assert_allclose(found, [found[1]] * 3, atol=1e-3 / np.sqrt(50))
+
+
+def test_the_floor_keeps_an_outlier_in_the_forward_divergence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    observed = np.random.default_rng(1).standard_t(3, 50)
+    sd = np.exp(fits(KullbackLeibler(), observed, (1e-12, 1e-9, 1e-7), monkeypatch)[:, 1])
+    assert sd[0] == pytest.approx(sd[1], rel=0.02)
+    assert sd[2] < 0.6 * sd[1]
+
+
+# -- a user's own metric ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -287,8 +202,7 @@ class Hellinger(Metric):
 
 class HellingerDiscrepancy(DensityDiscrepancy):
     def outer(self, *features: Any, xp: Any) -> Any:
-        p, q = features[0], self.density
-        return 1 - (xp.sqrt(p * q) * self.cells.widths).sum(axis=-1)
+        return 1 - (xp.sqrt(features[0] * self.density) * self.cells.widths).sum(axis=-1)
 
 
 def test_a_metric_on_densities_needs_its_outer_function_only(normal: Callable[..., Floats]) -> None:
@@ -300,12 +214,6 @@ def test_a_metric_on_densities_needs_its_outer_function_only(normal: Callable[..
     assert d(z + 1) == pytest.approx(expected, rel=5e-3)
     assert d.with_observed(z + 1)(z) == pytest.approx(expected, rel=5e-3)
     assert d.scale == 1.0
-
-
-def test_what_a_metric_does_not_declare_is_not_assumed() -> None:
-    plain = Hellinger()
-    assert plain.minimum is base.Minimum.UNKNOWN
-    assert not plain.additive
-    assert not plain.likelihood
-    assert plain.tail_responses == 0
-    assert plain.takes_weights
+    # Nothing is assumed that it does not declare.
+    assert (d.metric.minimum, d.metric.tail_responses) == (Minimum.UNKNOWN, 0)
+    assert (d.metric.additive, d.metric.likelihood, d.metric.takes_weights) == (False, False, True)

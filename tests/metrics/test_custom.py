@@ -1,3 +1,5 @@
+"""A metric from a user's function."""
+
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -19,43 +21,25 @@ def mean_difference(simulated: Any, observed: Any, weights: Any = None) -> Any:
 
 def test_it_is_the_value_of_the_function(draw: Callable[..., tuple[Floats, ...]]) -> None:
     x, _, z, _ = draw(12)
-    plain = FunctionMetric(mean_difference)
-    d = FunctionMetric(mean_difference, weighted=True).against(z)
+    plain, weighted = (FunctionMetric(mean_difference, weighted=w) for w in (False, True))
+    d = weighted.against(z)
     assert plain(x, z) == pytest.approx(abs(x.mean() - z.mean()))
     rows = np.random.default_rng(13).dirichlet(np.ones(x.size), (2, 3))
     np.testing.assert_allclose(d(x, rows), np.abs(rows @ x - z.mean()), rtol=1e-12)
     stored = d.outer(*d.basis(x).features(rows), xp=np)
     np.testing.assert_allclose(stored, d(x, rows), rtol=1e-12)
-
-
-def test_nothing_is_assumed_of_it() -> None:
-    plain, weighted = (
-        FunctionMetric(mean_difference),
-        FunctionMetric(mean_difference, weighted=True),
-    )
-    assert plain.minimum is Minimum.UNKNOWN
-    assert not plain.likelihood
+    # Nothing is assumed of it.
+    assert (plain.minimum, plain.likelihood, plain.symbolic) == (Minimum.UNKNOWN, False, False)
     assert [plain.takes_weights, weighted.takes_weights] == [False, True]
-    assert plain.against(OK).scale == 1.0
-    assert not plain.symbolic
+    assert d.scale == 1.0
 
 
-def test_wrong_functions_and_results() -> None:
+def test_wrong_functions_results_and_weights() -> None:
     with pytest.raises(TypeError, match=r"function: got float, expected f\(simulated, observed\)"):
         FunctionMetric(3.0)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"shape \(3,\) .*expected \(\); reduce over"):
         FunctionMetric(lambda x, z: x)(OK, OK)
-    with pytest.raises(ValueError, match=r"shape \(\) .*expected \(2,\); reduce over"):
-        FunctionMetric(lambda x, z: 0.0)([OK, OK], OK)
-
-
-def test_unequal_weights_need_a_function_that_takes_them() -> None:
     with pytest.raises(ValueError, match=r"weights: got unequal .*pass weighted=True"):
         FunctionMetric(mean_difference)(OK, OK, weights=[1, 2, 3])
     with pytest.raises(ValueError, match="observed weights: got unequal"):
         FunctionMetric(mean_difference).against(OK, [1, 2, 3])
-
-
-def test_simulated_values_come_first() -> None:
-    metric = FunctionMetric(lambda simulated, observed: simulated.mean(axis=-1) - observed.max())
-    assert metric([6.0, 8.0], [1.0, 4.0]) == pytest.approx(3.0)

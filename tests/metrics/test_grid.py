@@ -1,6 +1,9 @@
+"""Densities on cells: exactness, derivatives, readings, and the compiled loops."""
+
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,20 +33,17 @@ def draw(seed: int, *shape: int) -> tuple[Floats, Floats]:
     return rng.normal(size=shape), rng.dirichlet(np.ones(shape[-1]), shape[:-1])
 
 
-@pytest.mark.parametrize("n", [1, 2, 7, 300])
+@pytest.mark.parametrize("n", [1, 7, 300])
 @pytest.mark.parametrize("bandwidth", [0.03, 0.5, 4.0])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_kde_is_the_exact_sum_of_gaussians_to_a_few_parts_in_1e5(
-    n: int, bandwidth: float, seed: int
-) -> None:
-    x, w = draw(seed, n)
+def test_kde_is_the_exact_sum_of_gaussians_to_a_few_parts_in_1e5(n: int, bandwidth: float) -> None:
+    x, w = draw(n, n)
     cells = kernel_cells(bandwidth, np.array([-5.0, 5.0]))
     x[0] = cells.centers[1] + 0.3 * cells.step  # near the edge
     exact = w @ norm.pdf(cells.centers, x[:, None], bandwidth)
     np.testing.assert_allclose(cells.density(x, w)[:-2], exact, rtol=0, atol=3e-5 * exact.max())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_kde_has_the_exact_mass_mean_and_variance(seed: int) -> None:
     x, w = draw(seed, 9)
     cells = kernel_cells(observed=np.array([-5.0, 5.0]))
@@ -51,9 +51,8 @@ def test_kde_has_the_exact_mass_mean_and_variance(seed: int) -> None:
     mean = w @ x
     np.testing.assert_allclose(mass.sum(), 1, rtol=1e-10)
     np.testing.assert_allclose(mass[:-2] @ cells.centers, mean, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(
-        mass[:-2] @ (cells.centers - mean) ** 2, w @ (x - mean) ** 2 + H**2, rtol=1e-9
-    )
+    variance = mass[:-2] @ (cells.centers - mean) ** 2
+    np.testing.assert_allclose(variance, w @ (x - mean) ** 2 + H**2, rtol=1e-9)
 
 
 @both
@@ -65,22 +64,17 @@ def test_mass_outside_goes_to_the_last_two_cells_and_nan_nowhere(estimator: Any)
     np.testing.assert_allclose(mass[-2], w[[1, 6]].sum(), rtol=1e-14)
     np.testing.assert_allclose(mass[-1], w[[3, 4, 7]].sum(), rtol=1e-14)
     np.testing.assert_allclose(mass.sum(), 1 - w[5], rtol=1e-10)
-    assert (cells.density(np.full(3, INF), np.full(3, 1 / 3))[:-1] == 0).all()
     assert (cells.density(np.full(3, NAN), np.full(3, 1 / 3)) == 0).all()
 
 
 # Places of values from the last node on, in bandwidths.
-BEYOND = [-7.5, -3.0, -0.4, 0.0, 0.6, 2.0, 5.0, 7.4, 9.0]
-
-
-@pytest.mark.parametrize("place", BEYOND)
+@pytest.mark.parametrize("place", [-7.5, -0.4, 0.0, 0.6, 5.0, 7.4, 9.0])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_kernel_is_divided_between_the_grid_and_the_mass_beyond_its_end(
     place: float, side: int
 ) -> None:
     cells = kernel_cells()
-    last = cells.centers[-1] if side > 0 else cells.centers[0]
-    x = last + side * place * H
+    x = cells.centers[-1 if side > 0 else 0] + side * place * H
     found = cells.density(np.array([x]), np.ones(1)) * cells.widths
     np.testing.assert_allclose(found.sum(), 1, rtol=1e-11)
     # The cell of the last node ends half a step behind it.
@@ -90,7 +84,7 @@ def test_a_kernel_is_divided_between_the_grid_and_the_mass_beyond_its_end(
     np.testing.assert_allclose(found[:-2], exact, atol=3e-5 * norm.pdf(0) / H * cells.step)
 
 
-def test_all_is_twice_differentiable_where_values_cross_the_end_of_the_grid() -> None:
+def test_all_is_twice_differentiable_where_values_cross_nodes_and_the_end_of_the_grid() -> None:
     cells = kernel_cells()
     e = 1e-2 * H
     x = cells.centers[-1] + np.arange(-9 * H, 9 * H, e)
@@ -100,31 +94,31 @@ def test_all_is_twice_differentiable_where_values_cross_the_end_of_the_grid() ->
     steepest[-2:] /= cells.widths[-1]
     second = np.diff(density, 2, axis=0) / e**2
     assert (np.abs(second) < 1.03 * steepest).all()
-    third = np.diff(second, axis=0) / e
-    assert (np.abs(third) < 10 * steepest / H).all()
+    assert (np.abs(np.diff(second, axis=0) / e) < 10 * steepest / H).all()
+    # The second derivative at a node is that of a Gaussian.
+    k = cells.centers.size - 12
+    u = (x[1:-1] - cells.centers[k]) / H
+    exact = (u**2 - 1) * norm.pdf(u) / H**3
+    np.testing.assert_allclose(second[:, k], exact, atol=3e-2 * norm.pdf(0) / H**3)
 
 
 @both
-@pytest.mark.parametrize("batch", [(1,), (3,), (2, 3), (2, 1, 3)])
-def test_batches_equal_a_loop(estimator: Any, batch: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("batch", [(1,), (2, 3)])
+def test_batches_equal_a_loop_in_any_layout(estimator: Any, batch: tuple[int, ...]) -> None:
     cells = estimator.cells(OBSERVED, EQUAL)
     x, w = draw(5, *batch, 11)
-    expected = np.array([cells.density(x[i], w[i]) for i in np.ndindex(*batch)])
-    shared = np.array([cells.density(x[i], w[(0,) * len(batch)]) for i in np.ndindex(*batch)])
-    np.testing.assert_allclose(
-        cells.density(x, w), expected.reshape(*batch, -1), rtol=1e-12, atol=1e-15
-    )
-    result = cells.density(x, w[(0,) * len(batch)])
-    np.testing.assert_allclose(result, shared.reshape(*batch, -1), rtol=1e-12, atol=1e-15)
-
-
-@both
-def test_a_long_sample_is_the_sum_of_its_parts(estimator: Any) -> None:
-    n = (1 << 17) + 17
-    x = 3 * np.random.default_rng(3).normal(size=n)
-    cells = estimator.cells(OBSERVED, EQUAL)
-    parts = sum(cells.density(part, np.full(part.size, 1 / n)) for part in np.array_split(x, 7))
-    np.testing.assert_allclose(cells.density(x, np.full(n, 1 / n)), parts, rtol=1e-9, atol=1e-14)
+    first = w[(0,) * len(batch)]
+    for weights in (w, np.broadcast_to(first, w.shape), np.full(w.shape, 1 / 11)):
+        expected = [cells.density(x[i], weights[i]) for i in np.ndindex(*batch)]
+        expected = np.reshape(expected, (*batch, -1))
+        wide = np.asfortranarray(x)
+        wide.flags.writeable = False
+        for values in (x, wide, np.repeat(x, 2, axis=-1)[..., ::2]):
+            found = cells.density(values, np.asfortranarray(weights))
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
+    order = np.random.default_rng(12).permutation(11)
+    found = cells.density(x[..., order], w[..., order])
+    np.testing.assert_allclose(found, cells.density(x, w), rtol=1e-10, atol=1e-14)
 
 
 @both
@@ -132,24 +126,21 @@ def test_basis_turns_weights_into_the_density(estimator: Any) -> None:
     cells = estimator.cells(OBSERVED, EQUAL)
     x = np.r_[draw(6, 20)[0], -50, 60, INF, OBSERVED]
     w = draw(7, 4, x.size)[1]
-    a = cells.basis(x)
-    assert a.shape == (x.size, cells.widths.size)
-    np.testing.assert_allclose(
-        w @ a, cells.density(np.broadcast_to(x, w.shape), w), rtol=1e-12, atol=1e-15
-    )
+    expected = cells.density(np.broadcast_to(x, w.shape), w)
+    np.testing.assert_allclose(w @ cells.basis(x), expected, rtol=1e-12, atol=1e-15)
 
 
 @both
-@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
-def test_pullback_equals_finite_differences(estimator: Any, batch: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("batch", [(), (2, 2)])
+def test_adjoint_equals_finite_differences(estimator: Any, batch: tuple[int, ...]) -> None:
     cells = estimator.cells(OBSERVED, EQUAL)
-    rng = np.random.default_rng(8)
     x, w = draw(9, *batch, 8)
     x[..., :4] = -40.0, 50.0, INF, cells.centers[1] + 0.3 * cells.widths[0]
     # Beyond the ends, where a kernel reaches back.
     x[..., 4:6] = cells.centers[0] - 0.7 * H, cells.centers[-1] + 1.3 * H
-    cotangent = rng.normal(size=(*batch, cells.widths.size))
-    for_sample, for_weights = w * cells.slope(x, cotangent), cells.value(x, cotangent)
+    cotangent = np.random.default_rng(8).normal(size=(*batch, cells.widths.size))
+    adjoint = partial(cells.adjoint, for_sample=True)
+    for_sample, for_weights = w * adjoint(x, cotangent), cells.adjoint(x, cotangent)
     assert for_sample.shape == for_weights.shape == x.shape
 
     def objective(sample: Floats, weights: Floats) -> float:
@@ -164,50 +155,27 @@ def test_pullback_equals_finite_differences(estimator: Any, batch: tuple[int, ..
         slope = (objective(x, w + d) - objective(x, w - d)) / (2 * e)
         np.testing.assert_allclose(for_weights[i], slope, rtol=1e-6, atol=1e-8)
     assert (for_sample[..., :3] == 0).all()
+    # The same for any layout, and for a sample that rows share.
+    same = adjoint(np.asfortranarray(x), np.asfortranarray(cotangent))
+    np.testing.assert_array_equal(same, adjoint(x, cotangent))
+    if batch:
+        shared = adjoint(x[0, 0], cotangent)[1, 1]
+        np.testing.assert_array_equal(shared, adjoint(x[0, 0], cotangent[1, 1]))
 
 
-def test_second_derivative_is_continuous_across_nodes_and_that_of_a_gaussian() -> None:
+@pytest.mark.parametrize("function", [lambda z: 0 * z + 3, lambda z: z**2 - z + 2])
+def test_kernel_reading_is_exact_up_to_parabolas(function: Callable[[Floats], Floats]) -> None:
     cells = kernel_cells()
-    e, at = 1e-3 * H, cells.centers.size // 2
-    z = cells.centers[at]
-    exact = norm.pdf(0) / H**3  # the largest second derivative
-
-    def curvature(x: float) -> float:
-        f = [cells.density(np.array([v]), np.ones(1))[at] for v in (x - e, x, x + e)]
-        return float((f[0] - 2 * f[1] + f[2]) / e**2)
-
-    for node in range(at - 8, at + 9):
-        below, above = (curvature(float(cells.centers[node]) + d) for d in (-2 * e, 2 * e))
-        assert abs(above - below) < 2e-2 * exact
-        u = (cells.centers[node] - z) / H
-        assert abs(below - (u**2 - 1) * norm.pdf(u) / H**3) < 3e-2 * exact
-
-
-@pytest.mark.parametrize(
-    "function", [lambda z: 0 * z + 3, lambda z: 2 * z - 1, lambda z: z**2 - z + 2]
-)
-@pytest.mark.parametrize("seed", [0, 1])
-def test_kernel_reading_is_exact_up_to_parabolas(
-    function: Callable[[Floats], Floats], seed: int
-) -> None:
-    cells = kernel_cells()
-    points, w = draw(seed, 12)
-    points[:3] = cells.centers[[2, 10, -3]] + np.array(
-        [0, 0, -1e-9]
-    )  # on nodes, and at the last one
+    points, w = draw(0, 12)
+    points[:3] = cells.centers[[2, 10, -3]] + [0, 0, -1e-9]  # on nodes, and at the last one
     on_cells = np.r_[function(cells.centers), 1e6, -1e6]
-    reading = cells.reading(points, w)
-    assert reading.shape == on_cells.shape
-    np.testing.assert_allclose(reading @ on_cells, w @ function(points), rtol=1e-10)
-
-
-def test_kernel_reading_of_a_gaussian_is_close_and_points_outside_are_read_on_their_side() -> None:
-    cells = kernel_cells()
-    points, w = draw(2, 12)
-    on_cells = np.r_[norm.pdf(cells.centers, 0.3, 1), 0, 0]
     np.testing.assert_allclose(
-        cells.reading(points, w) @ on_cells, w @ norm.pdf(points, 0.3, 1), rtol=1e-3
+        cells.reading(points, w) @ on_cells, w @ function(points), rtol=1e-10
     )
+    on_cells = np.r_[norm.pdf(cells.centers, 0.3, 1), 0, 0]
+    gaussian = w @ norm.pdf(points, 0.3, 1)
+    np.testing.assert_allclose(cells.reading(points, w) @ on_cells, gaussian, rtol=1e-3)
+    # Points outside are read on their side.
     outside = cells.reading(np.array([-99.0, 99.0]), np.array([0.2, 0.8]))
     np.testing.assert_array_equal(outside[-2:], [0.2, 0.8])
     assert (outside[:-2] == 0).all()
@@ -222,10 +190,9 @@ def test_histogram_reading_is_the_mass_in_each_bin() -> None:
     np.testing.assert_allclose(cells.reading(points, w) @ values, expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("bins", [1, 2, 7, 50])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_histogram_equals_numpy(bins: int, seed: int) -> None:
-    x, w = draw(seed, 60)
+@pytest.mark.parametrize("bins", [1, 7, 50])
+def test_histogram_equals_numpy(bins: int) -> None:
+    x, w = draw(bins, 60)
     cells = Histogram(bins).cells(x, w)
     expected, edges = np.histogram(x, bins, weights=w, density=True)
     np.testing.assert_allclose(cells.density(x, w), [*expected, 0, 0], rtol=1e-10, atol=1e-13)
@@ -240,45 +207,15 @@ def test_histogram_bins_are_closed_on_the_left_and_the_last_on_both_sides() -> N
     np.testing.assert_allclose(cells.density(x, np.ones(10)), [3, 1, 1, 3, 1, 1], rtol=1e-12)
 
 
-@both
-def test_equal_weights_however_they_are_passed_give_the_same_density(estimator: Any) -> None:
-    cells = estimator.cells(OBSERVED, EQUAL)
-    x = draw(10, 3, 8)[0]
-    expected = cells.density(x, np.full(8, 1 / 8))
-    for weights in (
-        np.full((3, 8), 1 / 8),
-        np.broadcast_to(1 / 8, (3, 8)),
-        np.broadcast_to(1 / 8, 8),
-    ):
-        np.testing.assert_array_equal(cells.density(x, weights), expected)
-    almost = np.full((3, 8), 1 / 8)
-    almost[2, 7] = 1.0
-    assert (cells.density(x, almost)[2] != expected[2]).any()
-    np.testing.assert_allclose(cells.density(x, almost)[:2], expected[:2], rtol=1e-12, atol=1e-15)
-
-
-@both
-def test_the_order_of_the_sample_does_not_matter(estimator: Any) -> None:
-    cells = estimator.cells(OBSERVED, EQUAL)
-    x, w = draw(11, 40)
-    order = np.random.default_rng(12).permutation(40)
-    found = cells.density(x[order], w[order])
-    np.testing.assert_allclose(found, cells.density(x, w), rtol=1e-10, atol=1e-14)
-
-
 def test_a_product_of_rows_is_that_of_each_row() -> None:
     rng = np.random.default_rng(13)
     weights, matrix = rng.normal(size=(2, 3, 4)), rng.normal(size=(4, 5))
     found = product(weights, matrix)
     np.testing.assert_allclose(found, np.einsum("ijn,nm->ijm", weights, matrix), rtol=1e-12)
     assert product(weights[0, 0], matrix).shape == (5,)
-
-
-def test_a_product_of_nothing_is_nothing() -> None:
-    """As where a part of the data has no value of a group."""
+    # As where a part of the data has no value of a group.
     assert product(np.empty((0, 0)), np.empty((0, 5))).shape == (0, 5)
     assert product(np.empty((2, 3, 0)), np.empty((0, 5))).shape == (2, 3, 5)
-    assert product(np.ones(4), np.ones((4, 5))).shape == (5,)
 
 
 def test_without_a_folder_for_it_the_compiled_loop_is_not_kept(
@@ -299,12 +236,8 @@ def test_without_a_folder_for_it_the_compiled_loop_is_not_kept(
         return decorate
 
     monkeypatch.setattr(numba, "njit", njit)
-
-    def add(values: Floats) -> None:
-        values += 1
-
     values = np.zeros(3)
-    compiled = loops.compiled(add)
+    compiled = loops.compiled(lambda values: values.__iadd__(1))
     assert not asked  # nothing is compiled before it is called
     compiled(values)
     compiled(values)
@@ -313,32 +246,13 @@ def test_without_a_folder_for_it_the_compiled_loop_is_not_kept(
 
 
 @pytest.mark.parametrize("n", [1, 40])
-def test_smoothing_is_a_convolution_that_sees_zero_beyond_the_ends(n: int) -> None:
+def test_smoothing_is_a_convolution_of_values_that_are_zero_beyond_the_ends(n: int) -> None:
     rng = np.random.default_rng(n)
     values, kernel = rng.normal(size=(3, n)), rng.normal(size=7)
     values[1, ::2] = 0
-    out = np.zeros_like(values)
-    loops.smooth(values, kernel, 0, out)
-    expected = [np.convolve(row, kernel)[3:-3] for row in values]
-    np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-14)
-    # On fewer nodes, and on more, than the values have.
-    for first_at, size in ((-5, 4), (2, n + 9), (n + 50, 3), (-n - 50, 3)):
+    wide = np.zeros((3, n + 400))
+    wide[:, 197 : 203 + n] = [np.convolve(row, kernel) for row in values]
+    for first_at, size in ((0, n), (-5, 4), (2, n + 9), (n + 50, 3), (-n - 50, 3)):
         out = np.zeros((3, size))
         loops.smooth(values, kernel, first_at, out)
-        wide = np.zeros((3, n + 400))
-        wide[:, 197 : 203 + n] = [np.convolve(row, kernel) for row in values]
-        np.testing.assert_allclose(out, wide[:, 200 - first_at :][:, :size], atol=1e-14)
-
-
-def test_results_do_not_depend_on_layout_or_permission_to_write() -> None:
-    rng = np.random.default_rng(1)
-    cells = GaussianKDE().cells(rng.normal(size=30), np.full(30, 1 / 30))
-    x, w = rng.normal(size=(4, 50)), rng.random((4, 50))
-    expected, cotangent = cells.density(x, w), rng.normal(size=(4, cells.widths.size))
-    slopes = cells.slope(x, cotangent)
-    wide = np.asfortranarray(x)
-    wide.flags.writeable = False
-    np.testing.assert_array_equal(cells.density(wide, np.asfortranarray(w)), expected)
-    np.testing.assert_array_equal(cells.slope(wide, np.asfortranarray(cotangent)), slopes)
-    np.testing.assert_array_equal(cells.density(np.repeat(x, 2, axis=1)[:, ::2], w), expected)
-    np.testing.assert_array_equal(cells.slope(x[0], cotangent)[2], cells.slope(x[0], cotangent[2]))
+        np.testing.assert_allclose(out, wide[:, 200 - first_at :][:, :size], atol=1e-13)

@@ -16,8 +16,8 @@ import prbayes as prb
 from prbayes.model.description import (
     as_attribute,
     describe,
-    fits_attribute,
     from_attributes,
+    json_attribute,
     labelled,
     observed_dataset,
     versions,
@@ -90,14 +90,9 @@ def test_a_file_tells_what_the_model_does(model: pm.Model) -> None:
     assert from_attributes(as_attribute(model)) == describe(model)
 
 
-def test_what_is_too_long_for_an_attribute_is_left_out(
-    model: pm.Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_too_long_for_an_attribute_is_left_out(model: pm.Model) -> None:
     assert as_attribute(model)
-    assert fits_attribute("x" * 60_000)
-    assert not fits_attribute("x" * (1 << 16))
-    monkeypatch.setattr("prbayes.model.description.fits_attribute", lambda text: False)
-    assert as_attribute(model) == {}
+    assert json_attribute("text", {"x": "x" * 60_000}) == {}
 
 
 @pytest.mark.parametrize(

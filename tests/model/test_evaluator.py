@@ -482,35 +482,33 @@ def support(ess: Any = 100.0, mass: Any = 1.0, lost: Any = 0.0) -> dict[str, Any
     return dict(zip(("weight_ess", "mean_weight", "lost_mass"), values, strict=True))
 
 
-def found(level: Requirement = ENOUGH, **keywords: Any) -> Shortcoming:
+def found(level: Requirement = ENOUGH, **keywords: Any) -> Shortcoming | None:
     return shortcoming(support(**keywords), 80.0, 0.05, 256, level)
 
 
 def test_a_design_that_supports_all_falls_short_in_nothing() -> None:
     assert not found()
-    assert str(found()) == ""
 
 
 @pytest.mark.parametrize(
     ("keywords", "level", "which"),
     [
-        ({"ess": 79.0}, ENOUGH, "ess"),
+        ({"ess": 79.0}, ENOUGH, "sample size"),
         ({"ess": 79.0}, TOLERABLE, None),
-        ({"ess": 39.0}, TOLERABLE, "ess"),
-        ({"mass": 0.79}, ENOUGH, "mass"),
-        ({"mass": 1.26}, ENOUGH, "mass"),
+        ({"ess": 39.0}, TOLERABLE, "sample size"),
+        ({"mass": 0.79}, ENOUGH, "mean raw weight"),
+        ({"mass": 1.26}, ENOUGH, "mean raw weight"),
         ({"mass": 1.26}, TOLERABLE, None),
-        ({"mass": 0.69}, TOLERABLE, "mass"),
-        ({"mass": 1.41}, TOLERABLE, "mass"),
+        ({"mass": 0.69}, TOLERABLE, "mean raw weight"),
+        ({"mass": 1.41}, TOLERABLE, "mean raw weight"),
         ({"lost": 0.06}, ENOUGH, "lost"),
         ({"lost": 0.04}, ENOUGH, None),
     ],
 )
 def test_levels(keywords: dict[str, float], level: Requirement, which: str | None) -> None:
     short = found(level, **keywords)
-    assert bool(short) == (which is not None)
-    for name in ("ess", "mass", "lost"):
-        assert (getattr(short, name) is not None) == (name == which)
+    assert (which or "") in str(short)
+    assert (short is None) == (which is None)
 
 
 def test_single_populations_far_out_may_fall_short_and_a_tenth_may_not() -> None:
@@ -518,7 +516,7 @@ def test_single_populations_far_out_may_fall_short_and_a_tenth_may_not() -> None
     ess[:1] = 90.0
     assert not found(ess=ess)
     ess[:3] = 7.0
-    assert found(ess=ess).ess == (7.0, 100.0)
+    assert "7 (5% quantile) and 100 (median)" in str(found(ess=ess))
     mass = np.ones(20)
     mass[:3] = 0.5
     assert found(mass=mass)
@@ -527,7 +525,6 @@ def test_single_populations_far_out_may_fall_short_and_a_tenth_may_not() -> None
 
 def test_lost_mass_is_said_first_and_alone() -> None:
     short = found(ess=1.0, lost=0.5)
-    assert short.ess is not None
     assert str(short).startswith("lost mass: 50.0% of a population's weight")
     assert "effective" not in str(short)
     assert "expected 8 and 80, and mean raw weight from 3.00" in str(found(ess=1.0, mass=3.0))

@@ -21,6 +21,7 @@ from pymc.model.fgraph import clone_model
 import prbayes as prb
 from prbayes._progress import _hidden
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.random_variable import computed
 from prbayes.response.compile import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.5, 0.6, 20)
@@ -204,7 +205,7 @@ def test_two_threads_that_use_a_model_first_compute_its_runs_once() -> None:
 
     def use(_: int) -> object:
         barrier.wait()
-        return model["y"].owner.op.node
+        return computed(model["y"].owner.op.simulator)
 
     with ThreadPoolExecutor(2) as threads:
         first, second = threads.map(use, range(2))

@@ -177,7 +177,7 @@ def test_the_owner_of_a_node_keeps_it() -> None:
     own = node_of(clone)
     assert own is not node
     assert node_of(clone) is own
-    assert model["y"].owner.op.node is node
+    assert model["y"].owner.op.simulator is node
 
 
 def test_counts_of_resimulated_responses_are_apart() -> None:

@@ -14,23 +14,18 @@ def cubic(thetas: Floats) -> Floats:
 
 
 def test_a_cross_is_theta_then_all_up_then_all_down() -> None:
-    theta = np.array([1.0, 2.0])
-    points = cross(theta, np.array([0.5, 0.25]))
+    points = cross(np.array([1.0, 2.0]), np.array([0.5, 0.25]))
     np.testing.assert_array_equal(points, [[1, 2], [1.5, 2], [1, 2.25], [0.5, 2], [1, 1.75]])
 
 
-def test_slopes_are_derivatives_with_their_sign() -> None:
-    value, gradient, evaluations = differences(cubic, STEP)(np.array([2.0, 0.5]))
-    assert value == 6.0
+def test_first_differences() -> None:
+    theta = np.array([2.0, 0.5])
+    value, gradient, evaluations = differences(cubic, STEP)(theta)
+    assert (value, evaluations) == (6.0, 5)
     np.testing.assert_allclose(gradient, [11.0, -4.0], rtol=1e-7)
-    assert evaluations == 5
-
-
-def test_slopes_of_arrays_have_the_derivative_last() -> None:
-    def both(thetas: Floats) -> Floats:
-        return np.stack([cubic(thetas), -cubic(thetas)], axis=-1)
-
-    found = slopes(both(cross(np.array([2.0, 0.5]), STEP)), STEP)
+    # Slopes of arrays have the derivative last.
+    values = cubic(cross(theta, STEP))
+    found = slopes(np.stack([values, -values], axis=-1), STEP)
     np.testing.assert_allclose(found, [[11.0, -4.0], [-11.0, 4.0]], rtol=1e-7)
 
 
@@ -44,7 +39,7 @@ def test_differences_at_an_edge_are_one_sided(side: float) -> None:
     np.testing.assert_allclose(gradient, [2.0 * side, 1.0], rtol=1e-3)
 
 
-def test_a_parabola() -> None:
+def test_second_differences_of_a_parabola() -> None:
     exact = np.array([[3.0, 1.0, 0.5], [1.0, -2.0, 0.0], [0.5, 0.0, 1.0]])
     found = second_differences(
         lambda x: 0.5 * np.einsum("bsi,ij,bsj->s", x, exact, x) + x.sum(axis=(0, 2)), 3

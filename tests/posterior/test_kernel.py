@@ -1,10 +1,9 @@
-"""The kernel's stages and first particles, and runs that go on from a checkpoint of their own."""
+"""The kernel of SMC: steps, stages, first particles, and chains that continue from a checkpoint."""
 
 from __future__ import annotations
 
-import json
+import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,73 +12,73 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
-from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
+from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
-from prbayes.model.parameters import Hyperparameters
 from prbayes.posterior.kernel import (
     BatchedKernel,
     Checkpoint,
+    KernelOptions,
     Particles,
-    _sealed,
     correlation,
-    fitted_normal,
     starting_thetas,
-    stored_settings,
 )
+from prbayes.posterior.results import Chains
+from prbayes.posterior.smc import SamplingSettings, run_chains
 from prbayes.response.budget import BudgetError
 from prbayes.response.store import StoreError
 
-OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 20)
+AREA = prb.AreaMetric()
+DRAWS, CHAINS = 20, 3
+PROPAGATIONS: dict[str, Any] = {
+    "stored": prb.Reweighted(64),
+    "large": prb.Reweighted(512),
+    "random": prb.Fresh(32),
+}
 
 
-def same(x: Any) -> Any:
-    return x
+@pytest.fixture(autouse=True)
+def _large(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("prbayes.model.evaluator._LARGE", 512)
 
 
-@cache
-def area_model() -> pm.Model:
+def one_mean(propagation: Any, response: Any = np.positive, metric: Any = AREA) -> pm.Model:
     with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
         prb.Simulator(
-            "y",
-            same,
-            x,
-            metric=prb.AreaMetric(),
-            observed=OBSERVED,
-            epsilon=0.02,
-            propagation=prb.Reweighted(256),
-        )
+            "y", response, x, metric=metric, observed=OBSERVED, epsilon=0.05,
+            propagation=propagation,
+        )  # fmt: skip
     return model
 
 
+def evaluator(name: str) -> Evaluator:
+    return Evaluator.of(one_mean(PROPAGATIONS[name]))
+
+
 @cache
-def evaluator() -> Evaluator:
-    return Evaluator.of(area_model())
+def stored() -> Evaluator:
+    return evaluator("stored")
 
 
 def begun(draws: int = 60, **keywords: Any) -> BatchedKernel:
-    kernel = BatchedKernel(draws, model=area_model(), evaluator=evaluator(), **keywords)
+    kernel = BatchedKernel(draws, model=stored().model, evaluator=stored(), **keywords)
     kernel.initialize(None, np.random.default_rng(3))
     return kernel
-
-
-def stage(kernel: BatchedKernel) -> None:
-    kernel.update_beta_and_weights()
-    kernel.step()
 
 
 # -- Metropolis and Hastings
 
 
-@dataclass
 class Quadratic:
     """Log prior and log likelihood -x^2 / 4 and -x^2 / 2: at beta 1/2 a standard normal."""
 
-    within: float = np.inf
+    def __init__(self, within: float = np.inf) -> None:
+        self.within = within
 
     def __call__(self, thetas: Floats) -> Particles:
         squared = (thetas**2).sum(axis=1)
@@ -87,206 +86,118 @@ class Quadratic:
         return Particles(thetas, -squared / 4, likelihood, squared[:, None], thetas[:, :1] ** 3)
 
 
-def at_standard_normal(n: int, target: Quadratic) -> BatchedKernel:
+def at_standard_normal(n: int, target: Quadratic, within: float = np.inf) -> BatchedKernel:
     kernel = begun(10)
     kernel._evaluate = target
-    kernel.beta = 0.5
-    kernel.rng = np.random.default_rng(8)
-    kernel._take(target(kernel.rng.standard_normal((n, 2))))
+    kernel.beta, kernel.draws, kernel.rng = 0.5, n, np.random.default_rng(8)
+    thetas = stats.truncnorm(-within, within).rvs((n, 2), random_state=kernel.rng)
+    thetas[:, 1] = kernel.rng.standard_normal(n)
+    kernel._take(target(thetas))
     return kernel
 
 
-@pytest.mark.parametrize("proposal", ["_independent_step", "_random_walk_step"])
-def test_proposals_leave_a_standard_normal_as_it_is(proposal: str) -> None:
-    n = 20_000
-    kernel = at_standard_normal(n, Quadratic())
-    # A fit that is off, as one to few particles is: the acceptance has to make up for it.
-    root = np.array([[1.4, 0.0], [0.5, 0.8]])
-    fitted = (np.array([0.4, -0.3]), root) if proposal == "_independent_step" else (root,)
-    propose = getattr(kernel, proposal)
-    before = kernel.tempered_posterior
-    rates = [propose(*fitted, kernel.rng.standard_normal((n, 2))) for _ in range(8)]
-    after = kernel.tempered_posterior
-    assert 0.2 < np.mean(rates) < 0.95
-    assert (after != before).any(axis=1).mean() > 0.8
-    standard_error = n**-0.5
-    np.testing.assert_allclose(after.mean(axis=0), 0.0, atol=5 * standard_error)
-    np.testing.assert_allclose(after.var(axis=0), 1.0, atol=5 * 2**0.5 * standard_error)
-    assert abs((after[:, 0] * after[:, 1]).mean()) < 5 * standard_error
-    # What is noted of the particles goes with them.
-    for found, expected in zip(kernel.particles, Quadratic()(after), strict=True):
-        np.testing.assert_array_equal(found, expected)
+def test_steps_preserve_a_truncated_normal() -> None:
+    """The fitted normal passes the ends of the first element: acceptance makes up for it."""
+    n, target = 20_000, Quadratic(within=1.0)
+    kernel = at_standard_normal(n, target, within=1.0)
+    start = kernel.tempered_posterior
+    kernel.mutate()
+    end = kernel.tempered_posterior
+    assert 0.2 < kernel.accept_rate < 0.95
+    assert (end != start).any(axis=1).mean() > 0.8
+    assert np.abs(end[:, 0]).max() < 1  # points without a density are never accepted
+    sd = np.array([stats.truncnorm(-1, 1).std(), 1.0])
+    np.testing.assert_allclose(end.mean(axis=0) / sd, 0.0, atol=5 * n**-0.5)
+    np.testing.assert_allclose(end.std(axis=0) / sd, 1.0, atol=5 * (2 * n) ** -0.5)
+    assert abs((end[:, 0] * end[:, 1]).mean()) < 5 * sd[0] * n**-0.5
+    for values, expected in zip(kernel.particles, target(end), strict=True):
+        np.testing.assert_array_equal(values, expected)
 
 
-def test_places_without_a_discrepancy_are_never_accepted() -> None:
-    kernel = at_standard_normal(500, Quadratic())
-    inside = np.clip(kernel.tempered_posterior, -0.9, 0.9)
-    target = Quadratic(within=1.0)
-    kernel._evaluate = target
-    kernel._take(target(inside))
-    rate = kernel._accept(inside + 3.0, np.full(500, 100.0))
-    assert rate == 0.0
-    np.testing.assert_array_equal(kernel.tempered_posterior, inside)
-
-
-def test_the_fitted_normal_has_the_moments_of_the_particles() -> None:
-    particles = np.random.default_rng(2).normal([1.0, -2.0], [0.5, 3.0], (200, 2))
-    mean, root = fitted_normal(particles)
-    np.testing.assert_allclose(mean, particles.mean(axis=0))
-    np.testing.assert_allclose(root @ root.T, np.cov(particles.T), rtol=1e-9)
-    assert np.isfinite(fitted_normal(np.ones((10, 2)))[1]).all()
-
-
-def test_correlation_of_particles_with_those_before() -> None:
-    before = np.random.default_rng(2).normal(size=(2000, 2))
-    other = np.random.default_rng(3).normal(size=(2000, 2))
-    np.testing.assert_allclose(correlation(before, before), 1.0)
-    np.testing.assert_allclose(correlation(before, 3.0 - 2.0 * before), 1.0)
-    assert correlation(before, other) < 5 * 2000**-0.5
-    assert correlation(before, np.ones_like(before)) == 0.0
-
-
-# -- Stages
-
-
-def test_the_weights_of_a_stage_keep_the_share_asked_for() -> None:
-    for threshold in (0.3, 0.7):
-        kernel = begun(400, threshold=threshold)
-        kernel.update_beta_and_weights()
-        assert 0 < kernel.beta < 1
-        np.testing.assert_allclose(kernel.weights.sum(), 1.0)
-        effective = 1 / (kernel.weights**2).sum()
-        np.testing.assert_allclose(effective, threshold * 400, rtol=0.02)
-
-
-def test_what_is_noted_of_particles_is_theirs_after_a_stage() -> None:
-    kernel = begun()
-    stage(kernel)
-    expected = kernel._evaluate(kernel.tempered_posterior)
-    for found, values in zip(kernel.particles, expected, strict=True):
-        np.testing.assert_allclose(found, values)
-    np.testing.assert_allclose(kernel.likelihood_logp, -expected.discrepancies[:, 0] / 0.02)
-
-
-def test_resampling_takes_particles_by_their_weights() -> None:
+def test_identical_particles_move() -> None:
     kernel = begun(10)
-    before = kernel.particles
+    kernel._evaluate = Quadratic()
+    kernel._take(kernel._evaluate(np.ones((10, 2))))
+    kernel.mutate()
+    assert np.isfinite(kernel.tempered_posterior).all()
+
+
+def test_correlation_with_previous_particles() -> None:
+    previous, independent = np.random.default_rng(2).normal(size=(2, 2000, 2))
+    np.testing.assert_allclose(correlation(previous, 3.0 - 2.0 * previous), 1.0)
+    assert correlation(previous, independent) < 5 * 2000**-0.5
+    assert correlation(previous, np.ones_like(previous)) == 0.0
+
+
+# -- stages
+
+
+@pytest.mark.parametrize("threshold", [0.3, 0.7])
+def test_a_stage_keeps_the_threshold_of_effective_particles(threshold: float) -> None:
+    kernel = begun(400, threshold=threshold)
+    kernel.update_beta_and_weights()
+    assert 0 < kernel.beta < 1
+    np.testing.assert_allclose(1 / (kernel.weights**2).sum(), threshold * 400, rtol=0.02)
+    kernel.step()
+    expected = kernel._evaluate(kernel.tempered_posterior)
+    for values, others in zip(kernel.particles, expected, strict=True):
+        np.testing.assert_allclose(values, others)
+    np.testing.assert_allclose(kernel.likelihood_logp, -expected.discrepancies[:, 0] / 0.05)
+
+
+def test_resampling_follows_the_weights() -> None:
+    kernel = begun(10)
+    particles = kernel.particles
     kernel.weights = np.zeros(10)
     kernel.weights[[2, 7]] = 0.3, 0.7
     kernel.resample()
-    taken = np.repeat([2, 7], [3, 7])
-    np.testing.assert_array_equal(kernel.tempered_posterior, before.thetas[taken])
-    np.testing.assert_array_equal(kernel.particles.discrepancies, before.discrepancies[taken])
+    rows = np.repeat([2, 7], [3, 7])
+    np.testing.assert_array_equal(kernel.tempered_posterior, particles.thetas[rows])
+    np.testing.assert_array_equal(kernel.particles.discrepancies, particles.discrepancies[rows])
 
 
 def test_another_evaluator_weighs_the_particles() -> None:
     # A standard normal at beta 1, of prior and likelihood exp(-x^2 / 4) each.
     kernel = at_standard_normal(4000, Quadratic())
-    kernel.beta, kernel.draws, kernel.is_coarse = 1.0, 4000, True
-    likelihood = kernel.likelihood_logp / 2
-    kernel._take(kernel.particles._replace(log_likelihood=likelihood))
-    kernel._evaluate = Quadratic()
-    assert kernel.reweight(evaluator())
+    kernel.beta, kernel.is_coarse = 1.0, True
+    coarse = kernel.particles._replace(log_likelihood=kernel.likelihood_logp / 2)
+    kernel._take(coarse)
+    assert kernel.reweight(stored())
     assert not kernel.is_coarse
-    assert kernel.evaluator is evaluator()
     # The mean of exp(-x^2 / 4) in two dimensions is 2/3; variances become 2/3.
     assert kernel.log_marginal_likelihood == pytest.approx(np.log(2 / 3), abs=0.03)
     kernel.resample()
     np.testing.assert_allclose(kernel.tempered_posterior.var(axis=0), 2 / 3, rtol=0.1)
-    np.testing.assert_array_equal(kernel.likelihood_logp, Quadratic()(kernel.tempered_posterior)[2])
 
 
-def test_particles_that_carry_no_weight_do_not_serve() -> None:
+@pytest.mark.parametrize(("within", "is_enough"), [(0.0, False), (0.2, False), (0.4, True)])
+def test_a_fifth_of_the_particles_needs_weight(within: float, is_enough: bool) -> None:
+    """Of a standard normal, 0, 16 and 31 per cent are within."""
     kernel = at_standard_normal(1000, Quadratic())
-    kernel.beta, kernel.draws = 1.0, 1000
-    kernel._evaluate = Quadratic(within=0.0)
-    assert not kernel.reweight(evaluator())
-    kernel = at_standard_normal(1000, Quadratic())
-    kernel.draws = 1000
-    kernel._evaluate = Quadratic(within=0.2)  # 16% of them
-    assert not kernel.reweight(evaluator())
-    kernel = at_standard_normal(1000, Quadratic())
-    kernel.draws = 1000
-    kernel._evaluate = Quadratic(within=0.4)  # 31%
-    assert kernel.reweight(evaluator())
+    kernel._evaluate = Quadratic(within)
+    assert kernel.reweight(stored()) == is_enough
 
 
-def test_a_state_that_is_restored_goes_on_bit_for_bit() -> None:
-    kernel = begun()
-    stage(kernel)
-    arrays, note = kernel.state()
-    arrays = {name: array.copy() for name, array in arrays.items()}
-    note = json.loads(json.dumps(note))
-    again = BatchedKernel(60, model=area_model(), evaluator=evaluator(), random_seed=99)
-    again.restore(arrays, note)
-    while kernel.beta < 1:
-        stage(kernel)
-        stage(again)
-        assert again.beta == kernel.beta
-    assert again.log_marginal_likelihood == kernel.log_marginal_likelihood
-    assert again.iteration == kernel.iteration
-    expected, _ = kernel.state()
-    found, _ = again.state()
-    for name, array in expected.items():
-        np.testing.assert_array_equal(found[name], array)
-    assert not np.array_equal(arrays["thetas"], found["thetas"])  # the saved ones stay as they were
-
-
-@pytest.mark.parametrize("threshold", [0.0, 1.0, -1.0, np.nan])
-def test_a_threshold_that_is_no_share_is_refused(threshold: float) -> None:
-    with pytest.raises(ValueError, match="threshold"):
-        BatchedKernel(10, model=area_model(), threshold=threshold)
-
-
-# -- Under PyMC's own sampler
-
-
-def test_the_methods_that_the_kernel_relies_on_exist() -> None:
-    for name in (
-        "initialize", "set_rng", "_reset_state", "_initialize_kernel", "setup_kernel", "update_beta_and_weights",
-        "step", "resample", "tune", "mutate", "sample_stats", "sample_settings",
-    ):  # fmt: skip
-        assert callable(getattr(SMC_KERNEL, name)), name
-    index = systematic_resampling(np.array([0.5, 0.0, 0.5]), np.random.default_rng(1))
-    assert sorted(index) in ([0, 0, 2], [0, 2, 2])
-    kernel = BatchedKernel(20, model=area_model(), random_seed=1)
-    for name in (
-        "tempered_posterior",
-        "prior_logp",
-        "likelihood_logp",
-        "beta",
-        "iteration",
-        "weights",
-    ):
-        assert hasattr(kernel, name), name
-    assert kernel.beta == 0
-    assert kernel.log_marginal_likelihood == 0
+STEPS = {
+    "initialize", "set_rng", "_reset_state", "_initialize_kernel", "setup_kernel",
+    "update_beta_and_weights", "step", "resample", "tune", "mutate", "sample_stats",
+    "sample_settings",
+}  # fmt: skip
+RECORD: list[str] = []
 
 
 class Recording(BatchedKernel):
     def __getattribute__(self, name: str) -> Any:
-        if name in RECORDED:
+        if name in STEPS:
             RECORD.append(name)
         return super().__getattribute__(name)
 
 
-RECORD: list[str] = []
-RECORDED = {
-    "initialize", "set_rng", "_reset_state", "_initialize_kernel", "setup_kernel", "update_beta_and_weights", "step",
-    "resample", "tune", "mutate", "sample_stats", "sample_settings",
-}  # fmt: skip
-
-
 def test_pymc_calls_the_kernel_in_the_documented_order() -> None:
     RECORD.clear()
-    keywords = {
-        "draws": 60,
-        "chains": 1,
-        "cores": 1,
-        "progressbar": False,
-        "compute_convergence_checks": False,
-    }
-    idata = pm.sample_smc(kernel=Recording, model=area_model(), random_seed=1, **keywords)
+    keywords = {"chains": 1, "cores": 1, "progressbar": False, "compute_convergence_checks": False}
+    model = stored().model
+    idata = pm.sample_smc(60, kernel=Recording, model=model, random_seed=1, **keywords)
     stages = idata.sample_stats["beta"].size
     first = RECORD.index("initialize")
     start = ["initialize", "_reset_state", "set_rng", "_initialize_kernel", "setup_kernel"]
@@ -294,36 +205,26 @@ def test_pymc_calls_the_kernel_in_the_documented_order() -> None:
     assert RECORD[first:] == start + stages * stage + ["sample_settings"]
 
 
-def test_the_kernel_needs_an_epsilon() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
-        prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=prb.Reweighted(16)
-        )
-    with pytest.raises(ValueError, match=r"y: epsilon is not set; call prb\.set_epsilon"):
-        BatchedKernel(50, model=model)
+# -- first particles
+
+MU = np.random.default_rng(1).normal(1, 1, (7, 2))
+SIGMA = np.abs(np.random.default_rng(2).normal(size=7))
 
 
-RNG = np.random.default_rng(1)
-MU = RNG.normal(1, 1, (7, 2))
-SIGMA = np.abs(RNG.normal(size=7))
-
-
-def names() -> Hyperparameters:
+@cache
+def vector_model() -> Evaluator:
     with pm.Model() as model:
         mu, sigma = pm.Normal("mu", 1, 1, shape=2), pm.HalfNormal("sigma", 1)
-        prb.Simulator(
-            "y", np.positive, pm.Normal.dist(mu[0] + mu[1], sigma), metric=prb.AreaMetric(),
-            observed=[0.0, 1.0, 2.0], propagation=prb.Reweighted(64),
-        )  # fmt: skip
-    return Evaluator.of(model).hyperparameters
+        x = pm.Normal.dist(mu[0] + mu[1], sigma)
+        prb.Simulator("y", np.positive, x, observed=[0.0, 1.0, 2.0], metric=prb.AreaMetric())
+    return Evaluator.of(model)
 
 
 def test_own_units_and_transformed_values_are_the_same_thetas() -> None:
-    found = starting_thetas(names(), {"mu": MU, "sigma": SIGMA}, 7)
-    np.testing.assert_allclose(found, np.column_stack([MU, np.log(SIGMA)]), rtol=1e-12)
-    other = starting_thetas(names(), {"sigma_log__": np.log(SIGMA), "mu": MU}, 7)
-    np.testing.assert_allclose(found, other, rtol=1e-12)
+    expected = np.column_stack([MU, np.log(SIGMA)])
+    for start in ({"mu": MU, "sigma": SIGMA}, {"sigma_log__": np.log(SIGMA), "mu": MU}):
+        thetas = starting_thetas(vector_model().hyperparameters, start, 7)
+        np.testing.assert_allclose(thetas, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -339,150 +240,225 @@ def test_own_units_and_transformed_values_are_the_same_thetas() -> None:
         ({"mu": MU * np.nan, "sigma": SIGMA}, ValueError, "got 7 of 7 points outside"),
     ],
 )
-def test_other_starts_are_refused(start: Any, error: type[Exception], message: str) -> None:
+def test_invalid_starts(start: Any, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
-        starting_thetas(names(), start, 7)
+        starting_thetas(vector_model().hyperparameters, start, 7)
 
 
-READINGS = np.random.default_rng(1).normal(2.0, 1.0, 40)
+# -- chains
 
 
-def run(path: Path, **changes: Any) -> Any:
-    """Sample a model; any of its parts, or settings of the run, may be changed."""
-    prior = changes.pop("prior", lambda: pm.Normal("mu", 1, 1))
-    slope = changes.pop("slope", 2.0)
-    constant = changes.pop("constant", 3.0)
-    family: Any = changes.pop("family", pm.Normal)
-    simulator = {"metric": prb.KullbackLeibler(), "observed": READINGS, "epsilon": 0.05}
-    simulator |= {"propagation": prb.Reweighted(64, max_lost=0.9)} | changes.pop("simulator", {})
-    settings = {"draws": 20, "chains": 1, "random_seed": 1, "adjustment": None, "refine": False}
-    settings |= changes.pop("settings", {})
-    assert not changes
-    with pm.Model() as model:
-        mu = prior()
-        x = family.dist(mu, 1.0)
-        prb.Simulator("y", lambda x, c: slope * x + c - 3.0, x, constant, **simulator)
-    return prb.sample_smc(model=model, checkpoint=path, progressbar=False, **settings)
+class Killed(Exception):  # noqa: N818
+    pass
 
 
-def with_potential() -> Any:
-    mu = pm.Normal("mu", 1, 1)
-    pm.Potential("penalty", -50.0 * (mu - 5) ** 2)
-    return mu
+def run(name: str, path: Path | None = None) -> Chains:
+    problem = evaluator(name)
+    checkpoint = None if path is None else Checkpoint(path, identity_of(problem), {})
+    seeds = np.random.SeedSequence(3).spawn(CHAINS)
+    return run_chains(problem, SamplingSettings(draws=DRAWS), seeds, checkpoint=checkpoint)
 
 
-CHANGES: dict[str, dict[str, Any]] = {
-    "prior": {"prior": lambda: pm.Normal("mu", -3, 0.1)},
-    "prior family": {"prior": lambda: pm.Laplace("mu", 1, 1)},
-    "potential": {"prior": with_potential},
-    "response": {"slope": 4.0},
-    "constant": {"constant": 5.0},
-    "inputs": {"family": pm.Gumbel},
-    "metric": {"simulator": {"metric": prb.AreaMetric()}},
-    "observed": {"simulator": {"observed": READINGS + 1}},
-    "epsilon": {"simulator": {"epsilon": 0.1}},
-    "propagation": {"simulator": {"propagation": prb.Resimulated(64)}},
-    "design": {"simulator": {"propagation": prb.Reweighted(128, max_lost=0.9)}},
-    "seed": {"settings": {"random_seed": 2}},
-    "draws": {"settings": {"draws": 30}},
-    "chains": {"settings": {"chains": 2}},
-    "threshold": {"settings": {"threshold": 0.7}},
-    "adjustment": {"settings": {"adjustment": "estimate"}},
-    "refinement": {"settings": {"refine": True}},
-}
+@cache
+def undisturbed(name: str) -> Chains:
+    return run(name)
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
-    path = tmp_path_factory.mktemp("run") / "run.nc"
-    return path, run(path)
+def kill_after(n_stages: int, patch: pytest.MonkeyPatch) -> None:
+    """Raise at the stage after so many."""
+    original, calls = BatchedKernel.mutate, []
+
+    def mutate(self: BatchedKernel) -> None:
+        if len(calls) == n_stages:
+            raise Killed
+        calls.append(1)
+        original(self)
+
+    patch.setattr(BatchedKernel, "mutate", mutate)
 
 
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_checkpoint_of_another_run_is_refused(change: str, done: tuple[Path, Any]) -> None:
-    path, _ = done
-    before = path.read_bytes()
-    with pytest.raises(StoreError, match=r"belongs to another run: .*move it away"):
-        run(path, **CHANGES[change])
-    assert path.read_bytes() == before
+def require_same(chains: Chains, expected: Chains) -> None:
+    np.testing.assert_array_equal(chains.thetas, expected.thetas)
+    np.testing.assert_array_equal(chains.discrepancies, expected.discrepancies)
+    xr.testing.assert_equal(chains.sample_stats, expected.sample_stats)
 
 
-def test_the_same_run_gives_the_same_draws_at_once(done: tuple[Path, Any]) -> None:
-    path, first = done
-    again = run(path)
-    np.testing.assert_array_equal(again["posterior"]["mu"], first["posterior"]["mu"])
+@pytest.mark.long
+@pytest.mark.parametrize("name", PROPAGATIONS)
+@pytest.mark.parametrize("where", ["in the first", "before its end", "between", "in the last"])
+def test_a_killed_run_continues_with_the_same_particles(
+    name: str, where: str, tmp_path: Path
+) -> None:
+    expected = undisturbed(name)
+    first, second, _ = expected.sample_stats["beta"].count("stage").values
+    n_stages = {
+        "in the first": 1,
+        "before its end": first - 1,
+        "between": first,
+        "in the last": first + second + 1,
+    }[where]
+    with pytest.MonkeyPatch.context() as patch:
+        kill_after(n_stages, patch)
+        with pytest.raises(Killed):
+            run(name, tmp_path / "run.nc")
+    require_same(run(name, tmp_path / "run.nc"), expected)
+
+
+def test_finished_chains_compute_nothing_again(tmp_path: Path) -> None:
+    run("stored", tmp_path / "run.nc")
+    with pytest.MonkeyPatch.context() as patch:
+        kill_after(0, patch)
+        require_same(run("stored", tmp_path / "run.nc"), undisturbed("stored"))
+
+
+def test_a_restarted_chain_has_the_particles_of_the_user_again() -> None:
+    start = np.random.default_rng(4).normal(0, 2, (DRAWS, 1))
+    kernel = BatchedKernel(DRAWS, start, stored().model, evaluator=stored())
+    kernel.initialize(kernel.start, np.random.default_rng(1))
+    kernel.restore(*kernel.state())
+    kernel.initialize(kernel.start, kernel.rng)
+    np.testing.assert_array_equal(kernel.particles.thetas, start)
+
+
+@pytest.mark.parametrize("name", ["stored", "large"])
+def test_chains_are_independent_and_have_their_discrepancies(name: str) -> None:
+    chains = undisturbed(name)
+    assert np.unique(chains.thetas[:, :, 0]).size > 0.5 * CHAINS * DRAWS
+    for i in range(CHAINS):
+        assert not np.isin(chains.thetas[i], chains.thetas[:i]).any()
+    again = evaluator(name)(chains.thetas.reshape(-1, 1)).discrepancies
+    np.testing.assert_allclose(chains.discrepancies.reshape(-1, 1), again)
+
+
+def test_large_designs_are_complete_in_the_last_stage_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    n_points: list[int] = []
+    original = BatchedKernel.mutate
+
+    def mutate(self: BatchedKernel) -> None:
+        n_points.append(self.evaluator.nodes[0].bound.n_points)
+        original(self)
+
+    monkeypatch.setattr(BatchedKernel, "mutate", mutate)
+    stats_ = run("large").sample_stats
+    expected = []
+    for betas, evidence in zip(stats_["beta"], stats_["log_marginal_likelihood"], strict=True):
+        betas = betas[~np.isnan(betas)]
+        expected += [64] * (betas.size - 1) + [512]
+        # Twice at one: on an eighth of the points, and on all of them.
+        assert betas[-2:].values.tolist() == [1, 1]
+        assert betas[:-2].max() < 1
+        assert np.isnan(evidence[: betas.size - 2]).all()
+    assert n_points == expected
+
+
+def mean_evidence(chains: Chains) -> Any:
+    logs = chains.sample_stats["log_marginal_likelihood"].values
+    return np.mean([row[~np.isnan(row)][-1] for row in logs])
+
+
+def test_a_chain_with_few_weights_starts_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("prbayes.posterior.kernel._OPTIONS", KernelOptions(effective=1.1))
+    chains = run("large")
+    for betas in chains.sample_stats["beta"].values:
+        betas = betas[~np.isnan(betas)]
+        assert (betas == 1).sum() == 1
+        assert (np.diff(betas) > 0).all()
+    # From the prior: the whole evidence again.
+    expected = mean_evidence(undisturbed("large"))
+    assert mean_evidence(chains) == pytest.approx(expected, abs=0.5)
+
+
+def test_coarser_designs_change_no_posterior(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = evaluator("large")
+    settings = SamplingSettings(draws=500)
+    coarse = run_chains(problem, settings, np.random.SeedSequence(1).spawn(4))
+    monkeypatch.setattr("prbayes.model.evaluator._LARGE", 513)
+    whole = run_chains(problem, settings, np.random.SeedSequence(3).spawn(4))
+    assert abs(coarse.thetas.mean() - whole.thetas.mean()) < 0.2 * whole.thetas.std()
+    assert coarse.thetas.std() == pytest.approx(whole.thetas.std(), rel=0.15)
+    evidence, expected = (mean_evidence(chains) for chains in (coarse, whole))
+    np.testing.assert_allclose(evidence, expected, atol=0.2)
+
+
+# -- checkpoints
+
+
+def sample(path: Path, response: Any = np.positive, **changes: Any) -> xr.DataTree:
+    model = one_mean(prb.Reweighted(64, max_lost=0.9), response, prb.KullbackLeibler())
+    settings = {"draws": 20, "chains": 1, "random_seed": 1, "adjustment": None} | changes
+    return prb.sample_smc(model=model, checkpoint=path, progressbar=False, refine=False, **settings)
+
+
+def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.nc"
+    first = sample(path)
+    content = path.read_bytes()
+    for changes in ({"response": np.negative}, {"random_seed": 2}, {"draws": 30}):
+        with pytest.raises(StoreError, match=r"belongs to another run: .*move it away"):
+            sample(path, **changes)
+    assert path.read_bytes() == content
+    xr.testing.assert_equal(sample(path).posterior.to_dataset(), first.posterior.to_dataset())
 
 
 @pytest.mark.parametrize("adjustment", [None, "estimate"])
-def test_an_interrupted_run_gives_the_draws_that_it_would_have_given(
+def test_an_interrupted_run_gives_the_draws_of_an_uninterrupted_one(
     adjustment: str | None, tmp_path: Path
 ) -> None:
     settings = {"adjustment": adjustment, "chains": 2, "threshold": 0.7}
-    at_once = run(tmp_path / "at_once.nc", settings=settings)
+    expected = sample(tmp_path / "at_once.nc", **settings)
     with pytest.raises(BudgetError, match="max_stages = 1"):
-        run(tmp_path / "run.nc", settings=settings | {"max_stages": 1})
-    resumed = run(tmp_path / "run.nc", settings=settings)
+        sample(tmp_path / "run.nc", max_stages=1, **settings)
+    resumed = sample(tmp_path / "run.nc", **settings)
     for group in ("posterior", "sample_stats"):
-        xr.testing.assert_equal(resumed[group].to_dataset(), at_once[group].to_dataset())
+        xr.testing.assert_equal(resumed[group].to_dataset(), expected[group].to_dataset())
 
 
-def test_a_run_without_a_seed_takes_that_of_the_run_it_goes_on_with(tmp_path: Path) -> None:
-    seedless = {"settings": {"random_seed": None}}
-    first = run(tmp_path / "run.nc", **seedless)
-    again = run(tmp_path / "run.nc", **seedless)
+def test_a_run_without_a_seed_takes_that_of_the_run_that_it_continues(tmp_path: Path) -> None:
+    first, again = (sample(tmp_path / "run.nc", random_seed=None) for _ in range(2))
     np.testing.assert_array_equal(again["posterior"]["mu"], first["posterior"]["mu"])
 
 
-# Files.
+SETTINGS = {"draws": 10, "entropy": "7"}
 
 
-@pytest.fixture(scope="module")
-def problem() -> Any:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=READINGS)
-    return identity_of(Evaluator.of(model))
-
-
-def test_arrays_and_notes_come_back(problem: Any, tmp_path: Path) -> None:
-    path = tmp_path / "state.nc"
+def test_checkpoints_keep_arrays_and_notes(tmp_path: Path) -> None:
+    path, problem = tmp_path / "state.nc", identity_of(stored())
     arrays = {"thetas": np.arange(6.0).reshape(2, 3), "one": np.array(np.nan)}
-    Checkpoint(path, problem, {"draws": 10, "entropy": "7"}).save(arrays, {"round": 1})
-    again = Checkpoint(path, problem, {"draws": 10, "entropy": "7"})
+    Checkpoint(path, problem, SETTINGS).save(arrays, {"round": 1})
+    again = Checkpoint(path, problem, SETTINGS | {"entropy": None})
     assert again.note == {"round": 1}
+    assert again.settings == SETTINGS
     for name, array in arrays.items():
         np.testing.assert_array_equal(again.arrays[name], array)
-    assert stored_settings(path) == {"draws": 10, "entropy": "7"}
     assert not path.with_name("state.nc.part").exists()
     with xr.open_dataset(path, engine="h5netcdf") as data:  # for other programs it is netCDF
         np.testing.assert_array_equal(data["thetas"], arrays["thetas"])
+    for changed in (SETTINGS | {"draws": 11}, {"entropy": "7"}, SETTINGS | {"chains": 2}):
+        with pytest.raises(StoreError, match="belongs to another run"):
+            Checkpoint(path, problem, changed)
+    with pytest.raises(StoreError, match="belongs to another run"):
+        Checkpoint(path, identity_of(vector_model()), SETTINGS)
+    with pytest.raises(StoreError, match="whose folder does not exist"):
+        Checkpoint(tmp_path / "no" / "state.nc", problem, SETTINGS)
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda content: b"", "is damaged"),
-        (lambda content: b"hello", "is damaged"),
-        (lambda content: content[:-32], "is damaged, or no checkpoint of this version"),
-        (lambda content: _sealed(b"hello"), "cannot be read"),
+        (lambda content: b"", "it is damaged"),
+        (lambda content: b"hello", "it is damaged"),
+        (lambda content: content[:-32], "it is damaged"),
+        (lambda content: b"hello" + hashlib.sha256(b"hello").digest(), "cannot be read"),
     ],
-    ids=["empty", "text", "without digest", "sealed text"],
+    ids=["empty", "text", "without digest", "text with digest"],
 )
 def test_damaged_files_are_refused(
-    damage: Callable[[bytes], bytes], message: str, problem: Any, tmp_path: Path
+    damage: Callable[[bytes], bytes], message: str, tmp_path: Path
 ) -> None:
-    path = tmp_path / "state.nc"
-    Checkpoint(path, problem, {"entropy": "7"}).save({"a": np.zeros(3)}, {})
+    path, problem = tmp_path / "state.nc", identity_of(stored())
+    Checkpoint(path, problem, SETTINGS).save({"a": np.zeros(3)}, {})
     broken = damage(path.read_bytes())
     path.write_bytes(broken)
     with pytest.raises(StoreError, match=message):
-        Checkpoint(path, problem, {"entropy": "7"})
+        Checkpoint(path, problem, SETTINGS)
     assert path.read_bytes() == broken
-
-
-def test_a_folder_that_is_not_there_is_refused_before_any_work(
-    problem: Any, tmp_path: Path
-) -> None:
-    with pytest.raises(StoreError, match="whose folder does not exist"):
-        Checkpoint(tmp_path / "no" / "state.nc", problem, {})
-    assert stored_settings(tmp_path / "no" / "state.nc") == {}

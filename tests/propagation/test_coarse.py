@@ -14,6 +14,7 @@ import pytest
 from first_use import first_use
 
 import prbayes as prb
+from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import SimulatorIdentity, identity_of
 from prbayes.propagation.importance import SIZES
@@ -34,9 +35,19 @@ def unrelated(a: Any, b: Any, scale: Any = 1.0) -> Any:
     return np.sin(90 * a + 70 * b)
 
 
-OBSERVED = fine(
-    *(np.array([[1.2], [1.0]]) + [[0.8], [0.6]] * np.random.default_rng(1).normal(size=(2, 40)))
-)
+Z = np.random.default_rng(1).normal(size=(2, 40))
+OBSERVED = fine(1.2 + 0.8 * Z[0], 1.0 + 0.6 * Z[1])
+
+
+class Counted:
+    """A response that counts the points at which it is called."""
+
+    def __init__(self, function: Any) -> None:
+        self.function, self.count = function, 0
+
+    def __call__(self, a: Any, b: Any, scale: Any) -> Any:
+        self.count += np.size(a)
+        return self.function(a, b)
 
 
 def build(beside: Any = coarse, response: Any = fine, n: int = 64, **keywords: Any) -> pm.Model:
@@ -57,84 +68,59 @@ def design_of(model: pm.Model) -> ReweightedBound:
     return Evaluator.of(model).reweighted["y"]
 
 
-def off(bound: ReweightedBound) -> float:
-    """Return by how much the cloud's responses are off, in spreads of the response."""
-    cloud = bound.design.emulated
-    assert cloud is not None
-    truth = fine(*cloud.inputs)
-    return float(np.std(bound.design.sample.values[: len(cloud)] - truth) / np.std(truth))
+def off(bound: ReweightedBound, values: Floats | None = None) -> float:
+    """Return the error of emulated responses, in spreads of the response."""
+    points = bound.design.emulated
+    assert points is not None
+    truth = fine(*points.inputs)
+    values = bound.design.sample.values if values is None else values
+    return float(np.std(values[: len(points)] - truth) / np.std(truth))
 
 
-def test_a_cloud_follows_the_coarse_response_at_its_own_points() -> None:
-    followed, without = design_of(build()), design_of(build(None))
+def test_an_emulated_sample_follows_the_coarse_response_at_its_points() -> None:
+    without = design_of(build(None))
     assert off(without) > 0.05
-    assert off(followed) < 0.01
-    assert "It follows the coarse response." in followed.design.summary("y")
     assert "coarse" not in without.design.summary("y")
-
-
-def test_emulators_that_lack_runs_follow_it_too() -> None:
-    bound = design_of(build())
-    cloud = bound.design.emulated
-    assert cloud is not None
-    for said in bound.design.without_each_block():
-        assert np.std(said[: len(cloud)] - fine(*cloud.inputs)) < 0.02 * OBSERVED.std()
-
-
-def test_runs_that_are_added_have_a_coarse_response_as_well() -> None:
     evaluator = Evaluator.of(build())
     bound = evaluator.reweighted["y"]
+    assert off(bound) < 0.01
+    assert "It follows the coarse response." in bound.design.summary("y")
+    # So do emulators without a block of the runs, and runs that are added.
+    for values in bound.design.without_each_block():
+        assert off(bound, values) < 0.02
     with designs_restored([bound]):
         bound.add(evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0), 32)
-        known = bound.design.coarse
-        assert known is not None
-        np.testing.assert_allclose(known[:, 0], coarse(*bound.design.runs.points))
+        assert bound.design.coarse is not None
+        np.testing.assert_allclose(bound.design.coarse[:, 0], coarse(*bound.design.runs.points))
         assert off(bound) < 0.01
-    assert bound.design.coarse is not None
     assert len(bound.design.coarse) == bound.n_runs == 64
 
 
-def test_runs_that_are_added_where_there_is_none_are_no_mistake() -> None:
-    def partly(a: Any, b: Any, scale: Any) -> Any:
-        return np.where(a > 4, np.nan, coarse(a, b))
-
-    evaluator = Evaluator.of(build(partly))
+def test_runs_may_be_added_where_the_coarse_response_has_no_value() -> None:
+    evaluator = Evaluator.of(build(lambda a, b, _: np.where(a > 4, np.nan, coarse(a, b))))
     bound = evaluator.reweighted["y"]
-    far = [
-        np.full_like(root, 30.0 if i == 0 else 1.0)
-        for i, root in enumerate(evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0))
-    ]
-    bound.add(far, 16)
+    roots = evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0)
+    bound.add([np.full_like(roots[0], 30.0), *map(np.ones_like, roots[1:])], 16)
     assert bound.n_runs == 80
     assert np.isfinite(bound.design.sample.values).all()
 
 
 def test_its_calls_are_neither_counted_nor_limited() -> None:
-    calls: list[int] = []
-
-    def called(a: Any, b: Any, scale: Any) -> Any:
-        calls.append(np.size(a))
-        return coarse(a, b, scale)
-
+    called = Counted(coarse)
     with limited(None, max_runs=64):
         evaluator = Evaluator.of(build(called))
     assert evaluator.n_responses == 64
-    assert sum(calls) == 64 + SIZES.first
+    assert called.count == 64 + SIZES.first
 
 
-def test_one_that_tells_nothing_is_not_called_between_the_runs() -> None:
-    calls: list[int] = []
-
-    def called(a: Any, b: Any, scale: Any) -> Any:
-        calls.append(np.size(a))
-        return unrelated(a, b)
-
+def test_an_unrelated_one_is_not_called_between_the_runs() -> None:
     def smooth(a: Any, b: Any, scale: Any) -> Any:
         return a * np.exp(0.3 * b)
 
+    called = Counted(unrelated)
     bound, without = design_of(build(called, smooth)), design_of(build(None, smooth))
     np.testing.assert_array_equal(bound.design.sample.values, without.design.sample.values)
-    assert sum(calls) == 64
+    assert called.count == 64
     assert "It does not follow the coarse response" in bound.design.summary("y")
 
 
@@ -152,31 +138,24 @@ def test_where_it_raises_the_emulator_goes_on_without_it(caplog: pytest.LogCaptu
     assert off(bound) < 0.7 * off(design_of(build(None)))
 
 
-def test_threads_compute_it_where_they_compute_the_response() -> None:
-    seen: set[str] = set()
+def test_it_is_computed_on_the_executor_of_the_response_and_travels() -> None:
+    names: set[str] = set()
 
-    def told(a: Any, b: Any, scale: Any) -> Any:
-        seen.add(threading.current_thread().name)
+    def response(a: Any, b: Any, scale: Any) -> Any:
+        names.add(threading.current_thread().name)
         return coarse(a, b, scale)
 
+    model = build()
     with ThreadPoolExecutor(2, "worker") as threads:
-        there = design_of(build(told, executor=threads))
-    assert all(name.startswith("worker") for name in seen)
-    np.testing.assert_array_equal(
-        there.design.sample.values, design_of(build()).design.sample.values
-    )
-
-
-RUNS: list[int] = []
-
-
-def counted(a: Any, b: Any, scale: Any) -> Any:
-    RUNS.append(np.size(a))
-    return fine(a, b)
+        designs = [design_of(build(response, executor=threads)), design_of(model)]
+    assert all(name.startswith("worker") for name in names)
+    designs.append(design_of(cloudpickle.loads(cloudpickle.dumps(model))))
+    for bound in designs[1:]:
+        np.testing.assert_array_equal(bound.design.sample.values, designs[0].design.sample.values)
 
 
 @pytest.mark.parametrize(
-    ("beside", "told"),
+    ("beside", "words"),
     [
         (lambda a, b, s: np.stack([a, b], -1), r"y: coarse: the response returned shape .*, 2\)"),
         (lambda a, b, s: int("a"), r"y: coarse: got no number at any of 64 runs \(it raised Val"),
@@ -185,11 +164,11 @@ def counted(a: Any, b: Any, scale: Any) -> Any:
         (lambda a, b, s: np.inf * (1 + a**2), r"no number at any of 64 runs \(it is infinite\)"),
     ],
 )
-def test_what_is_no_coarse_response_is_refused_before_any_run(beside: Any, told: str) -> None:
-    RUNS.clear()
-    with pytest.raises((ResponseError, TypeError), match=told):
-        first_use(build(beside, counted))
-    assert sum(RUNS) == 0
+def test_other_functions_are_refused_before_any_run(beside: Any, words: str) -> None:
+    response = Counted(fine)
+    with pytest.raises((ResponseError, TypeError), match=words):
+        first_use(build(beside, response))
+    assert response.count == 0
 
 
 def test_several_outputs_are_followed_one_by_one() -> None:
@@ -206,38 +185,28 @@ def test_several_outputs_are_followed_one_by_one() -> None:
         first_use(build(coarse, both, observed=observed))
 
 
-def test_what_cannot_follow_is_refused() -> None:
+def test_designs_that_cannot_follow_are_refused() -> None:
     with pytest.raises(ValueError, match="coarse: got a coarse response and no emulator"):
         prb.Reweighted(64, emulator=None, coarse=coarse)
     with pytest.raises(TypeError, match="Reweighted: coarse: got int 3, expected a function"):
         prb.Reweighted(64, emulator="auto", coarse=3)  # type: ignore[arg-type]
-    RUNS.clear()
+    response = Counted(fine)
     with pytest.raises(TypeError, match=r"y: coarse: got a coarse response for 2 .* n = 4096"):
-        build(n=4096, response=counted)
-    assert sum(RUNS) == 0
+        build(n=4096, response=response)
+    assert response.count == 0
 
 
 def test_another_coarse_response_is_another_problem() -> None:
-    def biased(by: float) -> Any:
-        return lambda a, b, scale: coarse(a, b) + by * np.sin(9 * a)
+    def simulator(by: float) -> SimulatorIdentity:
+        biased = lambda a, b, scale: coarse(a, b) + by * np.sin(9 * a)  # noqa: E731
+        return identity_of(Evaluator.of(build(biased))).simulators[0]
 
-    def simulator(beside: Any) -> SimulatorIdentity:
-        return identity_of(Evaluator.of(build(beside))).simulators[0]
-
-    one, again, other = map(simulator, (biased(0.1), biased(0.1), biased(1.0)))
-    assert one == again
-    # The representation has no addresses, and no variables of closures: numbers tell these.
-    assert "coarse=test_another_coarse_response" in one.propagation
-    assert one.propagation == other.propagation
-    assert one.discrepancies != other.discrepancies
-
-
-def test_a_model_with_one_travels() -> None:
-    model = build()
-    there = cloudpickle.loads(cloudpickle.dumps(model))
-    np.testing.assert_array_equal(
-        design_of(there).design.sample.values, design_of(model).design.sample.values
-    )
+    first, again, changed = map(simulator, (0.1, 0.1, 1.0))
+    assert first == again
+    # The representation has no addresses, and no variables of closures: numbers differ.
+    assert "coarse=test_another_coarse_response" in first.propagation
+    assert first.propagation == changed.propagation
+    assert first.discrepancies != changed.discrepancies
 
 
 @pytest.mark.long

@@ -1,7 +1,8 @@
-"""A design of several inputs tells far more than its runs: a cloud of points is emulated."""
+"""Emulated samples of designs with several inputs: thousands of points between the runs."""
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,11 @@ from prbayes.optimize.design_refinement import (
     refine_at,
 )
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.importance import SIZES, MixtureSampler, columns, mixture_of, spread_over
+from prbayes.propagation.importance import SIZES, MixtureSampler, mixture_of, spread_over
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.budget import BudgetError
 from prbayes.response.compile import PLAIN
-
-AT = np.array([[1.1, 0.9, -0.2, -0.5]])
 
 
 def smooth(a: Any, b: Any) -> Any:
@@ -36,9 +35,9 @@ def smooth(a: Any, b: Any) -> Any:
 
 
 # Of specimens whose inputs have means 1.2 and 1, and standard deviations .8 and .6.
-OBSERVED = smooth(
-    *(np.array([[1.2], [1.0]]) + [[0.8], [0.6]] * np.random.default_rng(1).normal(size=(2, 40)))
-)
+Z = np.random.default_rng(1).normal(size=(2, 40))
+OBSERVED = smooth(1.2 + 0.8 * Z[0], 1.0 + 0.6 * Z[1])
+THETA = np.array([[1.1, -0.2, 0.9, -0.5]])  # ma, log sa, mb, log sb
 
 
 def jumping(a: Any, b: Any) -> Any:
@@ -68,113 +67,104 @@ def design_of(model: pm.Model) -> tuple[Evaluator, ReweightedBound]:
     return evaluator, evaluator.reweighted["y"]
 
 
-def theta_of(evaluator: Evaluator) -> Floats:
-    # The elements in the order of the model: ma, sa (log), mb, sb (log).
-    return AT[:, [0, 2, 1, 3]]
+@cache
+def emulated() -> tuple[Evaluator, ReweightedBound]:
+    """Return a design of 64 runs; tests that change it restore it."""
+    return design_of(build())
+
+
+def around(theta: Floats, spread: float = 0.1) -> Floats:
+    return theta + spread * np.random.default_rng(0).standard_normal((64, 4))
 
 
 @pytest.mark.parametrize("response", [smooth, failing])
 def test_emulated_points_are_far_better_than_weighted_runs(response: Any) -> None:
-    emulated, alone = build(response), build(response, emulator=None)
+    ma, la, mb, lb = THETA[0]
+    z = np.random.default_rng(7).standard_normal((2, 1_000_000))
+    truth = np.nan_to_num(response(ma + np.exp(la) * z[0], mb + np.exp(lb) * z[1])).mean()
     errors = []
-    for model in (emulated, alone):
-        evaluator, _ = design_of(model)
-        values, weights = evaluator.populations(theta_of(evaluator), 0)
-        found = float((np.nan_to_num(values) * weights).sum())
-        errors.append(abs(found - _truth_at(response)))
+    for keywords in ({}, {"emulator": None}):
+        evaluator, _ = design_of(build(response, **keywords))
+        values, weights = evaluator.populations(THETA, 0)
+        errors.append(abs(float((np.nan_to_num(values) * weights).sum()) - truth))
     assert errors[0] < 0.2 * errors[1]
 
 
-def _truth_at(response: Any) -> float:
-    z = np.random.default_rng(7).standard_normal((2, 1_000_000))
-    ma, la, mb, lb = AT[0][[0, 2, 1, 3]]
-    found = response(ma + np.exp(la) * z[0], mb + np.exp(lb) * z[1])
-    return float(np.nan_to_num(found).mean())
-
-
-def test_runs_are_counted_and_cloud_points_are_not() -> None:
-    model = build()
-    evaluator, bound = design_of(model)
-    assert evaluator.n_responses == bound.n_runs == 64
+def test_runs_are_counted_and_emulated_points_are_not() -> None:
+    evaluator, bound = emulated()
+    assert evaluator.n_responses == bound.n_runs == len(bound.first_responses) == 64
     assert bound.n_points == SIZES.first
-    assert len(bound.first_responses) == 64
-
-
-def test_weights_are_one_on_average_with_runs_among_the_points() -> None:
-    evaluator, bound = design_of(build(jumping, 256))
-    emulation = bound.design.emulator
-    if emulation is None:
-        assert bound.n_points == 256
-    support = evaluator.support(theta_of(evaluator))["y"]
-    assert support["mean_weight"] == pytest.approx(1.0, abs=0.2)
 
 
 def test_a_response_that_no_surface_follows_keeps_its_runs() -> None:
-    _, bound = design_of(build(jumping, 256))
-    emulation = bound.design.emulator
-    assert emulation is None or emulation.run_share > 0.1
+    evaluator, bound = design_of(build(jumping, 256))
+    emulator = bound.design.emulator
+    if emulator is None:
+        assert bound.n_points == 256
+    else:
+        assert emulator.run_share > 0.1
+    support = evaluator.support(THETA)["y"]
+    assert support["mean_weight"] == pytest.approx(1.0, abs=0.2)
 
 
-def test_a_cloud_reaches_other_populations_without_a_run() -> None:
-    evaluator, bound = design_of(build())
-    far = theta_of(evaluator) + np.array([1.0, 1.0, -1.0, -1.0])
-    before = evaluator.support(far)["y"]["weight_ess"]
-    bound.reach(evaluator.roots(far + 0.1 * np.random.default_rng(0).standard_normal((64, 4)), 0))
-    assert evaluator.support(far)["y"]["weight_ess"] > 2 * before
-    assert evaluator.n_responses == 64
-
-
-def test_the_prior_stays_in_reach() -> None:
-    evaluator, bound = design_of(build())
-    far = theta_of(evaluator) + np.array([1.0, 1.0, -2.0, -2.0])
-    for _ in range(3):
-        bound.reach(evaluator.roots(np.repeat(far, 16, axis=0), 0))
+def test_a_sample_reaches_other_populations_and_the_prior_without_a_run() -> None:
+    evaluator, bound = emulated()
+    far = THETA + np.array([1.0, 1.0, -1.0, -1.0])
     prior = evaluator.hyperparameters.prior_thetas(200, 1)
-    assert np.median(evaluator.support(prior)["y"]["mean_weight"]) == pytest.approx(1, abs=0.05)
+    before = evaluator.support(far)["y"]["weight_ess"]
+    with designs_restored([bound]):
+        for _ in range(3):
+            bound.reach(evaluator.roots(around(far), 0))
+        assert evaluator.support(far)["y"]["weight_ess"] > 2 * before
+        mass = np.median(evaluator.support(prior)["y"]["mean_weight"])
+        assert mass == pytest.approx(1, abs=0.05)
+        assert evaluator.n_responses == 64
 
 
 @pytest.mark.long
-def test_clouds_grow_for_their_points_and_runs_for_what_emulators_say() -> None:
+def test_samples_grow_for_errors_of_points_and_runs_for_errors_of_emulators() -> None:
     evaluator, bound = design_of(build())
-    thetas = theta_of(evaluator) + 0.1 * np.random.default_rng(0).standard_normal((64, 4))
+    thetas = around(THETA)
     assert not grow(evaluator, thetas, DesignErrors(points=0.05, emulators=0.05))
     assert grow(evaluator, thetas, DesignErrors(points=0.2, emulators=0.0))
     assert (bound.n_runs, bound.n_points) == (64, 2 * SIZES.first)
     assert grow(evaluator, thetas, DesignErrors(points=0.0, emulators=0.2))
     assert (bound.n_runs, bound.n_points) == (128, 2 * SIZES.first)
-    # Another emulator has another cloud: whether that is large enough is seen next.
+    # Another emulator has another sample, whose size is judged next.
     assert grow(evaluator, thetas, DesignErrors(points=0.2, emulators=0.2))
     assert bound.n_runs > 128
     assert bound.n_points == 2 * SIZES.first
 
 
 @pytest.mark.parametrize(("little", "runs"), [(0.25, 64), (0.0, 80)])
-def test_runs_are_added_where_emulators_tell_little(
+def test_runs_are_added_where_emulators_predict_little(
     little: float, runs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("prbayes.optimize.design_refinement._POOR_EMULATOR", little)
-    far = np.array([[2.5, 0.0, 2.5, 0.0]]) + 0.01 * np.random.default_rng(0).normal(size=(64, 4))
+    far = around(np.array([[2.5, 0.0, 2.5, 0.0]]), 0.01)
     evaluator, bound = design_of(build())
     assert refine_at(evaluator, far)
     assert bound.n_runs == runs
 
 
-def test_a_part_of_a_cloud_is_a_cloud_of_its_own_for_a_while() -> None:
-    evaluator, bound = design_of(build())
-    theta = theta_of(evaluator)
-    values, weights = evaluator.populations(theta, 0)
-    (whole,) = evaluator(theta).discrepancies
+def test_a_part_of_a_sample_for_a_while() -> None:
+    evaluator, bound = emulated()
+    values, weights = evaluator.populations(THETA, 0)
+    (whole,) = evaluator(THETA).discrepancies
     rows = bound.blocks == 3
     with designs_restored([bound]):
         bound.design = bound.design.rows(rows)
-        some, of_some = evaluator.populations(theta, 0)
+        part_values, part_weights = evaluator.populations(THETA, 0)
         expected = weights[:, rows] / weights[:, rows].sum()
-        np.testing.assert_allclose(of_some, expected, rtol=1e-9)
-        np.testing.assert_array_equal(some, values[:, rows])
-        (part,) = evaluator(theta).discrepancies
+        np.testing.assert_allclose(part_weights, expected, rtol=1e-9)
+        np.testing.assert_array_equal(part_values, values[:, rows])
+        (part,) = evaluator(THETA).discrepancies
+        bound.add(evaluator.roots(THETA, 0), 32)
+        assert bound.n_runs == 96
     assert 0 < abs(part[0] - whole[0]) < 0.2 * whole[0]
-    np.testing.assert_array_equal(evaluator(theta).discrepancies[0], whole)
-    np.testing.assert_array_equal(evaluator.populations(theta, 0)[1], weights)
+    assert bound.n_runs == 64
+    np.testing.assert_array_equal(evaluator(THETA).discrepancies[0], whole)
+    np.testing.assert_array_equal(evaluator.populations(THETA, 0)[1], weights)
 
 
 @pytest.mark.long
@@ -191,39 +181,38 @@ def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("lost", "known"), [(3, True), (5, False)])
-def test_parts_of_a_cloud_without_a_minimum_leave_its_error_to_the_others(
-    lost: int, known: bool, monkeypatch: pytest.MonkeyPatch
+def test_parts_of_a_sample_without_a_minimum_leave_its_error_to_the_others(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    model = build(known=True)
-    optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
+    optimum = prb.minimize(build(known=True), starts=0, refine=False, progressbar=False)
     sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
-    minima = iter(
-        [
-            (np.array([[k, -k]]), np.array([converged]))
-            for k, converged in enumerate([False] * lost + [True] * (8 - lost))
-        ]
-    )
-    monkeypatch.setattr(
-        "prbayes.inference.design_error.minimise_sets", lambda *_, **__: next(minima)
-    )
-    assert np.isfinite(_error_of_points(sampling)).all() == known
+    for lost, is_finite in ((3, True), (5, False)):
+        minima = iter([(np.array([[k, -k]]), np.array([k >= lost])) for k in range(8)])
+        monkeypatch.setattr(
+            "prbayes.inference.design_error.minimise_sets",
+            lambda *_, minima=minima, **__: next(minima),
+        )
+        assert np.isfinite(_error_of_points(sampling)).all() == is_finite
 
 
 def test_another_response_is_computed_at_the_runs_and_emulated() -> None:
-    evaluator, bound = design_of(build())
+    _, bound = emulated()
     calls: list[int] = []
 
     def double(a: Any, b: Any) -> Any:
         calls.append(np.size(a))
         return 2 * smooth(a, b)
 
-    other = evaluator.nodes[0].bound.responses.copied()
-    other.function = double
-    np.testing.assert_allclose(
-        bound.values_of(other), 2 * bound.design.sample.values, rtol=1e-2, atol=1e-2
-    )
+    second = bound.responses.copied()
+    second.function = double
+    expected = 2 * bound.design.sample.values
+    np.testing.assert_allclose(bound.values_of(second), expected, rtol=1e-2, atol=1e-2)
     assert sum(calls) == 64
+    # One that no surface follows is refused.
+    rough_response = bound.responses.copied()
+    rough_response.function = rough
+    with pytest.raises(PoorEmulatorError, match="another response of the same specimens is not"):
+        bound.values_of(rough_response)
 
 
 def rough(a: Any, b: Any) -> Any:
@@ -231,24 +220,18 @@ def rough(a: Any, b: Any) -> Any:
 
 
 @pytest.mark.long
-def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() -> None:
+def test_another_response_that_no_emulator_follows_is_predicted_from_the_runs() -> None:
     model = build(n=700, known=True, emulator=prb.surrogate.RadialBasis())
     optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
     (bound,) = optimum.evaluator.reweighted.values()
     values, weights = optimum.evaluator.populations(optimum.theta[None], 0)
-    other = optimum.evaluator.nodes[0].bound.responses.copied()
-    other.function = rough
-    with pytest.raises(
-        PoorEmulatorError, match="another response of the same specimens is not predicted"
-    ):
-        bound.values_of(other)
     inputs = optimum.evaluator.nodes[0].bound.inputs.aleatory
     predicted = prb.predict(optimum, rough, *inputs, n_samples=2000, random_seed=1)
     runs = rough(*bound.design.runs.points)
     assert np.isin(predicted, runs).all()
     # Sines of uniform phases.
     assert float(predicted.std()) == pytest.approx(1.0, abs=0.15)
-    # The cloud is there again.
+    # The sample is restored.
     np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[1], weights)
     null = prb.validation.JointNull(optimum, responses=(rough, *inputs), replicates=99)
     test = prb.area_test(rough(*np.full((2, 20), 1.0) + np.arange(20)), predicted, null=null)
@@ -272,50 +255,39 @@ def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
     np.testing.assert_array_equal(optimum.evaluator(optimum.theta[None]).discrepancies, before)
 
 
-def test_a_design_goes_back_to_what_it_was() -> None:
+def test_a_compiled_discrepancy_has_the_sample_that_was_drawn_last() -> None:
     evaluator, bound = design_of(build())
-    before = evaluator(theta_of(evaluator)).discrepancies
-    with designs_restored([bound]):
-        bound.add(evaluator.roots(theta_of(evaluator), 0), 32)
-        assert bound.n_runs == 96
-    assert bound.n_runs == 64
-    np.testing.assert_array_equal(evaluator(theta_of(evaluator)).discrepancies, before)
-
-
-def test_a_discrepancy_follows_the_cloud_that_was_drawn_last() -> None:
-    evaluator, bound = design_of(build())
-    thetas = theta_of(evaluator)
-    before = evaluator(thetas).discrepancies
+    before = evaluator(THETA).discrepancies
+    batches = identity_of(evaluator).simulators[0].batches
     compiled = evaluator.model.compile_logp(vars=[evaluator.model["y"]], mode=PLAIN)
-    bound.reach(evaluator.roots(thetas, 0))
-    after = evaluator(thetas).discrepancies
+    bound.reach(evaluator.roots(THETA, 0))
+    after = evaluator(THETA).discrepancies
     assert 0 < abs(after - before)[0, 0] < 0.05 * before[0, 0]
     prb.set_epsilon(evaluator.model, {"y": 1.0})
-    at = dict(zip([v.name for v in evaluator.model.value_vars], thetas[0], strict=True))
+    at = dict(zip([v.name for v in evaluator.model.value_vars], THETA[0], strict=True))
     assert -compiled(at) == pytest.approx(after[0, 0], rel=1e-9)
+    # Another sample is another design.
+    identity = identity_of(evaluator).simulators[0]
+    assert identity.n_points == 64
+    assert identity.batches != batches
 
 
-def test_on_the_way_surfaces_stay_and_what_they_are_worth_is_judged_anew() -> None:
-    # Smooth where the prior is, and with a corner where the populations are that come next.
-    def corner(a: Any, b: Any) -> Any:
-        return smooth(a, b) + np.abs(b - 0.5)
-
-    evaluator, bound = design_of(build(corner))
+def test_the_same_surfaces_are_judged_again_for_other_populations() -> None:
+    # Smooth where the prior is, and with a corner at the populations that come next.
+    evaluator, bound = design_of(build(lambda a, b: smooth(a, b) + np.abs(b - 0.5)))
+    roots = evaluator.roots(THETA, 0)
     before = bound.design.emulator
-    roots = evaluator.roots(theta_of(evaluator), 0)
     bound.reach(roots, same_surfaces=True)
-    after = bound.design.emulator
-    assert before is not None
-    assert after is not None
-    assert after.surfaces is before.surfaces
-    assert after.runs is before.runs
-    assert after.error != before.error
-    # The same as if they were chosen anew, but for the surfaces.
+    same = bound.design.emulator
     bound.reach(roots)
-    anew = bound.design.emulator
-    assert anew is not None
-    assert anew.runs is not before.runs
-    np.testing.assert_array_equal(anew.weights, after.weights)
+    fitted = bound.design.emulator
+    assert before is not None
+    assert same is not None
+    assert fitted is not None
+    assert same.surfaces is before.surfaces
+    assert same.error != before.error
+    assert fitted.runs is not before.runs
+    np.testing.assert_array_equal(fitted.weights, same.weights)
 
 
 def test_left_out_emulators_differ_where_the_emulator_is_wrong() -> None:
@@ -339,49 +311,30 @@ def test_an_optimum_from_few_runs_is_that_of_many() -> None:
 
 
 @pytest.mark.parametrize("emulator", [3, "cubic", object()])
-def test_what_is_no_emulator_is_refused(emulator: Any) -> None:
+def test_other_objects_are_no_emulators(emulator: Any) -> None:
     with pytest.raises((TypeError, ValueError), match="Reweighted: emulator: got"):
         prb.Reweighted(64, emulator=emulator)
 
 
-def test_one_input_and_discrete_ones_are_not_emulated() -> None:
-    with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
-        stored = prb.Reweighted(64, emulator="auto")
-        prb.Simulator(
-            "y", lambda a: a, a, metric=prb.AreaMetric(), observed=OBSERVED, propagation=stored
-        )
-    assert design_of(model)[1].design.emulated is None
-    with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
-        k = pm.Poisson.dist(pm.LogNormal("lam", 1, 0.3))
-        stored = prb.Reweighted(64, emulator="auto")
-        prb.Simulator(
-            "y", lambda a, k: a + k, a, k,
-            metric=prb.AreaMetric(), observed=OBSERVED, propagation=stored,
-        )  # fmt: skip
-    assert design_of(model)[1].design.emulated is None
-
-
-def test_a_users_emulator_with_nothing_to_do_is_refused() -> None:
+@pytest.mark.parametrize("discrete", [False, True])
+def test_one_input_and_discrete_ones_are_not_emulated(discrete: bool) -> None:
     calls: list[int] = []
-    with pm.Model():
-        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
-        stored = prb.Reweighted(64, emulator=prb.surrogate.RadialBasis())
-        keywords: dict[str, Any] = {"metric": prb.AreaMetric(), "observed": OBSERVED}
-        with pytest.raises(TypeError, match=r"y: emulator: got RadialBasis .* several continuous"):
-            prb.Simulator("y", lambda a: calls.append(1) or a, a, propagation=stored, **keywords)
+
+    def simulator(emulator: Any) -> pm.Model:
+        with pm.Model() as model:
+            inputs = [pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)]
+            if discrete:
+                inputs.append(pm.Poisson.dist(pm.LogNormal("lam", 1, 0.3)))
+            prb.Simulator(
+                "y", lambda *x: calls.append(1) or sum(x), *inputs, metric=prb.AreaMetric(),
+                observed=OBSERVED, propagation=prb.Reweighted(64, emulator=emulator),
+            )  # fmt: skip
+        return model
+
+    with pytest.raises(TypeError, match=r"y: emulator: got RadialBasis .* several continuous"):
+        simulator(prb.surrogate.RadialBasis())
     assert len(calls) <= 1  # the trial of the response
-
-
-def test_another_response_that_no_surface_follows_is_refused() -> None:
-    evaluator, bound = design_of(build(n=256))
-    other = evaluator.nodes[0].bound.responses.copied()
-    other.function = jumping
-    with pytest.raises(
-        DesignError, match="another response of the same specimens is not predicted"
-    ):
-        bound.values_of(other)
+    assert design_of(simulator("auto"))[1].design.emulated is None
 
 
 @pytest.mark.long
@@ -389,22 +342,14 @@ def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), pm.LogNormal("sa", 0, 0.5))
         b = pm.Normal.dist(pm.Normal("mb", 1, 0.5), pm.LogNormal("sb", -0.5, 0.5))
-        stored = prb.Reweighted(64, emulator="auto")
-        specimens = np.arange(OBSERVED.size)
         for name, response in {"one": smooth, "two": lambda a, b: b + 0.1 * a * b}.items():
             prb.Simulator(
-                name,
-                response,
-                a,
-                b,
-                metric=prb.KullbackLeibler(),
-                observed=OBSERVED,
-                propagation=stored,
-                specimens=specimens,
-            )
+                name, response, a, b, metric=prb.KullbackLeibler(), observed=OBSERVED,
+                propagation=prb.Reweighted(64), specimens=np.arange(OBSERVED.size),
+            )  # fmt: skip
     evaluator = Evaluator.of(model)
     assert aligned(evaluator.nodes)
-    far = theta_of(evaluator) + np.array([0.5, -1.5, 0.5, -1.5])
+    far = THETA + np.array([0.5, -1.5, 0.5, -1.5])
     _redraw_samples(evaluator, far, {"one"})
     assert aligned(evaluator.nodes)
     _enlarge_samples(evaluator, far, {"two"})
@@ -412,17 +357,8 @@ def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
     assert {d.n_points for d in evaluator.reweighted.values()} == {2 * SIZES.first}
 
 
-def test_another_cloud_is_another_design() -> None:
-    evaluator, bound = design_of(build())
-    before = identity_of(evaluator).simulators[0]
-    bound.reach(evaluator.roots(theta_of(evaluator), 0))
-    after = identity_of(evaluator).simulators[0]
-    assert (before.n_points, after.n_points) == (64, 64)
-    assert before.batches != after.batches
-
-
 @pytest.mark.slow
-def test_a_sampler_that_was_stopped_goes_on_with_its_clouds(tmp_path: Any) -> None:
+def test_a_sampler_that_was_stopped_continues_with_its_samples(tmp_path: Any) -> None:
     keywords: dict[str, Any] = {"chains": 1, "random_seed": 1, "progressbar": False}
     file = tmp_path / "run.nc"
     whole = prb.sample_smc(20, model=build(known=True), **keywords)
@@ -432,11 +368,7 @@ def test_a_sampler_that_was_stopped_goes_on_with_its_clouds(tmp_path: Any) -> No
     np.testing.assert_array_equal(again["posterior"]["ma"], whole["posterior"]["ma"])
 
 
-def test_inputs_are_columns() -> None:
-    assert columns([np.zeros(3), np.zeros((3, 2))]).shape == (3, 3)
-
-
-def test_clouds_are_of_populations_that_matter_and_the_prior_stays() -> None:
+def test_samples_are_of_populations_that_matter_and_of_the_prior() -> None:
     groups = [[np.zeros(500)], [np.ones(500)], [np.full(3, 2.0)]]
     for size in (SIZES.first, 2 * SIZES.first):
         (found,), shares = mixture_of(groups, size)
@@ -448,11 +380,10 @@ def test_clouds_are_of_populations_that_matter_and_the_prior_stays() -> None:
 
 
 def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
-    evaluator, bound = design_of(build())
-    thetas = evaluator.hyperparameters.prior_thetas(2, 0)
-    shares = np.array([0.125, 0.875])
+    evaluator, bound = emulated()
+    roots = evaluator.roots(evaluator.hyperparameters.prior_thetas(2, 0), 0)
     sampler = MixtureSampler("y", bound.inputs, PopulationDensity(bound.inputs))
-    _, mixture = sampler.draw(evaluator.roots(thetas, 0), 1024, 3, shares)
+    _, mixture = sampler.draw(roots, 1024, 3, np.array([0.125, 0.875]))
     np.testing.assert_array_equal(mixture.counts, [128, 896])
 
 

@@ -14,10 +14,10 @@ from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.propagation import moving_support as edges
 from prbayes.propagation.moving_support import (
     averaged_log_density,
     cells_around,
+    moving_inputs,
     refuse_moving_atoms,
 )
 from prbayes.response.inputs import read_inputs
@@ -57,31 +57,22 @@ def stored(dist: Callable[[], Any], **keywords: Any) -> Any:
 
 
 def test_cells_meet_half_way_and_have_the_outermost_points_in_their_middle() -> None:
-    cells = cells_around(np.array([3.0, 0.0, 1.0, 7.0]), 1)
-    np.testing.assert_allclose(cells.lower, [2.0, -0.5, 0.5, 5.0])
-    np.testing.assert_allclose(cells.upper, [5.0, 0.5, 2.0, 9.0])
-
-
-def test_cells_of_each_element_are_those_of_its_own_column() -> None:
+    lower, upper = cells_around(np.array([3.0, 0.0, 1.0, 7.0]), 1)
+    np.testing.assert_allclose(lower, [2.0, -0.5, 0.5, 5.0])
+    np.testing.assert_allclose(upper, [5.0, 0.5, 2.0, 9.0])
     columns = np.random.default_rng(0).normal(size=(40, 2))
-    cells = cells_around(columns, 3)
-    alone = cells_around(columns[:, 1], 3)
-    np.testing.assert_array_equal(cells.lower[:, 1], alone.lower)
-    assert (cells.lower < columns).all()
-    assert (columns < cells.upper).all()
+    lower, upper = cells_around(columns, 3)
+    np.testing.assert_array_equal(lower[:, 1], cells_around(columns[:, 1], 3)[0])
+    assert ((lower < columns) & (columns < upper)).all()
 
 
-def test_a_cell_that_an_edge_cuts_has_the_part_of_it_that_is_inside() -> None:
-    dist = pm.Uniform.dist(0.0, 2.0)
+def test_the_mean_density_of_a_cell_is_that_of_its_part_inside_the_support() -> None:
     ends = pt.dvector("lower"), pt.dvector("upper")
     x = pt.dvector("x")
-    graph = averaged_log_density(dist, x, *ends)
+    graph = averaged_log_density(pm.Uniform.dist(0.0, 2.0), x, *ends)
     found = graph.eval({x: [1.0, 0.25, 2.5], ends[0]: [0.9, -0.5, 1.0], ends[1]: [1.1, 1.0, 4.0]})
-    inside = np.array([1.0, 1.0 / 1.5, 1.0 / 3.0])
-    np.testing.assert_allclose(np.exp(found), 0.5 * inside)
-
-
-def test_far_in_the_tail_it_is_the_density_at_the_point() -> None:
+    np.testing.assert_allclose(np.exp(found), [0.5, 0.5 / 1.5, 0.5 / 3.0])
+    # Far in the tail it is the density at the point.
     dist = pm.TruncatedNormal.dist(0.0, 1.0, lower=-1.0)
     points = np.array([9.0, 12.0])
     graph = averaged_log_density(dist, points, points - 0.1, points + 0.1)
@@ -93,7 +84,6 @@ MOVING = {
     "TruncatedNormal": lambda: pm.TruncatedNormal.dist(1.0, 1.0, lower=pm.Normal("a", 0, 0.3)),
     "Pareto": lambda: pm.Pareto.dist(3.0, pm.HalfNormal("a", 1.0)),
     "Triangular": lambda: pm.Triangular.dist(lower=pm.Normal("a", 0, 0.3), c=2.0, upper=3.0),
-    "vector": lambda: pm.Uniform.dist(pm.Normal("a", 0, 0.3), 2.0, shape=(1,)),
 }
 STAYING = {
     "Normal": lambda: pm.Normal.dist(pm.Normal("a", 0, 0.3), 1.0),
@@ -102,33 +92,18 @@ STAYING = {
     "Weibull": lambda: pm.Weibull.dist(2.0, pm.HalfNormal("a", 1.0)),
     "TruncatedNormal": lambda: pm.TruncatedNormal.dist(pm.Normal("a", 0, 1), 1.0, lower=-1.0),
     "Beta": lambda: pm.Beta.dist(2.0, pm.HalfNormal("a", 1.0)),
+    "without hyperparameters": lambda: pm.Uniform.dist(0.0 * pm.Normal("a"), 1.0),
 }
 
 
-@pytest.mark.parametrize("kind", sorted(set(MOVING) - {"vector"}))
-def test_a_support_that_moves_is_found(kind: str) -> None:
+@pytest.mark.parametrize("kind", sorted(MOVING))
+def test_supports_that_move(kind: str) -> None:
     assert stored(MOVING[kind]).support_moves
 
 
 @pytest.mark.parametrize("kind", sorted(STAYING))
-def test_one_that_stays_is_not_taken_for_one_that_moves(kind: str) -> None:
+def test_supports_that_stay(kind: str) -> None:
     assert not stored(STAYING[kind]).support_moves
-
-
-def test_an_input_without_hyperparameters_stays() -> None:
-    with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("a", 0, 0.3), 1.0)
-        b = pm.Uniform.dist(0.0, 1.0)
-        prb.Simulator(
-            "y",
-            np.add,
-            a,
-            b,
-            metric=prb.AreaMetric(),
-            observed=np.arange(9.0),
-            propagation=prb.Reweighted(1024),
-        )
-    assert not Evaluator.of(model).nodes[0].bound.support_moves
 
 
 def test_a_discrete_support_that_moves_is_refused() -> None:
@@ -179,9 +154,11 @@ def mixture_of_a_point(point: Any) -> Any:
     return pm.Mixture.dist([0.3, 0.7], [pm.DiracDelta.dist(point), pm.Normal.dist(0.0, 1.0)])
 
 
-@pytest.mark.parametrize(
-    "dist", [mixture_of_a_point, pm.DiracDelta.dist], ids=["beside a density", "alone"]
-)
+def censored(bound: Any) -> Any:
+    return pm.Censored.dist(pm.Normal.dist(0.0, 1.0), lower=bound, upper=5.0)
+
+
+@pytest.mark.parametrize("dist", [mixture_of_a_point, pm.DiracDelta.dist, censored])
 def test_a_value_that_has_probability_and_moves_is_refused(dist: Callable[[Any], Any]) -> None:
     with pytest.raises(TypeError, match=r"values that move .* have probability .*prb.Fresh\(\)"):
         stored(lambda: dist(pm.Normal("a", 0, 1)))
@@ -232,19 +209,19 @@ def test_the_weights_follow_the_design_when_it_grows() -> None:
     assert mass == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("place", [0, 6])
 def test_a_support_that_moves_is_found_in_any_chunk_of_points(
-    monkeypatch: pytest.MonkeyPatch, place: int
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(edges, "AT_ONCE", 4)  # two points at a time
-    lower = np.array([0.0, 1.0])
-
-    def outside(lower: Any, x: Any) -> Any:
-        return (x < lower[:, None],)
-
+    with pm.Model() as model:
+        lower = pm.Normal("lower", 0, 1)
+        inputs = read_inputs("y", [pm.Uniform.dist(lower, lower + 3.0)], model)
+    monkeypatch.setattr("prbayes.propagation.moving_support.AT_ONCE", 4)  # two points at a time
+    components = [np.array([0.0, 1.0])]
     points = np.full(7, 2.0)
-    assert not edges._support_moves(outside, 1, [lower], points)
-    points[place] = -1.0  # outside for all
-    assert not edges._support_moves(outside, 1, [lower], points)
-    points[place] = 0.5
-    assert edges._support_moves(outside, 1, [lower], points)
+    assert moving_inputs("y", inputs, components, [points]) == ()
+    for place in (0, 6):
+        points[place] = -1.0  # outside of both populations
+        assert moving_inputs("y", inputs, components, [points]) == ()
+        points[place] = 0.5
+        assert moving_inputs("y", inputs, components, [points]) == (0,)
+        points[place] = 2.0

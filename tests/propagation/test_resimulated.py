@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Any
 
 import numpy as np
@@ -10,27 +9,28 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from first_use import first_use
 from scipy import stats
 
 import prbayes as prb
-from prbayes.model.random_variable import nodes
 from prbayes.propagation.base import Bound
 
 OBSERVED = [0.5, 1.0, 1.5, 2.5]
 
 
-def bound(response: Any, n: int = 64, metric: Any = None) -> Bound:
+def simulated(response: Any, propagation: Any = None, metric: Any = None) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))
         prb.Simulator(
-            "y",
-            response,
-            x,
-            metric=metric or prb.AreaMetric(),
-            observed=OBSERVED,
-            propagation=prb.Resimulated(n),
-        )
-    return next(iter(nodes(model).values())).bound
+            "y", response, x, metric=metric or prb.AreaMetric(), observed=OBSERVED, epsilon=0.5,
+            propagation=propagation or prb.Resimulated(64),
+        )  # fmt: skip
+    return model
+
+
+def bound(response: Any, propagation: Any = None, metric: Any = None) -> Bound:
+    (node,) = first_use(simulated(response, propagation, metric)).values()
+    return node.bound
 
 
 def opaque(x: Any) -> Any:
@@ -39,8 +39,7 @@ def opaque(x: Any) -> Any:
 
 def test_responses_are_those_of_the_quantiles_of_the_base_points() -> None:
     found = bound(np.positive)
-    params = [np.array([2.0]), np.array([3.0])]
-    (values,), (weights,) = found.populations(params)
+    (values,), (weights,) = found.populations([np.array([2.0]), np.array([3.0])])
     u = stats.norm.cdf((values - 2.0) / 3.0)
     # One scrambled Sobol point in each of 64 equal intervals.
     np.testing.assert_array_equal(np.sort((u * 64).astype(int)), np.arange(64))
@@ -55,20 +54,12 @@ def test_the_same_points_for_every_theta() -> None:
 
 
 def test_a_response_that_accepts_tensors_becomes_part_of_the_graph() -> None:
-    assert bound(lambda x: x**2).symbolic
-    assert not bound(opaque).symbolic
-
-
-def test_a_response_that_gives_other_numbers_on_tensors_is_called_with_arrays() -> None:
-    def two_faced(x: Any) -> Any:
-        return x**2 if isinstance(x, np.ndarray) else x**3
-
-    assert not bound(two_faced).symbolic
-
-
-def test_both_ways_give_the_same_discrepancy_and_count_alike() -> None:
-    params = [np.array([0.3, 1.0]), np.array([1.0, 0.5])]
     in_graph, called = bound(lambda x: x**2), bound(opaque)
+    assert in_graph.symbolic
+    assert not called.symbolic
+    # Other numbers on tensors than on arrays.
+    assert not bound(lambda x: x**2 if isinstance(x, np.ndarray) else x**3).symbolic
+    params = [np.array([0.3, 1.0]), np.array([1.0, 0.5])]
     before = [b.responses.count for b in (in_graph, called)]
     values = [b.discrepancies(params, b.target) for b in (in_graph, called)]
     np.testing.assert_allclose(values[0], values[1], rtol=1e-12)
@@ -76,150 +67,98 @@ def test_both_ways_give_the_same_discrepancy_and_count_alike() -> None:
     assert spent == [128, 128]
 
 
-def test_too_few_responses_for_a_log_likelihood_are_said(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING, logger="prbayes"):
-        bound(np.positive, 1199, prb.LogLikelihood(density=prb.GaussianKDE()))
+def test_too_few_responses_for_a_log_likelihood(caplog: pytest.LogCaptureFixture) -> None:
+    likelihood = prb.LogLikelihood(density=prb.GaussianKDE())
+    bound(np.positive, prb.Resimulated(1199), likelihood)
     assert "expected at least 1200 responses, 300 for each observation" in caplog.text
     caplog.clear()
-    with caplog.at_level(logging.WARNING, logger="prbayes"):
-        bound(np.positive, 1200, prb.LogLikelihood(density=prb.GaussianKDE()))
-        bound(np.positive, 64, prb.KullbackLeibler())
+    bound(np.positive, prb.Resimulated(1200), likelihood)
+    bound(np.positive, prb.Resimulated(64), prb.KullbackLeibler())
     assert not caplog.text
 
 
 def test_discrete_inputs_are_refused() -> None:
-    with pm.Model():
-        x = pm.Poisson.dist(pm.Exponential("rate", 1.0))
-        with pytest.raises(
-            TypeError,
-            match=r"is discrete, expected a continuous one; use propagation=prb.Reweighted\(\)",
-        ):
-            prb.Simulator(
-                "y",
-                np.square,
-                x,
-                metric=prb.AreaMetric(),
-                observed=OBSERVED,
-                propagation=prb.Resimulated(64),
-            )
+    words = r"is discrete, expected a continuous one; use propagation=prb.Reweighted\(\)"
+    with pm.Model(), pytest.raises(TypeError, match=words):
+        prb.Simulator(
+            "y", np.square, pm.Poisson.dist(pm.Exponential("rate", 1.0)), metric=prb.AreaMetric(),
+            observed=OBSERVED, propagation=prb.Resimulated(64),
+        )  # fmt: skip
 
 
 def fresh_bound(n: int = 40, random_seed: int = 0) -> Bound:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1))
-        prb.Simulator(
-            "y",
-            np.square,
-            x,
-            metric=prb.AreaMetric(),
-            observed=[0.5, 1.0, 1.5],
-            epsilon=0.1,
-            propagation=prb.Fresh(n, random_seed=random_seed),
-        )
-    return next(iter(nodes(model).values())).bound
+    return bound(np.square, prb.Fresh(n, random_seed=random_seed))
 
 
 PARAMS = [np.array([0.5]), np.array([1.0])]
 
 
-def test_every_evaluation_draws_anew_and_counts() -> None:
-    found = fresh_bound()
-    count = found.responses.count
-    first, second = (found.populations(PARAMS)[0] for _ in range(2))
+def test_every_evaluation_draws_other_specimens_that_seed_and_number_determine() -> None:
+    fresh, same, seeded = fresh_bound(), fresh_bound(), fresh_bound(random_seed=1)
+    count = fresh.responses.count
+    first, second = (fresh.populations(PARAMS)[0] for _ in range(2))
     assert not np.isin(first, second).any()
-    assert found.draws == 2
-    assert found.responses.count - count == 80
-
-
-def test_seed_and_number_of_draws_determine_the_next_ones() -> None:
-    one, two, other = fresh_bound(), fresh_bound(), fresh_bound(random_seed=1)
-    values = [b.populations(PARAMS)[0] for b in (one, two, other)]
-    np.testing.assert_array_equal(values[0], values[1])
-    assert not np.array_equal(values[0], values[2])
-    one.draws = 0
-    np.testing.assert_array_equal(one.populations(PARAMS)[0], values[0])
+    assert fresh.draws == 2
+    assert fresh.responses.count - count == 80
+    np.testing.assert_array_equal(same.populations(PARAMS)[0], first)
+    assert not np.array_equal(seeded.populations(PARAMS)[0], first)
+    fresh.draws = 0
+    np.testing.assert_array_equal(fresh.populations(PARAMS)[0], first)
+    # Chains in processes begin as copies; what they ask for differs. The same noise would be moved
+    # by .01.
+    moved = fresh_bound().populations([np.array([0.51]), np.array([1.0])])[0]
+    assert np.abs(np.sqrt(np.sort(moved[0])) - np.sqrt(np.sort(first[0]))).max() > 0.05
 
 
 def test_the_operation_takes_a_batch_and_has_no_gradient() -> None:
-    found = fresh_bound()
     mu, sigma = pt.dvector(), pt.dvector()
-    graph = found._discrepancy([mu, sigma])
+    graph = fresh_bound()._discrepancy([mu, sigma])
     values = pytensor.function([mu, sigma], graph)(np.zeros(3), np.array([1.0, -1.0, 2.0]))
-    assert values.shape == (3,)
     np.testing.assert_array_equal(np.isfinite(values), [True, False, True])
     with pytest.raises(TypeError, match="its log-density is random and has no gradient"):
         pt.grad(graph.sum(), mu)
 
 
-def test_chains_in_processes_of_their_own_draw_different_specimens() -> None:
-    """Processes begin as copies, with the same seeds and counts; what they ask for differs."""
-    here, there = fresh_bound(), fresh_bound()
-    a = here.populations([np.array([0.5]), np.array([1.0])])[0]
-    b = there.populations([np.array([0.51]), np.array([1.0])])[0]
-    # The same noise would be moved by .01.
-    assert np.abs(np.sqrt(np.sort(b[0])) - np.sqrt(np.sort(a[0]))).max() > 0.05
-
-
 def test_predictive_draws_follow_the_seed_and_are_new_specimens() -> None:
     found = fresh_bound(n=5)
     params = [np.array(0.5), np.array(1.0)]
-    one, same, other = (found.draw(np.random.default_rng(s), 50, params) for s in (1, 1, 2))
-    np.testing.assert_array_equal(one, same)
-    assert not np.isin(one, other).any()
-    assert np.unique(one).size == 50
+    first, same, second = (found.draw(np.random.default_rng(s), 50, params) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first, same)
+    assert not np.isin(first, second).any()
+    assert np.unique(first).size == 50
     assert np.isnan(found.draw(np.random.default_rng(1), 3, [np.array(0.5), np.array(-1.0)])).all()
 
 
-def model() -> pm.Model:
-    with pm.Model() as found:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
-        prb.Simulator(
-            "y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 1.5], epsilon=0.5,
-            propagation=prb.Fresh(20),
-        )  # fmt: skip
-    return found
+@pytest.mark.parametrize(
+    "of_prior", [False, pytest.param(True, marks=pytest.mark.long)], ids=["SMC", "prior"]
+)
+def test_a_sampler_s_seed_decides_the_draws_of_every_run(of_prior: bool) -> None:
+    model = simulated(np.square, prb.Fresh(20))
 
-
-def test_a_sampler_s_seed_decides_the_draws_of_every_run() -> None:
-    one = model()
-    runs = [
-        prb.sample_smc(
-            30, chains=2, model=one, adjustment=None, random_seed=seed, progressbar=False
+    def run(seed: int) -> Any:
+        if of_prior:
+            drawn = pm.sample_prior_predictive(3, model=model, random_seed=seed)
+            return drawn.prior_predictive["y"].values
+        keywords: dict[str, Any] = {"chains": 2, "adjustment": None, "progressbar": False}
+        return (
+            prb.sample_smc(30, model=model, random_seed=seed, **keywords)
+            .calibration["discrepancy"]
+            .values
         )
-        for seed in (1, 1, 2)
-    ]
-    first, again, other = (run.calibration["discrepancy"].values for run in runs)
+
+    first, again, other = map(run, (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.isin(first, other).any()
-
-
-@pytest.mark.long
-def test_prior_predictive_sampling_follows_its_seed() -> None:
-    drawn = [
-        pm.sample_prior_predictive(3, model=model(), random_seed=seed).prior_predictive["y"].values
-        for seed in (1, 1, 2)
-    ]
-    np.testing.assert_array_equal(drawn[0], drawn[1])
-    assert not np.isin(drawn[0], drawn[2]).any()
 
 
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (
-            lambda mu, sigma: pm.SkewNormal.dist(mu=mu, sigma=sigma, alpha=2.0),
-            stats.skewnorm(2.0, 2.0, 0.5),
-        ),
-        (lambda mu, sigma: pm.Rice.dist(nu=mu, sigma=sigma), stats.rice(4.0, scale=0.5)),
-        (lambda mu, sigma: pm.Moyal.dist(mu, sigma), stats.moyal(2.0, 0.5)),
-        (
-            lambda mu, sigma: pm.TruncatedNormal.dist(mu, sigma, lower=2.0),
-            stats.halfnorm(2.0, 0.5),
-        ),
-        (
-            lambda mu, sigma: pm.Truncated.dist(pm.Laplace.dist(mu, sigma), lower=mu),
-            stats.expon(2.0, 0.5),
-        ),
+        (lambda m, s: pm.SkewNormal.dist(mu=m, sigma=s, alpha=2.0), stats.skewnorm(2.0, 2.0, 0.5)),
+        (lambda m, s: pm.Rice.dist(nu=m, sigma=s), stats.rice(4.0, scale=0.5)),
+        (pm.Moyal.dist, stats.moyal(2.0, 0.5)),
+        (lambda m, s: pm.TruncatedNormal.dist(m, s, lower=2.0), stats.halfnorm(2.0, 0.5)),
+        (lambda m, s: pm.Truncated.dist(pm.Laplace.dist(m, s), lower=m), stats.expon(2.0, 0.5)),
     ],
     ids=["SkewNormal", "Rice", "Moyal", "TruncatedNormal", "Truncated"],
 )
@@ -230,7 +169,8 @@ def test_inputs_that_pymc_draws_by_functions_of_its_own(make: Any, expected: Any
             "y", np.positive, x, metric=prb.AreaMetric(), observed=expected.ppf([0.2, 0.5, 0.8]),
             epsilon=0.5, propagation=prb.Fresh(400),
         )  # fmt: skip
-    found = next(iter(nodes(model).values())).bound
+    (node,) = first_use(model).values()
+    found = node.bound
     given = {"mu": np.array([2.0]), "sigma": np.array([0.5])}
     values, weights = found.populations([given[str(r.name)] for r in found.inputs.roots])
     assert values.shape == weights.shape == (1, 400)

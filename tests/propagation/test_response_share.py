@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,44 +60,39 @@ def plausible(d: int, center: float) -> Populations:
     return Populations(means, 0.2 * np.exp(0.15 * rng.standard_normal(64)))
 
 
-def prior_specimens(d: int) -> Floats:
-    return 0.5 * np.random.default_rng(3).standard_normal((1000, d))
+def shared(
+    run: Callable[[Floats], Floats], populations: Populations, d: int, batches: int = 6
+) -> Any:
+    """Return the emulation before and after, and the share."""
+    emulation = emulation_of(run, d)
+    z = 0.5 * np.random.default_rng(3).standard_normal((1000, d))  # specimens of the prior
+    after, share = response_share(
+        run, emulation, lambda: z, lambda _: populations, OPTIONS, batches=batches
+    )
+    return emulation, after, share
 
 
 @pytest.mark.parametrize("d", [1, 2])
 def test_the_share_is_the_distribution_function(d: int) -> None:
     populations = plausible(d, 0.0)
-    emulation = emulation_of(half_space, d)
-    refined, share = response_share(
-        half_space, emulation, lambda: prior_specimens(d), lambda _: populations, OPTIONS
-    )
-    assert share is not None
+    before, after, share = shared(half_space, populations, d)
     error = populations.log_share(share) - populations.exact()
     # In nats over plausible populations: the posterior mean moves by as many standard deviations.
     assert np.std(error) <= 0.1
-    assert np.std(populations.exact()) > 1  # what is left out without the term
-    assert len(refined.z) > len(emulation.z)
+    assert np.std(populations.exact()) > 1  # without the term
+    assert len(after.z) > len(before.z)
 
 
-def test_a_region_far_away_is_left_out() -> None:
-    emulation = emulation_of(half_space, 1)
-    far = plausible(1, LIMIT - 1.5)
-    left, share = response_share(
-        half_space, emulation, lambda: prior_specimens(1), lambda _: far, OPTIONS
-    )
+def test_a_region_far_away_and_failed_specimens_have_no_share() -> None:
+    before, after, share = shared(half_space, plausible(1, LIMIT - 1.5), 1)
     assert share is None
-    assert left is emulation
+    assert after is before
 
-
-def test_failed_specimens_are_no_missing_response() -> None:
     def failing(z: Floats) -> Floats:
         return np.where(np.isnan(half_space(z)), np.inf, z)
 
-    emulation = emulation_of(failing, 1)
-    assert emulation.fails(np.array([[0.9]])).all()
-    _, share = response_share(
-        failing, emulation, lambda: prior_specimens(1), lambda _: plausible(1, 0.0), OPTIONS
-    )
+    before, _, share = shared(failing, plausible(1, 0.0), 1)
+    assert before.fails(np.array([[0.9]])).all()
     assert share is None
 
 
@@ -110,21 +107,14 @@ def test_runs_at_the_boundary_are_between_runs_with_and_without_response() -> No
     assert len(np.unique(points)) == 8
 
 
-def test_a_boundary_that_is_not_found_is_refused() -> None:
+def test_a_boundary_that_is_random_is_refused() -> None:
     rng = np.random.default_rng(0)
 
     def random(z: Floats) -> Floats:
         return np.where(rng.random(z.shape) < 0.5, np.nan, z)
 
     with pytest.raises(DesignError, match="boundary still changes"):
-        response_share(
-            random,
-            emulation_of(random, 1),
-            lambda: prior_specimens(1),
-            lambda _: plausible(1, 0.0),
-            OPTIONS,
-            batches=2,
-        )
+        shared(random, plausible(1, 0.0), 1, batches=2)
 
 
 def test_populations_without_a_point_have_no_share() -> None:

@@ -16,7 +16,7 @@ from line_problem import build, line
 
 import prbayes as prb
 from prbayes.response import BudgetError
-from prbayes.response.budget import Budget, budget, limited, unlimited
+from prbayes.response.budget import budget, limited, unlimited
 
 QUIET: dict[str, Any] = {"progressbar": False}
 
@@ -41,28 +41,21 @@ def slow(value: Any) -> Any:
 # -- what a budget is ------------------------------------------------------------------------------
 
 
-def test_without_limits_everything_is_granted() -> None:
-    assert budget().grant(10**9, least=10**9) == 10**9
-    assert Budget().grant(3, least=1) == 3
-
-
 def test_responses_are_granted_as_long_as_there_are_some() -> None:
+    assert budget().grant(10**9, least=10**9) == 10**9
     with limited(None, 10):
         assert budget().grant(6, least=1) == 6
         assert budget().grant(6, least=1) == 4
         with pytest.raises(BudgetError, match="max_runs = 10 was reached"):
             budget().grant(1, least=1)
-    assert budget().grant(1, least=1) == 1
-
-
-def test_a_budget_that_was_spent_stays_spent() -> None:
-    with limited(None, 10):
-        with pytest.raises(BudgetError):
-            budget().grant(11, least=11)
+        # What was spent stays spent.
         with pytest.raises(BudgetError):
             budget().check()
         with unlimited():
             budget().check()
+    assert budget().grant(1, least=1) == 1
+    with limited(None, 10), pytest.raises(BudgetError):
+        budget().grant(11, least=11)
 
 
 def test_time_runs_out() -> None:
@@ -251,6 +244,7 @@ def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_t
     assert posterior.attrs["n_responses"] == at_once.attrs["n_responses"]
 
 
+@pytest.mark.long
 def test_chains_that_finish_on_a_design_that_grew_are_returned_and_the_rest_goes_on(
     tmp_path: Path,
 ) -> None:

@@ -16,6 +16,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
+from contextlib import nullcontext
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ import pytest
 from first_use import first_use
 
 import prbayes as prb
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
 from prbayes.response.call import (
     CallSettings,
@@ -38,25 +40,20 @@ from prbayes.response.call import (
     respond,
 )
 from prbayes.response.executors import has_slipped
-from prbayes.response.failures import Abort, OnFailure, Replace
-from prbayes.response.store import Store
+from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError, Retry
+from prbayes.response.outputs import read_observed
+from prbayes.response.store import Store, StoreError
 
 N = 64
 
 
-def model(response: Any, propagation: Any = None, **keywords: Any) -> pm.Model:
-    propagation = prb.Reweighted(N, **keywords) if propagation is None else propagation
+def model(response: Any, propagation: Any = None, **settings: Any) -> pm.Model:
+    """Return a model whose first responses are computed."""
     with pm.Model() as found:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        prb.Simulator(
-            "y",
-            response,
-            x,
-            2.0,
-            metric=prb.AreaMetric(),
-            observed=[1, 2, 3, 5.0],
-            propagation=propagation,
-        )
+        data = {"metric": prb.AreaMetric(), "observed": [1, 2, 3, 5.0]}
+        propagation = propagation or prb.Reweighted(N, **settings)
+        prb.Simulator("y", response, x, 2.0, **data, propagation=propagation)
     first_use(found)
     return found
 
@@ -89,8 +86,28 @@ def nan_above_two(x: float, a: float) -> float:
     return np.nan if x > 2 else a * x
 
 
-EXPECTED = stored(model(times))
-POINTS = EXPECTED / 2
+def line(n: int) -> Points:
+    """The numbers 0 to n - 1, and a constant."""
+    return Points([np.arange(float(n)), 2.0], [True, False])
+
+
+X = np.random.default_rng(1).normal(1.0, 1.4, N)
+STEEP = X > 2
+KINDS = pytest.mark.parametrize("kind", ["scalar", "batched", "threads"])
+
+
+def run(
+    function: Any, kind: str = "scalar", points: Points | None = None, **settings: Any
+) -> tuple[Any, Tally]:
+    """Return responses at N points, or at those given, and what was counted."""
+    tally = Tally()
+    with ThreadPoolExecutor(2) if kind == "threads" else nullcontext() as pool:
+        response = prb.scalar(function)
+        if kind == "batched":
+            response = lambda x, a: np.array([function(v, a) for v in x])  # noqa: E731
+        calling = CallSettings("y", response, pool, **settings)
+        points = Points([X, 2.0], [True, False]) if points is None else points
+        return respond(calling, points, tally), tally
 
 
 # -- the same numbers, wherever they are computed --------------------------------------------------
@@ -105,11 +122,12 @@ def processes() -> Iterator[Executor]:
 @pytest.mark.long
 @pytest.mark.parametrize("response", [times, slow_times, prb.scalar(times), lambda x, a: a * x])
 def test_executors_give_the_same_responses(response: Any, processes: Executor) -> None:
-    np.testing.assert_array_equal(stored(model(response)), EXPECTED)
+    expected = stored(model(times))
+    np.testing.assert_array_equal(stored(model(response)), expected)
     with ThreadPoolExecutor(3) as threads:
         for executor in (threads, processes):
             found = model(response, executor=executor)
-            np.testing.assert_array_equal(stored(found), EXPECTED)
+            np.testing.assert_array_equal(stored(found), expected)
             assert responses(found).computed == N
 
 
@@ -122,44 +140,11 @@ def test_resimulated_and_fresh_use_the_executor_too() -> None:
 
     with ThreadPoolExecutor(2, thread_name_prefix="far") as pool:
         for propagation in (prb.Resimulated(N, executor=pool), prb.Fresh(N, executor=pool)):
+            evaluator = Evaluator.of(model(response, propagation))
             seen.clear()
-            prb.sample_smc(
-                20,
-                chains=1,
-                model=model(response, propagation),
-                epsilon=1.0,
-                adjustment=None,
-                random_seed=1,
-                progressbar=False,
-            )
+            evaluator(np.zeros((2, 1)))
             assert seen
             assert all(name.startswith("far") for name in seen)
-
-
-def test_a_multivariate_input_arrives_whole_at_a_scalar_function() -> None:
-    shapes = set()
-
-    def length(x: Any) -> float:
-        shapes.add(np.shape(x))
-        return float(np.hypot(*x))
-
-    with pm.Model() as found:
-        x = pm.MvNormal.dist(pm.Normal("mu", 0, 1, shape=2), np.eye(2))
-        prb.Simulator(
-            "y",
-            prb.scalar(length),
-            x,
-            metric=prb.AreaMetric(),
-            observed=[1, 2.0],
-            propagation=prb.Reweighted(N),
-        )
-    assert (stored(found) > 0).all()
-    assert shapes == {(2,)}
-
-
-def line(n: int) -> Points:
-    """The numbers 0 to n - 1, and a constant."""
-    return Points([np.arange(float(n)), 2.0], [True, False])
 
 
 def test_chunks_follow_the_measured_cost() -> None:
@@ -243,46 +228,44 @@ def test_a_tally_forgets_old_chunks_slowly() -> None:
 
 # -- failures --------------------------------------------------------------------------------------
 
-STEEP = POINTS > 2
-BATCHED = pytest.mark.parametrize("kind", ["scalar", "batched", "threads"])
 
-
-def failing(
-    kind: str, function: Any, on_failure: OnFailure | None = None, **keywords: Any
-) -> pm.Model:
-    keywords |= {} if on_failure is None else {"on_failure": on_failure}
-    if kind == "batched":
-        return model(lambda x, a: np.array([function(v, a) for v in x]), **keywords)
-    if kind == "threads":
-        with ThreadPoolExecutor(2) as pool:
-            return model(prb.scalar(function), executor=pool, **keywords)
-    return model(prb.scalar(function), **keywords)
-
-
-@BATCHED
+@KINDS
 def test_an_exception_aborts_by_default(kind: str) -> None:
-    with pytest.raises(prb.response.ResponseError, match=r"y: .*raised ArithmeticError: too steep"):
-        failing(kind, fails_above_two)
+    with pytest.raises(ResponseError, match=r"y: .*raised ArithmeticError: too steep"):
+        run(fails_above_two, kind)
 
 
-@BATCHED
+@KINDS
 @pytest.mark.parametrize("function", [fails_above_two, nan_above_two])
 def test_replaced(kind: str, function: Any, caplog: pytest.LogCaptureFixture) -> None:
-    assert 3 < STEEP.sum() < N - 3
     with caplog.at_level(logging.WARNING, "prbayes"):
-        found = failing(kind, function, prb.response.Replace(np.inf))
-    np.testing.assert_array_equal(stored(found), np.where(STEEP, np.inf, EXPECTED))
-    assert responses(found).failures == STEEP.sum()
+        values, tally = run(function, kind, on_failure=Replace(np.inf))
+    np.testing.assert_array_equal(values, np.where(STEEP, np.inf, 2 * X))
+    assert tally.failures == STEEP.sum()
     assert f"y: {STEEP.sum()} of {N} responses failed, replaced by inf" in caplog.text
+    assert sorted(f.inputs[0] for f in tally.failed.values()) == sorted(X[STEEP])
     if function is fails_above_two:
-        assert "too steep" in caplog.text
+        assert {f.reason for f in tally.failed.values()} == {"it raised ArithmeticError: too steep"}
 
 
-@BATCHED
+@KINDS
 def test_nan_is_a_result_by_default_and_a_failure_if_asked_for(kind: str) -> None:
-    np.testing.assert_array_equal(np.isnan(stored(failing(kind, nan_above_two))), STEEP)
-    with pytest.raises(prb.response.ResponseError, match="it is NaN"):
-        failing(kind, nan_above_two, prb.response.Abort(on_nan=True))
+    np.testing.assert_array_equal(np.isnan(run(nan_above_two, kind)[0]), STEEP)
+    with pytest.raises(ResponseError, match="it is NaN"):
+        run(nan_above_two, kind, on_failure=Abort(on_nan=True))
+
+
+@KINDS
+def test_a_response_that_leaves_python_is_a_failure_like_another(kind: str) -> None:
+    def leaves(x: float, a: float) -> float:
+        if x > 2:
+            raise SystemExit("bye")
+        return a * x
+
+    values, _ = run(leaves, kind, on_failure=Replace(np.inf))
+    np.testing.assert_array_equal(values, np.where(STEEP, np.inf, 2 * X))
+    with pytest.raises(ResponseError, match="raised SystemExit: bye"):
+        run(leaves, kind)
 
 
 def test_retried_once_and_then_it_works() -> None:
@@ -294,98 +277,72 @@ def test_retried_once_and_then_it_works() -> None:
             raise OSError("license server")
         return a * x
 
-    found = failing("scalar", moody, prb.response.Retry(1, then=prb.response.Abort()))
-    np.testing.assert_array_equal(stored(found), EXPECTED)
-    # The simulator tries 16 points of the prior only where it has to; here every design point,
-    # the steep ones twice.
-    assert sorted(set(calls.values())) == [1, 2]
-    assert responses(found).computed == N + STEEP.sum()
+    values, tally = run(moody, on_failure=Retry(1, then=Abort()))
+    np.testing.assert_array_equal(values, 2 * X)
+    assert tally.computed == N + STEEP.sum()
 
 
-@pytest.mark.exact
-def test_retried_in_vain() -> None:
-    found = failing(
-        "scalar", fails_above_two, prb.response.Retry(2, then=prb.response.Replace(-1.0))
-    )
-    np.testing.assert_array_equal(stored(found), np.where(STEEP, -1.0, EXPECTED))
-    assert responses(found).computed == N + 2 * STEEP.sum()
-    with pytest.raises(prb.response.ResponseError, match="too steep"):
-        failing("scalar", fails_above_two, prb.response.Retry(2, then=prb.response.Abort()))
-
-
-@pytest.mark.exact
-@BATCHED
-def test_the_store_knows_which_points_failed_and_why(kind: str, tmp_path: Path) -> None:
-    failing(
-        kind,
-        fails_above_two,
-        prb.response.Retry(1, then=prb.response.Replace(-1.0)),
-        store=tmp_path,
-    )
-    connection = sqlite3.connect(tmp_path / "responses.sqlite")
-    query = "SELECT key, reason FROM run WHERE state = 'failed'"
-    found = dict(connection.execute(query).fetchall())
+@KINDS
+def test_retried_in_vain(kind: str, tmp_path: Path) -> None:
+    policy, store = Retry(2, then=Replace(-1.0)), Store(tmp_path, "y", columns=2)
+    values, tally = run(fails_above_two, kind, on_failure=policy, store=store)
+    np.testing.assert_array_equal(values, np.where(STEEP, -1.0, 2 * X))
+    if kind == "scalar":
+        assert tally.computed == N + 2 * STEEP.sum()
+    # The store has the points that failed, and why.
+    with sqlite3.connect(tmp_path / "responses.sqlite") as connection:
+        query = "SELECT key, reason FROM run WHERE state = 'failed'"
+        failed = dict(connection.execute(query).fetchall())
     connection.close()
-    keys = [np.array([x, 2.0]).tobytes() for x in POINTS[STEEP]]
-    assert found == dict.fromkeys(keys, "it raised ArithmeticError: too steep")
+    keys = [np.array([x, 2.0]).tobytes() for x in X[STEEP]]
+    assert failed == dict.fromkeys(keys, "it raised ArithmeticError: too steep")
+    with pytest.raises(ResponseError, match="too steep"):
+        run(fails_above_two, kind, on_failure=Retry(2, then=Abort()))
 
 
 def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
-    with pytest.raises(prb.response.ResponseError, match=r"y: the response returned shape \(2,\)"):
-        model(lambda x, a: (a * x)[:2], on_failure=prb.response.Replace())
-
-
-# -- what is stored --------------------------------------------------------------------------------
+    with pytest.raises(ResponseError, match=r"the response returned shape \(2,\)"):
+        respond(CallSettings("y", lambda x, a: (a * x)[:2], on_failure=Replace()), line(9), Tally())
 
 
 def test_a_failure_says_where() -> None:
     def root(x: float, y: float) -> float:
-        return math.sqrt(x) + y  # which there is none of
+        return math.sqrt(x) + y
 
-    with pm.Model() as found:
-        inputs = [pm.Normal.dist(pm.Normal(name, 0, 1), 1.0) for name in ("mu", "nu")]
-        given = {"metric": prb.AreaMetric(), "observed": [1.0, 2.0, 3.0]}
-        prb.Simulator("y", prb.scalar(root), *inputs, **given)
+    points = Points([-X, X], [True, True])
     with pytest.raises(
-        prb.response.ResponseError,
+        ResponseError,
         match=r"failed at 1 point\(s\), the first with inputs \(-[\d.]+, -?[\d.]+\): it raised "
         r"ValueError.*; repair it, keep priors and inputs where it has a response, or pass",
     ) as raised:
-        first_use(found)
+        run(root, points=points)
     x, y = map(float, re.findall(r"inputs \((.*?), (.*?)\)", str(raised.value))[0])
     with pytest.raises(ValueError, match="math domain"):
         root(x, y)
 
 
 def test_a_function_that_never_gives_what_is_observed_ends_the_run_whatever_the_policy() -> None:
-    columns = {"a": np.arange(20.0), "b": np.arange(20.0) ** 2}
-    policy = prb.response.Retry(1, then=prb.response.Replace())
-    calls = 0
+    _, outputs = read_observed("y", {"a": [1.0, 2.0], "b": [1.0, 2.0]})
+    settings: dict[str, Any] = {"on_failure": Retry(1, then=Replace()), "outputs": outputs}
+    calls, good = 0, 0
 
-    def outputs(x: float, y: float) -> dict[str, float]:
+    def response(x: float, y: float) -> dict[str, float]:
         nonlocal calls
         calls += 1
         return {"a": x, "c": y} if calls > good else {"a": x, "b": y}
 
-    def run() -> prb.Optimum:
-        with pm.Model() as model:
-            inputs = [pm.Normal.dist(pm.Normal(name, 5, 5), 5.0) for name in ("mu", "nu")]
-            prb.Simulator(
-                "y", prb.scalar(outputs), *inputs, metric=prb.Joint(prb.AreaMetric()),
-                observed=columns, propagation=prb.Reweighted(64, on_failure=policy),
-            )  # fmt: skip
-            return prb.minimize(model, progressbar=False)
-
-    good = 0
     wrong = r"keys \['a', 'c'\], expected \['a', 'b'\].*; repair it; if this is what a run that"
-    with pytest.raises(prb.response.ResponseError, match=wrong):
-        run()
+    with pytest.raises(ResponseError, match=wrong):
+        run(response, **settings)
     assert calls < 5
     # Later on it is what some runs return that failed.
-    good, calls = 60, 0
-    with pytest.raises(prb.propagation.DesignError, match="lost mass"):
-        run()
-    assert calls >= 64
+    calls, good = 0, 60
+    values, tally = run(response, **settings)
+    np.testing.assert_array_equal(np.isnan(values).all(axis=1), np.arange(N) >= 60)
+    assert tally.failures == N - 60
+
+
+# -- what is stored --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("version", [None, "1"])
@@ -394,11 +351,12 @@ def test_nothing_is_computed_twice_but_one_response_without_a_version(
 ) -> None:
     again = int(version is None)
     kept: dict[str, Any] = {"store": tmp_path, "version": version}
-    first = model(prb.scalar(times), **kept)
-    second = model(prb.scalar(times), **kept)
-    np.testing.assert_array_equal(stored(second), EXPECTED)
+    first, second = (model(prb.scalar(times), **kept) for _ in range(2))
+    np.testing.assert_array_equal(stored(second), stored(first))
     assert (responses(first).computed, responses(second).computed) == (N, again)
-    more = model(prb.scalar(times), propagation=prb.Reweighted(N, random_seed=1, **kept))
+    prb.minimize(pm.do(second, {}), progressbar=False)
+    assert responses(second).computed == again  # nor by a clone
+    more = model(prb.scalar(times), prb.Reweighted(N, random_seed=1, **kept))
     assert responses(more).computed == N + again  # other points
     data = Store(tmp_path, "y", version=version).to_dataset()
     assert data["response"].size == 2 * N
@@ -428,80 +386,52 @@ def by_factor(factor: float, calls: list[Any] | None = None) -> Any:
 def test_a_store_refuses_a_response_whose_variables_have_changed(
     wrapped: Callable[[Any], Any], tmp_path: Path
 ) -> None:
-    model(wrapped(by_factor(1.0)), store=tmp_path)
+    def at(x: Any, response: Any) -> Any:
+        points = Points([x, 2.0], [True, False])
+        store = Store(tmp_path, "y", columns=2)
+        return respond(CallSettings("y", wrapped(response), store=store), points, Tally())
+
+    at(X, by_factor(1.0))
     before = Store(tmp_path, "y").to_dataset()
     for changed, calls in ((1.001, []), (-1.0, [])):
         with pytest.raises(
-            prb.response.StoreError,
+            StoreError,
             match=r"y: store: got a response that gives .* expected .* stored in .*have changed",
         ):
-            model(wrapped(by_factor(changed, calls)), store=tmp_path)
+            at(X, by_factor(changed, calls))
         assert np.size(calls[0]) == len(calls) == 1
     # Also at points of which none is stored; and rounding is tolerated.
-    with pytest.raises(prb.response.StoreError, match="have changed"):
-        model(
-            wrapped(by_factor(2.0)),
-            propagation=prb.Reweighted(N, random_seed=1, store=tmp_path),
-        )
+    with pytest.raises(StoreError, match="have changed"):
+        at(X + 1, by_factor(2.0))
+    with pytest.raises(StoreError, match=r"gives nothing .*ZeroDivisionError"):
+        at(X, lambda x, a: 1 // 0)
     assert Store(tmp_path, "y").to_dataset().identical(before)
-    model(wrapped(by_factor(1 + 1e-12)), store=tmp_path)
+    at(X, by_factor(1 + 1e-12))
 
 
-def test_a_response_that_raises_where_a_number_is_stored_is_another_one(tmp_path: Path) -> None:
-    model(prb.scalar(times), store=tmp_path)
-
-    def broken(x: Any, a: Any) -> Any:
-        raise ArithmeticError("no license")
-
-    with pytest.raises(prb.response.StoreError, match=r"gives nothing .*no license"):
-        model(prb.scalar(broken), store=tmp_path)
-
-
-@pytest.mark.exact
-def test_responses_of_each_version_are_kept_apart(tmp_path: Path) -> None:
-    for version, factor in (("1", 1.0), ("2", 3.0), (None, 5.0), ("1", 1.0)):
-        found = model(prb.scalar(by_factor(factor)), store=tmp_path, version=version)
-        np.testing.assert_array_equal(stored(found), factor * EXPECTED)
-    assert responses(found).computed == 0
-    with pytest.raises(TypeError, match="version: got int 2, expected a text"):
-        model(times, store=tmp_path, version=2)
-    with pytest.raises(prb.response.StoreError, match=r"version '3', expected one of \['y', ver"):
+def test_responses_of_each_version_and_constant_are_kept_apart(tmp_path: Path) -> None:
+    for version, factor, computed in (("1", 1.0, N), ("2", 3.0, N), (None, 5.0, N), ("1", 1.0, 0)):
+        store = Store(tmp_path, "y", columns=2, version=version)
+        values, tally = run(by_factor(factor), store=store)
+        np.testing.assert_array_equal(values, factor * 2 * X)
+        assert tally.computed == computed
+    with pytest.raises(StoreError, match=r"version '3', expected one of \['y', ver"):
         Store(tmp_path, "y", version="3")
-
-
-def test_a_clone_does_not_compute_a_stored_response_once_more(tmp_path: Path) -> None:
-    model(prb.scalar(times), store=tmp_path)
-    found = model(prb.scalar(times), store=tmp_path)
-    prb.minimize(pm.do(found, {}), progressbar=False)
-    assert responses(found).computed == 1
-
-
-@pytest.mark.exact
-def test_another_constant_is_another_input(tmp_path: Path) -> None:
-    model(times, store=tmp_path)
-    with pm.Model() as other:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        prb.Simulator(
-            "y",
-            times,
-            x,
-            3.0,
-            metric=prb.AreaMetric(),
-            observed=[1, 2.0],
-            propagation=prb.Reweighted(N, store=tmp_path),
-        )
-    np.testing.assert_array_equal(stored(other), 1.5 * EXPECTED)
-    assert responses(other).computed == N
+    other = Points([X, 3.0], [True, False])
+    values, tally = run(times, points=other, store=Store(tmp_path, "y", columns=2, version="1"))
+    np.testing.assert_array_equal(values, 3 * X)
+    assert tally.computed == N
 
 
 def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
-    with pytest.raises(prb.response.ResponseError, match=r"\d+ responses are kept in"):
-        model(prb.scalar(fails_above_two), store=tmp_path)
-    kept = len(Store(tmp_path, "y", columns=2))
-    found = model(prb.scalar(times), store=tmp_path)
-    np.testing.assert_array_equal(stored(found), EXPECTED)
-    assert responses(found).computed == N - kept + 1  # one of those that are kept
-    assert kept == int(np.argmax(STEEP))  # all that came before the first steep point
+    store = Store(tmp_path, "y", columns=2, version="1")
+    with pytest.raises(ResponseError, match=r"\d+ responses are kept in"):
+        run(fails_above_two, store=store)
+    assert len(store) == int(np.argmax(STEEP))  # all that came before the first steep point
+    n_kept = len(store)
+    values, tally = run(times, store=store)
+    np.testing.assert_array_equal(values, 2 * X)
+    assert tally.computed == N - n_kept
 
 
 def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
@@ -537,8 +467,8 @@ def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
     with ThreadPoolExecutor(N) as pool:
         cluster = Cluster(pool)
         calling = CallSettings("y", prb.scalar(lambda x: 2 * x), cluster)  # type: ignore[arg-type]
-        found = respond(calling, Points([POINTS], [True]), Tally())
-    np.testing.assert_array_equal(found, 2 * POINTS)
+        found = respond(calling, Points([X], [True]), Tally())
+    np.testing.assert_array_equal(found, 2 * X)
     assert cluster.most == N
 
 
@@ -564,21 +494,11 @@ def test_what_is_being_computed_when_one_fails_is_kept(
 
     points = Points([np.arange(12.0)], [True])
     store = Store(tmp_path, "y", columns=1)
-    with Pool(2) as pool, pytest.raises(prb.response.ResponseError, match="too steep"):
+    with Pool(2) as pool, pytest.raises(ResponseError, match="too steep"):
         respond(CallSettings("y", prb.scalar(function), pool, store), points, Tally())
     values, known = store.find(points.keys())
     np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
     np.testing.assert_array_equal(values[known], [2.0, 4.0, 6.0])
-
-
-@pytest.mark.exact
-def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Path) -> None:
-    model(prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.response.Replace(np.inf))
-    found = model(
-        prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.response.Replace(-1.0)
-    )
-    np.testing.assert_array_equal(stored(found), np.where(STEEP, -1.0, EXPECTED))
-    assert responses(found).computed == 1
 
 
 # -- failures are not results ----------------------------------------------------------------------
@@ -590,74 +510,45 @@ def fails_when_busy(busy: list[bool]) -> Any:
             raise OSError("license server")
         return a * x
 
-    return prb.scalar(response)
+    return response
 
 
-@pytest.mark.exact
-@pytest.mark.parametrize(
-    "first", [prb.response.Replace(np.inf), prb.response.Retry(2, then=prb.response.Replace())]
-)
+@pytest.mark.parametrize("first", [Replace(np.inf), Retry(2, then=Replace())], ids=repr)
 def test_a_failure_in_the_store_is_no_result_under_abort(tmp_path: Path, first: OnFailure) -> None:
     busy = [True]
-    response = fails_when_busy(busy)
-    model(response, store=tmp_path, on_failure=first)
-    with pytest.raises(prb.response.ResponseError, match="license server"):
-        model(response, store=tmp_path)
+    response, store = fails_when_busy(busy), Store(tmp_path, "y", columns=2, version="1")
+    run(response, store=store, on_failure=first)
+    with pytest.raises(ResponseError, match="license server"):
+        run(response, store=store)
     busy[0] = False
-    found = model(response, store=tmp_path)
-    np.testing.assert_array_equal(stored(found), EXPECTED)
-    # One to see whether the response is the same, and those that had failed.
-    assert responses(found).computed == 1 + STEEP.sum()
+    values, tally = run(response, store=store)
+    np.testing.assert_array_equal(values, 2 * X)
+    assert tally.computed == STEEP.sum()
 
 
-@pytest.mark.exact
-def test_failures_are_tried_again_when_asked_for(tmp_path: Path) -> None:
-    busy, replace = [True], prb.response.Replace(-1.0)
+def test_stored_failures_are_replaced_by_the_present_value_or_tried_again(tmp_path: Path) -> None:
+    busy = [True]
     response = fails_when_busy(busy)
-    model(response, store=tmp_path, on_failure=replace, version="1")
-    busy[0] = False
-    kept = model(response, store=tmp_path, on_failure=replace, version="1")
-    np.testing.assert_array_equal(stored(kept), np.where(STEEP, -1.0, EXPECTED))
-    assert responses(kept).computed == 0
-    assert len(responses(kept).failed) == STEEP.sum()
-    assert {f.reason for f in responses(kept).failed} == {"it raised OSError: license server"}
-    other = model(response, store=tmp_path, on_failure=replace, version="2")
-    np.testing.assert_array_equal(stored(other), EXPECTED)
-    again = model(response, store=tmp_path, on_failure=replace, version="1", retry_failed=True)
-    np.testing.assert_array_equal(stored(again), EXPECTED)
-    assert responses(again).computed == STEEP.sum()
-    assert not responses(again).failed
+    settings: dict[str, Any] = {"store": Store(tmp_path, "y", columns=2, version="1")}
+    run(response, on_failure=Replace(np.inf), **settings)
+    busy[0], settings["on_failure"] = False, Replace(-1.0)
+    values, tally = run(response, **settings)
+    np.testing.assert_array_equal(values, np.where(STEEP, -1.0, 2 * X))
+    assert tally.computed == 0
+    assert len(tally.failed) == STEEP.sum()
+    assert {f.reason for f in tally.failed.values()} == {"it raised OSError: license server"}
+    values, tally = run(response, retry_failed=True, **settings)
+    np.testing.assert_array_equal(values, 2 * X)
+    assert (tally.computed, len(tally.failed)) == (STEEP.sum(), 0)
     # What was tried again is a result from then on.
-    assert not responses(model(response, store=tmp_path, on_failure=replace, version="1")).failed
-
-
-@pytest.mark.exact
-@BATCHED
-def test_failures_are_told_with_their_inputs(kind: str) -> None:
-    found = failing(kind, fails_above_two, prb.response.Replace(np.inf))
-    failed = responses(found).failed
-    assert sorted(f.inputs[0] for f in failed) == sorted(POINTS[STEEP])
-    assert {f.reason for f in failed} == {"it raised ArithmeticError: too steep"}
+    assert not run(response, **settings)[1].failed
 
 
 def test_a_copy_of_a_response_has_failures_of_its_own() -> None:
-    found = responses(failing("scalar", fails_above_two, prb.response.Replace(np.inf)))
+    found = responses(model(prb.scalar(fails_above_two), on_failure=Replace(np.inf)))
     other = found.copied()
     other([np.array([5.0])], [])
     assert len(other.failed) == len(found.failed) + 1
-
-
-@BATCHED
-def test_a_response_that_leaves_python_is_a_failure_like_another(kind: str) -> None:
-    def leaves(x: float, a: float) -> float:
-        if x > 2:
-            raise SystemExit("bye")
-        return a * x
-
-    found = failing(kind, leaves, prb.response.Replace(np.inf))
-    np.testing.assert_array_equal(stored(found), np.where(STEEP, np.inf, EXPECTED))
-    with pytest.raises(prb.response.ResponseError, match="raised SystemExit: bye"):
-        failing(kind, leaves)
 
 
 class Slipping(Executor):
@@ -683,15 +574,11 @@ class Slipping(Executor):
         return future
 
 
-@pytest.mark.parametrize("policy", [Abort(), Replace()], ids=["abort", "replace"])
+@pytest.mark.parametrize("policy", [Abort(), Replace()], ids=repr)
 def test_a_result_that_slipped_away_is_computed_again(policy: Any) -> None:
-    found = model(prb.scalar(times), executor=Slipping(3), on_failure=policy)
-    np.testing.assert_array_equal(stored(found), EXPECTED)
-
-
-def test_a_type_error_of_another_is_no_slip() -> None:
-    assert not has_slipped(TypeError("x"))
-    assert not has_slipped(None)
+    calling = CallSettings("y", prb.scalar(times), Slipping(3), on_failure=policy)
+    np.testing.assert_array_equal(respond(calling, line(9), Tally()), 2 * np.arange(9.0))
+    assert not has_slipped(TypeError("x"))  # of another
 
 
 def test_points_give_keys_of_all_numbers_in_the_order_of_the_arguments() -> None:
@@ -704,6 +591,9 @@ def test_points_give_keys_of_all_numbers_in_the_order_of_the_arguments() -> None
     first, constant, number, _ = points.at(1).arguments
     np.testing.assert_array_equal(first, [2.0, 3.0])
     assert (constant, number) == (7.0, 1.0)
+    again, have_same_constants = points.read_keys(np.array([expected[1], [2, 3, 6, 1, 8, 9]]))
+    np.testing.assert_array_equal(again.at(np.array([0])).keys(), [expected[1]])
+    assert have_same_constants.tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -716,14 +606,9 @@ def test_points_give_keys_of_all_numbers_in_the_order_of_the_arguments() -> None
     ],
 )
 def test_what_is_no_response_is_refused(result: Any, message: str) -> None:
-    with pytest.raises(prb.response.ResponseError, match=f"the response returned {message}"):
+    with pytest.raises(ResponseError, match=f"the response returned {message}"):
         checked(result, (3,), [np.zeros(3), 1.0])
-    np.testing.assert_array_equal(checked([1, True, np.nan], (3,), []), [1.0, 1.0, np.nan])
-
-
-def test_a_scalar_needs_a_function() -> None:
-    with pytest.raises(TypeError, match=r"scalar: got int, expected a function of one specimen's"):
-        prb.scalar(3)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(checked([1, True, np.nan], (3,), [])[0], [1.0, 1.0, np.nan])
 
 
 def test_points_that_fail_are_found_by_halving() -> None:

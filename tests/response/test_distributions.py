@@ -13,13 +13,12 @@ from scipy import stats
 
 from prbayes.response.compile import PLAIN, compile_batched
 from prbayes.response.distributions import (
+    MVNORMAL,
     PopulationSampler,
     PriorPoints,
     PriorSampler,
     compiled_log_density,
-    is_mvnormal,
     log_density,
-    prior_draws,
     quantiles,
     refuse_lopsided,
     refuse_without_density,
@@ -116,8 +115,8 @@ def test_quantiles(dist: Any, expected: Any) -> None:
 def test_quantiles_of_a_multivariate_normal_have_its_mean_and_covariance() -> None:
     u = np.array([[0.5, 0.5], [stats.norm.cdf(1.0), 0.5], [0.5, stats.norm.cdf(1.0)]])
     dist = pm.MvNormal.dist(np.array([1.0, 2.0]), COVARIANCE)
-    assert is_mvnormal(dist)
-    assert not is_mvnormal(pm.Normal.dist())
+    assert isinstance(dist.owner.op, MVNORMAL)
+
     center, one, two = quantiles("y", dist, u).eval(mode=PLAIN)
     np.testing.assert_allclose(center, [1.0, 2.0], atol=1e-12)
     root = np.column_stack([one - center, two - center])
@@ -149,14 +148,14 @@ def test_priors_are_drawn_together_and_the_seed_decides() -> None:
     # Drawn given the variable above, from the prior: four standard errors.
     assert abs((first[1] - first[0][:, None]).std() - 0.1) < 4 * 0.1 / np.sqrt(2 * 800)
     assert abs(first[0].mean() - 5) < 4 / 20
-    np.testing.assert_array_equal(prior_draws(model.basic_RVs, 400, 1)[0], first[0])
+    np.testing.assert_array_equal(PriorSampler(model.basic_RVs)(400, 1)[0], first[0])
 
 
 def test_priors_that_cannot_be_drawn_are_refused() -> None:
     with pm.Model() as model:
         pm.Flat("mu")
     with pytest.raises(TypeError, match=r"priors: got mu, .*cannot be drawn .*replace pm.Flat and"):
-        prior_draws(model.basic_RVs, 3, 1)
+        PriorSampler(model.basic_RVs)(3, 1)
 
 
 def test_points_of_a_cube_are_brought_to_the_prior_in_order() -> None:
@@ -212,7 +211,7 @@ def test_a_distribution_without_density_says_nothing_of_its_parameters() -> None
         lambda mu, sigma: [pm.CustomDist.dist(mu, dist=lambda mu, size: mu + pm.Gamma.dist(2, 1))]
     )
     refuse_without_density("y", sum_of_two)
-    with pytest.raises(TypeError, match=r"y: got CustomDist.* no density, .*prb.Fresh\(\)"):
+    with pytest.raises(TypeError, match=r"y: got CustomDist.*no density, .*prb.Fresh\(\)"):
         refuse_without_density("y", inputs)
 
 
@@ -271,7 +270,7 @@ def test_what_has_no_density_is_refused() -> None:
             pm.Truncated.dist(pm.SkewNormal.dist(mu=mu, sigma=sigma, alpha=1.0), lower=0.0)
         ]
     )
-    with pytest.raises(TypeError, match=r"y: got Trunc.* PyMC has no density.* expected one .*"):
+    with pytest.raises(TypeError, match=r"y: got Trunc.*PyMC has no density, expected one"):
         refuse_without_density("y", inputs)
 
 

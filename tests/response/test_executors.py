@@ -29,7 +29,6 @@ import pytest
 import prbayes as prb
 from prbayes.response import executors
 from prbayes.response.executors import (
-    Capacity,
     Pool,
     capacity,
     failure_of,
@@ -68,13 +67,13 @@ def test_how_much_an_executor_takes() -> None:
     class Silent:
         pass
 
-    assert capacity(None) == Capacity(1, 1)
+    assert capacity(None) == (1, 1)
     with ThreadPoolExecutor(3) as pool:
-        assert capacity(pool) == Capacity(3, 6)
-    assert capacity(Mpi()) == Capacity(7, 14)  # type: ignore[arg-type]
-    assert capacity(Dask(Client(tcp_a=2, tcp_b=3))) == Capacity(5, 10)
+        assert capacity(pool) == (3, 6)
+    assert capacity(Mpi()) == (7, 14)  # type: ignore[arg-type]
+    assert capacity(Dask(Client(tcp_a=2, tcp_b=3))) == (5, 10)
     for silent in (Silent(), Dask(Client())):
-        assert capacity(silent).chunks == 1024  # type: ignore[arg-type]
+        assert capacity(silent)[1] == 1024  # type: ignore[arg-type]
 
 
 # -- time limits ---------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
-from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.random_variable import nodes
@@ -19,7 +18,6 @@ from prbayes.response.call import scalar
 from prbayes.response.failures import Abort, Replace, ResponseError
 from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.response import (
-    KnownPoints,
     Responses,
     deduplicated_responses,
     refuse_uncallable,
@@ -115,7 +113,7 @@ def test_mistakes_are_named() -> None:
     ):
         call(lambda x: x[:2], on_failure=Replace())
     with pytest.raises(
-        TypeError, match=r"y: response: got float, expected a function .*the order is"
+        TypeError, match=r"y: response: got float 3.0, expected a function .*the order is"
     ):
         call(3.0)
     refuse_uncallable("y", np.square)
@@ -209,78 +207,51 @@ def test_a_function_that_knows_its_sizes_is_told_those_of_a_simulator() -> None:
 
 # -- batches that mix their specimens ----------------------------------------------------------
 
-OBSERVED = np.linspace(-1, 1, 20)
+POINTS = np.linspace(-2.0, 2.5, 64)
 
 
-def simulate(
-    response: Any, *, observed: Any = OBSERVED, metric: Any = None, **keywords: Any
-) -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1)
-        metric = metric or prb.AreaMetric()
-        propagation = prb.Reweighted(64)
-        prb.Simulator(
-            "y", response, x, metric=metric, observed=observed, propagation=propagation, **keywords
-        )
-    first_use(model)
+def call(response: Any, *batches: Any) -> None:
+    responses = Responses("y", response, inputs(X), outputs=None)
+    for batch in batches or (POINTS,):
+        responses([batch], [])
+
+
+def second_is_reversed(x: Any) -> Any:
+    return np.stack([x, x[..., ::-1]], axis=-1)
 
 
 @pytest.mark.parametrize(
-    "response",
+    ("response", "batches"),
     [
-        lambda x: x[..., ::-1],
-        lambda x: x - x.mean(),
-        lambda x: np.sort(x)[..., ::-1],
-        lambda x: np.cumsum(x, axis=-1)[..., ::-1],
-        lambda x: x / np.abs(x).max(),
+        (lambda x: x[..., ::-1], ()),
+        (lambda x: x - x.mean(), ()),
+        (lambda x: np.sort(-x), ()),
+        (lambda x: np.cumsum(x, axis=-1)[..., ::-1], ()),
+        (lambda x: x / np.abs(x).max(), ()),
+        (second_is_reversed, ()),
+        (second_is_reversed, (np.array([0.5]), POINTS)),  # a batch of one shows nothing
     ],
-    ids=["flip", "mean", "sort", "sum", "maximum"],
+    ids=["flip", "mean", "sort", "sum", "maximum", "output", "later"],
 )
-def test_a_response_that_mixes_its_specimens_is_refused(response: Any) -> None:
-    with pytest.raises(
-        prb.response.ResponseError,
-        match=r"y: the response of a specimen depends on .* by itself, and .* among 64, expected",
-    ):
-        simulate(response)
-
-
-def test_of_several_outputs_one_is_enough() -> None:
-    def two(x: Any) -> Any:
-        return np.stack([x, x[..., ::-1]], axis=-1)
-
-    with pytest.raises(prb.response.ResponseError, match="depends on those that it is computed"):
-        simulate(
-            two,
-            observed=np.random.default_rng(0).normal(size=(20, 2)),
-            metric=prb.Joint(prb.AreaMetric()),
-        )
-
-
-def test_a_first_batch_of_one_specimen_is_no_look() -> None:
-    def two(x: Any) -> Any:
-        return np.stack([x, x[..., ::-1]], axis=-1)
-
-    with pm.Model() as model:
-        inputs = read_inputs("y", [pm.Normal.dist(pm.Normal("mu", 0, 1), 1)], model)
-    responses = Responses("y", two, inputs, outputs=None)
-    responses([np.array([0.5])], [])
-    with pytest.raises(prb.response.ResponseError, match="depends on those that it is computed"):
-        responses([np.arange(4.0)], [])
+def test_a_response_that_mixes_its_specimens_is_refused(response: Any, batches: Any) -> None:
+    said = r"y: the response of a specimen depends on .* by itself, and .* among 64, expected"
+    with pytest.raises(ResponseError, match=said):
+        call(response, *batches)
 
 
 def test_others_are_not_refused() -> None:
     rng = np.random.default_rng(0)
-    simulate(np.exp)
-    simulate(lambda x: np.where(x > 0, x, np.nan))
-    simulate(lambda x: x + 1e-4 * x.mean())  # as much as a solver's steps differ
-    simulate(lambda x: x + rng.normal(size=x.shape))  # scatter of its own
-    simulate(lambda x: x * 0.0 + 2.0)
 
     def of_many(x: Any) -> Any:
         assert x.size > 1, "takes no single specimen"
         return x
 
-    simulate(of_many)
+    call(np.exp)
+    call(lambda x: np.where(x > 0, x, np.nan))
+    call(lambda x: x + 1e-4 * x.mean())  # as much as a solver's steps differ
+    call(lambda x: x + rng.normal(size=x.shape))  # scatter of its own
+    call(lambda x: x * 0.0 + 2.0)
+    call(of_many)
 
 
 def test_it_costs_one_run_that_is_not_counted() -> None:
@@ -290,19 +261,11 @@ def test_it_costs_one_run_that_is_not_counted() -> None:
         sizes.append(x.size)
         return x
 
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1)
-        prb.Simulator(
-            "y",
-            line,
-            x,
-            metric=prb.AreaMetric(),
-            observed=OBSERVED,
-            propagation=prb.Reweighted(64),
-        )
-        optimum = prb.minimize(progressbar=False)
-    assert sizes.count(1) == 1
-    assert optimum.n_responses == sum(sizes) - 1
+    responses = Responses("y", line, inputs(X))
+    for _ in range(2):
+        responses([POINTS], [])
+    assert sizes == [64, 1, 64]
+    assert responses.count == responses.computed == 128
 
 
 # -- points that repeat ------------------------------------------------------------------------
@@ -339,12 +302,12 @@ def test_each_different_point_is_computed_once_and_four_of_them_twice_at_first()
     assert response.asked == [12 + 4]
     # Known ones are not computed, and none is again.
     more = [rng.integers(0, 4, 300), rng.integers(0, 4, 300)]
-    found = deduplicated_responses(responses, more, KnownPoints(points, found))
+    found = deduplicated_responses(responses, more, (points, found))
     np.testing.assert_array_equal(found, 10 * more[0] + more[1])
     assert response.asked == [16, 4]
     assert responses.count == 800
     assert responses.computed == 20
-    assert deduplicated_responses(responses, more, KnownPoints(more, found)) == pytest.approx(found)
+    assert deduplicated_responses(responses, more, (more, found)) == pytest.approx(found)
     assert response.asked == [16, 4]
 
 
@@ -366,7 +329,7 @@ def test_a_response_with_scatter_of_its_own_is_computed_everywhere() -> None:
     assert sum(response.asked) == 400
     assert np.unique(found).size == 400
     assert np.std(found - x) == pytest.approx(1, abs=0.2)
-    deduplicated_responses(responses, [x], KnownPoints([x], found))
+    deduplicated_responses(responses, [x], ([x], found))
     assert response.asked[-1] == 400
 
 

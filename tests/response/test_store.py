@@ -101,30 +101,21 @@ def test_every_bit_of_inputs_and_responses_survives(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.view(np.uint64), values[::-1].view(np.uint64))
 
 
-def test_columns_are_told_apart(tmp_path: Path) -> None:
+def test_columns_are_told_apart_and_the_last_response_at_a_point_counts(tmp_path: Path) -> None:
     store = Store(tmp_path, "y", columns=2)
-    store.add(np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([12.0, 21.0]))
-    values, _ = store.find(np.array([[2.0, 1.0], [1.0, 2.0]]))
-    np.testing.assert_array_equal(values, [21.0, 12.0])
-
-
-def test_the_last_of_two_responses_at_one_point_holds(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", columns=1)
-    for value in (1.0, 2.0):
-        store.add(np.array([[0.5]]), np.array([value]))
-    for again in (store, Store(tmp_path, "y", columns=1)):
-        assert again.find(np.array([[0.5]]))[0] == 2.0
-        assert len(again) == 1
-
-
-def test_why_a_response_failed_is_kept(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", columns=1)
-    store.add(np.arange(3.0)[:, None], np.array([1.0, np.nan, np.nan]), {1: "no licence"})
-    with sqlite3.connect(store.path) as connection:
+    keys = np.array([[1.0, 2.0], [2.0, 1.0], [0.5, 0.5]])
+    store.add(keys, np.array([12.0, 21.0, np.nan]), {2: "no licence"})
+    assert store.failed(keys) == {2: "no licence"}
+    store.add(keys[2:], np.array([np.nan]))
+    for again in (store, Store(tmp_path, "y", columns=2)):
+        values, known = again.find(keys[::-1])
+        np.testing.assert_array_equal(values, [np.nan, 21.0, 12.0])
+        assert known.all()
+        assert (len(again), again.failed(keys)) == (3, {})
+    with closing(sqlite3.connect(store.path)) as connection:
         found = connection.execute("SELECT state, reason FROM run ORDER BY id").fetchall()
-    connection.close()
-    assert found == [("computed", None), ("failed", "no licence"), ("computed", None)]
-    assert store.find(np.arange(3.0)[:, None])[1].all()  # as yet a failure is found, too
+    computed = ("computed", None)
+    assert found == [computed, computed, ("failed", "no licence"), computed]
 
 
 def test_names_of_any_kind_have_their_own_responses(tmp_path: Path) -> None:
@@ -137,15 +128,13 @@ def test_names_of_any_kind_have_their_own_responses(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
 
 
-@pytest.mark.parametrize("name", ["y%2f1.nc", "y%2f1.journal"])
-def test_files_of_an_older_version_are_refused_and_not_ignored(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(b"prbayes1")
-    with pytest.raises(StoreError, match=rf"y/1: store: .*beside {name}.*older version.*move it"):
+def test_files_of_an_older_version_are_refused_and_not_ignored(tmp_path: Path) -> None:
+    old = tmp_path / "y%2f1.journal"
+    old.write_bytes(b"prbayes1")
+    with pytest.raises(StoreError, match=rf"y/1: store: .*beside {old.name}.*older version.*move"):
         Store(tmp_path, "y/1", columns=2)
-    assert (tmp_path / name).read_bytes() == b"prbayes1"
+    assert old.read_bytes() == b"prbayes1"
     assert len(Store(tmp_path, "z", columns=2)) == 0
-    (tmp_path / name).unlink()
-    assert len(Store(tmp_path, "y/1", columns=2)) == 0
 
 
 def test_responses_go_to_other_programs_as_a_data_set(folder: Path, tmp_path: Path) -> None:
@@ -174,17 +163,13 @@ def test_a_hundred_thousand_responses_take_a_second_or_two(tmp_path: Path) -> No
 # -- closed, sent elsewhere, removed -------------------------------------------------------------
 
 
-def test_a_pickled_store_is_folder_and_name(folder: Path) -> None:
-    text = pickle.dumps(Store(folder, "y", columns=3))
+def test_a_store_is_pickled_as_folder_and_name_and_opens_again(folder: Path) -> None:
+    store = Store(folder, "y", columns=3)
+    text = pickle.dumps(store)
     assert len(text) < 500
     assert all_right(pickle.loads(text))
-
-
-def test_a_store_that_was_closed_opens_again(folder: Path) -> None:
-    store = Store(folder, "y", columns=3)
     store.close()
     store.close()
-    assert [p.name for p in folder.iterdir()] == ["responses.sqlite"]
     assert all_right(store)
 
 
@@ -201,70 +186,55 @@ def test_a_store_that_was_removed_begins_anew(folder: Path) -> None:
 # -- damage --------------------------------------------------------------------------------------
 
 
+def changed(folder: Path, statement: str, *values: object) -> None:
+    with closing(sqlite3.connect(file_of(folder))) as connection, connection:
+        connection.execute(statement, values)
+
+
 def refused(folder: Path, match: str) -> None:
-    """A store that is refused, with a sentence, and left as it is."""
+    """Check that a store is refused with a sentence, and left as it is."""
     before = file_of(folder).read_bytes()
     with pytest.raises(StoreError, match=rf"y: store: got .*responses.sqlite, {match}"):
         Store(folder, "y", columns=3)
     assert file_of(folder).read_bytes() == before
 
 
+CHANGED = "run 17 does not match its checksum, expected .*put back"
+
+
 @pytest.mark.parametrize(
-    ("column", "value"),
+    ("statement", "values", "damage"),
     [
-        ("value", np.array(99.0, dtype="<f8").tobytes()),
-        ("key", np.zeros(3, dtype="<f8").tobytes()),
-        ("response", 2),
-        ("state", "failed"),
-        ("reason", "none"),
-        ("checksum", 1),
-        ("value", "text"),
+        ("UPDATE run SET value = ? WHERE id = 17", [np.array(99.0).tobytes()], CHANGED),
+        ("UPDATE run SET value = 'text' WHERE id = 17", [], CHANGED),
+        ("UPDATE run SET key = ? WHERE id = 17", [np.zeros(3).tobytes()], CHANGED),
+        ("UPDATE run SET response = 2 WHERE id = 17", [], CHANGED),
+        ("UPDATE run SET state = 'failed' WHERE id = 17", [], CHANGED),
+        ("UPDATE run SET reason = 'none' WHERE id = 17", [], CHANGED),
+        ("UPDATE run SET checksum = 1 WHERE id = 17", [], CHANGED),
+        (
+            "UPDATE run SET key = (SELECT key FROM run AS other WHERE other.id = 7 - run.id) "
+            "WHERE id IN (3, 4)",
+            [],
+            "run 3 does not match",
+        ),
+        ("DELETE FROM run WHERE id = 5", [], "run 5 is missing"),
+        ("UPDATE response SET name = 'x' WHERE name = 'y'", [], "response 1 does not match its"),
     ],
 )
-def test_a_row_that_was_changed_is_named(column: str, value: object, folder: Path) -> None:
-    connection = sqlite3.connect(file_of(folder))
-    with connection:
-        connection.execute(f"UPDATE run SET {column} = ? WHERE id = 17", (value,))
-    connection.close()
-    refused(folder, r"which is damaged: run 17 does not match its checksum, expected .*put back")
-
-
-def test_keys_that_were_swapped_are_named(folder: Path) -> None:
-    connection = sqlite3.connect(file_of(folder))
-    with connection:
-        ((one,), (two,)) = connection.execute("SELECT key FROM run WHERE id IN (3, 4)").fetchall()
-        connection.execute("UPDATE run SET key = ? WHERE id = 3", (two,))
-        connection.execute("UPDATE run SET key = ? WHERE id = 4", (one,))
-    connection.close()
-    refused(folder, "which is damaged: run 3 does not match")
-
-
-def test_a_row_that_is_gone_is_missed(folder: Path) -> None:
-    connection = sqlite3.connect(file_of(folder))
-    with connection:
-        connection.execute("DELETE FROM run WHERE id = 5")
-    connection.close()
-    refused(folder, "which is damaged: run 5 is missing")
-
-
-def test_a_response_of_another_name_is_noticed(folder: Path) -> None:
-    connection = sqlite3.connect(file_of(folder))
-    with connection:
-        connection.execute("UPDATE response SET name = 'x' WHERE name = 'y'")
-    connection.close()
-    refused(folder, "which is damaged: response 1 does not match its checksum")
+def test_a_row_that_was_changed_is_named(
+    statement: str, values: list[bytes], damage: str, folder: Path
+) -> None:
+    changed(folder, statement, *values)
+    refused(folder, f"which is damaged: {damage}")
 
 
 def test_damage_that_happens_during_a_run_is_noticed(folder: Path) -> None:
     store = Store(folder, "y", columns=3)
-    connection = sqlite3.connect(file_of(folder))
-    with connection:
-        connection.execute(
-            "INSERT INTO run (response, key, state, value, checksum) "
-            "VALUES (1, ?, 'computed', ?, 0)",
-            (KEYS[0].tobytes(), b"12345678"),
-        )
-    connection.close()
+    insert = (
+        "INSERT INTO run (response, key, state, value, checksum) VALUES (1, ?, 'computed', ?, 0)"
+    )
+    changed(folder, insert, KEYS[0].tobytes(), b"12345678")
     with pytest.raises(StoreError, match="run 341 does not match its checksum"):
         store.find(KEYS)
 
@@ -288,26 +258,17 @@ def test_what_is_no_store_is_refused(folder: Path, tmp_path: Path) -> None:
         Store(tmp_path / "file", "y", columns=3)
 
 
-def test_another_layout_is_refused(folder: Path) -> None:
-    connection = sqlite3.connect(file_of(folder))
-    connection.execute("PRAGMA user_version = 3")
-    connection.close()
-    refused(
-        folder, "which has layout 3, expected layout 2; use the version of prbayes that wrote it"
-    )
-
-
-def test_other_inputs_are_refused(folder: Path) -> None:
-    with pytest.raises(
-        StoreError,
-        match=r"y: store: .* holds inputs of 3 values for simulator 'y', expected 2 values; no",
-    ):
+def test_another_layout_and_other_inputs_are_refused(folder: Path) -> None:
+    held = r"y: store: .* holds inputs of 3 values for simulator 'y', expected 2 values; no"
+    with pytest.raises(StoreError, match=held):
         Store(folder, "y", columns=2)
-    assert all_right(Store(folder, "y", columns=3))
     with pytest.raises(
         StoreError, match=r"no responses of simulator 'x', expected one of \['y', 'z'\]"
     ):
         Store(folder, "x")
+    assert all_right(Store(folder, "y", columns=3))
+    changed(folder, "PRAGMA user_version = 3")
+    refused(folder, "which has layout 3, expected layout 2; use the version of prbayes that wrote")
 
 
 # -- a disk that is full, a file that is locked --------------------------------------------------
@@ -352,31 +313,24 @@ def test_a_writer_that_hangs_is_told_of(folder: Path, monkeypatch: pytest.Monkey
 # -- the file ------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    create(tmp_path / "r.sqlite")
-    return tmp_path / "r.sqlite"
-
-
 def runs(path: Path) -> int:
     with closing(connect(path)) as connection:
         return int(connection.execute("SELECT count(*) FROM run").fetchone()[0])
 
 
-def test_a_new_file_is_sound_and_leaves_nothing_beside_it(path: Path) -> None:
-    assert [p.name for p in path.parent.iterdir()] == ["r.sqlite"]
+def test_a_new_file_is_sound_and_replaces_none(tmp_path: Path) -> None:
+    path = tmp_path / "a b?c#d%20é" / "r.sqlite"
+    create(path)
     with closing(connect(path)) as connection:
         check_file(path, connection)
         assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
         assert connection.execute("PRAGMA synchronous").fetchone() == (2,)
-
-
-def test_a_file_that_is_there_is_not_replaced(path: Path) -> None:
-    with closing(connect(path)) as connection, transaction(connection):
-        connection.execute(INSERT_RUN, (1, b"", "computed", None, b"", 0))
+        with transaction(connection):
+            connection.execute(INSERT_RUN, (1, b"", "computed", None, b"", 0))
     create(path)
     assert runs(path) == 1
     assert [p.name for p in path.parent.iterdir()] == ["r.sqlite"]
+    assert [p.name for p in tmp_path.iterdir()] == ["a b?c#d%20é"]
 
 
 def test_many_may_make_it_at_once(tmp_path: Path) -> None:
@@ -402,7 +356,10 @@ def test_a_file_system_without_links_will_do(
     assert runs(tmp_path / "r.sqlite") == 0
 
 
-def test_nothing_of_a_transaction_that_fails_is_written(path: Path) -> None:
+def test_nothing_of_a_transaction_that_fails_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "r.sqlite"
+    create(path)
+
     def write(connection: sqlite3.Connection, *values: bytes | None) -> None:
         with transaction(connection):
             for value in values:
@@ -429,13 +386,6 @@ def test_a_checksum_tells_bits_types_and_order_apart() -> None:
     ]
     assert checksum(*row) == 0xB6772A52  # files in use rest on it
     assert len({checksum(*r) for r in [row, *others]}) == 8
-
-
-def test_paths_of_any_kind_are_opened(tmp_path: Path) -> None:
-    path = tmp_path / "a b?c#d%20é" / "r.sqlite"
-    create(path)
-    assert runs(path) == 0
-    assert [p.name for p in tmp_path.iterdir()] == ["a b?c#d%20é"]
 
 
 def test_what_sqlite_reports_becomes_words(tmp_path: Path) -> None:

@@ -265,19 +265,15 @@ def test_a_specimen_that_fails_now_and_then_is_tried_again_by_policy() -> None:
 
 
 def test_what_is_no_server_is_refused_at_once(real: Real) -> None:
-    for url in ("localhost:4242", "http://", "ftp://localhost", "http://localhost:port"):
-        with pytest.raises(ValueError, match=r"umbridge: url: got .*, expected the address of a"):
-            prb.umbridge(url)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         clock = time.monotonic()
         with pytest.raises(ConnectionError, match=r"where no server answers /Info \(.*start it"):
             prb.umbridge(f"http://127.0.0.1:{free.getsockname()[1]}")
         assert time.monotonic() - clock < 5
-    with telling(Info="<html>") as server, pytest.raises(ConnectionError, match="something else"):
-        prb.umbridge(server.url)
-    with telling(Info={"hello": 1}) as server, pytest.raises(ConnectionError, match="something el"):
-        prb.umbridge(server.url)
+    for info in ("<html>", {"hello": 1}):
+        with telling(Info=info) as server, pytest.raises(ConnectionError, match="something else"):
+            prb.umbridge(server.url)
     with (
         telling(Info={"protocolVersion": 2.0, "models": []}) as server,
         pytest.raises(ValueError, match=r"speaks version 2.0 of the protocol .*, expected 1.0"),
@@ -285,16 +281,11 @@ def test_what_is_no_server_is_refused_at_once(real: Real) -> None:
         prb.umbridge(server.url)
 
 
-def test_models_that_are_not_there_and_arguments_of_another_kind_are_refused(real: Real) -> None:
+def test_models_that_are_not_there_are_refused(real: Real) -> None:
     with pytest.raises(ValueError, match=r"got 'forward', expected one of .* 'beam', 'mortal', 'v"):
         prb.umbridge(real.url)
     with pytest.raises(ValueError, match=r"got 'mute', which the server at .* cannot evaluate"):
         prb.umbridge(real.url, "mute")
-    for config in ("level 2", {"level": {2}}):
-        with pytest.raises(TypeError, match=r"umbridge: config: got .*, expected"):
-            prb.umbridge(real.url, "beam", config=config)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"umbridge: timeout: got 0"):
-        prb.umbridge(real.url, "beam", timeout=0)
     for sizes in ([], [0], "2", [1.5]):
         with (
             telling(OutputSizes={"outputSizes": sizes}) as server,

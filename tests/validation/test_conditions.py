@@ -72,7 +72,7 @@ def test_folded_values_are_the_distance_from_the_middle() -> None:
     [
         ({"a": [1.0]}, {"a": DRAWS}, {"b": [1]}, r"specimens: got \['b'\], expected a mapping"),
         ({"a": [1.0]}, {"a": DRAWS}, [[1]], "specimens: got list, expected a mapping"),
-        ([[1.0]], [DRAWS], [[1], [2]], "specimens: got 2 conditions, expected a list with the 1"),
+        ([[1.0]], [DRAWS], [[1], [2]], "specimens: got 2 conditions, expected a list with the"),
         ([], [], None, "observed: got 0 conditions"),
         ([1.0, 2.0], DRAWS, [[1, 2]], r"specimens: got shape \(1, 2\), expected \(2,\)"),
         ([1.0, -np.inf], DRAWS, None, "got 1 NaN or -inf among 2 values"),

@@ -66,7 +66,7 @@ def confounding_findings(evaluator: Evaluator, local: Local) -> list[Finding]:
                     f"{node.name}: the data do not tell the model inadequacy from the inputs: "
                     f"{reason}; measure under more conditions, state narrower priors, or leave one "
                     "of them out.",
-                    "inadequacy.md#can-it-be-told-from-the-scatter-of-the-inputs",
+                    "inadequacy.md#can-it-be-separated-from-the-scatter-of-the-inputs",
                 )
             )
     return findings
