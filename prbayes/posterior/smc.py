@@ -286,10 +286,15 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     epsilons = evaluator.epsilon
     try:
         with designs_as_before(evaluator) as restore_designs:
+            optimum = settings.optimum
             if is_pseudo:
                 optimum = _set_epsilons(evaluator, settings)
-            else:
-                optimum = estimate_of(evaluator, settings, "sample_smc")
+            elif evaluator.nodes:
+                require_density(evaluator)
+                if optimum is None:
+                    search = Minimisation(refine=settings.refine)
+                    optimum = require_finished(find_optimum(evaluator, search))
+                require_sampling(optimum, "sample_smc")
             chains = _chains_on_designs(evaluator, settings, optimum)
             if is_pseudo:
                 chains = _with_errors(evaluator, chains)
@@ -300,17 +305,6 @@ def sample(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataTree:
     finally:
         for node, value in zip(evaluator.nodes, epsilons, strict=True):
             node.epsilon.set_value(np.asarray(value))
-
-
-def estimate_of(evaluator: Evaluator, settings: SamplingSettings, caller: str) -> Optimum | None:
-    """Return the estimate that the posterior is given, by a search if needed, or raise."""
-    optimum = settings.optimum
-    if not evaluator.nodes:
-        return optimum
-    require_density(evaluator)
-    if optimum is None:
-        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=settings.refine)))
-    return require_sampling(optimum, caller)
 
 
 def result_of(

@@ -36,23 +36,19 @@ def fit(name: str, propagation: Any = R256) -> prb.Optimum:
 @pytest.mark.parametrize("name", [pytest.param("ll", marks=pytest.mark.slow), "kl"])
 @pytest.mark.parametrize("parametric", [False, True])
 def test_standard_deviations_of_a_normal_mean(name: str, parametric: bool) -> None:
+    """The Dirichlet weighted variance is s^2 / (N + 1), the sampling variance 0.5^2 / N."""
     result = prb.bootstrap(fit(name), 1000, parametric=parametric)
     draws = result.posterior["mu"]
     assert draws.shape == (1, 1000)
-    # The minimiser is about the mean: its Dirichlet weighted variance is s^2 / (N + 1), its
-    # sampling variance 0.5^2 / N with the model's sd. 1000 draws: 2.2%; the mean is not quite the
-    # minimiser, nor these data normal: 6%.
+    # 1000 draws: 2.2%; the mean is not quite the minimiser, nor these data normal: 6%.
     expected = 0.5 / N**0.5 if parametric else SD / (N + 1) ** 0.5
     np.testing.assert_allclose(float(draws.std()), expected, rtol=4 * 0.022 + 0.06)
-    assert abs(0.5 / SD - 1) > 0.1  # the two are told apart
-    assert (
-        abs(float(draws.mean()) - fit(name).point["mu"])
-        < 4 * expected / 1000**0.5 + 0.05 * expected
-    )
+    assert abs(0.5 / SD - 1) > 0.1  # the two are different
+    offset = abs(float(draws.mean()) - fit(name).point["mu"])
+    assert offset < (4 / 1000**0.5 + 0.05) * expected
     assert result.posterior.attrs["converged"] == 1.0
-    assert result.posterior.attrs["sampler"].startswith(
-        "parametric" if parametric else "loss-likelihood"
-    )
+    kind = "parametric" if parametric else "loss-likelihood"
+    assert result.posterior.attrs["sampler"] == f"{kind} bootstrap"
     np.testing.assert_array_equal(result.observed_data["y"], OBSERVED)
 
 

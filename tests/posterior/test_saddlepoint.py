@@ -16,8 +16,7 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
 from prbayes.metrics.score import WeightSlopes, specimen_scores
-from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.importance import ImportanceSample, importance_sample, laplace
+from prbayes.posterior.importance import importance_sample, laplace
 from prbayes.posterior.saddlepoint import (
     EstimateLikelihood,
     EstimateLikelihoodOptions,
@@ -161,184 +160,150 @@ LOG_PRIORS: dict[Parameters, LogPrior] = {
     sharp: lambda mu, s: stats.norm(0.7, 0.1).logpdf(mu) + stats.lognorm(0.1, scale=0.4).logpdf(s),
     bounded: lambda mu, s: stats.uniform(0, 1.05).logpdf(mu) + stats.uniform(0, 0.55).logpdf(s),
 }
+Y = np.random.default_rng(4).normal(1, 0.5, 20)
 
 
-def normal_model(parameters: Parameters, metric: Metric, *groups: Floats) -> pm.Model:
-    """Return a model of a normal population, with a simulator y = x for each group of data."""
+def optimum_of(parameters: Parameters, *groups: Floats, **keywords: Any) -> prb.Optimum:
+    """Return the optimum of a normal population with a simulator y = x for each group of data."""
     with pm.Model() as model:
         mu, sigma = parameters()
         for k, observed in enumerate(groups):
             x = pm.Normal.dist(mu, sigma)
-            propagation = prb.Reweighted(1024)
-            prb.Simulator(
-                f"y{k}", lambda x: x, x, observed=observed, metric=metric, propagation=propagation
-            )
-    return model
+            settings = {"metric": KLD, "propagation": prb.Reweighted(1024), **keywords}
+            prb.Simulator(f"y{k}", lambda x: x, x, observed=observed, **settings)
+    return prb.minimize(model=model, progressbar=False)
 
 
-def likelihood_of(model: pm.Model) -> EstimateLikelihood:
-    optimum = prb.minimize(model=model, progressbar=False)
+def likelihood_at(optimum: prb.Optimum) -> EstimateLikelihood:
     return estimate_likelihood(optimum.evaluator, optimum)
 
 
-def target_of(likelihood: EstimateLikelihood) -> Target:
-    log_likelihood = likelihood.log_likelihood
-    return Target(
-        likelihood.evaluator, log_likelihood, likelihood.starts[0][None], likelihood.scale
-    )
-
-
-def sample_of(likelihood: EstimateLikelihood) -> ImportanceSample:
-    target = target_of(likelihood)
-    modes = laplace(target.log_posterior, target.starts, target.scale)
-    return importance_sample(target.log_posterior, modes, 1000, seed=0)
-
-
-def moments_of(likelihood: EstimateLikelihood) -> Moments:
-    """Return those of the posterior given the estimate."""
-    sample = sample_of(likelihood)
+def draws_of(likelihood: EstimateLikelihood) -> dict[str, Floats]:
+    """Return draws of the posterior given the estimate, by name."""
+    evaluator = likelihood.evaluator
+    starts = likelihood.starts[:1]
+    target = Target(evaluator, likelihood.log_likelihood, starts, likelihood.scale)
+    modes = laplace(target.log_posterior, starts, target.scale)
+    sample = importance_sample(target.log_posterior, modes, 1000, seed=0)
     assert sample.pareto_k < 0.7
-    values = likelihood.evaluator.hyperparameters.constrained(sample.draws)
-    pair = np.stack([values["mu"], np.log(values["sigma"])], axis=1)
+    return evaluator.hyperparameters.constrained(sample.draws)
+
+
+def moments_of(draws: dict[str, Floats], mu: str = "mu", sigma: str = "sigma") -> Moments:
+    pair = np.stack([draws[mu], np.log(draws[sigma])], axis=1)
     return Moments(pair.mean(axis=0), pair.std(axis=0))
 
 
-def data(size: int = 20, seed: int = 4) -> Floats:
-    return np.random.default_rng(seed).normal(1, 0.5, size)
-
-
-@pytest.mark.parametrize("parameters", [vague, sharp, bounded])
-def test_the_posterior_of_a_normal_population(parameters: Parameters) -> None:
+def require_exact(likelihood: EstimateLikelihood, parameters: Parameters, y: Floats) -> None:
     """Mean and standard deviation are sufficient, and the divergence's estimate is close to both."""
-    y = data()
-    likelihood = likelihood_of(normal_model(parameters, KLD, y))
-    require_close(moments_of(likelihood), exact_moments(LOG_PRIORS[parameters], y))
+    require_close(moments_of(draws_of(likelihood)), exact_moments(LOG_PRIORS[parameters], y))
 
 
-def at_another_point(optimum: prb.Optimum) -> EstimateLikelihood:
-    """Return the likelihood by the score a standard deviation of the prior away."""
-    shifted = replace(optimum, theta=optimum.theta + optimum.evaluator.hyperparameters.prior_sd)
-    likelihood = estimate_likelihood(optimum.evaluator, shifted)
-    np.testing.assert_allclose(likelihood.starts[0], shifted.theta)
-    return likelihood
-
-
-def test_the_score_elsewhere_is_as_good_a_statistic(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its observed mean is subtracted there; with the wrong sign the posterior is elsewhere."""
-    y = data()
-    optimum = prb.minimize(model=normal_model(sharp, KLD, y), progressbar=False)
-    exact = exact_moments(LOG_PRIORS[sharp], y)
-    require_close(moments_of(at_another_point(optimum)), exact)
-
-    def wrong(target: Any, population: Any, specimens: Floats, **options: Any) -> Floats:
-        sign = -1 if len(specimens) == len(y) else 1
-        return sign * specimen_scores(target, population, specimens, **options)
-
-    monkeypatch.setattr("prbayes.posterior.saddlepoint.specimen_scores", wrong)
-    with pytest.raises(AssertionError, match=r"\["):
-        require_close(moments_of(at_another_point(optimum)), exact)
-
-
-def test_a_population_of_bounded_support() -> None:
-    """The scores include the points that the ends pass; widths are about the standard errors."""
-    rng = np.random.default_rng(3)
-    y = rng.uniform(0.2, 1.8, 20)
-    with pm.Model() as model:
-        mu, sigma = vague()
-        x = pm.Uniform.dist(mu - 1.73 * sigma, mu + 1.73 * sigma)
-        prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD)
-    optimum = prb.minimize(model=model, progressbar=False)
-    likelihood = estimate_likelihood(optimum.evaluator, optimum)
+# The last estimate is beyond the end of its prior, where scores of an element would vanish.
+@pytest.mark.parametrize(
+    ("parameters", "shift"), [(vague, 0.0), (sharp, 0.0), (bounded, 0.0), (bounded, 0.5)]
+)
+def test_the_posterior_of_a_normal_population(parameters: Parameters, shift: float) -> None:
+    likelihood = likelihood_at(optimum_of(parameters, Y + shift))
     assert likelihood.combinations.shape == (2, 2)
-    sample = sample_of(likelihood)
-    assert sample.pareto_k < 0.7
-    draws = likelihood.evaluator.hyperparameters.constrained(sample.draws)
-    for name, values in draws.items():
-        # The prior is vague, and a posterior of 20 specimens is wider than the standard error.
-        assert 0.9 < values.std() / optimum.stderr[name] < 1.4, name
+    require_exact(likelihood, parameters, Y + shift)
 
 
 @pytest.mark.long
 def test_a_prior_far_wider_than_the_population() -> None:
     y = 3.9 + 4e-4 * np.random.default_rng(7).standard_normal(50)
-    likelihood = likelihood_of(normal_model(vague, KLD, y))
-    require_close(moments_of(likelihood), exact_moments(LOG_PRIORS[vague], y))
+    require_exact(likelihood_at(optimum_of(vague, y)), vague, y)
 
 
-def test_an_estimate_at_the_end_of_a_prior_is_moved_inside() -> None:
-    """The data are beyond the end: scores of an element there would vanish."""
-    y = data() + 0.5
-    likelihood = likelihood_of(normal_model(bounded, KLD, y))
+# Responses that are computed at each theta are functions of it by common random numbers.
+@pytest.mark.parametrize(
+    "propagation",
+    [prb.Reweighted(1024), pytest.param(prb.Resimulated(256), marks=pytest.mark.long)],
+)
+def test_the_score_at_another_point_is_as_good_a_statistic(
+    propagation: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its observed mean is subtracted there; with the wrong sign the posterior is elsewhere."""
+    optimum = optimum_of(sharp, Y, propagation=propagation)
+    shifted = replace(optimum, theta=optimum.theta + optimum.evaluator.hyperparameters.prior_sd)
+    likelihood = likelihood_at(shifted)
+    np.testing.assert_allclose(likelihood.starts[0], shifted.theta)
+    require_exact(likelihood, sharp, Y)
+
+    def wrong(target: Any, population: Any, specimens: Floats, **options: Any) -> Floats:
+        sign = -1 if len(specimens) == len(Y) else 1
+        return sign * specimen_scores(target, population, specimens, **options)
+
+    monkeypatch.setattr("prbayes.posterior.saddlepoint.specimen_scores", wrong)
+    with pytest.raises(AssertionError, match=r"\["):
+        require_exact(likelihood_at(shifted), sharp, Y)
+
+
+def test_a_population_of_bounded_support() -> None:
+    """The scores include the points that the ends pass; widths are about the standard errors."""
+    y = np.random.default_rng(3).uniform(0.2, 1.8, 20)
+    with pm.Model() as model:
+        mu, sigma = vague()
+        x = pm.Uniform.dist(mu - 1.73 * sigma, mu + 1.73 * sigma)
+        prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD)
+    optimum = prb.minimize(model=model, progressbar=False)
+    likelihood = likelihood_at(optimum)
     assert likelihood.combinations.shape == (2, 2)
-    require_close(moments_of(likelihood), exact_moments(LOG_PRIORS[bounded], y))
+    for name, values in draws_of(likelihood).items():
+        # The prior is vague, and a posterior of 20 specimens is wider than the standard error.
+        assert 0.9 < values.std() / optimum.stderr[name] < 1.4, name
 
 
 def test_two_simulators_are_as_one_with_all_data() -> None:
     """They have one bandwidth, so that all specimens count alike."""
-    y = data(40)
+    y = np.random.default_rng(4).normal(1, 0.5, 40)
     metric = prb.KullbackLeibler(prb.GaussianKDE(0.3))
-    likelihood = likelihood_of(normal_model(vague, metric, y[:20], y[20:]))
+    likelihood = likelihood_at(optimum_of(vague, y[:20], y[20:], metric=metric))
     assert len(likelihood.groups) == 2
-    require_close(moments_of(likelihood), exact_moments(LOG_PRIORS[vague], y))
+    require_exact(likelihood, vague, y)
 
 
 def test_specimens_in_two_simulators_add_their_scores() -> None:
-    y = data()
-    labels = np.arange(20)
     with pm.Model() as model:
         x = pm.Normal.dist(*vague())
-        for name, response in (("y", lambda x: x), ("z", lambda x: 3 * x)):
-            prb.Simulator(
-                name,
-                response,
-                x,
-                observed=y if name == "y" else 3 * y,
-                metric=KLD,
-                propagation=prb.Reweighted(1024),
-                specimens=labels,
-            )
-    likelihood = likelihood_of(model)
+        settings = {"propagation": prb.Reweighted(1024), "specimens": np.arange(20)}
+        prb.Simulator("y", lambda x: x, x, observed=Y, metric=KLD, **settings)
+        prb.Simulator("z", lambda x: 3 * x, x, observed=3 * Y, metric=KLD, **settings)
+    likelihood = likelihood_at(prb.minimize(model=model, progressbar=False))
     assert len(likelihood.groups) == 1
-    require_close(moments_of(likelihood), exact_moments(LOG_PRIORS[vague], y))
+    require_exact(likelihood, vague, Y)
 
 
 def test_the_posterior_of_an_unidentified_hyperparameter_is_its_prior() -> None:
-    y = data()
-
     def parameters() -> tuple[Any, Any]:
         pm.Normal("unused", 3, 2)
         return vague()
 
-    likelihood = likelihood_of(normal_model(parameters, KLD, y))
+    likelihood = likelihood_at(optimum_of(parameters, Y))
     assert likelihood.combinations.shape == (3, 2)
-    sample = sample_of(likelihood)
-    place = likelihood.evaluator.hyperparameters.names.index("unused")
-    draws = sample.draws[:, place]
+    draws = draws_of(likelihood)["unused"]
     # Four standard errors of 1000 independent draws.
     assert abs(draws.mean() - 3) < 4 * 2 / np.sqrt(1000)
     assert abs(draws.std() / 2 - 1) < 4 / np.sqrt(2000)
 
 
 def test_an_estimate_at_an_edge_is_moved_inside() -> None:
-    """Known scatter of .5 exceeds that of the data: the standard deviation of mu's inputs is zero."""
-    noise = np.random.default_rng(5).normal(0, 0.3, 20)
+    """Known scatter of .5 exceeds that of the data: the standard deviation of inputs is zero."""
+    y = 1 + np.random.default_rng(5).normal(0, 0.3, 20)
     with pm.Model() as model:
         mu, sigma = vague()
         x = pm.Normal.dist(mu, pm.math.sqrt(sigma**2 + 0.25))
-        prb.Simulator("y", lambda x: x, x, observed=1 + noise, metric=KLD)
-    optimum = prb.minimize(model=model, progressbar=False)
-    likelihood = estimate_likelihood(optimum.evaluator, optimum)
+        prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD)
+    likelihood = likelihood_at(prb.minimize(model=model, progressbar=False))
     assert likelihood.combinations.shape[1] == 2
-    draws = likelihood.evaluator.hyperparameters.constrained(sample_of(likelihood).draws)
-    y = 1 + noise
-    mu_grid = np.linspace(0.2, 1.8, 401)[:, None]
-    sigma_grid = np.linspace(1e-3, 1.5, 600)[None]
-    variance = sigma_grid**2 + 0.25
-    logs = -10 * np.log(variance) - 10 * ((y.mean() - mu_grid) ** 2 + y.var()) / variance
-    logs = logs + LOG_PRIORS[vague](mu_grid, sigma_grid)
+    draws = draws_of(likelihood)
+    grids = {"mu": np.linspace(0.2, 1.8, 401)[:, None], "sigma": np.linspace(1e-3, 1.5, 600)[None]}
+    variance = grids["sigma"] ** 2 + 0.25
+    logs = -10 * np.log(variance) - 10 * ((y.mean() - grids["mu"]) ** 2 + y.var()) / variance
+    logs = logs + LOG_PRIORS[vague](grids["mu"], grids["sigma"])
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    for name, grid in (("mu", mu_grid), ("sigma", sigma_grid)):
+    for name, grid in grids.items():
         mean = (weights * grid).sum()
         sd = np.sqrt((weights * (grid - mean) ** 2).sum())
         assert abs(draws[name].mean() - mean) < 0.2 * sd
@@ -360,51 +325,20 @@ def test_two_outputs_by_a_joint_metric(metric: Metric) -> None:
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         b = pm.Normal.dist(pm.Normal("nu", 0, 2), pm.HalfNormal("tau", 1))
-        prb.Simulator(
-            "y",
-            lambda a, b: np.stack([a + b, a - b], axis=-1),
-            a,
-            b,
-            observed=x @ np.array([[1.0, 1.0], [1.0, -1.0]]),
-            metric=prb.Joint(metric),
-            propagation=prb.Reweighted(256),
-        )
+        observed = x @ np.array([[1.0, 1.0], [1.0, -1.0]])
+        settings = {"metric": prb.Joint(metric), "propagation": prb.Reweighted(256)}
+        response = lambda a, b: np.stack([a + b, a - b], axis=-1)  # noqa: E731
+        prb.Simulator("y", response, a, b, observed=observed, **settings)
     optimum = prb.minimize(model=model, progressbar=False)
-    likelihood = estimate_likelihood(optimum.evaluator, optimum)
-    draws = likelihood.evaluator.hyperparameters.constrained(sample_of(likelihood).draws)
+    draws = draws_of(likelihood_at(optimum))
     for mean_name, sd_name, inputs in (("mu", "sigma", x[:, 0]), ("nu", "tau", x[:, 1])):
         exact = exact_moments(LOG_PRIORS[vague], inputs)
-        pair = np.stack([draws[mean_name], np.log(draws[sd_name])], axis=1)
-        require_close(Moments(pair.mean(axis=0), pair.std(axis=0)), exact)
+        require_close(moments_of(draws, mean_name, sd_name), exact)
     by_data = EstimateLikelihoodOptions(rounds=0)
-    narrow = estimate_likelihood(optimum.evaluator, optimum, by_data)
-    tau = narrow.evaluator.hyperparameters.constrained(sample_of(narrow).draws)["tau"]
-    assert (np.log(tau).mean() - exact.mean[1]) / exact.sd[1] < -0.2
-
-
-@pytest.mark.long
-def test_responses_that_are_computed_at_each_theta() -> None:
-    """Common random numbers make them functions of theta; the score is taken beside the estimate."""
-    y = data()
-    with pm.Model() as model:
-        x = pm.Normal.dist(*sharp())
-        propagation = prb.Resimulated(256)
-        prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD, propagation=propagation)
-    likelihood = at_another_point(prb.minimize(model=model, progressbar=False))
-    require_close(moments_of(likelihood), exact_moments(LOG_PRIORS[sharp], y))
+    narrow = draws_of(estimate_likelihood(optimum.evaluator, optimum, by_data))
+    assert (np.log(narrow["tau"]).mean() - exact.mean[1]) / exact.sd[1] < -0.2
 
 
 def test_a_gradient_that_is_no_mean_is_refused() -> None:
-    optimum = prb.minimize(normal_model(vague, prb.AreaMetric(), data()), progressbar=False)
     with pytest.raises(ValueError, match=r"y0 has a AreaMetric.*expected a refit_likelihood"):
-        estimate_likelihood(optimum.evaluator, optimum)
-
-
-def test_the_options_reach_the_density() -> None:
-    model = normal_model(vague, KLD, data())
-    optimum = prb.minimize(model=model, progressbar=False)
-    options = EstimateLikelihoodOptions(saddlepoint=SaddlepointOptions(iterations=0))
-    evaluator: Evaluator = optimum.evaluator
-    likelihood = estimate_likelihood(evaluator, optimum, options)
-    away = likelihood.starts[0] + 0.1
-    assert np.isneginf(likelihood.log_likelihood(away[None])).all()
+        likelihood_at(optimum_of(vague, Y, metric=prb.AreaMetric()))

@@ -258,8 +258,9 @@ def test_responses_that_are_not_stored_are_refused_by_metrics_that_need_refits()
         prb.sample_smc(50, chains=1, model=model, **QUIET)
 
 
+# -- the likelihood by refits --
+
 SD = 0.5
-DRAWS = 2000
 OPTIONS = RefitLikelihoodOptions()
 
 
@@ -285,6 +286,9 @@ def data(size: int, mean: float = 1.0, seed: int = 0) -> Floats:
     return np.random.default_rng(seed).normal(mean, SD, size)
 
 
+Y12 = data(12)
+
+
 def likelihood_of(model: pm.Model, options: RefitLikelihoodOptions = OPTIONS) -> RefitLikelihood:
     """Return the likelihood given the optimum."""
     optimum = prb.minimize(model=model, progressbar=False)
@@ -293,143 +297,125 @@ def likelihood_of(model: pm.Model, options: RefitLikelihoodOptions = OPTIONS) ->
 
 def posterior(likelihood: RefitLikelihood) -> dict[str, Floats]:
     """Return draws by name."""
-    evaluator = likelihood.evaluator
+    hyperparameters = likelihood.evaluator.hyperparameters
 
     def density(thetas: Floats) -> Floats:
-        return log_posterior(evaluator.hyperparameters, thetas, likelihood.log_likelihood)
+        return log_posterior(hyperparameters, thetas, likelihood.log_likelihood)
 
     modes = laplace(density, likelihood.starts, likelihood.scale)
-    sample = importance_sample(density, modes, DRAWS, seed=0)
+    sample = importance_sample(density, modes, 2000, seed=0)
     assert sample.pareto_k < 0.7
-    return likelihood.evaluator.hyperparameters.constrained(sample.draws)
+    return hyperparameters.constrained(sample.draws)
 
 
-def mean_model(prior: Callable[[], Any], y: Floats, metric: Any = MEAN) -> pm.Model:
+def require_normal(draws: Floats, mean: float, sd: float, rtol: float = 0.1) -> None:
+    """Errors of 1024 data sets are below .1 standard deviations."""
+    assert abs(draws.mean() - mean) < 0.15 * sd
+    assert draws.std() == pytest.approx(sd, rel=rtol)
+
+
+def simulate(*inputs: Any, name: str = "y", response: Any = np.positive, **keywords: Any) -> None:
+    settings = {"metric": AREA, "propagation": prb.Reweighted(512), **keywords}
+    prb.Simulator(name, response, *inputs, **settings)
+
+
+def mean_model(prior: Callable[[], Any]) -> pm.Model:
     """Return y = x with a known standard deviation."""
     with pm.Model() as model:
-        x = pm.Normal.dist(prior(), SD)
-        prb.Simulator(
-            "y", lambda x: x, x, observed=y, metric=metric, propagation=prb.Reweighted(512)
-        )
+        simulate(pm.Normal.dist(prior(), SD), observed=Y12, metric=MEAN)
     return model
 
 
 @cache
 def normal_likelihood(seed: int = 0) -> RefitLikelihood:
     """Return the likelihood of a mean with a normal prior."""
-    model = mean_model(lambda: pm.Normal("mu", 1.3, 0.2), data(12))
+    model = mean_model(lambda: pm.Normal("mu", 1.3, 0.2))
     return likelihood_of(model, RefitLikelihoodOptions(seed=seed))
 
 
-# -- closed forms --
-
-
 def test_the_mean_of_a_normal_population() -> None:
-    """Normal prior and normal mean; errors of 1024 data sets are below .1 standard deviations."""
-    y = data(12)
-    draws = posterior(normal_likelihood())["mu"]
-    precision = 1 / 0.2**2 + len(y) / SD**2
-    mean = (1.3 / 0.2**2 + y.sum() / SD**2) / precision
-    assert abs(draws.mean() - mean) * np.sqrt(precision) < 0.15
-    assert draws.std() * np.sqrt(precision) == pytest.approx(1, abs=0.1)
+    precision = 1 / 0.2**2 + 12 / SD**2
+    mean = (1.3 / 0.2**2 + Y12.sum() / SD**2) / precision
+    require_normal(posterior(normal_likelihood())["mu"], mean, precision**-0.5)
+    grid = Y12.mean() + np.linspace(-3, 3, 13) * SD / np.sqrt(12)
+    logs = normal_likelihood().log_likelihood(grid[:, None])
+    expected = -12 * (grid - Y12.mean()) ** 2 / (2 * SD**2)
+    np.testing.assert_allclose(logs - logs[6], expected - expected[6], atol=0.35)
 
 
-def test_the_slope_of_the_log_likelihood() -> None:
-    y = data(12)
-    grid = y.mean() + np.linspace(-3, 3, 13) * SD / np.sqrt(12)
-    found = normal_likelihood().log_likelihood(grid[:, None])
-    expected = -12 * (grid - y.mean()) ** 2 / (2 * SD**2)
-    np.testing.assert_allclose(found - found[6], expected - expected[6], atol=0.35)
+def test_the_seed_determines_the_numbers() -> None:
+    thetas = np.array([[0.9], [1.1]])
+    logs, other = (normal_likelihood(seed).log_likelihood(thetas) for seed in (0, 1))
+    model = mean_model(lambda: pm.Normal("mu", 1.3, 0.2))
+    np.testing.assert_array_equal(likelihood_of(model).log_likelihood(thetas), logs)
+    assert not np.array_equal(other, logs)
+    np.testing.assert_allclose(np.diff(other), np.diff(logs), atol=0.3)
 
 
 def test_mean_and_standard_deviation() -> None:
-    """Both are sufficient: the posterior is that of the full data, here on a grid."""
+    """Both are sufficient: the posterior is that of the full data."""
     y = data(15)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0.8, 0.1), pm.LogNormal("sigma", np.log(0.7), 0.3))
-        prb.Simulator(
-            "y", lambda x: x, x, observed=y, metric=MOMENTS, propagation=prb.Reweighted(512)
-        )
+        simulate(x, observed=y, metric=MOMENTS)
     draws = posterior(likelihood_of(model))
-    mu = np.linspace(0.3, 1.6, 400)[:, None]
-    log_sd = np.linspace(-1.6, 0.4, 400)[None]
-    logs = -15 * log_sd - 15 * ((y.mean() - mu) ** 2 + y.var()) * np.exp(-2 * log_sd) / 2
-    logs = logs + stats.norm.logpdf(mu, 0.8, 0.1) + stats.norm.logpdf(log_sd, np.log(0.7), 0.3)
-    weights = np.exp(logs - logs.max())
-    weights /= weights.sum()
-    for values, points in ((draws["mu"], mu), (np.log(draws["sigma"]), log_sd)):
-        mean = (weights * points).sum()
-        sd = np.sqrt((weights * (points - mean) ** 2).sum())
-        assert abs(values.mean() - mean) < 0.15 * sd
-        assert values.std() == pytest.approx(sd, rel=0.1)
+
+    def log_prior(mu: Floats, sigma: Floats) -> Floats:
+        log_normal = stats.lognorm(0.3, scale=0.7)
+        return np.asarray(stats.norm.logpdf(mu, 0.8, 0.1) + log_normal.logpdf(sigma))
+
+    exact = exact_moments(log_prior, y)
+    require_normal(draws["mu"], exact.mean[0], exact.sd[0])
+    require_normal(np.log(draws["sigma"]), exact.mean[1], exact.sd[1])
 
 
 @pytest.mark.parametrize("upper", [0.85, 1.2])
 def test_a_uniform_prior_that_ends_near_the_estimate(upper: float) -> None:
     """The estimate is .97: the posterior is a normal distribution that is cut off."""
-    y = data(12)
-    model = mean_model(lambda: pm.Uniform("mu", 0, upper), y)
-    draws = posterior(likelihood_of(model))["mu"]
+    draws = posterior(likelihood_of(mean_model(lambda: pm.Uniform("mu", 0, upper))))["mu"]
     error = SD / np.sqrt(12)
-    ends = (np.array([0, upper]) - y.mean()) / error
-    exact = stats.truncnorm(*ends, y.mean(), error)
-    assert abs(draws.mean() - exact.mean()) < 0.15 * exact.std()
-    assert draws.std() == pytest.approx(exact.std(), rel=0.1)
+    ends = (np.array([0, upper]) - Y12.mean()) / error
+    exact = stats.truncnorm(*ends, Y12.mean(), error)
+    require_normal(draws, exact.mean(), exact.std())
 
 
 def test_only_the_sum_is_identified() -> None:
     """The difference of two means keeps its prior."""
     y = data(15, mean=2.0)
     with pm.Model() as model:
-        first = pm.Normal.dist(pm.Normal("a", 1, 0.5), 0.3)
-        second = pm.Normal.dist(pm.Normal("b", 1, 0.5), 0.4)
-        prb.Simulator(
-            "y", lambda x, z: x + z, first, second, observed=y, metric=prb.AreaMetric(),
-            propagation=prb.Reweighted(64),
-        )  # fmt: skip
+        sds = {"a": 0.3, "b": 0.4}
+        inputs = [pm.Normal.dist(pm.Normal(name, 1, 0.5), sd) for name, sd in sds.items()]
+        simulate(*inputs, response=np.add, observed=y, propagation=prb.Reweighted(64))
     draws = posterior(likelihood_of(model))
-    difference, total = draws["a"] - draws["b"], draws["a"] + draws["b"]
-    assert abs(difference.mean()) < 0.1
-    assert difference.std() == pytest.approx(0.5 * np.sqrt(2), rel=0.1)
+    require_normal(draws["a"] - draws["b"], 0.0, 0.5 * np.sqrt(2))
     precision = 1 / 0.5 + 15 / SD**2
+    total = draws["a"] + draws["b"]
     assert total.mean() == pytest.approx((2 / 0.5 + y.sum() / SD**2) / precision, abs=0.06)
-    assert total.std() == pytest.approx(1 / np.sqrt(precision), rel=0.2)
+    assert total.std() == pytest.approx(precision**-0.5, rel=0.2)
 
 
 def test_mirror_modes_have_the_weights_of_their_prior() -> None:
     y = (np.random.default_rng(3).normal(2, 0.3, 20) - 1) ** 2
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.3)
-        prb.Simulator(
-            "y", lambda x: (x - 1) ** 2, x, observed=y, metric=prb.AreaMetric(),
-            propagation=prb.Reweighted(1024),
-        )  # fmt: skip
+        propagation = prb.Reweighted(1024)
+        simulate(x, response=lambda x: (x - 1) ** 2, observed=y, propagation=propagation)
     likelihood = likelihood_of(model)
     assert len(likelihood.centers) == 2
     share = (posterior(likelihood)["mu"] > 1).mean()
     assert share == pytest.approx(1 / (1 + np.exp(0.5)), abs=0.06)
 
 
-# -- simulators, seeds --
-
-
-def pair_model(names: tuple[str, str], y: dict[str, Floats]) -> pm.Model:
-    """Return two simulators with a mean each, in an order."""
-    with pm.Model() as model:
-        means = {name: pm.Normal(f"mu_{name}", 1, 0.4) for name in names}
-        for name in names:
-            prb.Simulator(
-                name, lambda x: x, pm.Normal.dist(means[name], SD), observed=y[name],
-                metric=prb.AreaMetric(), propagation=prb.Reweighted(256),
-            )  # fmt: skip
-    return model
-
-
 def test_the_order_of_simulators_does_not_matter() -> None:
-    y = {"first": data(12, 0.6), "second": data(20, 1.5, seed=1)}
+    observed = {"first": data(12, 0.6), "second": data(20, 1.5, seed=1)}
     results = []
     for names in (("first", "second"), ("second", "first")):
-        draws = posterior(likelihood_of(pair_model(names, y)))
+        with pm.Model() as model:
+            means = {name: pm.Normal(f"mu_{name}", 1, 0.4) for name in names}
+            for name in names:
+                x = pm.Normal.dist(means[name], SD)
+                simulate(x, name=name, observed=observed[name], propagation=prb.Reweighted(256))
+        draws = posterior(likelihood_of(model))
         results.append(np.array([draws["mu_first"], draws["mu_second"]]))
     first, second = results
     np.testing.assert_allclose(first.mean(axis=1), second.mean(axis=1), atol=0.025)
@@ -438,64 +424,39 @@ def test_the_order_of_simulators_does_not_matter() -> None:
 
 
 def test_specimens_that_simulators_share_count_once() -> None:
-    y = data(12)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 2), SD)
-        for name, factor in (("y", 1.0), ("z", 2.0)):
-            prb.Simulator(
-                name, lambda x, factor=factor: factor * x, x, observed=factor * y, metric=MEAN,
-                propagation=prb.Reweighted(512), specimens=np.arange(12),
-            )  # fmt: skip
-    draws = posterior(likelihood_of(model))["mu"]
-    assert draws.std() == pytest.approx(SD / np.sqrt(12), rel=0.1)
-    assert abs(draws.mean() - y.mean()) < 0.15 * SD / np.sqrt(12)
-
-
-def test_the_same_seed_gives_the_same_numbers() -> None:
-    thetas = np.array([[0.9], [1.1]])
-    found = normal_likelihood().log_likelihood(thetas)
-    model = mean_model(lambda: pm.Normal("mu", 1.3, 0.2), data(12))
-    np.testing.assert_array_equal(likelihood_of(model).log_likelihood(thetas), found)
-    other = normal_likelihood(1).log_likelihood(thetas)
-    assert not np.array_equal(other, found)
-    np.testing.assert_allclose(np.diff(other), np.diff(found), atol=0.3)
+        settings = {"metric": MEAN, "specimens": np.arange(12)}
+        simulate(x, observed=Y12, **settings)
+        simulate(x, name="z", response=lambda x: 2 * x, observed=2 * Y12, **settings)
+    require_normal(posterior(likelihood_of(model))["mu"], Y12.mean(), SD / np.sqrt(12))
 
 
 def test_outputs_with_gaps() -> None:
     """Two outputs, one of which was not measured everywhere; the posterior is near the full one."""
-    rng = np.random.default_rng(4)
-    y = rng.normal([0.5, 1.5], SD, (20, 2))
-    gaps = y.copy()
-    gaps[15:, 1] = np.nan
+    y = np.random.default_rng(4).normal([0.5, 1.5], SD, (20, 2))
+    y[15:, 1] = np.nan
     with pm.Model() as model:
         inputs = [pm.Normal.dist(pm.Normal(name, 1, 1), SD) for name in "ab"]
-        prb.Simulator(
-            "y", lambda a, b: np.stack([a, b], axis=-1), *inputs, observed=gaps,
-            metric=prb.Joint(prb.AreaMetric()), propagation=prb.Reweighted(128),
-        )  # fmt: skip
+        response = lambda a, b: np.stack([a, b], axis=-1)  # noqa: E731
+        settings = {"metric": prb.Joint(AREA), "propagation": prb.Reweighted(128)}
+        simulate(*inputs, response=response, observed=y, **settings)
     draws = posterior(likelihood_of(model))
-    for name, column in zip("ab", gaps.T, strict=True):
+    for name, column in zip("ab", y.T, strict=True):
         measured = column[np.isfinite(column)]
         error = SD / np.sqrt(measured.size)
         assert abs(draws[name].mean() - measured.mean()) < error
         assert 0.9 < draws[name].std() / error < 1.5
 
 
-# -- refusals --
-
-
 def test_an_estimate_at_an_edge_is_refused() -> None:
-    model = mean_model(lambda: pm.Normal("mu", 1.3, 0.2), data(12))
+    model = mean_model(lambda: pm.Normal("mu", 1.3, 0.2))
     optimum = prb.minimize(model=model, progressbar=False)
+    edge = replace(optimum, search=replace(optimum.search, at_edge=("mu",)))
     with pytest.raises(ValueError, match="got mu at an edge"):
-        refit_likelihood(
-            optimum.evaluator, replace(optimum, search=replace(optimum.search, at_edge=("mu",)))
-        )
+        refit_likelihood(optimum.evaluator, edge)
     with pytest.raises(ValueError, match="estimates of synthetic data sets at an edge"):
         refit_likelihood(optimum.evaluator, optimum, RefitLikelihoodOptions(reach=0.5))
-
-
-# -- parts --
 
 
 def test_the_extended_density_of_normal_estimates() -> None:
@@ -504,18 +465,15 @@ def test_the_extended_density_of_normal_estimates() -> None:
     means = np.array([0.0, 0.5, -2.0, 3.0])[:, None]
     logs = stats.norm.logpdf(estimates.T, means, 1) - stats.norm.logpdf(estimates.T, 0, 2.5)
     logs -= np.log(np.exp(logs).sum(axis=1, keepdims=True))
-    found = extended_log_density(logs, estimates, means, OPTIONS)
+    density = extended_log_density(logs, estimates, means, OPTIONS)
     expected = stats.norm.logpdf(0, means[:, 0])
-    np.testing.assert_allclose(found - found[0], expected - expected[0], atol=0.02)
+    np.testing.assert_allclose(density - density[0], expected - expected[0], atol=0.02)
 
 
-def test_populations_go_on_beyond_the_ends_of_a_prior() -> None:
+def test_populations_continue_beyond_the_ends_of_a_prior() -> None:
     with pm.Model() as model:
-        mu, sigma = pm.Uniform("mu", 0, 2), pm.Uniform("sigma", 0, 1)
-        prb.Simulator(
-            "y", lambda x: x, pm.Normal.dist(mu, sigma), observed=data(12),
-            metric=prb.AreaMetric(), propagation=prb.Reweighted(256),
-        )  # fmt: skip
+        x = pm.Normal.dist(pm.Uniform("mu", 0, 2), pm.Uniform("sigma", 0, 1))
+        simulate(x, observed=Y12, propagation=prb.Reweighted(256))
     evaluator = prb.minimize(model=model, progressbar=False).evaluator
     thetas = evaluator.hyperparameters.prior_thetas(20, 0)
     continuation = continuation_of(evaluator, thetas[:1])

@@ -1,4 +1,4 @@
-"""Responses of the calibrated population: what is drawn and computed, and whose specimens."""
+"""Responses of the calibrated population: what is drawn and computed, and for which specimens."""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -19,11 +19,11 @@ from prbayes.response.failures import ResponseError
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 MEANS = np.array([[0.8, 1.0, 1.1], [0.9, 1.0, 1.2]])  # of two chains with three draws
-SDS = np.full((2, 3), 0.5)
 LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+AREA = prb.AreaMetric()
 
 
-def same(x: Any) -> Any:
+def identity(x: Any) -> Any:
     return x
 
 
@@ -39,7 +39,7 @@ class Counted:
 
 
 def tree(**values: Any) -> xr.DataTree:
-    """A posterior as any sampler gives it."""
+    """Return a posterior as any sampler gives it."""
     arrays = {
         n: (["chain", "draw", *(f"{n}_{i}" for i in range(np.ndim(v) - 2))], v)
         for n, v in values.items()
@@ -47,16 +47,14 @@ def tree(**values: Any) -> xr.DataTree:
     return xr.DataTree.from_dict({"posterior": xr.Dataset(arrays)})
 
 
-POSTERIOR = tree(mu=MEANS, sigma=SDS)
+POSTERIOR = tree(mu=MEANS, sigma=np.full((2, 3), 0.5))
 
 
-def build(propagation: Any = None, **keywords: Any) -> tuple[pm.Model, Any]:
+def build(response: Any = identity, n: int = 512, **keywords: Any) -> tuple[pm.Model, Any]:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
-        prb.Simulator(
-            "y", keywords.pop("response", same), x, metric=prb.KullbackLeibler(), observed=OBSERVED,
-            propagation=propagation or prb.Reweighted(512), **keywords,
-        )  # fmt: skip
+        settings = {"propagation": prb.Reweighted(n), "observed": OBSERVED, **keywords}
+        prb.Simulator("y", response, x, metric=prb.KullbackLeibler(), **settings)
     return model, x
 
 
@@ -65,119 +63,100 @@ def plain() -> tuple[pm.Model, Any]:
     return build()
 
 
+def predict(response: Any, posterior: Any = POSTERIOR, **keywords: Any) -> xr.DataArray:
+    """Predict with the plain model."""
+    model, x = plain()
+    return prb.predict(posterior, response, x, model=model, **{"random_seed": 1, **keywords})
+
+
 @cache
 def optimum() -> prb.Optimum:
     return prb.minimize(plain()[0])
 
 
-# One population per draw
+# -- one population per draw
 
 
 @pytest.mark.parametrize("stored", [True, False])
-def test_each_draw_is_a_population_of_its_own(stored: bool) -> None:
-    model, x = plain()
-    found = prb.predict(
-        POSTERIOR, same, x, model=model, n_samples=400, stored=stored, random_seed=1
-    )
-    assert found.dims == ("chain", "draw", "sample")
-    assert found.shape == (2, 3, 400)
-    assert found.name == "same"
+def test_each_draw_is_a_population(stored: bool) -> None:
+    y = predict(identity, n_samples=400, stored=stored)
+    assert y.dims == ("chain", "draw", "sample")
+    assert y.shape == (2, 3, 400)
+    assert y.name == "identity"
     exact = MEANS[..., None] + 0.5 * ndtri(LEVELS)
-    # Points that cut the population into nearly equal parts: far better than 400 random ones
-    # (0.05).
-    np.testing.assert_allclose(
-        np.moveaxis(np.quantile(found, LEVELS, axis=-1), 0, -1), exact, atol=0.02
-    )
-    np.testing.assert_allclose(found.std("sample"), 0.5, atol=0.02)
+    # Points that cut the population into nearly equal parts: far better than 400 random ones (.05).
+    quantiles = np.moveaxis(np.quantile(y, LEVELS, axis=-1), 0, -1)
+    np.testing.assert_allclose(quantiles, exact, atol=0.02)
+    np.testing.assert_allclose(y.std("sample"), 0.5, atol=0.02)
+    # They are in random order: the standard error of each correlation is 1 / sqrt(400) = .05.
+    residuals = y.values - y.values.mean(axis=-1, keepdims=True)
+    correlation = (residuals[..., :-1] * residuals[..., 1:]).mean(axis=-1) / 0.25
+    assert np.abs(correlation).max() < 0.2
 
 
 def test_an_optimum_is_one_population() -> None:
-    _, x = plain()
-    found = prb.predict(optimum(), same, x, random_seed=1)
-    assert found.shape == (1, 1, 500)
-    assert found.mean() == pytest.approx(optimum().point["mu"], abs=0.02)
-
-
-def test_samples_are_in_random_order() -> None:
-    model, x = plain()
-    for stored in (True, False):
-        found = prb.predict(
-            POSTERIOR, same, x, model=model, n_samples=400, stored=stored, random_seed=1
-        ).values
-        first, second = (
-            found[..., :-1] - found.mean(-1, keepdims=True),
-            found[..., 1:] - found.mean(-1, keepdims=True),
-        )
-        correlation = (first * second).mean(axis=-1) / 0.25
-        # The standard error of each is 1 / sqrt(400) = .05.
-        assert np.abs(correlation).max() < 0.2
+    y = prb.predict(optimum(), identity, plain()[1], random_seed=1)
+    assert y.shape == (1, 1, 500)
+    assert y.mean() == pytest.approx(optimum().point["mu"], abs=0.02)
 
 
 def test_draws_are_thinned_evenly_and_keep_their_coordinates() -> None:
-    model, x = plain()
     many = tree(mu=np.tile(np.linspace(0.5, 1.5, 101), (2, 1)), sigma=np.full((2, 101), 0.5))
-    many = xr.DataTree.from_dict(
-        {"posterior": many["posterior"].to_dataset().assign_coords(draw=np.arange(101) * 10)}
-    )
-    found = prb.predict(many, same, x, model=model, n_draws=10, n_samples=200, random_seed=1)
-    assert found.draw.values.tolist() == [0, 250, 500, 750, 1000]
-    np.testing.assert_allclose(found.mean("sample")[0], [0.5, 0.75, 1.0, 1.25, 1.5], atol=0.05)
-    assert prb.predict(many, same, x, model=model, n_draws=1, n_samples=9).shape == (2, 1, 9)
+    many["posterior"] = many["posterior"].to_dataset().assign_coords(draw=np.arange(101) * 10)
+    y = predict(identity, many, n_draws=10, n_samples=200)
+    assert y.draw.values.tolist() == [0, 250, 500, 750, 1000]
+    np.testing.assert_allclose(y.mean("sample")[0], [0.5, 0.75, 1.0, 1.25, 1.5], atol=0.05)
+    assert predict(identity, many, n_draws=1, n_samples=9).shape == (2, 1, 9)
 
 
 @pytest.mark.slow
-def test_a_posterior_of_stock_pymc_serves() -> None:
+def test_a_posterior_of_stock_pymc() -> None:
     model, x = plain()
     prb.refine(model)
     idata = pm.sample(
         200, tune=200, chains=2, cores=1, model=model, random_seed=1, progressbar=False, quiet=True,
         compute_convergence_checks=False,
     )  # fmt: skip
-    found = prb.predict(idata, same, x, model=model, random_seed=1)
-    assert found.shape == (2, 200, 500)
-    assert found.mean() == pytest.approx(float(idata.posterior["mu"].mean()), abs=0.01)
+    y = prb.predict(idata, identity, x, model=model, random_seed=1)
+    assert y.shape == (2, 200, 500)
+    assert y.mean() == pytest.approx(float(idata.posterior["mu"].mean()), abs=0.01)
     with pytest.raises(ValueError, match="the very data of the calibration"):
-        prb.area_test(OBSERVED, found)
+        prb.area_test(OBSERVED, y)
 
 
-# What is computed
+# -- what is computed
 
 
 def test_the_simulators_own_response_is_not_computed_again() -> None:
     response = Counted()
-    model, x = build(response=response)
+    model, x = build(response)
     first_use(model)
-    before = response.count
-    found = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
-    assert response.count == before
-    assert found.attrs["responses"] == 0
-    assert found.attrs["source"] == "stored responses of y"
-    assert found.name == "Counted"
+    count = response.count
+    y = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
+    assert response.count == count
+    assert y.attrs["responses"] == 0
+    assert y.attrs["source"] == "stored responses of y"
+    assert y.name == "Counted"
 
 
 def test_another_response_is_computed_once_for_each_design_point() -> None:
-    model, x = plain()
-    response = Counted()
-    found = prb.predict(POSTERIOR, response, x, model=model, n_samples=2000, random_seed=1)
-    assert found.attrs["responses"] == 512
-    assert response.count == 512 + 1  # one by itself, to see that none depends on others
-    assert found.attrs["source"] == "design points of y"
-    np.testing.assert_allclose(np.median(np.log(found), axis=-1), MEANS, atol=0.01)
-
-
-def test_what_was_computed_for_one_prediction_serves_the_next() -> None:
     model, x = build()
     response = Counted()
-    one = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
-    two = prb.predict(prb.minimize(model, refine=False), response, x, n_samples=100, random_seed=2)
+    first = prb.predict(POSTERIOR, response, x, model=model, n_samples=2000, random_seed=1)
+    assert first.attrs["responses"] == 512
+    assert response.count == 512 + 1  # one by itself, to find out whether it depends on others
+    assert first.attrs["source"] == "design points of y"
+    np.testing.assert_allclose(np.median(np.log(first), axis=-1), MEANS, atol=0.01)
+    best = prb.minimize(model, refine=False)
+    second = prb.predict(best, response, x, n_samples=100, random_seed=2)
     assert response.count == 512 + 1
-    assert (one.attrs["responses"], two.attrs["responses"]) == (512, 0)
-    assert two.attrs["source"] == "stored responses of y"
+    assert second.attrs["responses"] == 0
+    assert second.attrs["source"] == "stored responses of y"
     bound = nodes(model)[model["y"]].bound
     bound.add([np.array([0.9, 1.1]), np.array([0.5, 0.5])], 100)
-    after = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
+    third = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
     assert response.count == 612 + 2
-    np.testing.assert_allclose(np.median(np.log(after), axis=-1), MEANS, atol=0.01)
+    np.testing.assert_allclose(np.median(np.log(third), axis=-1), MEANS, atol=0.01)
 
 
 def test_another_constant_is_another_response() -> None:
@@ -186,250 +165,183 @@ def test_another_constant_is_another_response() -> None:
 
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", shifted, x, 2.0, metric=prb.AreaMetric(), observed=OBSERVED)
-    own, other = (
+        prb.Simulator("y", shifted, x, 2.0, metric=AREA, observed=OBSERVED)
+    two, three = (
         prb.predict(POSTERIOR, shifted, x, c, model=model, random_seed=1) for c in (2.0, 3.0)
     )
-    assert (own.attrs["responses"], other.attrs["responses"]) == (0, 1024)
-    np.testing.assert_allclose(other, own + 1)
+    assert (two.attrs["responses"], three.attrs["responses"]) == (0, 1024)
+    np.testing.assert_allclose(three, two + 1)
 
 
 def test_without_stored_points_every_specimen_is_computed() -> None:
-    model, x = plain()
     response = Counted()
     with ThreadPoolExecutor(2) as pool:
-        found = prb.predict(
-            POSTERIOR, response, x, model=model, n_samples=100, stored=False, executor=pool
-        )
-    assert response.count == found.attrs["responses"] == 600
-    assert found.attrs["source"] == "new specimens"
+        y = predict(response, n_samples=100, stored=False, executor=pool)
+    assert response.count == y.attrs["responses"] == 600
+    assert y.attrs["source"] == "new specimens"
 
 
 def test_a_store_keeps_the_responses(tmp_path: Path) -> None:
     response = Counted()
     for _ in range(2):
         model, x = build()
-        prb.predict(
-            POSTERIOR, response, x, model=model, store=tmp_path, name="later", random_seed=1
-        )
-    assert response.count == 512 + 1  # one again, to see that it is the same response
+        prb.predict(POSTERIOR, response, x, model=model, store=tmp_path, name="later")
+    assert response.count == 512 + 1  # one again, to find out whether it is the same response
     with pytest.raises(ValueError, match="a function called <lambda>, expected a name"):
         prb.predict(POSTERIOR, lambda x: x, x, model=model, store=tmp_path)
 
 
-# Inputs
+# -- inputs
 
 
-def test_new_distributions_over_the_models_variables() -> None:
+def test_other_distributions_over_the_models_variables() -> None:
     model, _ = plain()
     mu, sigma = model["mu"], model["sigma"]
-    found = prb.predict(
-        POSTERIOR, same, pm.Normal.dist(2 * mu, sigma / 5), model=model, random_seed=1
-    )
-    assert found.attrs["source"] == "new specimens"
-    np.testing.assert_allclose(found.mean("sample"), 2 * MEANS, atol=0.01)
-    np.testing.assert_allclose(found.std("sample"), 0.1, atol=0.005)
-
-
-def test_distributions_without_inverse_or_that_depend_on_each_other_are_drawn() -> None:
-    model, _ = plain()
-    with model:
-        count = pm.Poisson.dist(10 * model["mu"])
-        nested = pm.Normal.dist(pm.Normal.dist(model["mu"], 0.3), 0.4)
-    for x, mean, sd in ((count, 10 * MEANS, np.sqrt(10 * MEANS)), (nested, MEANS, 0.5)):
-        found = prb.predict(POSTERIOR, same, x, model=model, n_samples=4000, random_seed=1)
+    with model:  # the last two have no inverse distribution function
+        cases = {
+            pm.Normal.dist(2 * mu, sigma / 5): (2 * MEANS, 0.1),
+            pm.Poisson.dist(10 * mu): (10 * MEANS, np.sqrt(10 * MEANS)),
+            pm.Normal.dist(pm.Normal.dist(mu, 0.3), 0.4): (MEANS, 0.5),
+        }
+    for x, (mean, sd) in cases.items():
+        y = prb.predict(POSTERIOR, identity, x, model=model, n_samples=4000, random_seed=1)
+        assert y.attrs["source"] == "new specimens"
         # 4000 random draws: 5 standard errors.
-        assert (np.abs(found.mean("sample") - mean) < 5 * sd / np.sqrt(4000)).all()
-        np.testing.assert_allclose(
-            found.std("sample"), np.broadcast_to(sd, (2, 3)), rtol=5 / np.sqrt(8000)
-        )
+        assert (np.abs(y.mean("sample") - mean) < 5 * sd / np.sqrt(4000)).all()
+        sds = np.broadcast_to(sd, (2, 3))
+        np.testing.assert_allclose(y.std("sample"), sds, rtol=5 / np.sqrt(8000))
 
 
 def test_epistemic_variables_and_vectors() -> None:
     with pm.Model() as model:
         mu, factor = pm.Normal("mu", 0, 1, shape=2), pm.HalfNormal("factor")
         x = pm.MvNormal.dist(mu, np.array([[1.0, 0.5], [0.5, 1.0]]))
-        prb.Simulator("y", lambda x: x.sum(axis=-1), x, metric=prb.AreaMetric(), observed=OBSERVED)
+        prb.Simulator("y", lambda x: x.sum(axis=-1), x, metric=AREA, observed=OBSERVED)
     means = np.array([[[0.0, 1.0], [1.0, 2.0]]])
     posterior = tree(mu=means, factor=np.array([[1.0, 3.0]]))
+    settings = {"model": model, "random_seed": 1}
 
     def scaled(x: Any, factor: Any, shift: Any) -> Any:
         return factor * x[..., 0] + shift
 
-    found = prb.predict(posterior, scaled, x, factor, 5.0, model=model, random_seed=1)
-    assert found.attrs["source"] == "new specimens"
-    np.testing.assert_allclose(found.mean("sample"), [[5.0, 8.0]], atol=0.03)
-    np.testing.assert_allclose(found.std("sample"), [[1.0, 3.0]], rtol=0.03)
-    sums = prb.predict(posterior, lambda x: x.sum(axis=-1), x, model=model, random_seed=1)
+    y = prb.predict(posterior, scaled, x, factor, 5.0, **settings)
+    assert y.attrs["source"] == "new specimens"
+    np.testing.assert_allclose(y.mean("sample"), [[5.0, 8.0]], atol=0.03)
+    np.testing.assert_allclose(y.std("sample"), [[1.0, 3.0]], rtol=0.03)
+    sums = prb.predict(posterior, lambda x: x.sum(axis=-1), x, **settings)
     np.testing.assert_allclose(sums.std("sample"), np.sqrt(3), rtol=0.1)
+    # Specimens are the same beside an epistemic variable.
+    plain = prb.predict(posterior, lambda x: x[..., 0], x, stored=False, **settings)
+    np.testing.assert_allclose(y, plain * [[[1.0], [3.0]]] + 5)
+    assert y.attrs["specimens_id"] == plain.attrs["specimens_id"]
 
 
-# Specimens
+# -- specimens
 
 
 @pytest.mark.parametrize("stored", [True, False])
-def test_the_same_seed_gives_the_same_specimens_under_every_condition(stored: bool) -> None:
-    model, x = plain()
-
-    def conditions(seed: int, **keywords: Any) -> list[xr.DataArray]:
-        responses = (same, np.exp, lambda x: x**3)
-        return [
-            prb.predict(POSTERIOR, f, x, model=model, stored=stored, random_seed=seed, **keywords)
-            for f in responses
-        ]
-
-    one, exponential, cube = conditions(1)
-    np.testing.assert_allclose(exponential, np.exp(one))
-    np.testing.assert_allclose(cube, one**3)
-    assert len({p.attrs["specimens_id"] for p in (one, exponential, cube)}) == 1
-    others = [conditions(2)[0], conditions(1, n_samples=499)[0]]
-    assert one.attrs["specimens_id"] not in {p.attrs["specimens_id"] for p in others}
+def test_the_seed_determines_the_specimens(stored: bool) -> None:
+    y, again, cube = (predict(f, stored=stored) for f in (identity, identity, lambda x: x**3))
+    xr.testing.assert_identical(y, again)
+    np.testing.assert_allclose(cube, y**3)
+    assert y.attrs["specimens_id"] == cube.attrs["specimens_id"]
+    changes: list[dict[str, Any]] = [{"random_seed": 2}, {"n_samples": 499}, {"random_seed": None}]
+    for change in changes:
+        other = predict(identity, stored=stored, **change)
+        assert other.attrs["specimens_id"] != y.attrs["specimens_id"]
 
 
-def test_specimens_are_the_same_beside_an_epistemic_variable() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
-        factor = pm.HalfNormal("factor")
-        prb.Simulator(
-            "y",
-            same,
-            x,
-            metric=prb.AreaMetric(),
-            observed=OBSERVED,
-            propagation=prb.Resimulated(64),
-        )
-    posterior = tree(mu=MEANS, factor=np.full((2, 3), 2.0))
-    one = prb.predict(posterior, same, x, model=model, random_seed=1)
-    two = prb.predict(posterior, lambda x, f: f * x, x, factor, model=model, random_seed=1)
-    np.testing.assert_allclose(two, 2 * one)
-    assert one.attrs["specimens_id"] == two.attrs["specimens_id"]
-
-
-def test_a_seed_gives_the_same_numbers_and_none_gives_others() -> None:
-    model, x = plain()
-    a, b = (prb.predict(POSTERIOR, same, x, model=model, random_seed=5) for _ in range(2))
-    xr.testing.assert_identical(a, b)
-    c, d = (prb.predict(POSTERIOR, same, x, model=model, random_seed=None) for _ in range(2))
-    assert not np.array_equal(c, d)
-
-
-def test_designs_of_their_own_are_told_apart() -> None:
+def test_each_simulator_has_a_design() -> None:
+    responses = {"y0": identity, "y1": np.exp}
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
-        for k, response in enumerate((same, np.exp)):
+        for k, (name, response) in enumerate(responses.items()):
+            propagation = prb.Reweighted(256, random_seed=k)
             prb.Simulator(
-                f"y{k}",
-                response,
-                x,
-                metric=prb.AreaMetric(),
-                observed=OBSERVED,
-                propagation=prb.Reweighted(256, random_seed=k),
+                name, response, x, metric=AREA, observed=OBSERVED, propagation=propagation
             )
-    first, second = (
-        prb.predict(POSTERIOR, f, x, model=model, random_seed=1) for f in (same, np.exp)
-    )
-    assert (first.attrs["source"], second.attrs["source"]) == (
-        "stored responses of y0",
-        "stored responses of y1",
-    )
-    assert first.attrs["specimens_id"] != second.attrs["specimens_id"]
+    identities = set()
+    for name, response in responses.items():
+        y = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
+        assert y.attrs["source"] == f"stored responses of {name}"
+        identities.add(y.attrs["specimens_id"])
+    assert len(identities) == 2
 
 
-def test_the_calibrations_specimens_and_data_are_noted_and_saved(tmp_path: Path) -> None:
+def test_specimens_and_data_of_the_calibration_are_saved(tmp_path: Path) -> None:
     model, x = build(specimens=np.arange(40.0))
-    found = prb.predict(POSTERIOR, same, x, model=model, random_seed=1)
-    assert found.attrs["calibration_specimens"][:3] == ["0", "1", "2"]
-    found.to_netcdf(tmp_path / "predicted.nc")
-    xr.testing.assert_equal(xr.load_dataarray(tmp_path / "predicted.nc"), found)
+    y = prb.predict(POSTERIOR, identity, x, model=model, random_seed=1)
+    assert y.attrs["calibration_specimens"][:3] == ["0", "1", "2"]
+    y.to_netcdf(tmp_path / "predicted.nc")
+    loaded = xr.load_dataarray(tmp_path / "predicted.nc")
+    xr.testing.assert_equal(loaded, y)
     with pytest.raises(ValueError, match="2 specimens of the calibration, such as '3'"):
-        prb.area_test(
-            [0.1, 0.2, 0.3], xr.load_dataarray(tmp_path / "predicted.nc"), specimens=[3, 7, 90]
-        )
+        prb.area_test([0.1, 0.2, 0.3], loaded, specimens=[3, 7, 90])
 
 
-# Failures and refusals
+# -- failures and refusals
 
 
 def test_failed_specimens_stay_and_nan_is_counted(caplog: pytest.LogCaptureFixture) -> None:
-    model, x = plain()
-
     def fragile(x: Any) -> Any:
         return np.where(x > 1.5, np.inf, np.where(x < 0.2, np.nan, x))
 
-    given: dict[str, Any] = {"model": model, "random_seed": 1}
-    found = prb.predict(POSTERIOR, fragile, x, max_lost=0.5, **given)
-    assert np.isinf(found).any()
-    assert found.attrs["nan"] == int(np.isnan(found).sum()) > 0
-    share = found.attrs["nan"] / found.size
-    assert share > 0.05
+    y = predict(fragile, max_lost=0.5)
+    assert np.isinf(y).any()
+    missing = int(np.isnan(y).sum())
+    assert y.attrs["nan"] == missing > 0.05 * y.size
+    assert f"{missing} of {y.size} predicted responses are NaN" in caplog.text
     for stored in (True, False):
         with pytest.raises(DesignError, match=r"fragile: lost mass: got \d+\.\d% NaN .* = 5\.0%"):
-            prb.predict(POSTERIOR, fragile, x, stored=stored, **given)
-    assert f"{found.attrs['nan']} of {found.size} predicted responses are NaN" in caplog.text
+            predict(fragile, stored=stored)
     with pytest.raises(ResponseError, match="got NaN at all 3000 specimens"):
-        prb.predict(POSTERIOR, lambda x: x * np.nan, x, model=model)
+        predict(lambda x: x * np.nan)
 
 
-def test_a_design_that_does_not_reach_the_populations_is_refused() -> None:
-    model, x = plain()
+def test_a_design_that_does_not_cover_the_populations_is_refused() -> None:
     far = tree(mu=np.full((1, 3), 9.0), sigma=np.full((1, 3), 0.01))
-    with pytest.raises(
-        DesignError, match=r"y: got a weight effective sample size of .*stored=False"
-    ):
-        prb.predict(far, same, x, model=model)
-    assert prb.predict(far, same, x, model=model, stored=False).mean() == pytest.approx(
-        9.0, abs=0.01
-    )
+    with pytest.raises(DesignError, match=r"y: got a weight effective sample .*stored=False"):
+        predict(identity, far)
+    assert predict(identity, far, stored=False).mean() == pytest.approx(9.0, abs=0.01)
 
 
-def test_refusals() -> None:
+@pytest.mark.parametrize(
+    ("arguments", "keywords", "error", "message"),
+    [
+        (({"mu": 1.0}, identity), {}, TypeError, "got dict, expected an Optimum"),
+        ((tree(mu=MEANS), identity), {}, KeyError, r"a result without \['sigma'\]"),
+        ((POSTERIOR, identity), {"model": None}, TypeError, "no model on the context"),
+        ((POSTERIOR, 3), {}, TypeError, "response: got int"),
+        ((POSTERIOR, lambda x: 1 // 0), {}, ResponseError, "raised ZeroDivisionError"),
+        ((POSTERIOR, identity), {"n_samples": 1}, ValueError, "n_samples: got 1"),
+        ((POSTERIOR, identity), {"n_draws": 0}, ValueError, "n_draws: got 0"),
+    ],
+)
+def test_invalid_arguments(
+    arguments: Any, keywords: dict[str, Any], error: type[Exception], message: str
+) -> None:
     model, x = plain()
-    with pytest.raises(TypeError, match="got dict, expected an Optimum"):
-        prb.predict({"mu": 1.0}, same, x, model=model)  # type: ignore[arg-type]
-    with pytest.raises(KeyError, match=r"a result without \['sigma'\]"):
-        prb.predict(tree(mu=MEANS), same, x, model=model)
-    with pytest.raises(TypeError, match="no model on the context"):
-        prb.predict(POSTERIOR, same, x)
-    with pytest.raises(TypeError, match="response: got TensorVariable"):
-        prb.predict(POSTERIOR, x, same, model=model)
+    with pytest.raises(error, match=message):
+        prb.predict(*arguments, x, **{"model": model, **keywords})
     with pytest.raises(ValueError, match="none of them aleatory"):
-        prb.predict(POSTERIOR, same, 1.0, model=model)
-    with pytest.raises(ResponseError, match="the response raised ZeroDivisionError"):
-        prb.predict(POSTERIOR, lambda x: 1 // 0, x, model=model)
-    for keywords, match in (
-        ({"n_samples": 1}, "n_samples: got 1"),
-        ({"n_draws": 0}, "n_draws: got 0"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            prb.predict(POSTERIOR, same, x, model=model, **keywords)
+        prb.predict(POSTERIOR, identity, 1.0, model=model)
 
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_names_of_a_function_of_one_specimen_are_kept(workers: int) -> None:
-    """In another order of columns a test would reject a true model, and nobody would know why."""
+    """A mapping has no order: with other columns a test would reject a true model."""
 
-    def one(x: float) -> dict[str, float]:
-        found = {"high": x + 5, "low": x}
-        # A mapping has no order.
-        return found if x > 0 else dict(reversed(found.items()))
+    def named(x: float) -> dict[str, float]:
+        outputs = {"high": x + 5, "low": x}
+        return outputs if x > 0 else dict(reversed(outputs.items()))
 
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=np.arange(-2.0, 3.0))
-    optimum = prb.minimize(model, progressbar=False)
     with ThreadPoolExecutor(2) as pool:
-        executor = pool if workers else None
-        response = prb.scalar(one)
-        later = prb.predict(optimum, response, x, model=model, executor=executor, random_seed=1)
-    assert sorted(later["output"].values) == ["high", "low"]
-    np.testing.assert_allclose(later.sel(output="high") - later.sel(output="low"), 5)
+        y = predict(prb.scalar(named), stored=False, executor=pool if workers else None)
+    assert sorted(y["output"].values) == ["high", "low"]
+    np.testing.assert_allclose(y.sel(output="high") - y.sel(output="low"), 5)
 
 
 def test_other_keys_for_other_specimens_are_refused() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=np.arange(-2.0, 3.0))
-    optimum = prb.minimize(model, progressbar=False)
-    response = prb.scalar(lambda x: {"a": x, "b": x} if x > 0 else {"a": x, "c": x})
-    with pytest.raises(prb.response.ResponseError, match=r"keys \['a', '[bc]'\]"):
-        prb.predict(optimum, response, x, model=model, random_seed=1)
+    response = prb.scalar(lambda x: {"a": x, "b": x} if x > 1 else {"a": x, "c": x})
+    with pytest.raises(ResponseError, match=r"keys \['a', '[bc]'\]"):
+        predict(response)
