@@ -29,10 +29,7 @@ warnings.filterwarnings(
 
 
 class OwnOp(Op):
-    """An operation on arrays (..., *event), which takes leading axes itself.
-
-    Operations are equal if the objects that ``__props__`` names are the same.
-    """
+    """An operation on arrays (..., *event); two are equal if ``__props__`` are the same objects."""
 
     __props__: tuple[str, ...] = ()
     event_ndims: Sequence[int] = (1, 1)  # of the inputs: a sample and its weights
@@ -224,10 +221,7 @@ def stored_discrepancy(target: Discrepancy, basis: Basis, weights: Any) -> Any:
 
 
 def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
-    """Return the graph of a discrepancy for a sample that depends on theta.
-
-    Shapes (n,), or (n, m) of several outputs, (n,) -> ().
-    """
+    """Return the graph of a discrepancy for a sample (n,) or (n, m) that depends on theta."""
     if not target.metric.symbolic:
         return OpaqueOp(target)(sample, weights)
     parts = target.parts
