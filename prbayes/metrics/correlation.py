@@ -109,11 +109,11 @@ class MarginalCorrelation(LiftedMetric):
         values, _ = together.observed_of(observed)
         has = ~np.isnan(values[weights > 0])
         for i, j in zip(*np.tril_indices(m, -1), strict=True):
-            both = int((has[:, i] & has[:, j]).sum())
-            if both < 3:
+            n_complete = int((has[:, i] & has[:, j]).sum())
+            if n_complete < 3:
                 raise ValueError(
-                    f"observed: got {both} specimens that have both output {i} and output {j} "
-                    "(counted from 0), expected at least 3; leave one of the outputs out"
+                    f"observed: got {n_complete} specimens that have both output {i} and "
+                    f"output {j} (counted from 0), expected at least 3; leave one of the outputs out"
                 )
         correlations = CorrelationDiscrepancy(
             self, values, weights, _observed_correlations(values, weights)
