@@ -114,8 +114,8 @@ class Populations:
         if simulator is None:
             raise TypeError(
                 f"{self.caller}: {responses.name}: got inputs without stored responses in any "
-                "simulator of the model, expected the .dist() objects of one with prb.Reweighted(), "
-                "and constants"
+                "simulator of the model, expected the .dist() objects of one with "
+                "prb.Reweighted(), and constants"
             )
         k = simulators.index(simulator)
         if simulator.is_emulated:

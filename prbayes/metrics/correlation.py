@@ -108,12 +108,13 @@ class MarginalCorrelation(LiftedMetric):
         together = Projection(np.arange(m), caps, center, unit=unit)
         values, _ = together.observed_of(observed)
         has = ~np.isnan(values[weights > 0])
-        for i, j in zip(*np.tril_indices(m, -1), strict=True):
-            n_complete = int((has[:, i] & has[:, j]).sum())
+        for i, k in zip(*np.tril_indices(m, -1), strict=True):
+            n_complete = int((has[:, i] & has[:, k]).sum())
             if n_complete < 3:
                 raise ValueError(
                     f"observed: got {n_complete} specimens that have both output {i} and "
-                    f"output {j} (counted from 0), expected at least 3; leave one of the outputs out"
+                    f"output {k} (counted from 0), expected at least 3; leave one of the outputs "
+                    "out"
                 )
         correlations = CorrelationDiscrepancy(
             self, values, weights, _observed_correlations(values, weights)
