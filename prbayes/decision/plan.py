@@ -252,6 +252,7 @@ class _Forecast:
         return sd
 
     def _quantity_sd(self, thetas: Floats) -> float:
+        """Return the standard deviation of the quantity."""
         assert self.quantity is not None
         assert self.sample is not None
         values = self.sample.evaluate(self.quantity, thetas)
@@ -360,7 +361,7 @@ def fisher_information(sample: ResponseSample) -> Floats:
 def _at_most(information: Floats, bound: Floats) -> Floats:
     """Return information that exceeds a bound in no direction, (d, d).
 
-    Along directions of which the response contains next to no information, both factors of a
+    The response contains next to no information along some directions. There both factors of a
     sandwich are rounding errors, and their quotient is arbitrary.
     """
     if not np.isfinite(bound).all():  # the support moves, and the likelihood is no bound

@@ -96,30 +96,26 @@ class Populations:
     def sample(
         self, response: Callable[..., Any], inputs: Sequence[Any], output: Any, **calling: Any
     ) -> ResponseSample:
-        """Return one output of a response at the design's specimens; compute it where unknown.
-
-        Raises
-        ------
-        TypeError
-            If no simulator has stored or emulated specimens of these inputs.
-        DesignError
-            If the design does not support the populations, or too many responses are NaN.
-        """
+        """Return one output of a response at the design's specimens, computed where unknown."""
         sample = self.sample_of_all_outputs(response, inputs, **calling)
         return replace(sample, column=output_column(sample.responses, sample.outputs, output))
 
     def sample_of_all_outputs(
         self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
     ) -> ResponseSample:
-        """Return all outputs of a response at the design's specimens, as `sample` does."""
+        """Return all outputs of a response at the design's specimens.
+
+        Raises TypeError if no simulator has specimens of these inputs, and DesignError if the
+        design does not support the populations, or too many responses are NaN.
+        """
         responses = self.responses(response, inputs, **calling)
         simulators = self.evaluator.simulators
         simulator = serving(simulators, responses)
         if simulator is None:
             raise TypeError(
-                f"{self.caller}: {responses.name}: got inputs of which no simulator of the model "
-                "has stored responses, expected the .dist() objects of one with prb.Reweighted(), "
-                "and constants"
+                f"{self.caller}: {responses.name}: got inputs without stored responses in any "
+                "simulator of the model, expected the .dist() objects of one with "
+                "prb.Reweighted(), and constants"
             )
         k = simulators.index(simulator)
         if simulator.is_emulated:
@@ -298,7 +294,7 @@ def _sobol_thetas(optimum: Optimum, n: int, caller: str) -> Floats:
             if not is_ok
         ]
         raise ValueError(
-            f"{caller}: got an optimum that says nothing of the uncertainty of {unknown}, expected "
+            f"{caller}: got an optimum without the uncertainty of {unknown}, expected "
             "a standard error of each; pass the posterior of prb.sample_smc"
         )
     z = ndtri(sobol(n, optimum.theta.size, seed=0))
