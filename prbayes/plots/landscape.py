@@ -142,10 +142,8 @@ def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
     evaluator = Evaluator.of(model)
     simulators = [node.name for node in evaluator.nodes or evaluator.measurements]
     expected = list(optimum.scales)
-    if (
-        evaluator.hyperparameters.names != optimum.evaluator.hyperparameters.names
-        or simulators != expected
-    ):
+    names, expected_names = (e.hyperparameters.names for e in (evaluator, optimum.evaluator))
+    if names != expected_names or simulators != expected:
         raise ValueError(
             f"model: got hyperparameters and simulators {names} and "
             f"{simulators}, expected {expected_names} and {expected}"
