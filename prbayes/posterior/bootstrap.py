@@ -128,7 +128,8 @@ def _specimen_estimates(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return maximum-likelihood estimates, (draws, d), and whether they converged."""
     refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
-    _require_identified(np.array(optimum.names)[np.isinf(np.diag(optimum.covariance))].tolist())
+    is_infinite = np.isinf(np.diag(optimum.covariance))
+    _require_identified(np.array(optimum.names)[is_infinite].tolist())
     if not parametric:
         return refits.reweighted(dirichlet_weights(refits.evaluator.emulated, draws, seed))
     estimates = list(refits.simulated(draws, seed))

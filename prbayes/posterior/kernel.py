@@ -172,7 +172,7 @@ class BatchedKernel(SMC_KERNEL):
     def resample(self) -> None:
         """Resample the particles in proportion to their weights."""
         self.resampling_indexes = systematic_resampling(self.weights, self.rng)
-        self._take(Particles(*(array[self.resampling_indexes] for array in self.particles)))
+        self._take(Particles(*[array[self.resampling_indexes] for array in self.particles]))
 
     def tempered(self, evaluator: Evaluator, max_stages: int | None = None) -> Iterator[None]:
         """Do the remaining stages, the last one with this evaluator, and yield after each."""
@@ -249,7 +249,7 @@ class BatchedKernel(SMC_KERNEL):
             gain = proposed.log_prior - current.log_prior + tempered + log_ratio
         log_uniform = np.log(self.rng.random(len(thetas)))
         is_accepted = log_uniform < np.nan_to_num(gain, nan=-np.inf)
-        merged = Particles(*(array.copy() for array in current))
+        merged = Particles(*[array.copy() for array in current])
         for array, new in zip(merged, proposed, strict=True):
             array[is_accepted] = new[is_accepted]
         self._take(merged)

@@ -24,7 +24,6 @@ from prbayes.posterior import smc
 from prbayes.posterior.importance import (
     ImportanceOptions,
     Laplace,
-    Prior,
     importance_sample,
     laplace,
 )
@@ -214,7 +213,7 @@ def _importance_chains(
     """Return draws by importance sampling, None if they are not reliable."""
     shape = settings.chains, settings.draws
     hyperparameters = target.evaluator.hyperparameters
-    prior = Prior(hyperparameters.prior_thetas, hyperparameters.log_prior)
+    prior = hyperparameters.prior_thetas, hyperparameters.log_prior
     seed = seed_number(settings.random_seed)
     size = settings.chains * settings.draws
     options = ImportanceOptions()

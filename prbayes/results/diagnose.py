@@ -381,23 +381,23 @@ def _convergence(posterior: xr.Dataset) -> list[Finding]:
     findings = []
     limit = max(1.01, 1 + _NOISE / (chains * draws))
     rhats = _by_element("rhat", posterior) if chains > 1 else {}
-    listed = ", ".join(f"{rhat:.2f} for {name}" for name, rhat in rhats.items() if rhat > limit)
-    if listed:
+    large = [f"{rhat:.2f} for {name}" for name, rhat in rhats.items() if rhat > limit]
+    if large:
         text = (
-            f"R-hat is {listed}, expected at most {limit:.2f}: the chains disagree, look at "
-            "az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; if "
-            "the chains sit in separate modes, state a prior that excludes one."
+            f"R-hat is {', '.join(large)}, expected at most {limit:.2f}: the chains disagree, look "
+            "at az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; "
+            "if the chains sit in separate modes, state a prior that excludes one."
         )
         findings.append(Finding("chains-disagree", text, page))
     total = chains * draws
     # For R-hat and ESS themselves to be reliable; of few draws a quarter.
     needed = min(400, 0.25 * total)
     sizes = _by_element("ess", posterior)
-    listed = ", ".join(f"{size:.0f} for {name}" for name, size in sizes.items() if size < needed)
-    if listed:
+    small = [f"{size:.0f} for {name}" for name, size in sizes.items() if size < needed]
+    if small:
         text = (
-            f"The effective sample size is {listed} of {total} draws: too few for means and "
-            "intervals. Pass more draws."
+            f"The effective sample size is {', '.join(small)} of {total} draws: too few for means "
+            "and intervals. Pass more draws."
         )
         findings.append(Finding("few-independent-draws", text, page))
     return findings
