@@ -441,12 +441,13 @@ def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum |
 
 def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
     """Return chains with log-likelihoods, and errors and missing responses at the best draw."""
-    assert chains.discrepancies is not None
-    kernels = np.asarray(log_kernel(chains.discrepancies, evaluator.epsilon))
+    discrepancies = chains.discrepancies
+    assert discrepancies is not None
+    kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
     rows = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
     other_terms = evaluator.log_other(rows).reshape(kernels.shape[:2])
     chains = replace(chains, log_likelihood=kernels.sum(axis=-1) + other_terms)
-    total = (chains.discrepancies / evaluator.epsilon).sum(axis=-1)
+    total = (discrepancies / evaluator.epsilon).sum(axis=-1)
     best = chains.thetas[np.unravel_index(total.argmin(), total.shape)]
     errors = []
     missing = {}
