@@ -46,7 +46,7 @@ def fleet(products: int, size: int = 20) -> dict[str, Any]:
         readings = Readings.exact(np.concatenate(data[first : first + BLOCK]))
         roots = specimen_roots(emulation, readings, likelihood.options)
         points = draw_points(
-            emulation, emulation.error, readings, roots, emulation.box, likelihood.options
+            emulation.values, emulation.error, readings, roots, emulation.box, likelihood.options
         )
         block = min(BLOCK, products - first)
         inputs = [v.reshape(block, size, -1) for v in coordinates.inputs(points.z)]

@@ -19,9 +19,12 @@ import prbayes as prb
 from prbayes.model.evaluator import specimen_log_likelihoods, specimen_params
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.optimize.maximum_likelihood import other_specimens, specimen_pool, specimen_refits
+from prbayes.response.distributions import compiled_log_density
+from prbayes.results.diagnose import _check_sampler
 from prbayes.results.likelihood_checks import (
-    NormalScores,
+    _check_conflict,
     influence,
+    score_function,
     scored_specimens,
     separate_modes,
 )
@@ -240,7 +243,7 @@ def test_refits_of_simulated_data_are_maximum_likelihood_estimates(optimum: prb.
     (likelihood,) = evaluator.likelihoods
     params = specimen_params(evaluator, optimum.theta[None], 0)
     pool = specimen_pool(likelihood, params, np.random.default_rng(3), size=1)
-    (points,), log_a = data = pool.data_set(np.random.default_rng(4))
+    (points,), log_a = data = pool(np.random.default_rng(4))
     before = specimen_log_likelihoods(evaluator, optimum.theta[None])["y"]
     refits = specimen_refits(optimum, "test")
     with other_specimens(evaluator.likelihoods, [data]):
@@ -295,32 +298,22 @@ def test_scores_of_the_population_test_are_those_of_the_inputs(
     (likelihood,) = evaluator.likelihoods
     (points,), log_a = arrays(likelihood)
     data = [([points.get_value()], log_a.get_value())]
-    scores = [NormalScores.of(likelihood.inputs)]
+    inputs = likelihood.inputs
+    scores = [(score_function(inputs), compiled_log_density(inputs))]
     ((z, weights),) = scored_specimens(evaluator, scores, optimum.theta, data)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0)
     exact = (2 * np.log(problem.observed) - optimum.point["mu"]) / optimum.point["sigma"]
     np.testing.assert_allclose((weights * z[..., 0]).sum(axis=1), exact, atol=1e-3)
 
 
-@pytest.mark.long
-def test_population_with_two_modes_is_found() -> None:
-    rng = np.random.default_rng(5)
-    x = np.where(rng.random(60) < 0.5, 0.4, 1.6) + 0.1 * rng.standard_normal(60)
-    found = prb.diagnose(prb.minimize(build(np.exp(0.5 * x)).model))
-    assert [finding.code for finding in found.findings] == ["population-misfit"]
-    assert "population" in found.messages[0]
-
-
 @pytest.mark.usefixtures("no_run")
-@pytest.mark.parametrize("name", ["posterior", "chains"])
-def test_diagnosis_of_draws(problem: Problem, results: Any, name: str) -> None:
-    found = prb.diagnose(results[name], model=problem.model)
+def test_diagnosis_of_draws(problem: Problem, posterior: xr.DataTree) -> None:
+    found = prb.diagnose(posterior, model=problem.model)
     assert found.ok
-    text = str(found)
     assert not found.untested
-    assert text.startswith("No problem was found.")
+    assert str(found).startswith("No problem was found.")
     assert any("a power of 0.23 for skewness 1" in note for note in found.notes)
-    assert "epsilon" not in text
+    assert "epsilon" not in str(found)
 
 
 def test_diagnosis_without_the_model_says_what_was_not_tested(
@@ -342,26 +335,24 @@ def test_chains_in_different_modes() -> None:
     assert "prb.sample_smc" in finding.text
 
 
-def test_chains_in_different_modes_take_the_place_of_r_hat(
-    problem: Problem, chains: xr.DataTree
-) -> None:
+def test_chains_in_different_modes_take_the_place_of_r_hat(chains: xr.DataTree) -> None:
     apart = chains.copy(deep=True)
     apart["posterior"]["mu"][{"chain": 1}] += 2.0
-    found = prb.diagnose(apart, model=problem.model)
-    assert "chains-in-different-modes" in [finding.code for finding in found.findings]
-    assert not any("R-hat" in message for message in found.messages)
+    codes = [finding.code for finding in _check_sampler(apart, None, by_specimen=True).findings]
+    assert codes == ["chains-in-different-modes"]
 
 
 def test_conflict_of_prior_and_data() -> None:
     observed = np.exp(0.5 * np.random.default_rng(7).normal(1.0, 0.4, N))
     with pm.Model() as model:
-        mu = pm.Normal("mu", -1.0, 0.1)
-        x = pm.Normal.dist(mu, pm.HalfNormal("sigma", 1.0))
+        x = pm.Normal.dist(pm.Normal("mu", -1.0, 0.1), pm.HalfNormal("sigma", 1.0))
         prb.Simulator("y", lambda x: np.exp(0.5 * x), x, observed=observed)
-    posterior = prb.sample_smc(model=model, draws=200, chains=2, random_seed=1, progressbar=False)
-    found = prb.diagnose(posterior, model=model)
-    assert [finding.code for finding in found.findings] == ["prior-conflict"]
-    assert found.messages[0].startswith("mu: got prior")
+    optimum = prb.minimize(model, progressbar=False)
+    checked = _check_conflict(optimum, (optimum.theta - [1.5, 0.0])[None, None])
+    assert [finding.code for finding in checked.findings] == ["prior-conflict"]
+    assert str(checked.findings[0]).startswith("mu: got prior")
+    checked = _check_conflict(optimum, optimum.theta[None, None])
+    assert [finding.code for finding in checked.remarks] == ["prior-agrees"]
 
 
 def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-import xarray as xr
 from scipy.stats import norm
 
 import prbayes as prb
@@ -22,7 +21,6 @@ from benchmarks.scoreboard.problems import frame
 from prbayes._finding import Finding
 from prbayes.inference.checks.population import population_statistics, population_test
 from prbayes.inference.checks.prior import conflict_findings
-from prbayes.model.data_checks import data_findings
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import specimen_likelihoods
@@ -30,7 +28,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.specimen_emulation import PointOptions
 from prbayes.response.failures import ResponseError
-from prbayes.results.likelihood_checks import check_draws, check_optimum
+from prbayes.results.likelihood_checks import check_optimum
 
 type Floats = np.ndarray
 SEEDS = range(20)
@@ -355,17 +353,9 @@ def shift(
 ) -> float:
     """Return the largest shift of a posterior mean, in exact posterior standard deviations.
 
-    NaN, which is at most nothing, where the points do not cover the posterior.
-
-    Parameters
-    ----------
-    model : pymc.Model
-    thetas : ndarray, shape (S, d)
-        Points in unconstrained space that cover the posterior.
-    log_proposal : ndarray, shape (S,)
-        Their log-density.
-    exact : callable
-        Hyperparameters by name, (S,) each -> exact log-likelihood up to a constant, (S,).
+    ``thetas``, (S, d), are unconstrained points with a log-density ``log_proposal``, and ``exact``
+    maps hyperparameters by name, (S,) each, to exact log-likelihoods. NaN where the points do not
+    cover the posterior.
     """
     evaluator = Evaluator.of(model)
     prior = evaluator.hyperparameters.log_prior(thetas)
@@ -427,33 +417,17 @@ RESPONSES: dict[str, Any] = {
 }
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["three specimens", "pole outside"])
-def test_one_input_has_the_exact_posterior(name: str) -> None:
-    assert one_input(name, 0) <= 0.1
+def one_input_model(name: str, seed: int) -> tuple[pm.Model, Floats]:
+    """Return a problem with one normal input, and the inputs of its specimens."""
+    x = sample(np.random.default_rng([seed, 3]), 3 if name == "three specimens" else 50)
+    response = RESPONSES.get(name, line)
+    return model_of(response, normal_input, response(x)), x
 
 
 def one_input(name: str, seed: int) -> float:
-    """Return the shift of a problem with one normal input."""
-    rng = np.random.default_rng([seed, 3])
-    x = sample(rng, 3 if name == "three specimens" else 50)
-    response = line
-    if name in RESPONSES:
-        response = RESPONSES[name]
-    model = model_of(response, normal_input, response(x))
-    wide = 2.5 if name == "three specimens" else 1.4
-    return shift(
-        model,
-        *around_normal(x, wide=wide),
-        lambda at: normal_log(x, at["mu"], at["sigma"]),
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["three specimens", "pole outside"])
-def test_one_input_has_the_exact_posterior_in_twenty_data_sets(name: str) -> None:
-    shifts = [one_input(name, seed) for seed in SEEDS]
-    assert np.sum(np.array(shifts) <= 0.1) >= 19, np.sort(shifts)[-3:]
+    model, x = one_input_model(name, seed)
+    thetas = around_normal(x, wide=2.5 if name == "three specimens" else 1.4)
+    return shift(model, *thetas, lambda at: normal_log(x, at["mu"], at["sigma"]))
 
 
 def with_few_starts(model: pm.Model, starts: int) -> SpecimenLikelihood:
@@ -525,23 +499,20 @@ def frame_shift(seed: int) -> float:
 
 
 @pytest.mark.long
-def test_a_mirror_root_that_is_nearly_as_good() -> None:
-    assert frame_shift(0) <= 0.1
-    # Without the third output both roots are kept.
+def test_a_mirror_root_is_kept_without_the_third_output() -> None:
     y = frame.data(20, 0)[:, :2]
     model = model_of(lambda a, b: frame_response(a, b)[..., :2], frame_inputs, y)
     assert np.mean(prepared(likelihood_of(model)).points.n_roots == 2) >= 0.9
 
 
-@pytest.mark.slow
-def test_a_mirror_root_that_is_nearly_as_good_in_twenty_data_sets() -> None:
-    assert np.sum([frame_shift(seed) <= 0.1 for seed in SEEDS]) >= 19
+def crossing_model(seed: int) -> tuple[pm.Model, Floats]:
+    rng = np.random.default_rng([seed, 5])
+    x = np.stack([sample(rng, 30, 1.0, 0.3), sample(rng, 30, 1.3, 0.3)])
+    return model_of(sorted_frequencies, two_inputs, sorted_frequencies(*x)), x
 
 
 def crossing_shift(seed: int) -> float:
-    rng = np.random.default_rng([seed, 5])
-    x = np.stack([sample(rng, 30, 1.0, 0.3), sample(rng, 30, 1.3, 0.3)])
-    model = model_of(sorted_frequencies, two_inputs, sorted_frequencies(*x))
+    model, x = crossing_model(seed)
 
     def exact(at: dict[str, Floats]) -> Floats:
         def log_density(k1: Floats, k2: Floats) -> Floats:
@@ -567,18 +538,7 @@ def is_repaired_or_reported(
     return shift_of(seed) <= 0.1
 
 
-def crossing_model(seed: int) -> pm.Model:
-    rng = np.random.default_rng([seed, 5])
-    x = np.stack([sample(rng, 30, 1.0, 0.3), sample(rng, 30, 1.3, 0.3)])
-    return model_of(sorted_frequencies, two_inputs, sorted_frequencies(*x))
-
-
-def one_input_model(name: str, seed: int) -> pm.Model:
-    y = RESPONSES[name](sample(np.random.default_rng([seed, 3])))
-    return model_of(RESPONSES[name], normal_input, y)
-
-
-ROUGH: dict[str, tuple[Callable[[int], pm.Model], Callable[[int], float]]] = {
+ROUGH: dict[str, tuple[Callable[[int], tuple[pm.Model, Floats]], Callable[[int], float]]] = {
     "crossing modes": (crossing_model, crossing_shift),
     "jump": (partial(one_input_model, "jump"), partial(one_input, "jump")),
     "pole": (partial(one_input_model, "pole"), partial(one_input, "pole")),
@@ -589,7 +549,7 @@ ROUGH: dict[str, tuple[Callable[[int], pm.Model], Callable[[int], float]]] = {
 @pytest.mark.parametrize("name", ROUGH)
 def test_a_rough_response_is_repaired_or_reported(name: str, outcome: Any) -> None:
     model, shift_of = ROUGH[name]
-    assert is_repaired_or_reported(outcome, model(1), shift_of, 1)
+    assert is_repaired_or_reported(outcome, model(1)[0], shift_of, 1)
 
 
 @pytest.mark.slow
@@ -598,7 +558,7 @@ def test_a_rough_response_is_repaired_or_reported_in_twenty_data_sets(
     name: str, outcome: Any
 ) -> None:
     model, shift_of = ROUGH[name]
-    good = [is_repaired_or_reported(outcome, model(seed), shift_of, seed) for seed in SEEDS]
+    good = [is_repaired_or_reported(outcome, model(seed)[0], shift_of, seed) for seed in SEEDS]
     assert np.sum(good) >= 19
 
 
@@ -618,22 +578,12 @@ def ends_shift(seed: int) -> float:
     return shift(model, thetas, np.zeros(len(thetas)), exact)
 
 
-@pytest.mark.long
-def test_moving_ends_have_the_exact_posterior() -> None:
-    assert ends_shift(0) <= 0.1
-
-
 def bounded_shift(seed: int) -> float:
     """Return the shift of a population whose standard deviation is at the end of its prior."""
     x = sample(np.random.default_rng([seed, 7]), 50)
     model = model_of(line, bounded_input, line(x))
     bounds = np.array([[0.6, -7.0], [1.4, 0.0]])
     return shift(model, *over_box(bounds), lambda at: normal_log(x, at["mu"], at["sigma"]))
-
-
-@pytest.mark.long
-def test_a_true_value_at_the_end_of_its_prior_has_the_exact_posterior() -> None:
-    assert bounded_shift(0) <= 0.1
 
 
 def truncated_shift(seed: int) -> float:
@@ -648,11 +598,6 @@ def truncated_shift(seed: int) -> float:
 
     bounds = np.array([[-1.0, np.log(0.15)], [4.0, np.log(2.5)]])
     return shift(model, *over_box(bounds, 4000), exact)
-
-
-@pytest.mark.long
-def test_a_failing_region_has_the_exact_posterior() -> None:
-    assert truncated_shift(0) <= 0.1
 
 
 def sum_shift(seed: int) -> float:
@@ -670,17 +615,27 @@ def sum_shift(seed: int) -> float:
     )
 
 
+SHIFTS: dict[str, Callable[[int], float]] = {
+    "three specimens": partial(one_input, "three specimens"),
+    "pole outside": partial(one_input, "pole outside"),
+    "mirror root": frame_shift,
+    "moving ends": ends_shift,
+    "end of a prior": bounded_shift,
+    "failing region": truncated_shift,
+    "ridge": sum_shift,
+}
+
+
 @pytest.mark.long
-def test_a_ridge_has_the_exact_posterior() -> None:
-    assert sum_shift(0) <= 0.1
+@pytest.mark.parametrize("name", SHIFTS)
+def test_the_posterior_is_exact(name: str) -> None:
+    assert SHIFTS[name](0) <= 0.1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "of_seed", [ends_shift, bounded_shift, sum_shift, truncated_shift], ids=lambda f: f.__name__
-)
-def test_other_problems_have_the_exact_posterior_in_twenty_data_sets(of_seed: Any) -> None:
-    shifts = [of_seed(seed) for seed in SEEDS]
+@pytest.mark.parametrize("name", SHIFTS)
+def test_the_posterior_is_exact_in_twenty_data_sets(name: str) -> None:
+    shifts = [SHIFTS[name](seed) for seed in SEEDS]
     assert np.sum(np.array(shifts) <= 0.1) >= 19, np.sort(shifts)[-3:]
 
 
@@ -800,33 +755,7 @@ def test_power_and_size_of_the_conflict() -> None:
     assert share <= 0.06 + 4 * 0.017  # Holm: at most .05, standard error .015
 
 
-@pytest.mark.long
-def test_draws_report_a_conflict() -> None:
-    def prior() -> list[Any]:
-        return normal_input((0.0, 0.1), 0.5)
-
-    x = sample(np.random.default_rng(5), 20, 0.5, 0.3)
-    model = model_of(line, prior, line(x))
-    evaluator = Evaluator.of(model)
-    thetas, log_proposal = over_box(np.array([[-0.2, -2.2], [0.8, 0.2]]))
-    logs = -evaluator.total(thetas, np.empty(0)) + evaluator.hyperparameters.log_prior(thetas)
-    weights = np.exp(logs - log_proposal - logs.max())
-    rng = np.random.default_rng(0)
-    draws = thetas[rng.choice(len(thetas), 400, p=weights / weights.sum())]
-    posterior = xr.DataTree.from_dict({"posterior": xr.Dataset()})
-    optimum = prb.minimize(model, progressbar=False)
-    findings = check_draws(evaluator, posterior, draws.reshape(2, 200, 2), optimum).findings
-    assert [each.code for each in findings] == ["prior-conflict"]
-
-
 # -- size before the fit ---------------------------------------------------------------------
-
-
-def test_clean_data_have_no_finding() -> None:
-    rng = np.random.default_rng(15)
-    for several_roots in (False, True):
-        x = rng.normal(1, 0.5, (50, 2))
-        assert not data_findings(line(x), several_roots=several_roots)
 
 
 @pytest.mark.slow

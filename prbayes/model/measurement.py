@@ -1,7 +1,6 @@
 """Measured specimens: readings of one simulator, readings of all, and the record of a likelihood.
 
 A specimen has one row: the outputs of all simulators side by side, NaN where one was not measured.
-Repeated readings of an output are one reading, their weighted mean.
 """
 
 from __future__ import annotations
@@ -83,9 +82,7 @@ class Measurement:
     def observing(self, data: Any) -> Measurement:
         """Return the measurement with other observed values; the same object for equal ones."""
         values = np.asarray(data, dtype=np.float64)
-        if values.shape == self.observed.shape and np.array_equal(
-            values, self.observed, equal_nan=True
-        ):
+        if np.array_equal(values, self.observed, equal_nan=True):
             return self
         if values.ndim != self.observed.ndim or values.shape[1:] != self.event:
             raise ValueError(
@@ -136,9 +133,7 @@ class StackedReadings:
         )
 
 
-def _specimen_numbers(
-    measurements: Sequence[Measurement],
-) -> tuple[list[NDArray[np.intp]], int]:
+def _specimen_numbers(measurements: Sequence[Measurement]) -> tuple[list[NDArray[np.intp]], int]:
     """Return the specimen of each row, by simulator, and the number of specimens."""
     first: dict[object, int] = {}
     numbers = []
@@ -160,20 +155,17 @@ def _averaged(
     np.add.at(count, numbers, present)
     is_repeated = present & (count > 1)[numbers]
     is_normal = (readings.step == 0) & ~readings.is_censored & ~readings.is_relative
-    problems = (
-        (
-            is_repeated & ~is_normal,
-            "with rounded or censored readings or a relative error, expected repeated "
-            "readings with a normal error; leave rounded=, censored= and relative= out, and pass "
-            "an error= that covers them",
-        ),
-        (
-            is_repeated & (measurement.scale == 0),
-            "without error=, expected it once: exact readings of one specimen would be "
-            "equal; pass metric=prb.LogLikelihood(error=...) with their standard deviation",
-        ),
+    of_kind = (
+        "with rounded or censored readings or a relative error, expected repeated readings with a "
+        "normal error; leave rounded=, censored= and relative= out, and pass an error= that covers "
+        "them"
     )
-    for where, problem in problems:
+    of_error = (
+        "without error=, expected it once: exact readings of one specimen would be equal; pass "
+        "metric=prb.LogLikelihood(error=...) with their standard deviation"
+    )
+    for is_bad, problem in ((~is_normal, of_kind), (measurement.scale == 0, of_error)):
+        where = is_repeated & is_bad
         if where.any():
             row = int(np.argmax(where.any(axis=1)))
             labels = measurement.specimens
@@ -315,8 +307,8 @@ class SpecimenLikelihood:
         )
         if all(a is b for a, b in zip(changed, self.measurements, strict=True)):
             return self
-        preparation = self.cache.get("preparation")
-        emulation = self.shared_emulation if preparation is None else preparation.emulation
+        prepared = self.cache.get("preparation")
+        emulation = prepared.emulation if prepared else self.shared_emulation
         return replace(self, measurements=changed, shared_emulation=emulation)
 
 

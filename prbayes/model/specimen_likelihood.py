@@ -1,17 +1,11 @@
 """The log-likelihood by specimen, from importance points, as PyMC evaluates and draws it.
 
-The log-likelihood of specimen i is
-
     log p(y_i | theta) = logsumexp_k(log p(x_ik | theta) + A_ik),
 
 with PyMC's own log-densities of the inputs at points x_ik. Points and numbers A_ik contain no
-hyperparameter (`prbayes.model.specimen_preparation`), so that NUTS, SMC and optimisers evaluate
-the graph without a run.
-
-The log-density of the observed variable is a vector with an element for each specimen. Simulators
-that measured the same specimens have one likelihood: the log-density of the last one has an element
-for each specimen, those of the first ones have none; their observed variables are parameters of the
-last one's.
+hyperparameter, so that samplers evaluate the graph without a run. Simulators that measured the same
+specimens have one likelihood: the log-density of the last one has an element for each specimen,
+those of the first ones have none; their observed variables are parameters of the last one's.
 """
 
 from __future__ import annotations
@@ -24,7 +18,6 @@ import numpy as np
 import pymc as pm
 import pytensor
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pymc.logprob.abstract import ValuedRV, _logprob
 from pytensor.graph.basic import Apply, Constant
 from pytensor.graph.replace import graph_replace, vectorize_graph
@@ -95,21 +88,24 @@ def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
     return points
 
 
-def log_likelihoods(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats]) -> Floats:
-    """Return the log-likelihoods of the specimens in batches of populations, (P, S).
-
-    The numbers of `log_likelihood_graph`, for likelihoods that need no graph. Values are by the
-    likelihood's variables, shapes (P, *shape), without the group of a specimen.
-    """
+def _roots(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats], group: Any) -> list[Any]:
+    """Return the values of the inputs' roots, (P, *shape), in the populations of a group."""
     size = len(next(iter(params.values())))
+    return [
+        np.full(size, group) if is_group(root) else params[root] for root in likelihood.inputs.roots
+    ]
+
+
+def log_likelihoods(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats]) -> Floats:
+    """Return the log-likelihoods of the specimens in populations, (P, S), without a graph.
+
+    Values are by the likelihood's variables, shapes (P, *shape), without the group of a specimen.
+    """
     share = prepared(likelihood).share
-    result = np.empty((size, len(likelihood.readings)))
+    result = np.empty((len(next(iter(params.values()))), len(likelihood.readings)))
     groups = zip(likelihood.by_group, _points_by_group(likelihood), strict=True)
     for (group, rows), points in groups:
-        roots = [
-            np.full(size, group) if is_group(root) else params[root]
-            for root in likelihood.inputs.roots
-        ]
+        roots = _roots(likelihood, params, group)
         result[:, rows] = likelihood.density.log_likelihoods(roots, points)
         if share is not None:
             log_share = share.of_populations(likelihood.density, roots, likelihood.coordinates)
@@ -233,12 +229,15 @@ def draw_readings(
 
     Values are by the likelihood's variables, shapes (P, *shape), without the group of a specimen:
     specimens are of the groups of the observed ones. Readings are those of one simulator, or the
-    outputs of all, with repeated readings as their mean. They have errors, and gross errors where
-    the metric has them. As many as the simulator's rows are of its specimens, so that repeated
-    readings have common inputs. NaN in a population of which next to nothing has a response.
+    outputs of all. If n is the number of a simulator's rows, repeated readings have common inputs.
+    NaN in a population of which next to nothing has a response.
     """
-    roots = [params[root] for root in likelihood.inputs.roots if not is_group(root)]
+    emulation, size = prepared(likelihood).emulation, len(next(iter(params.values())))
     groups = likelihood.stacked.groups if measurement is None else measurement.groups
+    by_group: list[tuple[Any, Any]] = [(None, np.arange(n))]
+    if groups is not None:
+        groups = np.resize(groups, n)
+        by_group = [(group, np.flatnonzero(groups == group)) for group in np.unique(groups)]
     specimens: Any = slice(None)
     if measurement is not None and n == len(measurement.observed):
         numbers = specimen_numbers(likelihood, measurement)
@@ -246,12 +245,17 @@ def draw_readings(
         specimens = first[inverse]
 
     def draw_outputs() -> Floats:
-        if groups is None:
-            inputs, _ = likelihood.density.sampler(roots, n, rng)
-        else:
-            inputs = _draw_groups(likelihood, rng, roots, np.resize(groups, n))
+        inputs: list[Floats] = []
+        for group, columns in by_group:
+            roots = _roots(likelihood, params, group)
+            drawn, _ = likelihood.density.sampler(roots, len(columns), rng)
+            inputs = inputs or [np.empty((size, n, *x.shape[2:])) for x in drawn]
+            for whole, part in zip(inputs, drawn, strict=True):
+                whole[:, columns] = part
         flat = [x[:, specimens].reshape(-1, *x.shape[2:]) for x in inputs]
-        return _emulated(likelihood, flat).reshape(len(roots[0]), n, -1)
+        # Beyond the runs' range an input has the response at the end of the range.
+        z = np.clip(likelihood.coordinates.of(flat, 1), emulation.box[0], emulation.box[1])
+        return emulation.values(z).reshape(size, n, -1)
 
     outputs = draw_outputs()
     # Specimens without a response are not measured.
@@ -264,7 +268,7 @@ def draw_readings(
         return _with_errors(rng, outputs, likelihood.readings, likelihood.measurements, params)
     outputs = outputs[..., output_columns(likelihood, measurement)]
     values = _with_errors(rng, outputs, measurement.readings, [measurement], params)
-    return values.reshape(*values.shape[:2], *measurement.event)
+    return values.reshape(size, n, *measurement.event)
 
 
 def _with_errors(
@@ -296,43 +300,11 @@ def _with_errors(
     return np.asarray(values)
 
 
-def _draw_groups(
-    likelihood: SpecimenLikelihood,
-    rng: np.random.Generator,
-    roots: Sequence[Floats],
-    groups: NDArray[np.intp],
-) -> list[Floats]:
-    """Return the inputs of specimens of each population, of these groups."""
-    inputs: list[Floats] = []
-    for group in np.unique(groups):
-        values = iter(roots)
-        roots_of_group = [
-            np.full(len(roots[0]), group) if is_group(root) else next(values)
-            for root in likelihood.inputs.roots
-        ]
-        columns = np.flatnonzero(groups == group)
-        specimens, _ = likelihood.density.sampler(roots_of_group, len(columns), rng)
-        inputs = inputs or [np.empty((x.shape[0], len(groups), *x.shape[2:])) for x in specimens]
-        for whole, part in zip(inputs, specimens, strict=True):
-            whole[:, columns] = part
-    return inputs
-
-
-def _emulated(likelihood: SpecimenLikelihood, inputs: Sequence[Floats]) -> Floats:
-    """Return the emulated outputs of specimens, (n, *event) by input -> (n, M); no run is computed.
-
-    Beyond the runs' range an input has the response at the end of the range.
-    """
-    emulation = prepared(likelihood).emulation
-    z = likelihood.coordinates.of(inputs, 1)
-    return emulation.values(np.clip(z, emulation.box[0], emulation.box[1]))
-
-
 class SpecimenRV(RandomVariable):  # type: ignore[misc]
     """The operation of the observed variable: draws data sets, and carries the likelihood.
 
-    PyTensor's rewriters keep every operation that they have met. The likelihood with its arrays is
-    therefore referenced by applications of the operation, and weakly by the operation itself.
+    PyTensor's rewriters keep every operation that they have met: the operation refers weakly to the
+    likelihood, its applications refer to it.
     """
 
     __props__ = ("name", "signature", "dtype", "inplace", "reference", "simulators")
@@ -365,7 +337,7 @@ class SpecimenRV(RandomVariable):  # type: ignore[misc]
 
     @property
     def measurements(self) -> list[Measurement]:
-        """The measurements of `simulators`."""
+        """The measurements of `simulators`; the last is that of this simulator."""
         by_name = {m.name: m for m in self.likelihood.measurements}
         return [by_name[name] for name in self.simulators]
 
@@ -406,25 +378,20 @@ class SpecimenRV(RandomVariable):  # type: ignore[misc]
         """Draw responses of specimens; their shape is the last of the arguments."""
         *params, size = arguments
         measurement = self.measurement
-        roots = {}
-        batch: tuple[int, ...] = ()
         # Readings of other simulators, the last parameters, are not part of the population.
-        for param, root in zip(params, self.variables, strict=False):
-            if is_group(root):
-                continue
-            leading = param.shape[: param.ndim - root.type.ndim]
-            batch = np.broadcast_shapes(batch, leading)
-            roots[root] = param
+        pairs = zip(self.variables, params, strict=False)
+        roots = {root: param for root, param in pairs if not is_group(root)}
+        leading = [param.shape[: param.ndim - root.type.ndim] for root, param in roots.items()]
+        batch = np.broadcast_shapes(*leading)
         shape = batch if size is None else tuple(int(s) for s in size)
         n = len(measurement.observed) if not shape else shape[-1]
         # The last batch axis is that of the specimens, along which parameters have length one.
-        populations = batch[:-1] if batch else ()
         flat = {}
         for root, param in roots.items():
             ndim = root.type.ndim
             first = param if param.ndim == ndim else param[..., 0, *(slice(None),) * ndim]
             tail = first.shape[first.ndim - ndim :]
-            flat[root] = np.broadcast_to(first, (*populations, *tail)).reshape(-1, *tail)
+            flat[root] = np.broadcast_to(first, (*batch[:-1], *tail)).reshape(-1, *tail)
         values = draw_readings(self.likelihood, rng, flat, n, measurement)
         return values.reshape(*shape, *measurement.event)
 
@@ -494,12 +461,8 @@ def _log_density_of_vector(
     ]
     if not conditions:
         return result
-    return require_data(
-        op.measurement.name,
-        "whose points are part of it",
-        result,
-        pt.all(pt.stack(conditions)),
-    )
+    is_same = pt.all(pt.stack(conditions))
+    return require_data(op.measurement.name, "whose points are part of it", result, is_same)
 
 
 def _without_marks(variable: Any) -> Any:

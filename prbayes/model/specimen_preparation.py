@@ -1,10 +1,7 @@
 """Importance points of measured specimens, from runs and an emulator.
 
-The log-likelihood by specimen is computed at these points. They contain no hyperparameter.
-
-Posterior draws of the hyperparameters, given such points, give the population in which the fibres
-of specimens are covered, and the unit of Monte Carlo errors. Adaptive importance sampling with a
-multivariate t proposal needs no gradient.
+Posterior draws of the hyperparameters, given such points, give the population in which fibres are
+covered, and the unit of Monte Carlo errors.
 """
 
 from __future__ import annotations
@@ -84,7 +81,6 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         response.on_start = partial(_log_first_runs, likelihood, response)
     populations = Populations(likelihood)
     runs = Runs(likelihood)
-    options = likelihood.options
     try:
         emulation, points, findings = _emulate(runs, populations, likelihood.shared_emulation)
         refined, share = response_share(
@@ -92,7 +88,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             emulation,
             populations.prior_specimens,
             lambda share: populations.posterior(points.z, points.log_a, share=share),
-            options,
+            likelihood.options,
             name=likelihood.name,
         )
         if refined is not emulation and not _is_partial(likelihood):
@@ -100,10 +96,9 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             refined, points, findings = _emulate(runs, populations, refined)
         return Preparation(refined, points, report(*findings), share)
     except DesignError as error:
-        causes = "" if runs.first is None else unreached(runs.first, likelihood.readings)
-        for finding in _data_findings(likelihood, several_roots=False):
-            causes += f". {finding}"
-        raise DesignError(f"{error}{causes}") from None
+        cause = "" if runs.first is None else unreached(runs.first, likelihood.readings)
+        findings = _data_findings(likelihood, several_roots=False)
+        raise DesignError(". ".join([f"{error}{cause}", *map(str, findings)])) from None
     finally:
         for response in responses:
             response.on_start = None
@@ -185,15 +180,9 @@ def _emulate(
                 f"{name}: propagation: got prb.Resimulated, expected stored responses where "
                 "specimens have fewer readings than inputs; leave propagation= out"
             )
+        specimens, posterior = populations.prior_specimens(), populations.posterior
         emulation, points = fibre_points(
-            runs,
-            readings,
-            bounds,
-            populations.prior_specimens(),
-            populations.posterior,
-            options,
-            n=n,
-            name=name,
+            runs, readings, bounds, specimens, posterior, options, n=n, name=name
         )
         return emulation, points, _data_findings(likelihood, several_roots=True)
     box = np.stack([-np.ones(d), np.ones(d)])
@@ -204,19 +193,14 @@ def _emulate(
     )
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
+    error, is_known = emulation.error, likelihood.error_is_known
     points = draw_points(
-        emulation,
-        emulation.error,
-        readings,
-        roots,
-        emulation.box,
-        options,
-        error_is_known=likelihood.error_is_known,
+        emulation.values, error, readings, roots, emulation.box, options, error_is_known=is_known
     )
     findings: list[Finding] = [
         *_data_findings(likelihood, several_roots=bool((points.n_roots > 1).any())),
-        *misfit_findings(name, readings, roots, emulation.error),
-        *emulator_findings(name, readings, emulation.error),
+        *misfit_findings(name, readings, roots, error),
+        *emulator_findings(name, readings, error),
     ]
     return emulation, points, findings
 
@@ -254,8 +238,7 @@ class Populations:
         """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
 
         With `smoothing`, a covariance (d, d), populations are normal with the moments of the
-        coordinates z, and wider by it: the log-likelihood is then smooth where points lie farther
-        apart than a population is wide.
+        coordinates z, and wider by it: the log-likelihood is then smooth.
         """
         n, count, d = z.shape
         likelihood = self.likelihood
@@ -280,7 +263,7 @@ class Populations:
 
     def prior_specimens(self) -> Floats:
         """Return coordinates of specimens of the prior predictive population, (n, d)."""
-        return specimens_of(self, self.hyperparameters.prior_thetas(2048, 0), 1)
+        return PopulationDraws(self, self.hyperparameters.prior_thetas(2048, 0)).specimens(1)
 
     def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
@@ -323,9 +306,8 @@ class Populations:
     ) -> PopulationDraws:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
 
-        Weights are tempered until their effective sample size is ten times the number of
-        hyperparameters, so that a few draws do not decide the next proposal. Points and smoothing
-        are those of `log_likelihoods`; the share is that of a population with a response.
+        Adaptive importance sampling. Weights are tempered until their effective sample size is ten
+        times the number of hyperparameters, so that a few draws do not decide the next proposal.
         """
         names = self.hyperparameters
         d = names.size
@@ -389,18 +371,13 @@ class PopulationDraws:
 
     def specimens(self, n_of_each: int = 16, seed: int = 0) -> Floats:
         """Return coordinates of specimens of all groups and draws, (n, d)."""
-        return specimens_of(self.populations, self.thetas, n_of_each, seed)
-
-
-def specimens_of(populations: Populations, thetas: Floats, n_of_each: int, seed: int = 0) -> Floats:
-    """Return coordinates of specimens of the populations at thetas, (n, d)."""
-    rng = np.random.default_rng([seed, 3])
-    likelihood = populations.likelihood
-    parts = []
-    for group, _ in likelihood.by_group:
-        roots = roots_of(populations.hyperparameters, thetas, likelihood.inputs, group)
-        specimens, _ = likelihood.density.sampler(roots, n_of_each, rng)
-        z = likelihood.coordinates.of(specimens, 2)
-        parts.append(z.reshape(-1, z.shape[-1]))
-    z = np.concatenate(parts)
-    return z[np.isfinite(z).all(axis=1)]
+        populations, likelihood = self.populations, self.populations.likelihood
+        rng = np.random.default_rng([seed, 3])
+        parts = []
+        for group, _ in likelihood.by_group:
+            roots = roots_of(populations.hyperparameters, self.thetas, likelihood.inputs, group)
+            inputs, _ = likelihood.density.sampler(roots, n_of_each, rng)
+            z = likelihood.coordinates.of(inputs, 2)
+            parts.append(z.reshape(-1, z.shape[-1]))
+        z = np.concatenate(parts)
+        return z[np.isfinite(z).all(axis=1)]

@@ -27,6 +27,19 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
     return inside(points)
 
 
+def farthest_rows(points: Floats, count: int, squares: Floats | None = None) -> list[int]:
+    """Return rows of points, (n, d), selected one by one: each is farthest from those before.
+
+    ``squares``, (n,), are squared distances from earlier points; without them row 0 is the first.
+    """
+    squares = np.full(len(points), np.inf) if squares is None else squares
+    rows: list[int] = []
+    while len(rows) < count:
+        rows.append(int(np.argmax(squares)))
+        squares = np.minimum(squares, ((points - points[rows[-1]]) ** 2).sum(axis=1))
+    return rows
+
+
 def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
     """Return n independent random points in the open unit cube, shape (n, dimensions)."""
     return inside(np.random.default_rng(seed).random((n, dimensions)))

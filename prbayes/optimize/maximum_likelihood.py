@@ -1,11 +1,8 @@
 """Maximum likelihood for models whose observed variables have exact log-densities.
 
 BFGS with exact gradients from the most likely points of the prior. Every local optimum is kept with
-its weight, the share of the posterior mass by Laplace's approximation.
-
-The estimates of other data sets are by the log-likelihood by specimen. Such a data set is either
-the observed specimens with other weights, or specimens of a pool: simulated specimens whose points
-are computed once. Both cost no run.
+its weight, the share of the posterior mass by Laplace's approximation. Estimates of other data sets
+cost no run: these are the observed specimens with other weights, or simulated specimens of a pool.
 """
 
 from __future__ import annotations
@@ -37,6 +34,7 @@ from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
 from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_likelihood import arrays, draw_readings
 from prbayes.model.specimen_preparation import prepared
+from prbayes.numerics.points import farthest_rows
 from prbayes.optimize.convergence import Result
 from prbayes.optimize.optimum import (
     Optimum,
@@ -72,6 +70,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     """
     clock = time.perf_counter()
     n_previous = evaluator.n_responses
+    hyperparameters = evaluator.hyperparameters
     objective = _Objective(evaluator, settings.prior)
     starts, n_screened = _starts(evaluator, settings)
     optima = []
@@ -79,17 +78,22 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         optima.append(_descend(objective, start, settings))
         if objective.count > settings.max_evaluations:
             break
+    preparations = [prepared(likelihood) for likelihood in evaluator.likelihoods]
     # Points of specimens have a Monte Carlo error, with which a ridge has ripples.
     errors = [
-        max(prepared(x).points.difference, x.options.half_difference) for x in evaluator.likelihoods
+        max(preparation.points.difference, likelihood.options.half_difference)
+        for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
     ]
     modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
     best = modes[0]
     point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
-    ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
-    weights = _posterior_weights(evaluator, modes, with_prior=settings.prior)
-    findings = [f for likelihood in evaluator.likelihoods for f in prepared(likelihood).findings]
-    findings += report(*_findings(evaluator, modes, weights, ends))
+    if settings.prior or len(modes) == 1:
+        weights = mode_weights(modes)
+    else:
+        log_prior = hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
+        weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
+    findings = [finding for preparation in preparations for finding in preparation.findings]
+    findings += report(*_findings(evaluator, objective, modes, weights))
     rivals = tuple(
         {
             "point": point_at(evaluator, mode.theta),
@@ -108,7 +112,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         stderr=stderr,
         theta=best.theta,
         covariance=best.covariance,
-        names=evaluator.hyperparameters.names,
+        names=hyperparameters.names,
         evaluator=evaluator,
         discrepancy=best.value,
         discrepancies={name: -float(v.sum()) for name, v in log_likelihoods.items()},
@@ -130,23 +134,12 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     )
 
 
-def _posterior_weights(
-    evaluator: Evaluator, modes: list[LocalOptimum], *, with_prior: bool
-) -> Floats:
-    """Return the share of each mode in the posterior's mass."""
-    if with_prior or len(modes) == 1:
-        return mode_weights(modes)
-    log_prior = evaluator.hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
-    return mode_weights(modes, log_prior, evaluator.hyperparameters.prior_sd)
-
-
 def mode_weights(
     modes: list[LocalOptimum], log_prior: Floats | None = None, prior_sd: Floats | None = None
 ) -> Floats:
     """Return the share of each mode in the posterior's mass, by Laplace's approximation.
 
-    ``log_prior``, (M,), is added to optima of the likelihood. ``prior_sd``, (d,), bounds the mass
-    along directions that the data do not identify.
+    ``log_prior``, (M,), is added to optima of the likelihood. ``prior_sd``, (d,), bounds the mass.
     """
     logs = np.array([-mode.value for mode in modes])
     if log_prior is not None:
@@ -211,15 +204,11 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
     order = order[np.isfinite(values[order])]
     if not order.size:
         return [hyperparameters.initial], n_screened
-    # The best one, and of the better quarter always the one farthest from all selected ones.
+    # The best one, and points of the better quarter that are far from each other.
     n_starts = 8 if settings.starts is None else max(1, settings.starts)
     candidates = thetas[order[: max(n_starts, order.size // 4)]] / hyperparameters.prior_sd
-    selected = [0]
-    distance = ((candidates - candidates[0]) ** 2).sum(axis=1)
-    while len(selected) < min(n_starts, len(candidates)):
-        selected.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, ((candidates - candidates[selected[-1]]) ** 2).sum(axis=1))
-    return list(candidates[selected] * hyperparameters.prior_sd), n_screened
+    rows = farthest_rows(candidates, min(n_starts, len(candidates)))
+    return list(candidates[rows] * hyperparameters.prior_sd), n_screened
 
 
 def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimum:
@@ -338,8 +327,7 @@ def share_mode(
 ) -> bool:
     """Return whether two optima are of one mode: no barrier in nats lies between them.
 
-    The profile along the straight line between the optima has the smallest value across the line,
-    in units of the prior. So a ridge, straight or curved, is one mode.
+    The profile along the straight line has the smallest value across it: a ridge is one mode.
     """
     from scipy.linalg import null_space
     from scipy.optimize import minimize as scipy_minimize
@@ -364,23 +352,20 @@ def share_mode(
 
 
 def _prior_ends(
-    evaluator: Evaluator, optimum: LocalOptimum, objective: Callable[[Floats], float]
+    evaluator: Evaluator, optimum: LocalOptimum, objective: _Objective
 ) -> list[PriorEnd]:
     """Return the hyperparameters that the data push to a finite end of their prior.
 
-    In unconstrained space the end is at infinity, and nothing changes on the way there. Back at the
-    median of the prior the log-likelihood is lower by more than three nats, whatever the others do.
+    At the median of the prior the log-likelihood is lower by more than three nats.
     """
     from scipy.optimize import minimize as scipy_minimize
 
     hyperparameters = evaluator.hyperparameters
     theta, unit = optimum.theta, hyperparameters.prior_sd
-    flat = np.flatnonzero(np.isinf(np.diag(optimum.covariance)))
-    if not flat.size:
-        return []
-    prior = hyperparameters.prior_thetas(THETAS, 0)
+    flat = np.flatnonzero(np.isinf(np.diag(optimum.covariance))).tolist()
+    prior = hyperparameters.prior_thetas(THETAS, 0) if flat else np.empty(0)
     ends = []
-    for i in flat.tolist():
+    for i in flat:
         below = float((prior[:, i] <= theta[i]).mean())
         if 0.05 <= below <= 0.95:
             continue
@@ -391,7 +376,7 @@ def _prior_ends(
         start[i] = np.median(prior[:, i])
 
         def along(u: Floats, start: Floats = start, i: int = i) -> float:
-            return objective(start + np.insert(u, i, 0.0) * unit)
+            return objective(start + np.insert(u, i, 0.0) * unit)[0]
 
         origin = np.zeros(theta.size - 1)
         lowest = along(origin)
@@ -404,10 +389,11 @@ def _prior_ends(
 
 
 def _findings(
-    evaluator: Evaluator, modes: list[LocalOptimum], weights: Floats, ends: list[PriorEnd]
+    evaluator: Evaluator, objective: _Objective, modes: list[LocalOptimum], weights: Floats
 ) -> list[Finding]:
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
+    ends = _prior_ends(evaluator, best, objective)
     findings = list(failing_region_findings(evaluator, best.theta))
     findings += prior_end_findings(ends)
     if np.isnan(best.covariance).any():
@@ -477,20 +463,8 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class SpecimenPool:
-    """Simulated specimens of one likelihood with the points of each."""
-
-    copies: int  # simulated specimens for each observed one, with its group and missing outputs
-    points: list[Floats]  # (copies * N, K, *event): inputs
-    log_a: Floats  # (copies * N, K): the numbers A
-    z: Floats  # (copies * N, K, d): coordinates of the points
-
-    def data_set(self, rng: np.random.Generator) -> tuple[list[Floats], Floats]:
-        """Return points and numbers A of one data set of N specimens."""
-        n = len(self.log_a) // self.copies
-        rows = rng.integers(0, self.copies, n) * n + np.arange(n)
-        return [x[rows] for x in self.points], self.log_a[rows]
+type SpecimenData = tuple[list[Floats], Floats]
+"""Points, (N, K, *event) by input, and numbers A, (N, K), of the specimens of a likelihood."""
 
 
 def specimen_pool(
@@ -498,11 +472,11 @@ def specimen_pool(
     params: Mapping[Any, Floats],
     rng: np.random.Generator,
     size: int = 2000,
-) -> SpecimenPool:
-    """Simulate specimens of one population, and draw their points.
+) -> Callable[[np.random.Generator], SpecimenData]:
+    """Simulate at least ``size`` specimens of one population, with their points.
 
-    ``params`` has the values of the variables without the group, (1, *shape). ``size`` is rounded
-    up to a multiple of the number of observed specimens.
+    ``params`` has the values of the variables without the group, (1, *shape). Return a function
+    that draws a data set: for each observed specimen one with its group and missing outputs.
     """
     n = len(likelihood.readings)
     copies = max(1, -(-size // n))
@@ -522,49 +496,35 @@ def specimen_pool(
     options = replace(options, half_difference=options.half_difference * np.sqrt(copies))
     emulation = prepared(likelihood).emulation
     roots = specimen_roots(emulation, readings, options)
-
-    def values_alone(z: Floats) -> tuple[Floats, Floats]:
-        # Points take no Jacobian, which costs more than the values.
-        outputs = emulation.surface.values(z)
-        outputs[emulation.fails(z)] = np.nan
-        return outputs, np.empty((len(z), 0, 0))
-
     points = draw_points(
-        values_alone, emulation.error, readings, roots, emulation.box, options, seed=1
+        emulation.values, emulation.error, readings, roots, emulation.box, options, seed=1
     )
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
-    return SpecimenPool(copies, likelihood.coordinates.inputs(points.z), log_a, points.z)
+    inputs = likelihood.coordinates.inputs(points.z)
+
+    def data_set(rng: np.random.Generator) -> SpecimenData:
+        rows = rng.integers(0, copies, n) * n + np.arange(n)
+        return [x[rows] for x in inputs], log_a[rows]
+
+    return data_set
 
 
 @contextmanager
 def other_specimens(
-    likelihoods: Sequence[SpecimenLikelihood],
-    data: Sequence[tuple[list[Floats], Floats]],
+    likelihoods: Sequence[SpecimenLikelihood], data: Sequence[SpecimenData]
 ) -> Iterator[None]:
     """Give compiled likelihoods the points and numbers A of other specimens within the context."""
     shared = [arrays(likelihood) for likelihood in likelihoods]
-    before = [([x.get_value() for x in points], log_a.get_value()) for points, log_a in shared]
+    variables = [v for points, log_a in shared for v in (*points, log_a)]
+    values = [value for points, log_a in data for value in (*points, log_a)]
+    before = [variable.get_value() for variable in variables]
     try:
-        _set(shared, data)
+        for variable, value in zip(variables, values, strict=True):
+            variable.set_value(np.ascontiguousarray(value), borrow=True)
         yield
     finally:
-        _set(shared, before)
-
-
-def _set(shared: Sequence[Any], data: Sequence[tuple[list[Floats], Floats]]) -> None:
-    for (points, log_a), (new_points, new_log_a) in zip(shared, data, strict=True):
-        for variable, value in zip(points, new_points, strict=True):
-            variable.set_value(np.ascontiguousarray(value), borrow=True)
-        log_a.set_value(np.ascontiguousarray(new_log_a), borrow=True)
-
-
-@dataclass(frozen=True, eq=False)
-class Refit:
-    """The estimate of one simulated data set."""
-
-    theta: Floats  # (d,)
-    converged: bool
-    data: list[tuple[list[Floats], Floats]]  # points and numbers A, by likelihood
+        for variable, value in zip(variables, before, strict=True):
+            variable.set_value(value, borrow=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -575,9 +535,8 @@ class SpecimenRefits:
     theta: Floats  # (d,): start of all estimates
     covariance: Floats  # (d, d): unit of the parameters, or the prior's spread if not finite
 
-    @property
     def _function(self) -> Any:
-        """The compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
+        """Return the compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
         evaluator = self.evaluator
         key = "weighted log-likelihood"
         if key in evaluator.functions:
@@ -614,9 +573,10 @@ class SpecimenRefits:
         if weights is None:
             weights = [np.ones(len(each.readings)) for each in self.evaluator.likelihoods]
         root = self._root
+        function = self._function()
 
         def objective(u: Floats) -> tuple[float, Floats]:
-            value, gradient = self._function(self.theta + root @ u, *weights)
+            value, gradient = function(self.theta + root @ u, *weights)
             if not np.isfinite(value):
                 return np.inf, np.zeros_like(u)
             return float(value), root.T @ np.where(np.isfinite(gradient), gradient, 0.0)
@@ -631,30 +591,20 @@ class SpecimenRefits:
         slope = np.abs(objective(result.x)[1]).max()
         return self.theta + root @ result.x, bool(np.isfinite(result.fun) and slope < 0.05)
 
-    @cached_property
-    def _pools(self) -> dict[int, list[SpecimenPool]]:
-        return {}
-
-    def pools(self, seed: int) -> list[SpecimenPool]:
-        """Return a pool of simulated specimens of the optimum for each likelihood."""
-        if seed not in self._pools:
-            rng = np.random.default_rng([seed, 21])
-            evaluator = self.evaluator
-            self._pools[seed] = [
-                specimen_pool(likelihood, specimen_params(evaluator, self.theta[None], k), rng)
-                for k, likelihood in enumerate(evaluator.likelihoods)
-            ]
-        return self._pools[seed]
-
-    def simulated(self, draws: int, seed: int) -> Iterator[Refit]:
-        """Yield estimates of data sets simulated at the optimum."""
-        pools = self.pools(seed)
+    def simulated(self, draws: int, seed: int) -> Iterator[tuple[Floats, bool, list[SpecimenData]]]:
+        """Yield estimates of simulated data sets, whether they converged, and the data."""
+        evaluator = self.evaluator
+        rng = np.random.default_rng([seed, 21])
+        pools = [
+            specimen_pool(likelihood, specimen_params(evaluator, self.theta[None], k), rng)
+            for k, likelihood in enumerate(evaluator.likelihoods)
+        ]
         rng = np.random.default_rng([seed, 22])
         for _ in range(draws):
-            data = [pool.data_set(rng) for pool in pools]
-            with other_specimens(self.evaluator.likelihoods, data):
+            data = [pool(rng) for pool in pools]
+            with other_specimens(evaluator.likelihoods, data):
                 theta, converged = self.fit()
-            yield Refit(theta, converged, data)
+            yield theta, converged, data
 
     def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """Return estimates of weighted data sets, (S, d), and which converged.

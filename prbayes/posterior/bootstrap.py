@@ -132,9 +132,8 @@ def _specimen_estimates(
     _require_identified(np.array(optimum.names)[is_infinite].tolist())
     if not parametric:
         return refits.reweighted(dirichlet_weights(refits.evaluator.emulated, draws, seed))
-    estimates = list(refits.simulated(draws, seed))
-    thetas = np.array([estimate.theta for estimate in estimates])
-    return thetas, np.array([estimate.converged for estimate in estimates])
+    thetas, converged, _ = zip(*refits.simulated(draws, seed), strict=True)
+    return np.array(thetas), np.array(converged)
 
 
 def _require_identified(unidentified: Sequence[str]) -> None:

@@ -236,7 +236,7 @@ def _ranks(evaluator: Evaluator, settings: SamplingSettings, number: int) -> dic
     ]
     settings = replace(settings, random_seed=int(rng.integers(2**31)))
     draw = sample if settings.adjustment is None else draw_posterior
-    with other_specimens(evaluator.likelihoods, [pool.data_set(rng) for pool in pools]):
+    with other_specimens(evaluator.likelihoods, [pool(rng) for pool in pools]):
         posterior = draw(evaluator.observing(data), settings)["posterior"]
     row = {}
     for name, (truth,) in hyperparameters.constrained(theta).items():

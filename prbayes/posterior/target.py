@@ -41,7 +41,7 @@ from prbayes.inference.resampling import (
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
 from prbayes.model.parameters import THETAS, log_posterior
-from prbayes.numerics.points import sobol
+from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.numerics.threads import one_thread
 from prbayes.optimize.optimum import Optimum, optima_of
 from prbayes.posterior.importance import LogDensity, importance_sample, laplace
@@ -79,13 +79,7 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
     thetas = evaluator.hyperparameters.prior_points(1024, 0)
     order = np.argsort(-target.log_posterior(thetas), kind="stable")
     candidates = thetas[order[: len(thetas) // 4]] / prior_sd
-    selected = [0]
-    distances = np.full(len(candidates), np.inf)
-    while len(selected) < 8:
-        squares = ((candidates - candidates[selected[-1]]) ** 2).sum(axis=1)
-        distances = np.minimum(distances, squares)
-        selected.append(int(np.argmax(distances)))
-    return replace(target, starts=candidates[selected] * prior_sd)
+    return replace(target, starts=candidates[farthest_rows(candidates, 8)] * prior_sd)
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:

@@ -6,8 +6,7 @@ solves for the m others. `prbayes.propagation.fibre_points` derives the density 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -16,9 +15,7 @@ from scipy.special import gammaln, logsumexp, ndtri
 
 from prbayes._validate import Floats
 from prbayes.numerics.points import sobol
-
-Response = Callable[[Floats], tuple[Floats, Floats]]
-"""Inputs (n, d) to outputs (n, m) and Jacobians (n, m, d); NaN where the response has no value."""
+from prbayes.propagation.roots import Response
 
 Indices = NDArray[np.intp]
 
@@ -32,16 +29,7 @@ class ReferencePopulation:
 
     @classmethod
     def from_sample(cls, x: Floats) -> ReferencePopulation:
-        """Return the population with the mean and covariance of a sample, (n, d).
-
-        For the predictive population of posterior draws, let `x` be inputs drawn for each draw of
-        theta. A Laplace approximation in place of draws is too narrow if the posterior is skewed.
-
-        Raises
-        ------
-        ValueError
-            If the covariance is singular.
-        """
+        """Return the population with the moments of a sample, (n, d), or raise ValueError."""
         weights = np.full(len(x), 1 / len(x))
         mean = weights @ x
         centred = x - mean
@@ -61,25 +49,12 @@ class ReferencePopulation:
         """Return the inputs (..., d) at whitened inputs (..., d)."""
         return self.mean + z @ self.root.T
 
-    def wider(self, covariance: Floats) -> ReferencePopulation:
-        """Return the population whose covariance is larger by a matrix (d, d)."""
-        total = self.root @ self.root.T + covariance
-        return ReferencePopulation(self.mean, np.linalg.cholesky(total))
-
-    def with_errors(self, outputs: int) -> ReferencePopulation:
-        """Return the population of d inputs and the standard normal errors of m outputs."""
-        d = len(self.mean)
-        root = np.eye(d + outputs)
-        root[:d, :d] = self.root
-        return ReferencePopulation(np.concatenate([self.mean, np.zeros(outputs)]), root)
-
 
 @dataclass(frozen=True, eq=False)
 class Fibres:
-    """Fibres {z : g(z) = y_i} of N specimens in whitened inputs.
+    """Fibres {z : g(z) = y_i} of N specimens in whitened inputs; g is the response over `unit`.
 
-    g is the response divided by `unit`, as a function of z. No number of this class depends on
-    more than one specimen, and all of them are free of the units of inputs and outputs.
+    All numbers are free of the units of inputs and outputs.
     """
 
     response: Response
@@ -90,32 +65,29 @@ class Fibres:
     @classmethod
     def of(cls, response: Response, y: Floats, population: ReferencePopulation) -> Fibres:
         """Return the fibres of measured outputs y, (N, m)."""
-        z = ndtri(sobol(64, len(population.mean), 0))
-        values, _ = cls(response, population, np.ones(y.shape[1]), y).outputs(z)
-        values = values[np.isfinite(values).all(axis=1)]
         unit = np.ones(y.shape[1])
+        z = ndtri(sobol(64, len(population.mean), 0))
+        values, _ = cls(response, population, unit, y).outputs(z)
+        values = values[np.isfinite(values).all(axis=1)]
         if len(values) > 1:
             # Quantiles, as a pole of the response makes the standard deviation arbitrary.
             low, high = np.quantile(values, [0.16, 0.84], axis=0)
             unit = np.where(high > low, (high - low) / 2, 1.0)
         return cls(response, population, unit, y / unit)
 
-    def subset(self, specimens: slice) -> Fibres:
-        """Return the fibres of some of the specimens."""
-        return Fibres(self.response, self.population, self.unit, self.y[specimens])
-
+    @np.errstate(all="ignore")
     def outputs(self, z: Floats) -> tuple[Floats, Floats]:
         """Return g(z), (n, m), and its Jacobian, (n, m, d); NaN where either is not finite."""
-        with np.errstate(all="ignore"):
-            values, jacobian = self.response(self.population.inputs(z))
-            values = values / self.unit
-            jacobian = (jacobian / self.unit[:, None]) @ self.population.root
-            # Determinants of larger numbers overflow.
-            usable = (np.abs(values) < 1e12).all(axis=1)
-            usable &= (np.abs(jacobian) < 1e12).all(axis=(1, 2))
+        values, jacobian = self.response(self.population.inputs(z))
+        values = values / self.unit
+        jacobian = (jacobian / self.unit[:, None]) @ self.population.root
+        # Determinants of larger numbers overflow.
+        usable = (np.abs(values) < 1e12).all(axis=1)
+        usable &= (np.abs(jacobian) < 1e12).all(axis=(1, 2))
         values = np.where(usable[:, None], values, np.nan)
         return values, np.where(usable[:, None, None], jacobian, np.nan)
 
+    @np.errstate(all="ignore")
     def solve(
         self,
         specimen: Indices,
@@ -125,24 +97,18 @@ class Fibres:
     ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Move z onto fibres by at most 15 Newton steps, at most one unit long.
 
-        With directions the determinant of the Jacobian along them keeps its sign on the way: beyond
-        a fold of the fibre another chart finds the points.
-
-        The same start always gives the same point. Convergence is judged by the length of the
-        step, in units of the population: a tolerance relative to the range of y depends on the
-        batch, and counted points of two charts twice. Steps of 1e-6 leave an error of their square.
-
         ``directions``, (n, d, m), are the span of the steps, by default that of the Jacobian's rows
-        (steps of least norm). ``solution`` has points of the fibres, (n, d), and Jacobians there:
-        steps that come within .01 of these points have converged to them. Returns points, Jacobians
-        there, (n, m, d), and which of them converged.
+        (steps of least norm). Along them the determinant of the Jacobian keeps its sign: beyond a
+        fold another chart finds the points. ``solution`` has points of the fibres and Jacobians
+        there: steps that come within .01 of them have converged. Returns points, Jacobians there,
+        (n, m, d), and which of them converged.
         """
         z = z.copy()
         jacobian = np.zeros((len(z), self.y.shape[1], z.shape[1]))
         converged = np.zeros(len(z), dtype=bool)
         sign = np.zeros(len(z))
         if directions is not None and solution is not None:
-            sign = _signs(solution[1] @ directions)
+            sign = np.sign(np.linalg.det(solution[1] @ directions))
         active = np.arange(len(z))
         for _ in range(15):
             if not active.size:
@@ -151,15 +117,14 @@ class Fibres:
             span = slopes.transpose(0, 2, 1) if directions is None else directions[active]
             matrices = slopes @ span
             if directions is not None:
-                signs = _signs(matrices)
+                signs = np.sign(np.linalg.det(matrices))
                 same = (signs == sign[active]) | (sign[active] == 0)
                 sign[active] = signs
                 active, values, slopes = active[same], values[same], slopes[same]
                 span, matrices = span[same], matrices[same]
             coefficients = solve_each(matrices, self.y[specimen[active]] - values)
-            with np.errstate(all="ignore"):
-                step = (span @ coefficients[..., None])[..., 0]
-                length = np.sqrt((step**2).sum(axis=1))
+            step = (span @ coefficients[..., None])[..., 0]
+            length = np.sqrt((step**2).sum(axis=1))
             # Beyond 12 standard deviations no population of interest has mass.
             usable = np.isfinite(length) & (np.abs(z[active]) < 12).all(axis=1)
             active, step, length = active[usable], step[usable], length[usable]
@@ -177,12 +142,8 @@ class Fibres:
 class Charts:
     """Charts of the fibres of N specimens, at most C for each.
 
-    Chart c of specimen i maps free coordinates u to
-
-        z = centre + free u + solved w(u),    w(u) such that g(z) = y_i,
-
-    and u has a t distribution as proposal. The proposal of a specimen is the mixture of its charts.
-    Arrays of some charts have the shape (n, ...) in place of (N, C, ...).
+    Chart c maps u to z = centre + free u + solved w(u) with w(u) such that g(z) = y_i; u has a t
+    distribution as proposal. Arrays of some charts have the shape (n, ...) in place of (N, C, ...).
     """
 
     # Degrees of freedom of the t distributions; 5 and 20 gave the same effective sample sizes.
@@ -207,21 +168,9 @@ class Charts:
         scale = np.tile(np.eye(k), (n, charts, 1, 1))
         return cls(centre, free, solved, location, scale, np.zeros((n, charts)))
 
-    @classmethod
-    def concatenated(cls, parts: list[Charts]) -> Charts:
-        """Return the charts of all specimens of the parts."""
-        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
-
-    def subset(self, specimens: slice) -> Charts:
-        """Return the charts of some of the specimens."""
-        return Charts(*(getattr(self, f.name)[specimens] for f in fields(self)))
-
     def including(self, specimen: Indices, slot: Indices, charts: Charts) -> Charts:
-        """Return charts in which (specimen, slot), both (n,), is replaced by `charts`, (n, ...).
-
-        All charts of a specimen get the same share.
-        """
-        arrays = {f.name: getattr(self, f.name).copy() for f in fields(self)}
+        """Replace charts (specimen, slot), both (n,); all charts of a specimen share alike."""
+        arrays = {name: array.copy() for name, array in vars(self).items()}
         for name, array in arrays.items():
             array[specimen, slot] = getattr(charts, name)
         present = arrays["share"] > 0
@@ -247,12 +196,7 @@ class Charts:
         return (centred[:, None, :] @ self.free[specimen, slot])[:, 0]
 
     def reach(
-        self,
-        fibres: Fibres,
-        specimen: Indices,
-        slot: Indices,
-        z: Floats,
-        jacobian: Floats,
+        self, fibres: Fibres, specimen: Indices, slot: Indices, z: Floats, jacobian: Floats
     ) -> NDArray[np.bool_]:
         """Return whether charts reach points z of their fibre, (n, d), with Jacobians (n, m, d)."""
         u = self.coordinates(specimen, slot, z)
@@ -262,36 +206,30 @@ class Charts:
     def log_mixture(
         self, fibres: Fibres, specimen: Indices, slot: Indices, z: Floats, jacobian: Floats
     ) -> Floats:
-        """Return the log-density of the proposal at its points, by the balance heuristic.
+        """Return the log-density of the proposal, by the balance heuristic.
 
-        The density is with respect to the fibre's volume over sqrt(det J J'), the same measure in
-        every chart: the sum of share t(u) |det(J solved)| over the charts that reach the point.
-        ``specimen`` and ``slot``, (n,), are the chart that the point was drawn from.
+        The sum of share t(u) |det(J solved)| over the charts that reach the point: a density with
+        respect to the fibre's volume over sqrt(det J J'), the same measure in every chart. Chart
+        ``slot`` of ``specimen``, (n,) both, drew the point.
         """
-        k = self.location.shape[-1]
+        k, nu = self.location.shape[-1], Charts.degrees
+        exponent = (nu + k) / 2
         inverse = np.linalg.inv(self.scale)
-        constant = (
-            gammaln((Charts.degrees + k) / 2)
-            - gammaln(Charts.degrees / 2)
-            - k / 2 * np.log(Charts.degrees * np.pi)
-        )
+        constant = gammaln(exponent) - gammaln(nu / 2) - k / 2 * np.log(nu * np.pi)
+        n, charts = len(z), self.share.shape[1]
+        terms = np.full((n, charts), -np.inf)
         with np.errstate(divide="ignore"):
             constant = constant + np.log(np.diagonal(inverse, axis1=2, axis2=3)).sum(axis=2)
             constant = constant + np.log(self.share)
-        n, charts = len(z), self.share.shape[1]
-        terms = np.full((n, charts), -np.inf)
-        for c in range(charts):
-            rows = np.flatnonzero(self.share[specimen, c] > 0)
-            i, j = specimen[rows], np.full(len(rows), c)
-            centred = self.coordinates(i, j, z[rows]) - self.location[i, c]
-            scaled = inverse[i, c] @ centred[..., None]
-            distance = (scaled[..., 0] ** 2).sum(axis=1)
-            with np.errstate(divide="ignore"):
-                projected = jacobian[rows] @ self.solved[i, c]
-                log_det = np.log(np.abs(np.linalg.det(projected)))
-            exponent = (Charts.degrees + k) / 2
-            log_t = constant[i, c] - exponent * np.log1p(distance / Charts.degrees)
-            terms[rows, c] = log_t + log_det
+            for c in range(charts):
+                rows = np.flatnonzero(self.share[specimen, c] > 0)
+                i = specimen[rows]
+                centred = self.coordinates(i, np.full(len(rows), c), z[rows]) - self.location[i, c]
+                scaled = inverse[i, c] @ centred[..., None]
+                distance = (scaled[..., 0] ** 2).sum(axis=1)
+                log_det = np.log(np.abs(np.linalg.det(jacobian[rows] @ self.solved[i, c])))
+                log_t = constant[i, c] - exponent * np.log1p(distance / nu)
+                terms[rows, c] = log_t + log_det
         # Only charts whose term matters need the check that they reach the point.
         nearest = terms[np.arange(n), slot]
         terms[terms < nearest[:, None] - 10] = -np.inf
@@ -303,22 +241,15 @@ class Charts:
         return np.asarray(logsumexp(terms, axis=1))
 
 
-def _signs(matrices: Floats) -> Floats:
-    """Return the signs of determinants, (n, m, m) -> (n,)."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.sign(np.linalg.det(matrices)))
-
-
+@np.errstate(all="ignore")
 def solve_each(matrices: Floats, right: Floats) -> Floats:
     """Return the solutions (n, m) of n linear systems, NaN where a matrix is singular."""
     if matrices.shape[-1] == 1:
-        with np.errstate(all="ignore"):
-            return right / matrices[..., 0]
+        return right / matrices[..., 0]
     try:
         return np.linalg.solve(matrices, right[..., None])[..., 0]
     except np.linalg.LinAlgError:
-        with np.errstate(all="ignore"):
-            singular = np.linalg.det(matrices) == 0
+        singular = np.linalg.det(matrices) == 0
         safe = np.where(singular[:, None, None], np.eye(matrices.shape[-1]), matrices)
         solution = np.linalg.solve(safe, right[..., None])[..., 0]
         return np.where(singular[:, None], np.nan, solution)
@@ -327,8 +258,7 @@ def solve_each(matrices: Floats, right: Floats) -> Floats:
 def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
     """Return charts at the modes of the reference population on the fibres.
 
-    Levenberg-Marquardt from z = 0 and Sobol points finds the modes. Modes within 8 nats of the
-    best, and .7 apart from better ones, get a chart: at most four of ``charts`` for a specimen.
+    At most four for a specimen: modes within 8 nats of the best, and .7 apart from better ones.
     """
     n, m = fibres.y.shape
     d = len(fibres.population.mean)
@@ -347,8 +277,7 @@ def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
     for rank in range(starts):
         row = np.arange(n) * starts + order[:, rank]
         value = log_density.ravel()[row]
-        squares = ((z[row, None] - modes) ** 2).sum(axis=2)
-        distance = np.sqrt(squares).min(axis=1)
+        distance = np.sqrt(((z[row, None] - modes) ** 2).sum(axis=2)).min(axis=1)
         accepted = np.isfinite(value) & (value > best - 8) & (distance > 0.7)
         i = np.flatnonzero(accepted & (count < modes.shape[1]))
         modes[i, count[i]] = z[row[i]]
@@ -395,13 +324,9 @@ def _levenberg_marquardt(fibres: Fibres, specimen: Indices, z: Floats) -> Floats
 def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
     """Add charts until random points of the fibres are covered, at most three for a specimen.
 
-    A chart covers a point if it reaches the point, and if the Jacobian there is not steep to the
-    chart: |det(J solved)| >= .3 sqrt(det J J'). The most probable point that no chart covers gets
-    a chart. Other sheets are detected thus, and turns, where the weights of a chart diverge.
-
-    ``normal``, (N, tries, d), are standard normal numbers. The first half of the tries start from
-    them, the others within .5 of the first mode: random points miss the far side of a small closed
-    fibre beside an extremum.
+    A chart covers a point if it reaches the point, and |det(J solved)| >= .3 sqrt(det J J') there.
+    The most probable point that no chart covers gets a chart: other sheets and turns are detected
+    thus. ``normal``, (N, tries, d), are standard normal numbers.
     """
     n, tries, d = normal.shape
     specimen = np.repeat(np.arange(n), tries)
@@ -422,13 +347,12 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
 
     def uncovered(rows: Indices, slot: Indices) -> Indices:
         """Return the points that chart `slot` of their specimen does not cover."""
-        i = specimen[rows]
-        projected = jacobian[rows] @ charts.solved[i, slot]
-        cosine = np.abs(np.linalg.det(projected)) / volume[rows]
-        is_covered = cosine >= 0.3
-        near, near_slot = rows[is_covered], slot[is_covered]
-        is_reached = charts.reach(fibres, specimen[near], near_slot, z[near], jacobian[near])
-        is_covered[is_covered] = is_reached
+        projected = jacobian[rows] @ charts.solved[specimen[rows], slot]
+        is_covered = np.abs(np.linalg.det(projected)) / volume[rows] >= 0.3
+        near = rows[is_covered]
+        is_covered[is_covered] = charts.reach(
+            fibres, specimen[near], slot[is_covered], z[near], jacobian[near]
+        )
         return np.asarray(rows[~is_covered])
 
     for c in range(present.shape[1]):
@@ -450,9 +374,8 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
 def _charts_at(fibres: Fibres, z: Floats, jacobian: Floats) -> Charts:
     """Return charts at points of the fibres, (n, d), with the Laplace approximation of u.
 
-    log p(u) = -|z(u)|^2 / 2 - log |det J solved| has a Hessian and a slope that follow from
-    Jacobians beside the centre. The second derivative of the determinant is left out, and
-    eigenvalues of the covariance are clipped: weighted points correct both later.
+    Hessian and slope of log p(u) = -|z(u)|^2 / 2 - log |det J solved| follow from Jacobians beside
+    the centre; the second derivative of the determinant is left out.
     """
     n, m, d = jacobian.shape
     right = np.linalg.svd(jacobian)[2].transpose(0, 2, 1)
@@ -468,13 +391,10 @@ def _charts_at(fibres: Fibres, z: Floats, jacobian: Floats) -> Charts:
         behind = fibres.outputs(z - step * free[..., a])[1]
         change = (ahead - behind) / (2 * step)
         curvature[:, a] = (multiplier[:, None, :] @ change @ free)[:, 0]
-        for o in range(m):
-            # trace(square^-1 change solved), by columns
-            column = solve_each(square, (change @ solved)[..., o])
-            slope[:, a] -= column[:, o]
+        for o in range(m):  # trace(square^-1 change solved), by columns
+            slope[:, a] -= solve_each(square, (change @ solved)[..., o])[:, o]
     # NaN beside the range of the response, or at a singular Jacobian
-    is_curved = np.isfinite(curvature).all(axis=(1, 2))
-    bad = ~(is_curved & np.isfinite(slope).all(axis=1))
+    bad = ~(np.isfinite(curvature).all(axis=(1, 2)) & np.isfinite(slope).all(axis=1))
     curvature[bad], slope[bad] = 0, 0
     hessian = np.eye(d - m) - (curvature + curvature.transpose(0, 2, 1)) / 2
     precision, axes = np.linalg.eigh(hessian)

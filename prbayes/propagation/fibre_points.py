@@ -21,20 +21,12 @@ the balance heuristic [2]_,
 
 .. math:: A_{ik} = \log |L| - \log K - \log \sum_j s_j t_j(u_j) |\det J R_j|. \qquad (3)
 
-The sum is over the charts that map u_j = F_j'(z - z*_j) to the point.
+**Accuracy.** Errors of specimens add up: two sets of points are compared until they agree. A small
+closed fibre beside an extremum of the response can be missed, and no number shows it.
 
-**Accuracy.** Errors of specimens add up, so effective sample sizes do not show the error of the
-log-likelihood. Use K = 256 first, then compare two sets of points with different seeds, and join
-more of them until they agree. Theta far outside the reference population needs a new one: fit it to
-inputs of posterior draws (`ReferencePopulation.from_sample`), twice.
-A small closed fibre beside an extremum of the response can be missed, and no number shows it.
-
-Papadimas and Dodwell [3]_ integrate over the inputs of specimens by an emulator and quadrature.
-
-**Specimens.** The readings of such a specimen do not determine its inputs: its points have to cover
-every plausible population. The reference population in which they are drawn is the prior predictive
-one at first, then that of draws of the posterior, twice. Posteriors of smoothed populations come
-before these where points lie farther apart than populations are wide.
+**Reference population.** The prior predictive one at first, then that of posterior draws, twice.
+Posteriors of smoothed populations come before these where points lie farther apart than
+populations are wide. Papadimas and Dodwell [3]_ integrate over the inputs by quadrature.
 
 References
 ----------
@@ -50,10 +42,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv, ndtri, stdtrit
 
 from prbayes._validate import Floats
@@ -112,18 +103,12 @@ def fibre_points(
     seed: int = 0,
     name: str = "response",
 ) -> tuple[Emulation, SpecimenPoints]:
-    """Emulate a response and draw points on the fibres of all specimens.
+    """Emulate a response with n first runs, and draw points on the fibres of all specimens.
 
-    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. ``bounds``,
-    (2, d), and ``prior_specimens``, (n, d), are those of the prior predictive population, whose
-    middle 99 % lies within [-1, 1]. ``posterior`` maps points (N, K, d), their numbers (N, K), and
-    None or a covariance (d, d) by which populations are smoothed, to draws of the hyperparameters.
-    ``n`` is the number of first runs.
-
-    Raises
-    ------
-    DesignError
-        If the response cannot be emulated well enough, or `most_points` are not enough.
+    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response; the middle
+    99 % of the prior predictive population lies within [-1, 1]. ``posterior`` maps points
+    (N, K, d), their numbers (N, K), and None or a covariance by which populations are smoothed, to
+    draws. Raise DesignError if the emulator is too inaccurate, or `most_points` are not enough.
     """
     d = bounds.shape[1]
     n = first_runs(d) if n is None else n
@@ -157,7 +142,7 @@ def fibre_points(
         is_last = 4 * count > options.most_points
         largest = 3 * unit if is_last else 2 * unit
         if difference <= largest:
-            break
+            return emulation, replace(joined(*halves), difference=difference)
         if is_last:
             raise _monte_carlo_error(name, 2 * count, difference, largest)
         halves = [
@@ -165,7 +150,6 @@ def fibre_points(
             for half, proposal in zip(halves, proposals, strict=True)
         ]
         count *= 2
-    return emulation, replace(joined(*halves), difference=difference)
 
 
 def _reliable_draws(
@@ -182,9 +166,7 @@ def _reliable_draws(
 
     Where points lie farther apart than populations are wide, the likely populations are those
     where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
-    have a smooth log-likelihood. They narrow the reference population, in which points are drawn
-    again, until it narrows no more; then points are doubled. A half difference of one nat shifts
-    the posterior of four hyperparameters by about half of their standard deviations.
+    narrow the reference population, until it narrows no more; then points are doubled.
     """
     free = population.root.shape[0] - int(readings.is_measured.sum(axis=1).min())
     narrows = False
@@ -203,18 +185,18 @@ def _reliable_draws(
                 raise _monte_carlo_error(name, count, difference, limit)
         smoothing = count ** (-2 / (free + 4)) * population.root @ population.root.T
         specimens = posterior(points.z, points.log_a, smoothing).specimens()
-        smoothed = ReferencePopulation.from_sample(specimens).wider(smoothing)
-        volumes = [np.diag(p.root).prod() for p in (smoothed, population)]
-        narrows = bool(volumes[0] < volumes[1] / 2)
-        population = smoothed
+        narrow = ReferencePopulation.from_sample(specimens)
+        root = np.linalg.cholesky(narrow.root @ narrow.root.T + smoothing)
+        narrows = bool(np.diag(root).prod() < np.diag(population.root).prod() / 2)
+        population = ReferencePopulation(narrow.mean, root)
         count = count if narrows else 2 * count
 
 
 def _per_hyperparameter(draws: Draws) -> float:
     """Return the error of a log-likelihood that shifts hyperparameters as 1 shifts each of four.
 
-    A random function of p hyperparameters with a standard deviation of s nats over the posterior
-    has slopes of about s / sqrt(p) nats a posterior standard deviation, and shifts means by that.
+    A random function of p hyperparameters with a standard deviation of s nats shifts means by about
+    s / sqrt(p) posterior standard deviations.
     """
     return float(np.sqrt(max(draws.thetas.shape[1], 4) / 4))
 
@@ -231,6 +213,15 @@ def _difference(first: Floats, second: Floats) -> float:
     """Return the half difference of log-likelihoods (S, N) over the draws where both are finite."""
     finite = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
     return half_difference(first[finite], second[finite]) if finite.any() else np.inf
+
+
+class _Pattern(NamedTuple):
+    """Specimens with the same outputs measured, and the proposal on their fibres."""
+
+    rows: Indices
+    columns: Indices
+    proposal: FibreProposal | None  # None: nothing is measured
+    error: Floats | None  # (columns,): of the readings; None if they are exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,16 +250,15 @@ class FibreProposals:
             rows = np.flatnonzero(number.ravel() == k)
             columns = np.flatnonzero(pattern[:m])
             if not len(columns):
-                proposals.append(_Pattern(rows, columns))
+                proposals.append(_Pattern(rows, columns, None, None))
                 continue
             response = _columns(emulation, columns)
-            y = readings.values[np.ix_(rows, columns)]
             error, reference = None, population
             if pattern[m:].any() or len(columns) >= len(population.mean):
                 # A reading error per pattern; the density of each reading replaces it in `draw`.
                 error = typical_sd(sd[np.ix_(rows, columns)])
-                response = with_error(response, error)
-                reference = population.with_errors(len(columns))
+                response, reference = with_errors(response, population, error)
+            y = readings.values[np.ix_(rows, columns)]
             proposal = fit_fibres(response, y, reference, seed=seed, numbers=rows)
             proposals.append(_Pattern(rows, columns, proposal, error))
         return cls(emulation, readings, population, seed, proposals)
@@ -281,48 +271,36 @@ class FibreProposals:
         z = np.empty((n, count, d))
         log_proposal = np.full((n, count), np.inf)
         exact = np.full((n, count), np.nan)
-        for pattern in self.patterns:
-            rows, columns = pattern.rows, pattern.columns
-            if pattern.proposal is None:
+        for rows, columns, proposal, error in self.patterns:
+            if proposal is None:
                 z[rows], log_proposal[rows] = _population_points(
                     self.population, rows, count, self.seed, after
                 )
                 continue
-            points = pattern.proposal.draw(count, self.seed, after)
-            if pattern.error is None:
-                z[rows], exact[rows] = points.x, points.log_a
+            x, log_a = proposal.draw(count, self.seed, after)
+            if error is None:
+                z[rows], exact[rows] = x, log_a
                 log_proposal[rows] = 0.0
                 continue
-            points = points.without_errors(len(columns))
-            z[rows] = points.x
-            values, _ = _columns(self.emulation, columns)(points.x.reshape(-1, d))
+            z[rows], log_a = without_errors(x, log_a, len(columns))
+            values, _ = _columns(self.emulation, columns)(z[rows].reshape(-1, d))
             y = self.readings.values[np.ix_(rows, columns)]
-            residual = (y[:, None] - values.reshape(len(rows), count, -1)) / pattern.error
-            log_normal = -0.5 * residual**2 - np.log(pattern.error) - 0.5 * np.log(2 * np.pi)
-            log_proposal[rows] = log_normal.sum(axis=-1) - points.log_a
+            residual = (y[:, None] - values.reshape(len(rows), count, -1)) / error
+            log_normal = -0.5 * residual**2 - np.log(error) - 0.5 * np.log(2 * np.pi)
+            log_proposal[rows] = log_normal.sum(axis=-1) - log_a
         outputs = self.emulation.values(z.reshape(-1, d)).reshape(n, count, m)
-        readings, error = self.readings, self.emulation.error
+        readings, of_emulator = self.readings, self.emulation.error
         censored = replace(readings, values=np.full_like(readings.values, np.nan))
         log_a = np.where(
             np.isnan(exact),
-            readings.log_density(outputs, error) - log_proposal,
-            exact + censored.log_density(outputs, error),
+            readings.log_density(outputs, of_emulator) - log_proposal,
+            exact + censored.log_density(outputs, of_emulator),
         )
         log_a = np.where(np.isnan(log_a), -np.inf, log_a)
         return SpecimenPoints(z, outputs, log_a, log_proposal, np.zeros(n, dtype=np.intp))
 
 
-@dataclass(frozen=True, eq=False)
-class _Pattern:
-    """Specimens with the same outputs measured, and the proposal on their fibres."""
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    proposal: FibreProposal | None = None  # None: nothing is measured
-    error: Floats | None = None  # (columns,): of the readings; None if they are exact
-
-
-def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
+def _columns(emulation: Emulation, columns: Indices) -> Response:
     """Return the response of some outputs."""
 
     def response(z: Floats) -> tuple[Floats, Floats]:
@@ -338,30 +316,21 @@ def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
 
 
 def _population_points(
-    population: ReferencePopulation, rows: NDArray[np.intp], count: int, seed: int, after: int
+    population: ReferencePopulation, rows: Indices, count: int, seed: int, after: int
 ) -> tuple[Floats, Floats]:
     """Return points of a wide population, and the log of count times their density."""
-    d = len(population.mean)
+    d, wide = len(population.mean), 1.5
     base = sobol(after + count, d, seed)[after:]
-    rng = np.random.default_rng([seed, 2])
-    size = int(rows.max()) + 1
-    shift = rng.random((size, 1, d))[rows]
-    u = np.clip((base + shift) % 1.0, 1e-12, 1 - 1e-12)
-    standard = ndtri(u)
-    wide = 1.5
+    shift = np.random.default_rng([seed, 2]).random((int(rows.max()) + 1, 1, d))[rows]
+    standard = ndtri(np.clip((base + shift) % 1.0, 1e-12, 1 - 1e-12))
     z = population.mean + wide * standard @ population.root.T
     log_det = np.log(np.diag(population.root)).sum() + d * np.log(wide)
-    square = (standard**2).sum(axis=-1)
-    density = -0.5 * square - d / 2 * np.log(2 * np.pi) - log_det
+    density = -0.5 * (standard**2).sum(axis=-1) - d / 2 * np.log(2 * np.pi) - log_det
     return z, density + np.log(count)
 
 
 def _fresh(
-    points: SpecimenPoints,
-    draws: Draws,
-    count: int,
-    bounds: Floats,
-    rng: np.random.Generator,
+    points: SpecimenPoints, draws: Draws, count: int, bounds: Floats, rng: np.random.Generator
 ) -> Floats:
     """Return points for new runs: half a sample of the specimens' inputs, half spread out."""
     specimens = draws.specimens()
@@ -385,28 +354,6 @@ def _fresh(
 
 
 @dataclass(frozen=True, eq=False)
-class FibrePoints:
-    """K importance points on the fibre of each of N specimens.
-
-    log L_i(theta) = logsumexp_k(log p(x_ik | theta) + log_a_ik).
-    """
-
-    x: Floats  # (N, K, d): inputs; the mean of the reference population for points of weight zero
-    # (N, K): logarithms of the importance numbers, minus log K; -inf for points of weight zero
-    log_a: Floats
-
-    def without_errors(self, outputs: int) -> FibrePoints:
-        """Return points over the inputs alone, with log N(e; 0, 1) added to `log_a`.
-
-        For points over inputs and reading errors e, from a response with `with_error`: the last
-        ``outputs`` inputs.
-        """
-        e = self.x[..., -outputs:]
-        log_normal = -(e**2).sum(axis=-1) / 2 - outputs / 2 * np.log(2 * np.pi)
-        return FibrePoints(self.x[..., :-outputs], self.log_a + log_normal)
-
-
-@dataclass(frozen=True, eq=False)
 class FibreProposal:
     """Proposal distribution on the fibres of N specimens: a mixture over charts for each."""
 
@@ -414,20 +361,20 @@ class FibreProposal:
     charts: Charts
     numbers: Indices  # (N,): numbers of the specimens, from which their random numbers follow
 
-    def draw(self, points: int, seed: int, after: int = 0) -> FibrePoints:
-        """Draw points on all fibres.
+    def draw(self, points: int, seed: int, after: int = 0) -> tuple[Floats, Floats]:
+        """Return inputs x, (N, K, d), on all fibres, and numbers A, (N, K); -inf for no point.
 
-        K = ``points`` for each specimen: a power of two fills the fibre most evenly. The first
-        ``after`` points of the same seed are left out, as they were drawn before.
+        The first ``after`` points of the seed are left out.
         """
         n, d = len(self.fibres.y), len(self.fibres.population.mean)
         x = np.empty((n, points, d))
         log_a = np.empty((n, points))
         for block in _blocks(n, points):
-            fibres, charts = self.fibres.subset(block), self.charts.subset(block)
+            fibres = replace(self.fibres, y=self.fibres.y[block])
+            charts = Charts(*(array[block] for array in vars(self.charts).values()))
             sample = _draw(fibres, charts, points, (1, seed), self.numbers[block], after)
-            x[block], log_a[block] = self.fibres.population.inputs(sample.z), sample.log_a
-        return FibrePoints(x, log_a)
+            x[block], log_a[block] = fibres.population.inputs(sample.z), sample.log_a
+        return x, log_a
 
 
 def fit_fibres(
@@ -435,26 +382,19 @@ def fit_fibres(
     y: Floats,
     population: ReferencePopulation,
     *,
-    starts: int = 8,
     tries: int = 64,
     most_charts: int = 8,
     rounds: int = 2,
     seed: int = 0,
     numbers: Indices | None = None,
 ) -> FibreProposal:
-    """Fit proposals to the fibres of measured specimens.
+    """Fit proposals to the fibres of measured outputs y, (N, m) with m < d.
 
-    Charts at the modes, more charts until random points of the fibres are covered, then rounds of
-    adaptation to 256 weighted points each. Charts turn in all rounds but the last, before which
-    the cover is repeated: without that, single specimens of a study with three inputs and two
-    outputs lacked up to .35 in log L. Numbers of a specimen depend on the other specimens only by
-    rounding.
-
-    The response is called with many inputs (n, d), and is NaN where it has no value; y are the
-    measured outputs, (N, m) with m < d. The proposals are fitted to ``population``, which should
-    cover the plausible populations. Modes are searched from ``starts`` points, and ``tries`` random
-    points of the fibre show whether charts are missing. A specimen has the same points alone as in
-    a batch if its number is the same.
+    Charts at the modes, more charts until ``tries`` random points of the fibres are covered, then
+    rounds of adaptation to 256 weighted points each. Charts turn in all rounds but the last, before
+    which the cover is repeated: without that, single specimens lacked up to .35 in log L.
+    ``population`` should cover the plausible populations. A specimen has the same points alone as
+    in a batch if its number is the same.
 
     Examples
     --------
@@ -466,9 +406,9 @@ def fit_fibres(
     ...     r = np.sqrt((x**2).sum(axis=1, keepdims=True))
     ...     return r, (x / r)[:, None, :]
     >>> population = ReferencePopulation(np.array([0.1, 0.0]), np.eye(2))
-    >>> points = fit_fibres(radius, np.array([[0.5], [2.0]]), population).draw(1024, seed=1)
-    >>> log_density = -(points.x**2).sum(axis=2) / 2 - np.log(2 * np.pi)
-    >>> likelihood = np.exp(logsumexp(log_density + points.log_a, axis=1))
+    >>> x, log_a = fit_fibres(radius, np.array([[0.5], [2.0]]), population).draw(1024, seed=1)
+    >>> log_density = -(x**2).sum(axis=2) / 2 - np.log(2 * np.pi)
+    >>> likelihood = np.exp(logsumexp(log_density + log_a, axis=1))
     >>> np.allclose(likelihood, [0.5 * np.exp(-0.125), 2 * np.exp(-2)], rtol=0.02)
     True
     """
@@ -477,8 +417,8 @@ def fit_fibres(
     fibres = Fibres.of(response, y, population)
     parts = [Charts.empty(0, most_charts, d, y.shape[1])]
     for block in _blocks(len(y), 256):
-        part, label = fibres.subset(block), numbers[block]
-        charts = charts_at_modes(part, starts, most_charts)
+        part, label = replace(fibres, y=fibres.y[block]), numbers[block]
+        charts = charts_at_modes(part, 8, most_charts)
         normal = ndtri(_shifted_sobol(tries, d, (0, seed), label))
         charts = cover(part, charts, normal)
         for r in range(rounds):
@@ -489,18 +429,18 @@ def fit_fibres(
             sample = _draw(part, charts, 256, (2 + r, seed), label)
             charts = _adapted(charts, sample, turn=not last)
         parts.append(charts)
-    return FibreProposal(fibres, Charts.concatenated(parts), numbers)
+    arrays = zip(*(vars(part).values() for part in parts), strict=True)
+    return FibreProposal(fibres, Charts(*map(np.concatenate, arrays)), numbers)
 
 
-def with_error(response: Response, error: Floats) -> Response:
-    """Return the response with the reading's error, f(x) + error e, of d + m inputs (x, e).
+def with_errors(
+    response: Response, population: ReferencePopulation, error: Floats
+) -> tuple[Response, ReferencePopulation]:
+    """Return response f(x) + error e and population of inputs x and standard normal errors e, (m,).
 
-    Use it with `ReferencePopulation.with_errors` and `FibrePoints.without_errors`. The number of
-    outputs may then be that of the inputs or more.
-
-    The errors, (m,), are positive standard deviations of the reading, in units of the outputs.
+    The number of outputs may then be that of the inputs or more.
     """
-    m = len(error)
+    d, m = len(population.mean), len(error)
 
     def response_with_error(x: Floats) -> tuple[Floats, Floats]:
         values, jacobian = response(x[:, :-m])
@@ -508,12 +448,21 @@ def with_error(response: Response, error: Floats) -> Response:
         values = values + x[:, -m:] * error
         return values, np.concatenate([jacobian, by_error], axis=2)
 
-    return response_with_error
+    root = np.eye(d + m)
+    root[:d, :d] = population.root
+    mean = np.concatenate([population.mean, np.zeros(m)])
+    return response_with_error, ReferencePopulation(mean, root)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sample:
-    """Points of a block of specimens, with what the adaptation of charts needs."""
+def without_errors(x: Floats, log_a: Floats, m: int) -> tuple[Floats, Floats]:
+    """Return points over the inputs alone, with log N(e; 0, 1) of m errors added to A."""
+    e = x[..., -m:]
+    log_normal = -(e**2).sum(axis=-1) / 2 - m / 2 * np.log(2 * np.pi)
+    return x[..., :-m], log_a + log_normal
+
+
+class _Sample(NamedTuple):
+    """Points of n specimens, with their charts and Jacobians."""
 
     z: Floats  # (n, K, d): whitened inputs
     log_a: Floats  # (n, K)
@@ -565,9 +514,8 @@ def _draw(
 def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
     """Return charts with location, scale and share of their weighted points.
 
-    The weights are those of the reference population. With `turn` the solved directions become
-    the row space of the mean Jacobian, which keeps det(J solved) off zero over more of the fibre
-    than the row space at one point. The present values count as 4 (d - m) points.
+    With `turn` the solved directions become the row space of the mean Jacobian, which keeps
+    det(J solved) off zero over more of the fibre. The present values count as 4 (d - m) points.
     """
     d, k = charts.free.shape[2:]
     m = d - k

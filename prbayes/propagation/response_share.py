@@ -22,7 +22,7 @@ from scipy.special import logsumexp, stdtrit
 
 from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats
-from prbayes.numerics.points import sobol
+from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions, first_runs
@@ -184,10 +184,5 @@ def boundary_points(emulation: Emulation, z: Floats, count: int, seed: int = 0) 
     near = np.flatnonzero(np.maximum(with_response, without) < 2 * distance)
     # A sample: the population decides where on the boundary the runs are.
     near = np.random.default_rng(seed).permutation(near)[: 4 * count]
-    candidates, distance = z[near] / width, distance[near]
-    rows: list[int] = []
-    while len(rows) < min(count, len(near)):
-        rows.append(int(np.argmax(distance)))
-        to_last = np.sqrt(((candidates - candidates[rows[-1]]) ** 2).sum(axis=1))
-        distance = np.minimum(distance, to_last)
+    rows = farthest_rows(z[near] / width, min(count, len(near)), distance[near] ** 2)
     return z[near[rows]]

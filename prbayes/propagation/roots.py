@@ -1,8 +1,6 @@
 """All roots of f(x) = y: the inputs with which a response reproduces each measured specimen.
 
-Levenberg-Marquardt runs for all specimens and starts at once. A root is kept if its misfit is at
-most `gap` nats above the specimen's best: a mirror root that the error of the comparison does not
-exclude is kept.
+A mirror root that the error of the comparison does not exclude is kept.
 """
 
 from __future__ import annotations
@@ -33,35 +31,17 @@ class Roots:
 
 
 def find_roots(
-    response: Response,
-    y: Floats,
-    sd: Floats,
-    starts: Floats,
-    box: Floats,
-    *,
-    gap: float = 20.0,
+    response: Response, y: Floats, sd: Floats, starts: Floats, box: Floats, *, gap: float = 20.0
 ) -> Roots:
-    """Find the roots of each specimen from several starts.
+    """Find the roots of each specimen by Levenberg-Marquardt [1]_ from several starts, (N, S, d).
 
-    Specimens whose starts all have no response have no root.
-
-    Parameters
-    ----------
-    response : callable
-    y : ndarray, shape (N, m)
-        Measured outputs.
-    sd : ndarray, shape (m,) or (N, m)
-        Standard deviation of the comparison.
-    starts : ndarray, shape (N, S, d)
-    box : ndarray, shape (2, d)
-        Bounds of the search.
-    gap : float
-        Largest misfit above the specimen's best, in nats.
+    ``y``, (N, m), are measured outputs, ``sd``, (m,) or (N, m), the standard deviations of the
+    comparison, and ``box``, (2, d), bounds of the search. A root has a misfit of at most ``gap``
+    nats above the specimen's best. Specimens whose starts all have no response have no root.
 
     References
     ----------
-    .. [1] Moré, J. J. (1978), The Levenberg-Marquardt algorithm, Lecture Notes in Mathematics 630,
-       105-116, doi:10.1007/BFb0067700.
+    .. [1] Moré, J. J. (1978), The Levenberg-Marquardt algorithm, doi:10.1007/BFb0067700.
 
     Examples
     --------
@@ -167,13 +147,7 @@ def rows_by_specimen(specimen: NDArray[np.intp]) -> NDArray[np.intp]:
 def gabriel_neighbours(z: Floats, most: int = 32) -> NDArray[np.bool_]:
     """Return which pairs of points have no third point in the sphere between them, (n, n).
 
-    Among the `most` nearest points of each. In one dimension these are the left and the right
-    neighbour.
-
-    References
-    ----------
-    .. [1] Gabriel, K. R. and R. R. Sokal (1969), A new statistical approach to geographic variation
-       analysis, Systematic Zoology 18(3), 259-278, doi:10.2307/2412323.
+    Among the `most` nearest points of each. Gabriel and Sokal (1969), doi:10.2307/2412323.
     """
     squares = ((z[:, None] - z) ** 2).sum(axis=2)
     near = np.argsort(squares, axis=1, kind="stable")[:, 1 : most + 1]
@@ -196,10 +170,8 @@ def nearest_starts(
 ) -> Floats:
     """Return starts of the search among the runs, by specimen, (N, S, d).
 
-    First the runs whose outputs are nearer to the specimen's than those of all their neighbours:
-    each root lies in the basin of such a run, unless it lies between runs. Then the runs with the
-    nearest outputs. S is `count`, or the largest number of the former if that is larger. The
-    spread, (m,) or (N, m), is infinite for outputs without a reading.
+    First the runs whose outputs are nearer to the specimen's than those of all their neighbours,
+    then those with the nearest outputs. The spread is infinite for outputs without a reading.
     """
     unit = np.broadcast_to(spread, y.shape)
     distance = np.zeros((len(y), len(run_y)))

@@ -1,7 +1,6 @@
 """Emulation of a response near the measured specimens: runs over the prior and at the roots.
 
-`Coordinates` are the aleatory inputs as one vector, scaled to a box. Guards of the log-likelihood
-by specimen (missing roots, emulator error, Monte Carlo error) return numbers, with which loops add
+Guards (missing roots, emulator error, Monte Carlo error) return numbers, with which loops add
 starts, runs or points. No guard detects a root outside the box of the search, or an emulator error
 that is smooth between the fresh runs.
 """
@@ -20,7 +19,7 @@ from scipy.special import ndtri
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
 from prbayes.metrics.readings import Readings
-from prbayes.numerics.points import sobol
+from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import (
     fit_normal,
@@ -65,10 +64,10 @@ def first_runs(dimensions: int) -> int:
 
 
 class Surface(Protocol):
-    """Outputs at coordinates between runs, with their Jacobian."""
+    """Outputs (k, m) at coordinates (k, d) between runs, with their Jacobian (k, m, d)."""
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return values and Jacobian, (k, d) -> (k, m), (k, m, d)."""
+        """Return values and Jacobian."""
 
     def values(self, z: Floats) -> Floats:
         """Return the values alone."""
@@ -144,18 +143,16 @@ class Emulation:
 
     def covers(self, z: Floats) -> bool:
         """Return whether points lie in the range of the roots at which runs were made."""
-        with np.errstate(invalid="ignore"):
-            margin = np.nan_to_num(0.1 * np.maximum(self.range[1] - self.range[0], 0.0))
         low, high = self.range
-        is_covered = (z >= low - margin) & (z <= high + margin)
-        return bool(is_covered.all())
+        with np.errstate(invalid="ignore"):
+            margin = np.nan_to_num(0.1 * np.maximum(high - low, 0.0))
+        return bool(((z >= low - margin) & (z <= high + margin)).all())
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian, NaN where the nearest run has no response."""
         values, jacobian = self.surface(z)
         failed = self.fails(z)
-        if failed.any():
-            values[failed], jacobian[failed] = np.nan, np.nan
+        values[failed], jacobian[failed] = np.nan, np.nan
         return values, jacobian
 
     def values(self, z: Floats) -> Floats:
@@ -174,35 +171,16 @@ class Emulation:
 
     def _of_nearest(self, of_runs: NDArray[np.bool_], z: Floats) -> NDArray[np.bool_]:
         """Return a property of the nearest run of each point."""
-        result = np.zeros(len(z), dtype=bool)
-        width = self.box[1] - self.box[0]
-        if len(z) and of_runs.any() and not _are_distant(of_runs, self.z / width, z / width):
-            _, nearest = self._tree.query(z / width)
-            result = of_runs[nearest]
-        return result
+        if not of_runs.any():
+            return np.zeros(len(z), dtype=bool)
+        _, nearest = self._tree.query(z / (self.box[1] - self.box[0]))
+        return np.asarray(of_runs[nearest])
 
     @cached_property
     def _tree(self) -> Any:
         from scipy.spatial import cKDTree
 
         return cKDTree(self.z / (self.box[1] - self.box[0]))
-
-
-def _are_distant(mask: NDArray[np.bool_], runs: Floats, points: Floats) -> bool:
-    """Return whether each of some runs is farther from all points than another run.
-
-    |x - f|^2 - |x - g|^2 is linear in x: it is least at a corner of the points' range.
-    """
-    # By columns: along the first axis of many rows it takes five times as long.
-    low = np.array([column.min() for column in points.T])
-    high = np.array([column.max() for column in points.T])
-    middle, reach = (low + high) / 2, (high - low) / 2
-    inner, outer = runs[mask, None] - middle, runs[~mask] - middle
-    # Runs near the middle are most likely nearer.
-    outer = outer[np.argsort((outer**2).sum(axis=1))[: len(low) * 8]]
-    margin = (inner**2).sum(axis=2) - (outer**2).sum(axis=1)
-    margin = margin - 2 * np.abs(inner - outer) @ reach
-    return bool((margin.max(axis=1, initial=-np.inf) > 0).all())
 
 
 def emulate(
@@ -220,21 +198,15 @@ def emulate(
     """Fit the emulator: runs over a box, then batches at the roots until the bias is small.
 
     ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. The first n
-    runs are in ``box``, and roots are searched in ``search_box``, both (2, d). ``known`` is the
-    emulation of the same response for other data: runs are added where the roots leave its range.
-
-    Raises
-    ------
-    DesignError
-        If the response cannot be emulated well enough.
+    runs are in ``box``. ``known`` is the emulation of the same response for other data. Raise
+    DesignError if the response cannot be emulated well enough.
     """
     d = box.shape[1]
     n = first_runs(d) if n is None else n
-    if known is None:
+    emulation = known
+    if emulation is None:
         first = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
         emulation = Emulation.first(run, first, search_box, readings, options, name)
-    else:
-        emulation = known
     rng = np.random.default_rng([seed, 1])
     for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
@@ -283,12 +255,11 @@ def require_accurate(
 def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
     """Return by how much the error of the emulator could narrow the population of an input.
 
-    In posterior standard deviations of its standard deviation sigma. The comparison allows an error
-    covariance C of a root; the part of it that the runs have overestimated is missing in sigma^2:
+    The comparison allows an error covariance C of a root; the part of it that the runs have
+    overestimated is missing in sigma^2. In posterior standard deviations of sigma, with weights
+    w_ir of the roots under a fitted normal population:
 
         sqrt(2 N) / 2 max_j mean_i sum_r w_ir C_jj / (C_jj + sigma_j^2)
-
-    with weights w_ir of the roots under a normal population that is fitted to them.
     """
     sd = np.where(readings.is_measured, readings.comparison_sd(emulation.error), 1.0)
     factor = (sd / emulation.error)[roots.specimen][:, :, None]
@@ -326,8 +297,7 @@ def extended(
 ) -> Emulation:
     """Return the emulation with runs at fresh points, whose misfit gives its error and bias.
 
-    The misfit is that of the emulator before at the first points. With `sampled` it is the left-out
-    error of the new emulator at so many first points, which are a sample of the specimens' inputs.
+    With `sampled` the misfit is the left-out error of the new emulator at so many first points.
     """
     values, jacobian = emulation.surface(fresh)
     outputs = run(fresh)
@@ -364,8 +334,7 @@ def surface_near(
 ) -> tuple[Interpolant, Floats, NDArray[np.bool_]]:
     """Return the interpolant, left-out errors, (n, m), and which runs are near the data, (n,).
 
-    Of runs that are equal to nine digits one is taken: copies add nothing but rounding errors.
-    Left-out errors are NaN where there is no response.
+    Runs that are equal to nine digits count once. Left-out errors are NaN without a response.
     """
     good = np.isfinite(y).all(axis=1)
     if good.sum() < 8:
@@ -375,58 +344,43 @@ def surface_near(
         )
     spread = readings.spread()
     rows = np.flatnonzero(good)
-    _, first, copies = np.unique(
-        np.round(z[rows], 9), axis=0, return_index=True, return_inverse=True
-    )
-    zg = z[rows[first]]
-    yg = _limited(y[rows[first]], readings, spread)
+    rounded = np.round(z[rows], 9)
+    _, first, copies = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    # A response that is steep outside the data would take the digits that outputs near them need:
+    # outputs are limited to 10^4 standard deviations of the data, and at least ten times the
+    # distance of 90 % of the runs.
+    yg = y[rows[first]]
+    center = np.nanmean(readings.values, axis=0)
+    largest = 10 * np.quantile(np.abs(yg - center), 0.9, axis=0)
+    largest = np.maximum(1e4 * spread, largest)
+    yg = np.clip(yg, center - largest, center + largest)
     # Outputs within the range of the readings or half of it away.
     low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
     margin = np.maximum((high - low) / 2, spread)
     inside = ((yg >= low - margin) & (yg <= high + margin)).all(axis=1)
     if inside.sum() < len(yg) // 4:
-        distance = (((yg - np.nanmean(readings.values, axis=0)) / spread) ** 2).sum(axis=1)
+        distance = (((yg - center) / spread) ** 2).sum(axis=1)
         inside = np.zeros(len(yg), dtype=bool)
         inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
-    surface = fit_interpolant(zg, yg, inside)
+    surface = fit_interpolant(z[rows[first]], yg, inside)
     left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
     left_out[rows], is_near[rows] = surface.left_out[copies.ravel()], inside[copies.ravel()]
     return surface, left_out, is_near
 
 
-def _limited(y: Floats, readings: Readings, spread: Floats) -> Floats:
-    """Return outputs (n, m) within a distance of the data, beyond which they are not resolved.
-
-    A response that is steep outside the data would take the digits that outputs near them need.
-    The distance is 10^4 standard deviations of the data, and at least ten times that of 90 % of
-    the runs: outputs over a wide prior keep their values.
-    """
-    center = np.nanmean(readings.values, axis=0)
-    distance = np.abs(y - center)
-    largest = np.maximum(1e4 * spread, 10 * np.quantile(distance, 0.9, axis=0))
-    return np.clip(y, center - largest, center + largest)
-
-
 def _widened(box: Floats, roots: Roots) -> Floats:
-    """Return the box with more room where roots or their population reach beyond its sides.
+    """Return the box with room for roots that end at its sides, and for their population.
 
-    A quarter where the search for a root ends at the side with a misfit of 50 nats. And room for a
-    normal population that is fitted to the roots: all specimens of a data set are within the box,
-    with the probability 1 - 1 / 4097 of `Coordinates.bounds`.
+    All specimens of a data set are then within it with a probability of 1 - 1 / 4097.
     """
     poor = roots.z[roots.misfit > 50.0]
     width = box[1] - box[0]
-    at_low = poor <= box[0] + 1e-6 * width
-    at_high = poor >= box[1] - 1e-6 * width
-    ends = np.stack([at_low, at_high])
+    ends = np.stack([poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width])
     wider = box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1)
     table, log_mass, _ = _laplace(roots, box)
     mean, root = fit_normal(roots.z[table], log_mass)
-    sd = np.sqrt((root**2).sum(axis=1))
-    reach = -ndtri(1 / 4097 / len(table)) * sd
-    low = np.minimum(wider[0], mean - reach)
-    high = np.maximum(wider[1], mean + reach)
-    return np.stack([low, high])
+    reach = -ndtri(1 / 4097 / len(table)) * np.sqrt((root**2).sum(axis=1))
+    return np.stack([np.minimum(wider[0], mean - reach), np.maximum(wider[1], mean + reach)])
 
 
 def _all_roots(
@@ -462,7 +416,7 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     run_z, run_y = emulation.z[good], emulation.y[good]
     measured = readings.is_measured
     target = np.where(measured, readings.values, 0.0)
-    sd = readings.comparison_sd(emulation.error)
+    scale = np.where(measured, readings.comparison_sd(emulation.error), 1e150)
     solvable = np.flatnonzero(measured.sum(axis=1) >= emulation.z.shape[1])
     # Runs are not chosen by an output that a reading error dominates.
     error = readings.error_sd(target)
@@ -475,36 +429,27 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     for first in range(0, len(solvable), block):
         rows = solvable[first : first + block]
         starts = nearest_starts(run_z, run_y, target[rows], unit[rows], options.starts, neighbours)
-        scale = np.where(measured[rows], sd[rows], 1e150)
-        box = emulation.box
-        roots = find_roots(emulation, target[rows], scale, starts, box, gap=options.gap)
-        parts.append((roots, rows))
-    names = ("z", "misfit", "residual", "jacobian")
-    joined = [np.concatenate([getattr(r, name) for r, _ in parts]) for name in names]
-    specimen = np.concatenate([rows[r.specimen] for r, rows in parts])
-    return Roots(specimen, *joined)
+        roots = find_roots(
+            emulation, target[rows], scale[rows], starts, emulation.box, gap=options.gap
+        )
+        parts.append(replace(roots, specimen=rows[roots.specimen]))
+    arrays = zip(*(vars(part).values() for part in parts), strict=True)
+    return Roots(*map(np.concatenate, arrays))
 
 
 def spread_out(
     z: Floats, box: Floats, count: int, sampled: int, rng: np.random.Generator
 ) -> Floats:
-    """Return points for new runs, (count, d): a sample of the given ones, then others spread out.
-
-    The spread ones are selected one by one, each farthest from all others, among the given points
-    and points around them.
-    """
+    """Return points for new runs, (count, d): a sample of the given ones, then points far apart."""
     scale = np.maximum(z.std(axis=0), 1e-9 * (box[1] - box[0]))
     sample = z[rng.permutation(len(z))[: min(sampled, len(z))]]
     around = z[rng.integers(0, len(z), 8 * count)]
     jittered = around + 0.4 * scale * rng.standard_normal(around.shape)
     candidates = np.clip(np.concatenate([z, jittered]), box[0], box[1]) / scale
-    points = list(sample / scale)
-    distance = np.min([((candidates - p) ** 2).sum(axis=1) for p in points], axis=0)
-    while len(points) < count:
-        best = int(np.argmax(distance))
-        points.append(candidates[best])
-        distance = np.minimum(distance, ((candidates - candidates[best]) ** 2).sum(axis=1))
-    return np.asarray(np.array(points) * scale)
+    points = sample / scale
+    squares = np.min([((candidates - p) ** 2).sum(axis=1) for p in points], axis=0)
+    rows = farthest_rows(candidates, count - len(points), squares)
+    return np.asarray(np.concatenate([points, candidates[rows]]) * scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -542,19 +487,15 @@ class Coordinates:
         flat = draw(1)
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
         is_log = (flat > 0).all(axis=0) & (high > 10 * low)
-        flat = np.where(is_log, np.log(np.where(is_log, flat, 1.0)), flat)
-        low, high = np.quantile(flat, [0.005, 0.995], axis=0)
+        low, high = np.quantile(_logs(flat, is_log), [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)
         center = (low + high) / 2
-        z = (flat - center) / half_width
-        ends = [z.min(axis=0), z.max(axis=0)]
+        ends = []
         # Specimens in blocks: memory stays constant.
         block = max(1, 16 * AT_ONCE // (populations * len(center)))
-        for first in range(1, n, block):
-            flat = draw(min(block, n - first))
-            with np.errstate(divide="ignore", invalid="ignore"):
-                flat = np.where(is_log, np.log(flat), flat)
-            z = (flat - center) / half_width
+        for first in (0, *range(1, n, block)):
+            flat = draw(min(block, n - first)) if first else flat
+            z = (_logs(flat, is_log) - center) / half_width
             z = z[np.isfinite(z).all(axis=1)]
             ends += [z.min(axis=0), z.max(axis=0)]
         bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
@@ -581,14 +522,18 @@ class Coordinates:
         """Return the coordinates (..., d) of aleatory inputs with so many batch axes."""
         batch = inputs[0].shape[:batch_ndim]
         flat = np.concatenate([x.reshape(*batch, -1) for x in inputs], axis=-1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            flat = np.where(self.is_log, np.log(np.where(self.is_log, flat, 1.0)), flat)
-        return np.asarray((flat - self.center) / self.half_width)
+        return np.asarray((_logs(flat, self.is_log) - self.center) / self.half_width)
 
     def log_jacobian(self, z: Floats) -> Floats:
         """Return log|dx/dz|, (..., d) -> (...)."""
         logs = np.where(self.is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
         return np.asarray(logs + np.log(self.half_width).sum())
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def _logs(flat: Floats, is_log: NDArray[np.bool_]) -> Floats:
+    """Return inputs (..., d), the logarithms of some; NaN of negative values."""
+    return np.where(is_log, np.log(np.where(is_log, flat, 1.0)), flat)
 
 
 def missing_share(
@@ -600,14 +545,11 @@ def missing_share(
     seed: int = 0,
     tolerance: float = 0.03,
 ) -> float:
-    """Return the share of simulated specimens whose own inputs are not among their roots.
+    """Return the share of n simulated specimens whose own inputs are not among their roots.
 
-    Inputs x* are uniform in the box of the runs. Only responses near the data count. As x* is a
-    draw from its own posterior under a flat population, the share estimates the missing posterior
-    mass. 0 of 128 means less than 2.3 % (95 %).
-
-    NaN if no response in the box is near the data. A root may differ from x* by ``tolerance`` of
-    the box. Responses of at most n specimens are (n, m); ``y`` are the measured ones, (N, m).
+    Inputs x* are uniform in the box of the runs, with responses near the data y, (N, m); NaN if
+    there are none. As x* is a draw from its own posterior under a flat population, the share
+    estimates the missing posterior mass. A root may differ from x* by ``tolerance`` of the box.
     """
     low, high = box
     y = y[np.isfinite(y).all(axis=1)]
@@ -633,18 +575,10 @@ def missing_share(
 def half_difference(log_likelihoods_a: Floats, log_likelihoods_b: Floats) -> float:
     """Return the Monte Carlo error of the log-likelihood over the posterior, in nats.
 
-    sd_s sum_i (log L_i^a(theta_s) - log L_i^b(theta_s)) / 2
-
-    over posterior draws theta_s, with points of two independent halves a and b. The log-likelihood
-    of all points is about their mean. A tilt of it by one nat for each posterior standard deviation
-    moves the posterior mean by one standard deviation. At .15: size .00 to .06 with 256 Sobol
-    points, power .80 to 1.00 with up to 16 (one to four free inputs, 20 and 50 specimens, 200 data
-    sets). With data that inform little it flags .45 to .58 of the good sets, at the price of free
-    points. It is a single number from two halves: single data sets with a large error are missed
-    in up to .71 where these are rare (<= .07).
-
-    Both have shape (S, N), by posterior draw and specimen; 32 draws suffice. A specimen without a
-    point in one of the halves, as beside a region without response, is left out.
+    sd_s sum_i (log L_i^a(theta_s) - log L_i^b(theta_s)) / 2 over posterior draws theta_s, with
+    points of two independent halves a and b, both (S, N). A tilt of one nat for each posterior
+    standard deviation moves the posterior mean by one standard deviation. A specimen without a
+    point in one of the halves is left out. Size and power: docs/likelihood.md.
     """
     is_finite = np.isfinite(log_likelihoods_a) & np.isfinite(log_likelihoods_b)
     with np.errstate(invalid="ignore"):
@@ -657,15 +591,10 @@ def predicted_bias(misfit: Floats, jacobian: Floats, x: Floats, size: int) -> Fl
     """Return the bias that the emulator's error causes, (2, d), in posterior standard deviations.
 
     The true root lies at x + shift, where shift = -J^+ (run - emulator). From the shifts follow the
-    biases of mean (first row) and standard deviation (second row) of each input's population. At
-    .15 for the largest absolute value, 16 fresh runs: flagged .91 of the data sets with a true bias
-    > .25 and .055 of the others (kinks, poles, crossing modes, jump, frame; 7000 data sets). At a
-    jump the prediction has .10 to .45 of the true size. Missing roots are not seen. Infinite if all
-    runs have the same value of an input.
-
-    ``misfit`` is run minus emulator at n fresh runs, (n, m), whose inputs ``x``, (n, d), are a
-    sample of the roots of ``size`` specimens; the emulator's Jacobian there has shape (n, m, d).
-    Scale outputs of different units in misfit and Jacobian.
+    biases of mean (first row) and standard deviation (second row) of each input's population.
+    ``misfit`` is run minus emulator, (n, m), at a sample x, (n, d), of the roots of ``size``
+    specimens. Infinite if all runs have the same value of an input. At a jump the prediction has
+    .10 to .45 of the true size.
     """
     shift = -np.einsum("ndm,nm->nd", np.linalg.pinv(jacobian), misfit)
     sd = x.std(axis=0)

@@ -1,24 +1,17 @@
 """Importance points around the roots of each measured specimen.
 
-The likelihood of specimen i under a population p(x | theta) is
-
     p(y_i | theta) = integral p(y_i | f(x)) p(x | theta) dx  ~=  sum_k exp(A_ik) p(x_ik | theta).
 
-Points x_ik and numbers A_ik do not contain theta. An emulator of the response is fitted to runs
-over the prior's range and at the roots of the specimens (`specimen_emulation`). Points are drawn
-around every root from a multivariate t distribution, whose mixture over the roots of a specimen is
-the proposal density.
-
-References
-----------
-Papadimas, N. and T. Dodwell (2021), A hierarchical Bayesian approach for calibration of stochastic
-material models, Data-Centric Engineering 2, e20, doi:10.1017/dce.2021.20.
+Points x_ik and numbers A_ik do not contain theta. Points are drawn around every root from a
+multivariate t distribution; the mixture over the roots of a specimen is the proposal density.
+Papadimas and Dodwell (2021), doi:10.1017/dce.2021.20, integrate over the inputs by quadrature.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import compress
 from typing import Any
 
@@ -37,7 +30,7 @@ from prbayes.propagation.population_density import (
     fit_normal,
     normal_log_density,
 )
-from prbayes.propagation.roots import Response, Roots, rows_by_specimen
+from prbayes.propagation.roots import Roots, rows_by_specimen
 from prbayes.propagation.specimen_emulation import PointOptions, half_difference
 
 
@@ -55,15 +48,6 @@ class SpecimenPoints:
     log_proposal: Floats
     n_roots: NDArray[np.intp]  # (N,)
     difference: float = np.nan  # the half difference of the log-likelihoods
-
-    def with_rows(self, rows: NDArray[np.intp], points: SpecimenPoints) -> SpecimenPoints:
-        """Return the points with those of a sample for some specimens, which have fewer roots."""
-        arrays = {}
-        for name in ("z", "outputs", "log_a", "log_proposal"):
-            values = getattr(points, name)
-            arrays[name] = getattr(self, name).copy()
-            arrays[name][rows, : values.shape[1]] = values
-        return replace(self, **arrays)
 
 
 def joined(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
@@ -86,41 +70,21 @@ class _Components:
     root: Floats  # (R, d, d): lower Cholesky factors of the scale matrices
     log_mass: Floats  # (R,): log of the integral of the readings' density; NaN of uncertain ones
 
-    @property
-    def sd(self) -> Floats:
-        """Standard deviations of the components by input, (R, d)."""
-        return np.asarray(np.sqrt(np.einsum("rde,rde->rd", self.root, self.root)))
-
-    @property
+    @cached_property
     def table(self) -> NDArray[np.intp]:
         """The components of each specimen, (N, most), filled up with -1."""
         return rows_by_specimen(self.specimen)
 
-    def of_specimens(self, rows: NDArray[np.intp]) -> _Components:
-        """Return the components of some specimens, with the numbers 0, 1, ..."""
-        ranks = np.searchsorted(rows, self.specimen)
-        is_member = np.isin(self.specimen, rows)
-        return _Components(
-            ranks[is_member],
-            self.center[is_member],
-            self.root[is_member],
-            self.log_mass[is_member],
-        )
-
     def by_component(self, values: Floats) -> Floats:
-        """Return values by component, (R, k, ...), of values by specimen, (N, S * k, ...)."""
-        table = self.table
-        n, slots = table.shape
-        count = values.shape[1] // slots
-        shaped = values.reshape(n, slots, count, *values.shape[2:])
-        rows, columns = np.nonzero(table >= 0)
-        result = np.empty((len(self.specimen), count, *values.shape[2:]))
-        result[table[rows, columns]] = shaped[rows, columns]
-        return result
+        """Return values by component, (R, k, ...), of values by specimen, (N, most * k, ...)."""
+        slots = self.table.shape[1]
+        slot = np.nonzero(self.table >= 0)[1]  # components are in the order of specimens
+        shaped = values.reshape(len(values), slots, -1, *values.shape[2:])
+        return shaped[self.specimen, slot]
 
 
 def draw_points(
-    emulation: Response,
+    emulation: Callable[[Floats], Floats],
     error: Floats,
     readings: Readings,
     roots: Roots,
@@ -132,15 +96,10 @@ def draw_points(
 ) -> SpecimenPoints:
     """Draw points around all roots until two independent halves of them agree.
 
-    ``error``, (m,), is the standard deviation of the emulation's error. A specimen without a root,
-    whose readings are censored, gets points of the population. If ``error_is_known``, the error of
-    the readings is the one given, and the weights around the root of certain readings are scaled to
-    its mass, which 256 points measure; otherwise the error is approximate.
-
-    Raises
-    ------
-    DesignError
-        If `most_points` are not enough.
+    ``emulation`` maps coordinates (k, d) to outputs (k, m), with the standard deviation ``error``.
+    If ``error_is_known``, the weights around the root of certain readings are scaled to its mass,
+    which 256 points measure; otherwise the error of the readings is approximate. Raise DesignError
+    if `most_points` are not enough.
     """
     sampler = _PointSampler(emulation, error, readings, options.degrees)
     components = _fit_components(sampler, roots, box, seed)
@@ -155,7 +114,6 @@ def draw_points(
         halves = [sampler.draw(components, max(1, count // 2), (seed, h)) for h in (1, 2)]
         if error_is_known:
             halves = [_normalised(half, components) for half in halves]
-        points = joined(*halves)
         of_error = {
             k: halves if k == 1.0 else [sampler.with_error(half, k) for half in halves]
             for k in scales
@@ -183,17 +141,13 @@ def draw_points(
             "metric, such as prb.ProbabilityResidual()"
         )
     n_roots = np.bincount(roots.specimen, minlength=len(readings))
-    return replace(points, n_roots=n_roots, difference=difference)
+    return replace(samples[1.0], n_roots=n_roots, difference=difference)
 
 
 def _plausible(
     samples: dict[float, SpecimenPoints], fits: dict[float, list[Normal]], narrowing: float
 ) -> dict[float, list[Normal]]:
-    """Return narrowed normal populations that the data do not exclude, by scale of the error.
-
-    At most 4 nats below the best of the fits, whose standard deviations are multiplied by
-    ``narrowing``.
-    """
+    """Return populations of narrowed fits at most 4 nats below the best fit, by scale."""
     totals = {k: _log_likelihoods(samples[k], fits[k]).sum(axis=1) for k in fits}
     best = max(total.max() for total in totals.values())
     plausible = {}
@@ -220,11 +174,9 @@ def _fit_components(
     """Return a t component for each root, fitted to the readings' density around it.
 
     The first scale matrix is that of the Gauss-Newton approximation, within the box. Where the
-    weights of 256 points are uneven, as at a turning point of the response, location and scale
-    become their weighted moments, twice. The points of the last components give the population and
-    the masses. Where the readings leave an input about as uncertain as the population does, the
-    component is that of the specimen given a population twice as wide. A component or a reading
-    that is uncertain by this share of the scatter has no mass: see `_normalised`.
+    readings leave an input about as uncertain as the population does, the component is that of the
+    specimen given a population twice as wide. A component or a reading that is uncertain by this
+    share of the scatter has no mass: see `_normalised`.
     """
     d = roots.z.shape[1] if len(roots.z) else box.shape[1]
     precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
@@ -242,10 +194,10 @@ def _fit_components(
         mean, root = fit_normal(sample.z, sample.log_a)
         covariance = root @ root.T
         scatter = np.sqrt(np.diag(covariance))
-        is_pulled = (ranked.sd > 0.2 * scatter).any()
+        is_pulled = (_sd(ranked) > 0.2 * scatter).any()
         if is_pulled:
             ranked = _given_population(ranked, mean, 4 * covariance)
-        is_wide = (ranked.sd > share * scatter).any(axis=1)
+        is_wide = (_sd(ranked) > share * scatter).any(axis=1)
         sd = subset.readings.comparison_sd(sampler.error)
         is_noisy = (sd > share * readings.spread()) & subset.readings.is_measured
         is_uncertain = (is_noisy | subset.readings.is_censored).any(axis=1)
@@ -258,6 +210,11 @@ def _fit_components(
     if unsolved.size:
         components = _with_population(components, unsolved, mean, covariance, box, seed)
     return components
+
+
+def _sd(components: _Components) -> Floats:
+    """Return the standard deviations of components by input, (R, d)."""
+    return np.asarray(np.sqrt(np.einsum("rde,rde->rd", components.root, components.root)))
 
 
 def _given_population(components: _Components, mean: Floats, wide: Floats) -> _Components:
@@ -289,10 +246,7 @@ def _with_population(
     box: Floats,
     seed: int,
 ) -> _Components:
-    """Add components of specimens without a root: 8 of the population, and 16 over the box.
-
-    The specimens with a root may be few, and far from these.
-    """
+    """Add components of specimens without a root: 8 of the population, and 16 over the box."""
     d = len(mean)
     width = box[1] - box[0]
     centers = np.concatenate([np.tile(mean, (8, 1)), box[0] + width * sobol(16, d, seed)])
@@ -340,8 +294,15 @@ def _moment_matched(
         components = replace(components, center=new_center, root=new_root)
         changed = np.unique(components.specimen[uneven])
         subset = replace(sampler, readings=sampler.readings.rows(changed))
-        fresh = subset.draw(components.of_specimens(changed), 256, (seed, 4 + attempt))
-        sample = sample.with_rows(changed, fresh)
+        rows = np.isin(components.specimen, changed)
+        ranks = np.searchsorted(changed, components.specimen[rows])
+        of_changed = _Components(
+            ranks, components.center[rows], components.root[rows], components.log_mass[rows]
+        )
+        fresh = subset.draw(of_changed, 256, (seed, 4 + attempt))
+        for name in ("z", "outputs", "log_a", "log_proposal"):
+            values = getattr(fresh, name)
+            getattr(sample, name)[changed, : values.shape[1]] = values
     return components, sample
 
 
@@ -349,7 +310,7 @@ def _moment_matched(
 class _PointSampler:
     """Points of the readings, weighted by the mixture over the components of a specimen."""
 
-    emulation: Response
+    emulation: Callable[[Floats], Floats]
     error: Floats  # (m,): standard deviation of the emulator's error
     readings: Readings
     degrees: float  # of the t distributions
@@ -359,12 +320,17 @@ class _PointSampler:
         table = components.table
         n, slots = table.shape
         d = components.center.shape[1]
-        u = _scrambled(len(components.specimen), count, d + 1, seed)
+        u = sobol(count, d + 1, seed[0] * 1009 + seed[1])
+        u = u + np.random.default_rng(seed).random((len(components.specimen), 1, d + 1))
+        u -= u >= 1.0
+        np.clip(u, 1e-9, 1 - 1e-9, out=u)
         nu = self.degrees
         normal = ndtri(u[..., :d])
         normal *= _t_radius(u[..., d], nu)[..., None]
         z = components.center[:, None] + normal @ components.root.swapaxes(1, 2)
-        values = _in_blocks(self.emulation, z.reshape(-1, d))
+        flat = z.reshape(-1, d)
+        starts = range(0, len(flat), IN_CACHE)
+        values = np.concatenate([self.emulation(flat[k : k + IN_CACHE]) for k in starts])
         # By specimen.
         filled = np.maximum(table, 0)
         z_all = z[filled].reshape(n, slots * count, d)
@@ -394,26 +360,10 @@ class _PointSampler:
         return replace(points, log_a=log_density - points.log_proposal)
 
 
-def _in_blocks(emulation: Response, z: Floats) -> Floats:
-    """Return values at points, without the Jacobian where the emulation has them alone."""
-    values = getattr(emulation, "values", lambda z: emulation(z)[0])
-    step = IN_CACHE
-    return np.concatenate([values(z[first : first + step]) for first in range(0, len(z), step)])
-
-
-def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, int]) -> Floats:
-    """Return Sobol points with a random shift for each component, (components, count, d)."""
-    base = sobol(count, dimensions, seed[0] * 1009 + seed[1])
-    u = base + np.random.default_rng(seed).random((components, 1, dimensions))
-    u -= u >= 1.0
-    return np.clip(u, 1e-9, 1 - 1e-9, out=u)
-
-
 def _t_radius(u: Floats, degrees: float) -> Floats:
     """Return the factors that turn normal vectors into vectors of a t distribution.
 
-    Their log is smooth in the logit of u. A spline of it, to nine digits, takes a tenth of the time
-    of the quantiles.
+    A spline in the logit of u, to nine digits, takes a tenth of the time of the quantiles.
     """
     from scipy.interpolate import CubicSpline  # takes long to import
 
@@ -441,8 +391,7 @@ def _component_weights(sample: SpecimenPoints, components: _Components) -> tuple
 def _normalised(sample: SpecimenPoints, components: _Components) -> SpecimenPoints:
     """Scale the weights of the points around each root to the root's mass, if there is one.
 
-    Few points with scaled weights have too small a variance: a negligible bias if the readings are
-    certain. Both halves have that bias, and their difference does not show it.
+    Few points have too small a variance, in both halves: a negligible bias of certain readings.
     """
     table = components.table
     n, slots = table.shape

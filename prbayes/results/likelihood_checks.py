@@ -33,17 +33,10 @@ from prbayes.model.parameters import roots_of
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.maximum_likelihood import (
-    simulation_obstacle,
-    specimen_refits,
-)
+from prbayes.optimize.maximum_likelihood import simulation_obstacle, specimen_refits
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.compile import compile_batched
-from prbayes.response.distributions import (
-    MVNORMAL,
-    PopulationSampler,
-    compiled_log_density,
-)
+from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs, aleatory_names
 
 
@@ -71,13 +64,10 @@ class Checked:
     remarks: tuple[Finding, ...] = ()  # tests without a finding, with their power
     untested: tuple[str, ...] = ()  # tests that were not run, and why
 
-    def __add__(self, other: Checked) -> Checked:
-        """Return both."""
-        return Checked(
-            (*self.findings, *other.findings),
-            (*self.remarks, *other.remarks),
-            (*self.untested, *other.untested),
-        )
+    def __add__(self, second: Checked) -> Checked:
+        """Return the reports of both."""
+        pairs = zip(vars(self).values(), vars(second).values(), strict=True)
+        return Checked(*(a + b for a, b in pairs))
 
 
 def _not_tested(subject: str, reason: str) -> Checked:
@@ -128,11 +118,15 @@ def _check_population(optimum: Optimum) -> Checked:
     reason = _population_obstacle(optimum)
     if reason:
         return _not_tested(_FAMILY, reason)
-    scores = [NormalScores.of(likelihood.inputs) for likelihood in likelihoods]
-    for likelihood, score in zip(likelihoods, scores, strict=True):
-        if score.function is None:
+    functions = [score_function(likelihood.inputs) for likelihood in likelihoods]
+    for likelihood, function in zip(likelihoods, functions, strict=True):
+        if function is None:
             reason = f"PyMC has no distribution function of an input of {likelihood.name}"
             return _not_tested(_FAMILY, reason)
+    scores = [
+        (function, compiled_log_density(likelihood.inputs))
+        for likelihood, function in zip(likelihoods, functions, strict=True)
+    ]
     refits = specimen_refits(optimum, "diagnose", simulated=True)
     data = [
         ([x.get_value() for x in points], log_a.get_value())
@@ -140,9 +134,9 @@ def _check_population(optimum: Optimum) -> Checked:
     ]
     samples = scored_specimens(evaluator, scores, optimum.theta, data)
     null: list[list[Floats]] = [[] for _ in samples]
-    for refit in refits.simulated(_OPTIONS.replicates, seed=0):
-        if refit.converged:
-            replicates = scored_specimens(evaluator, scores, refit.theta, refit.data)
+    for theta, converged, simulated in refits.simulated(_OPTIONS.replicates, seed=0):
+        if converged:
+            replicates = scored_specimens(evaluator, scores, theta, simulated)
             for statistics, (z, weights) in zip(null, replicates, strict=True):
                 statistics.append(population_statistics(z, weights))
     if len(null[0]) < _OPTIONS.replicates / 2:
@@ -158,12 +152,9 @@ def _check_population(optimum: Optimum) -> Checked:
             labels += [f"{name}[{i}]" for i in range(size)] if shape else [name]
         test = population_test(z, weights, statistics)
         misfit = population_findings(test, labels, threshold=0.05 / len(samples))
-        remarks: tuple[Finding, ...] = ()
-        if not misfit:
-            power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
-            text = f"{likelihood.name}: the test of the population found no misfit. {power}"
-            remarks = (Finding("population-tested", text),)
-        checked += Checked(misfit, remarks)
+        power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
+        text = f"{likelihood.name}: the test of the population found no misfit. {power}"
+        checked += Checked(misfit, () if misfit else (Finding("population-tested", text),))
     return checked
 
 
@@ -187,88 +178,82 @@ def _population_obstacle(optimum: Optimum) -> str:
     return ""
 
 
-@dataclass(frozen=True, eq=False)
-class NormalScores:
-    """Compiled normal scores and log-densities of inputs at points of populations."""
+def score_function(inputs: Inputs) -> Any:
+    """Compile (*roots, *points) -> distribution functions by input, normal scores of MvNormal.
 
-    function: Any  # (*roots, *points) -> distribution functions by input; None if unknown
-    log_density: Any
-
-    @classmethod
-    def of(cls, inputs: Inputs) -> NormalScores:
-        """Compile them; scores of dependent inputs are unknown."""
-        symbols = inputs.placeholders()
-        dists, _ = inputs.rebuilt(symbols)
-        points = [
-            pt.tensor(dtype="float64", shape=(None,) * (x.type.ndim + 1)) for x in inputs.aleatory
-        ]
-        log_density = compiled_log_density(inputs)
-        if inputs.nested:
-            return cls(None, log_density)
-        graphs = []
-        for dist, x in zip(dists, points, strict=True):
-            if isinstance(dist.owner.op, MVNORMAL):
-                mean, covariance = dist.owner.op.dist_params(dist.owner)
-                root = pt.linalg.cholesky(covariance)
-                graphs.append(pt.linalg.solve_triangular(root, (x - mean).T, lower=True).T)
-                continue
-            try:
-                graphs.append(pm.logcdf(dist, x))
-            except NotImplementedError:
-                return cls(None, log_density)
-        return cls(compile_batched(symbols, graphs, points), log_density)
-
-    def at(
-        self, inputs: Inputs, roots: Sequence[Floats], points: Sequence[Floats], log_a: Floats
-    ) -> tuple[Floats, Floats]:
-        """Return scores (N, K, d) and posterior weights (N, K) of points (N, K, *event)."""
-        n, count = log_a.shape
-        flat = [x.reshape(n * count, *x.shape[2:]) for x in points]
-        columns = []
-        for dist, value, x in zip(inputs.aleatory, self.function(*roots, *flat), flat, strict=True):
-            value = np.broadcast_to(value, (1, *x.shape))[0].reshape(n * count, -1)
-            columns.append(
-                value if isinstance(dist.owner.op, MVNORMAL) else normal_scores(np.exp(value))
-            )
-        (log_p,) = self.log_density(*roots, *flat)
-        terms = np.broadcast_to(log_p, (1, n * count))[0].reshape(n, count) + log_a
-        terms = np.where(np.isfinite(terms), terms, -np.inf)
-        largest = terms.max(axis=1, keepdims=True)
-        weights = np.exp(terms - np.where(np.isfinite(largest), largest, 0.0))
-        total = weights.sum(axis=1, keepdims=True)
-        weights = np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1 / count)
-        z = np.concatenate(columns, axis=1).reshape(n, count, -1)
-        # Points that fill up an array have no weight and any score.
-        return np.where(np.isfinite(z), z, 0.0), weights
+    None for dependent inputs, and inputs without a distribution function.
+    """
+    if inputs.nested:
+        return None
+    symbols = inputs.placeholders()
+    dists, _ = inputs.rebuilt(symbols)
+    graphs, points = [], []
+    for dist in dists:
+        x = pt.tensor(dtype="float64", shape=(None,) * (dist.type.ndim + 1))
+        points.append(x)
+        if isinstance(dist.owner.op, MVNORMAL):
+            mean, covariance = dist.owner.op.dist_params(dist.owner)
+            root = pt.linalg.cholesky(covariance)
+            graphs.append(pt.linalg.solve_triangular(root, (x - mean).T, lower=True).T)
+            continue
+        try:
+            graphs.append(pm.logcdf(dist, x))
+        except NotImplementedError:
+            return None
+    return compile_batched(symbols, graphs, points)
 
 
 def scored_specimens(
     evaluator: Evaluator,
-    scores: Sequence[NormalScores],
+    scores: Sequence[tuple[Any, Any]],
     theta: Floats,
     data: Sequence[tuple[list[Floats], Floats]],
 ) -> list[tuple[Floats, Floats]]:
-    """Return scores and weights of the specimens of each likelihood in the population at theta."""
+    """Return normal scores (N, K, d) and posterior weights (N, K) of points, by likelihood.
+
+    ``scores`` are `score_function` and the compiled log-density of each likelihood's inputs, and
+    ``data`` points (N, K, *event) and numbers A (N, K).
+    """
     result = []
-    for likelihood, score, (points, log_a) in zip(evaluator.likelihoods, scores, data, strict=True):
+    for likelihood, functions, (points, log_a) in zip(
+        evaluator.likelihoods, scores, data, strict=True
+    ):
+        inputs = likelihood.inputs
         z = np.empty((*log_a.shape, likelihood.coordinates.size))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
-            roots = roots_of(evaluator.hyperparameters, theta[None], likelihood.inputs, place)
-            in_group = [x[rows] for x in points]
-            z[rows], weights[rows] = score.at(likelihood.inputs, roots, in_group, log_a[rows])
-        result.append((z, weights))
+            roots = roots_of(evaluator.hyperparameters, theta[None], inputs, place)
+            size = log_a[rows].size
+            flat = [x[rows].reshape(size, *x.shape[2:]) for x in points]
+            values, (log_p,) = (function(*roots, *flat) for function in functions)
+            columns = []
+            for dist, value, x in zip(inputs.aleatory, values, flat, strict=True):
+                column = np.broadcast_to(value, (1, *x.shape))[0].reshape(size, -1)
+                columns.append(
+                    column if isinstance(dist.owner.op, MVNORMAL) else normal_scores(np.exp(column))
+                )
+            z[rows] = np.concatenate(columns, axis=1).reshape(*log_a[rows].shape, -1)
+            weights[rows] = np.broadcast_to(log_p, (1, size))[0].reshape(log_a[rows].shape)
+        # Points that fill up an array have no weight and any score.
+        z = np.where(np.isfinite(z), z, 0.0)
+        result.append((z, _normalised(weights + log_a)))
     return result
+
+
+def _normalised(log_weights: Floats) -> Floats:
+    """Return weights of sum one by row, equal ones where all are zero."""
+    log_weights = np.where(np.isfinite(log_weights), log_weights, -np.inf)
+    largest = log_weights.max(axis=1, keepdims=True)
+    weights = np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
+    total = weights.sum(axis=1, keepdims=True)
+    return np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1 / weights.shape[1])
 
 
 # -- draws -----------------------------------------------------------------------------------
 
 
 def check_draws(
-    evaluator: Evaluator | None,
-    result: xr.DataTree,
-    thetas: Floats | None,
-    optimum: Optimum | None,
+    evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None, optimum: Optimum | None
 ) -> Checked:
     """Return the reports of the checks of draws.
 
@@ -276,12 +261,8 @@ def check_draws(
     """
     checked = Checked(findings=influence(result))
     if evaluator is None or thetas is None:
-        return checked + Checked(
-            untested=(
-                "The family of the population and the conflict of prior and data were not tested: "
-                "that needs the model; pass model=.",
-            )
-        )
+        both = f"{_FAMILY} and the conflict of prior and data were not tested"
+        return checked + Checked(untested=(f"{both}: that needs the model; pass model=.",))
     center = thetas.reshape(-1, evaluator.hyperparameters.size).mean(axis=0)
     checked += Checked(failing_region_findings(evaluator, center), emulator_remarks(evaluator))
     if optimum is None:
@@ -385,8 +366,7 @@ def _check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
 def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
     """Return estimates of data sets simulated at draws of the prior, (S, d); NaN if unknown.
 
-    They are normal around a draw. Their covariance is the inverse of the information of the
-    specimens' inputs, times its ratio to the covariance at the optimum.
+    Normal around a draw: the covariance is the inverse information of the inputs, scaled.
     """
     rng = np.random.default_rng(31)
     evaluator = optimum.evaluator

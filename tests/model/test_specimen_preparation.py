@@ -14,7 +14,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.specimen_likelihood import specimen_likelihoods
-from prbayes.model.specimen_preparation import Populations, specimens_of
+from prbayes.model.specimen_preparation import Populations
 
 N, SD, PRIOR_SD = 12, 0.5, 2.0
 X = np.random.default_rng(4).normal(1.0, SD, N)
@@ -52,18 +52,13 @@ def test_moments_are_those_of_the_posterior(scale: float) -> None:
     assert len(thetas) == 256
     assert thetas.mean() == pytest.approx(mean, abs=5 * sd / np.sqrt(256))
     assert thetas.std() == pytest.approx(sd, abs=5 * sd / np.sqrt(512))
-
-
-def test_log_likelihoods_are_those_of_the_population() -> None:
-    model = normal_model()
-    populations = populations_of(model)
-    z, log_a = points_at(populations, X)
-    thetas = np.array([[0.0], [1.5]])
-    expected = norm.logpdf(X, thetas, SD)
-    np.testing.assert_allclose(populations.log_likelihoods(thetas, z, log_a), expected)
-    # The same point with half the number each
-    twice = np.repeat(z, 2, axis=1), np.repeat(log_a, 2, axis=1) - np.log(2)
-    np.testing.assert_allclose(populations.log_likelihoods(thetas, *twice), expected)
+    (x,) = populations.likelihood.coordinates.inputs(draws.specimens())
+    assert x.shape == (256 * 16,)
+    assert x.mean() / scale == pytest.approx(mean, abs=5 * sd / 16)
+    assert x.std() / scale == pytest.approx(np.hypot(SD, sd), rel=5 / np.sqrt(2 * 256))
+    again, other = (populations.posterior(z, log_a, seed=seed) for seed in (0, 1))
+    np.testing.assert_array_equal(again.thetas, draws.thetas)
+    assert not np.array_equal(other.thetas, draws.thetas)
 
 
 def test_smoothing_widens_populations() -> None:
@@ -82,17 +77,6 @@ def test_smoothing_widens_populations() -> None:
     draws = populations.posterior(z, log_a, smoothing)
     precision = N / (SD**2 + 0.7**2) + 1 / PRIOR_SD**2
     assert draws.thetas.std() == pytest.approx(precision**-0.5, rel=0.25)
-
-
-def test_specimens_are_those_of_the_predictive_population() -> None:
-    model = normal_model()
-    populations = populations_of(model)
-    draws = populations.posterior(*points_at(populations, X))
-    (x,) = populations.likelihood.coordinates.inputs(draws.specimens())
-    precision = N / SD**2 + 1 / PRIOR_SD**2
-    assert x.shape == (256 * 16,)
-    assert x.mean() == pytest.approx(X.sum() / SD**2 / precision, abs=5 * precision**-0.5 / 16)
-    assert x.std() == pytest.approx(np.hypot(SD, precision**-0.5), rel=5 / np.sqrt(2 * 256))
 
 
 def test_groups_have_populations_of_their_own() -> None:
@@ -115,22 +99,11 @@ def test_groups_have_populations_of_their_own() -> None:
         mean = (X + 3 * groups)[groups == group].sum() / SD**2 / precision
         error = 5 * precision**-0.5 / 16
         assert draws.thetas[:, group].mean() == pytest.approx(mean, abs=error)
-    specimens = specimens_of(populations, draws.thetas, n_of_each=4)
+    specimens = draws.specimens(4)
     assert len(specimens) == 2 * 256 * 4
     (x,) = populations.likelihood.coordinates.inputs(specimens)
     assert x[: len(x) // 2].mean() == pytest.approx(draws.thetas[:, 0].mean(), abs=0.1)
     assert x[len(x) // 2 :].mean() == pytest.approx(draws.thetas[:, 1].mean(), abs=0.1)
-
-
-def test_seeds() -> None:
-    model = normal_model()
-    populations = populations_of(model)
-    points = points_at(populations, X)
-    first, same, second = (populations.posterior(*points, seed=seed) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first.thetas, same.thetas)
-    np.testing.assert_array_equal(first.specimens(), same.specimens())
-    assert not np.array_equal(first.thetas, second.thetas)
-    assert not np.array_equal(first.specimens(), first.specimens(seed=1))
 
 
 def test_specimens_that_no_population_reaches() -> None:

@@ -87,14 +87,6 @@ def test_the_value_is_minus_the_log_likelihood() -> None:
     assert optimum.rivals == ()
 
 
-@pytest.mark.long
-def test_the_first_optimum_reports_its_runs_and_the_next_has_none() -> None:
-    model = normal_model()
-    first, second = fit(model), fit(model)
-    assert (first.n_responses, second.n_responses) == (128, 0)
-    assert first.theta.tolist() == second.theta.tolist()
-
-
 def test_the_mode_with_the_prior() -> None:
     sd, prior_sd = 0.7, 0.2
     model = normal_model(sigma=sd, prior_sd=prior_sd)
@@ -104,14 +96,6 @@ def test_the_mode_with_the_prior() -> None:
     assert optimum.point["mu"] == pytest.approx(X.sum() / sd**2 / precision, abs=1e-4)
     assert optimum.stderr["mu"] == pytest.approx(precision**-0.5, abs=1e-4)
     assert fit(model).point["mu"] == pytest.approx(X.mean(), abs=1e-4)
-
-
-def test_a_specimen_beyond_all_draws_of_the_prior() -> None:
-    sd, prior_sd = 0.5, 0.1
-    precision = N / sd**2 + 1 / prior_sd**2
-    optimum = fit(normal_model(sigma=sd, prior_sd=prior_sd), prior=True)
-    exact = X.sum() / sd**2 / precision
-    assert optimum.point["mu"] == pytest.approx(exact, abs=1e-3)
 
 
 # -- several modes -----------------------------------------------------------------------------------
@@ -225,16 +209,6 @@ def test_hyperparameters_that_are_not_identified(codes: list[str]) -> None:
     assert optimum.converged
 
 
-def test_a_hyperparameter_without_influence(codes: list[str]) -> None:
-    with pm.Model() as model:
-        mu, spare = pm.Normal("mu", 0, 2), pm.Normal("spare", 0, 1)
-        prb.Simulator("y", line, pm.Normal.dist(mu + 0 * spare, 0.5), observed=line(X))
-    optimum = fit(model)
-    assert codes == ["not-identified"]
-    assert optimum.stderr["spare"] == np.inf
-    assert optimum.stderr["mu"] == pytest.approx(0.1, abs=1e-3)
-
-
 # -- moving supports ---------------------------------------------------------------------------------
 
 
@@ -261,22 +235,6 @@ def test_the_number_of_evaluations_is_limited(most: int) -> None:
     assert optimum.search.n_evaluations <= most + 40
     # The trace is that of the best descent.
     assert len(optimum.search.trace["theta"]) <= optimum.search.n_evaluations
-
-
-@pytest.mark.long
-def test_the_number_of_starts() -> None:
-    model = normal_model()
-    few, many = fit(model, starts=1), fit(model, starts=8)
-    assert few.search.n_evaluations < many.search.n_evaluations
-    assert "from 1 starts" in few.message
-    assert few.point == pytest.approx(many.point, abs=1e-4)
-
-
-@pytest.mark.long
-def test_the_same_seed_gives_the_same_bits() -> None:
-    optima = [fit(normal_model(), random_seed=s) for s in (0, 0, 1)]
-    assert optima[0].theta.tolist() == optima[1].theta.tolist()
-    assert np.allclose(optima[0].theta, optima[2].theta, atol=1e-4)
 
 
 @pytest.mark.long

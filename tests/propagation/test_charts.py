@@ -149,45 +149,6 @@ def test_cover_adds_charts_where_points_of_the_fibre_have_none() -> None:
     np.testing.assert_array_equal(cover(linear, charts, normal * 0.5).share, charts.share)
 
 
-def test_cover_gives_a_chart_to_a_specimen_without_a_mode() -> None:
-    fibres = unscaled(circle, np.array([[1.0]]))
-    charts = cover(fibres, Charts.empty(1, 4, 2, 1), ndtri(sobol(64, 2, 0))[None])
-    assert (charts.share > 0).sum() == 3
-
-
-def test_the_density_of_the_mixture_is_that_of_the_coarea_measure() -> None:
-    # On a circle of radius r the measure is dV / (2 r); the proposal's density integrates to the
-    # share of u that the charts reach.
-    fibres = unscaled(circle, np.array([[4.0]]))
-    charts = cover(fibres, charts_at_modes(fibres, 4, 8), ndtri(sobol(64, 2, 0))[None])
-    angle = (np.arange(4000) + 0.5) * 2 * np.pi / 4000
-    z = 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    n = len(z)
-    # A chart that reaches the point stands for the one that it was drawn from.
-    present = np.flatnonzero(charts.share[0] > 0)
-    reached = np.stack(
-        [
-            charts.reach(fibres, np.zeros(n, dtype=int), np.full(n, s), z, circle(z)[1])
-            for s in present
-        ],
-        axis=1,
-    )
-    assert reached.any(axis=1).all()
-    first = present[reached.argmax(axis=1)]
-    zeros = np.zeros(n, dtype=int)
-    log_density = charts.log_mixture(fibres, zeros, first, z, circle(z)[1])
-    total = np.exp(log_density).sum() * (2 * np.pi * 2 / n) / 4
-    u = np.linspace(-30, 30, 60_001)[:, None]
-    mass = 0.0
-    for s in present:
-        c = np.full(len(u), s)
-        _, _, converged = charts.points(fibres, np.zeros(len(u), dtype=int), c, u)
-        scaled = (u - charts.location[0, s]) / charts.scale[0, s, 0, 0]
-        density = (1 + scaled**2 / 8) ** -4.5
-        mass += charts.share[0, s] * density[converged].sum() / density.sum()
-    assert total == pytest.approx(mass, rel=2e-3)
-
-
 @pytest.mark.parametrize("m", [1, 2, 3])
 def test_singular_systems_have_no_solution(m: int) -> None:
     rng = np.random.default_rng(m)

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-from scipy.interpolate import RBFInterpolator
-from scipy.special import logsumexp, ndtri
-from scipy.stats import norm, qmc
+from scipy.stats import norm
 
 from prbayes._validate import Floats
 from prbayes.propagation.specimen_emulation import (
@@ -64,15 +62,6 @@ def test_the_log_jacobian_is_that_of_differences() -> None:
     assert np.allclose(THREE.log_jacobian(z), np.log(np.abs(np.linalg.det(jacobian))), atol=1e-7)
 
 
-def test_vector_inputs_keep_their_order() -> None:
-    z = np.zeros((1, 4))
-    z[0, 3] = 1.0
-    before, after = (THREE.inputs(v)[2][0] for v in (np.zeros((1, 4)), z))
-    assert after[0] == before[0]
-    assert after[1] > before[1]
-    assert np.allclose(before, [10.0, -20.0], atol=0.3)
-
-
 def test_the_prior_range_is_from_minus_one_to_one() -> None:
     one = coordinates(lambda factor: [pm.Normal.dist(pm.Normal("mu", 5.0, 3.0), 4.0 * factor)])
     # The prior predictive distribution is N(5, 5); its .005 quantile is -2.576. Standard error of
@@ -119,12 +108,6 @@ def test_positive_inputs_over_more_than_a_decade_are_logarithms(dist: Any, is_lo
     assert np.allclose(one.inputs(one.of([x], 1))[0], x)
 
 
-def test_each_element_of_a_vector_is_a_logarithm_or_not() -> None:
-    assert coordinates(
-        lambda factor: [pm.LogNormal.dist(np.zeros(2), factor * np.array([0.1, 2.0]), shape=2)]
-    ).is_log.tolist() == [False, True]
-
-
 def test_inputs_outside_the_log_range_have_no_number() -> None:
     one = coordinates(lambda factor: [pm.LogNormal.dist(0.0, factor)])
     z = one.of([np.array([-1.0, 0.0, 1.0])], 1).ravel()
@@ -146,15 +129,6 @@ def test_units_of_inputs_change_the_jacobian_alone(unit: float) -> None:
     change = second.log_jacobian(z) - first.log_jacobian(z)
     assert np.allclose(change, 2 * np.log(unit), atol=1e-9)
 
-
-def test_the_same_prior_gives_the_same_coordinates() -> None:
-    again = coordinates(three_inputs)
-    assert np.array_equal(again.center, THREE.center)
-    assert np.array_equal(again.half_width, THREE.half_width)
-    assert np.array_equal(again.bounds, THREE.bounds)
-
-
-PREDICTED_BIAS = 0.15
 
 # Round trip: simulated specimens should get their inputs back as roots.
 
@@ -178,8 +152,8 @@ def specimens(n: int, seed: int) -> Floats:
 
 
 def test_no_root_is_missing_where_all_are_returned() -> None:
-    shares = [missing_share(both_roots, folded, BOX, specimens(20, s), seed=s) for s in range(100)]
-    assert shares == [0.0] * 100
+    shares = [missing_share(both_roots, folded, BOX, specimens(20, s), seed=s) for s in range(10)]
+    assert shares == [0.0] * 10
 
 
 def test_the_share_is_that_of_the_missing_root() -> None:
@@ -251,34 +225,6 @@ def test_a_tilt_of_the_log_likelihood_is_half_its_size() -> None:
     assert half_difference(log_likelihood[::-1, ::-1], tilted[::-1, ::-1]) == pytest.approx(0.15)
 
 
-def half_of_the_points(
-    y: Floats, points: int, mean: Floats, sd: Floats, rng: np.random.Generator
-) -> Floats:
-    """Return log-likelihoods (S, N) of y = x1 exp(.1 v), v ~ N(0, 1), from shifted Sobol points."""
-    u = (qmc.Sobol(1, rng=rng).random(points) + rng.random((len(y), 1, 1))) % 1
-    v = 1.6 * ndtri(u[..., 0].clip(1e-9, 1 - 1e-9))
-    x = y[:, None] / np.exp(0.1 * v)
-    log_a = -0.1 * v + norm.logpdf(v) - norm.logpdf(v, 0, 1.6) - np.log(points)
-    z = (x - mean[:, None, None]) / sd[:, None, None]
-    result: Floats = logsumexp(log_a - z**2 / 2, axis=-1) - np.log(sd)[:, None]
-    return result
-
-
-@pytest.mark.parametrize(("points", "median"), [(4, 1.06), (16, 0.15), (64, 0.019)])
-def test_half_difference_of_the_study(points: int, median: float) -> None:
-    rng = np.random.default_rng(points)
-    values = []
-    for _ in range(60):
-        y = rng.normal(10, 1.5, 20) * np.exp(0.1 * rng.standard_normal(20))
-        spread = np.sqrt(max(y.var() - 1, 0.5))  # of x1: the free input adds 1
-        mean = y.mean() + spread / np.sqrt(20) * rng.standard_normal(32)
-        sd = spread * np.exp(rng.standard_normal(32) / np.sqrt(40))
-        halves = [half_of_the_points(y, points // 2, mean, sd, rng) for _ in range(2)]
-        values.append(half_difference(*halves))
-    # The logarithms scatter by about 1: standard error .16 of the median's.
-    assert np.log(np.median(values)) == pytest.approx(np.log(median), abs=0.8)
-
-
 # Emulator error: the bias that fresh runs at the roots predict.
 
 
@@ -315,37 +261,6 @@ def test_bias_has_no_unit() -> None:
     assert scaled == pytest.approx(expected)
     order = rng.permutation(16)
     assert predicted_bias(misfit[order], jacobian[order], x[order], 30) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(("runs", "flagged"), [(8, 0.97), (16, 0.02)])
-def test_a_kink_is_flagged_where_runs_are_few(runs: int, flagged: float) -> None:
-    def response(x: Floats) -> Floats:
-        return np.where(x < 10, x, 10 + 0.2 * (x - 10))
-
-    x = 4 + 9.9 * qmc.Sobol(1, seed=3).random(runs)
-    unit = (x - x.mean()) / x.std()
-    emulator = RBFInterpolator(unit, response(x), kernel="quintic", degree=2)
-    grid = np.linspace(4, 13.9, 4001)
-    image = emulator(((grid - x.mean()) / x.std())[:, None])[:, 0]
-    slope = np.gradient(image, grid)
-    true_bias, bias = [], []
-    for seed in range(100):
-        rng = np.random.default_rng([seed, runs])
-        true = np.clip(10 + rng.standard_normal(50), 6, 13.8)
-        # The emulator is monotone enough for a table of its roots.
-        nearest = np.abs(image - response(true)[:, None]).argmin(axis=1)
-        root, jacobian = grid[nearest], slope[nearest]
-        true_bias.append((root.mean() - true.mean()) / true.std() * np.sqrt(50))
-        at = rng.permutation(50)[:16]
-        misfit = response(root[at]) - image[nearest[at]]
-        bias.append(
-            predicted_bias(misfit[:, None], jacobian[at, None, None], root[at, None], 50)[:, 0]
-        )
-    share = np.mean(np.abs(bias).max(axis=1) > PREDICTED_BIAS)
-    # standard error at most .025
-    assert share == pytest.approx(flagged, abs=0.12)
-    # Signed medians; their standard error is .02
-    assert np.median(bias, axis=0)[0] == pytest.approx(np.median(true_bias), abs=0.12)
 
 
 def test_roots_at_one_place_have_an_unknown_bias() -> None:

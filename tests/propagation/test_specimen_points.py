@@ -21,7 +21,6 @@ from prbayes.propagation.specimen_emulation import (
     PointOptions,
     _narrowing,
     emulate,
-    first_runs,
     specimen_roots,
     surface_near,
 )
@@ -51,7 +50,9 @@ def points_of(
     data = readings(y, error)
     boxes = unit * cube(d), unit * cube(d, 1.5)
     emulation, roots = emulate(run, data, *boxes, options, seed=seed)
-    points = draw_points(emulation, emulation.error, data, roots, boxes[1], options, seed=seed)
+    points = draw_points(
+        emulation.values, emulation.error, data, roots, boxes[1], options, seed=seed
+    )
     return emulation, points
 
 
@@ -138,28 +139,6 @@ def test_a_linear_response_with_an_error_of_the_readings(d: int, m: int) -> None
         exact.append(problem.exact(mean, covariance, sd).sum())
     # Within a few of the tolerance of half differences, .15 nats
     assert np.abs(np.subtract(ours, exact)).max() < 0.6
-
-
-def test_points_are_the_roots_of_a_precise_response() -> None:
-    problem = Linear(2, 2)
-    _, points = points_of(problem, problem.y, 2)
-    assert np.abs(points.z - problem.x[:, None]).max() < 1e-3
-    assert points.z.shape == (12, PointOptions().points, 2)
-    assert np.allclose(points.outputs, problem(points.z), atol=1e-5)
-
-
-def test_a_mixture_of_populations() -> None:
-    problem = Linear(2, 2)
-    emulation, points = points_of(problem, problem.y, 2)
-    (first, second, *_), shares = populations(2), np.log([0.3, 0.7])
-
-    def density(z: Floats) -> Floats:
-        parts = [normal(*p)(z) + s for p, s in zip((first, second), shares, strict=True)]
-        return np.logaddexp(*parts)
-
-    parts = [problem.sharp(*p, emulation.error) for p in (first, second)]
-    exact = logsumexp(np.stack(parts) + shares[:, None], axis=0)
-    assert np.allclose(log_likelihoods(points, density), exact, atol=3e-2)
 
 
 @pytest.mark.parametrize("d", [1, 2])
@@ -270,19 +249,9 @@ def test_the_end_of_a_support_jumps_at_the_largest_specimen() -> None:
 # -- loops -------------------------------------------------------------------------------------------
 
 
-def test_the_number_of_points_grows_with_the_error_of_the_readings() -> None:
-    problem = Linear(1, 1, n=30)
-    counts = []
-    for error in (0.0, 0.05):
-        y = problem.y + error * np.random.default_rng(0).normal(size=problem.y.shape)
-        _, points = points_of(problem, y, 1, error=error)
-        counts.append(points.z.shape[1])
-        assert points.difference <= PointOptions().half_difference
-    assert counts[0] == 4
-    assert counts[1] >= 8
-
-
-@pytest.mark.parametrize("scatter", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize(
+    "scatter", [0.05, *(pytest.param(scatter, marks=pytest.mark.long) for scatter in (0.3, 1.0))]
+)
 def test_populations_of_readings_with_a_large_error(scatter: float) -> None:
     """y = z + error: the population is narrower than the error, as wide, or wider."""
     ranges = []
@@ -313,7 +282,7 @@ def test_censored_specimens_far_from_the_measured_ones(
     data = replace(Readings.exact(y), lower=lower, upper=upper)
     options = PointOptions(half_difference=0.5)
     emulation, roots = emulate(lambda z: z, data, cube(1), cube(1, 1.5), options)
-    points = draw_points(emulation, emulation.error, data, roots, cube(1, 1.5), options)
+    points = draw_points(emulation.values, emulation.error, data, roots, cube(1, 1.5), options)
     exact = norm.logpdf(y[:measured, 0], mean, sd).sum()
     exact += (20 - measured) * norm.logsf(-0.4, mean, sd)
     ours = log_likelihoods(points, normal(mean, sd**2)).sum()
@@ -337,11 +306,6 @@ def test_a_response_that_cannot_be_emulated_is_refused() -> None:
         points_of(rough, y, 1)
 
 
-@pytest.mark.parametrize(("d", "n"), [(1, 64), (2, 64), (3, 128), (4, 128), (5, 480)])
-def test_the_first_runs(d: int, n: int) -> None:
-    assert first_runs(d) == n
-
-
 def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
     """A response that is steep beyond the data is emulated well at them."""
 
@@ -349,7 +313,7 @@ def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
         return np.exp(np.exp(6 * z - 3.6))
 
     errors, misfits = [], []
-    for seed in range(6):
+    for seed in range(2):
         z = (np.log(np.random.default_rng(seed).uniform(0, 2, 25)) + 3.6) / 6
         y = steep(z[:, None])
         emulation, points = points_of(steep, y, 1)
@@ -388,7 +352,7 @@ def test_points_of_a_mirror_population_stay_at_its_roots() -> None:
     data, box = readings(y), cube(2, 1.5)
     emulation, roots = emulate(symmetric, data, cube(2), box, PointOptions())
     error = np.array([3e-4, 3e-4])
-    points = draw_points(emulation, error, data, roots, box, PointOptions())
+    points = draw_points(emulation.values, error, data, roots, box, PointOptions())
     for side in (x, x[:, ::-1]):
         away = np.abs(points.z - side[:, None]).max(axis=2).min(axis=1)
         assert away.max() < 0.01
@@ -449,24 +413,11 @@ FOLDED = (0.2 + 0.1 * np.random.default_rng(4).random(12))[:, None] ** 2
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
-def test_units_of_outputs_shift_the_log_likelihood(unit: float) -> None:
+def test_units_of_inputs_and_outputs_shift_the_log_likelihood(unit: float) -> None:
     _, points = points_of(square, FOLDED, 1)
-    _, other = points_of(lambda z: unit * square(z), unit * FOLDED, 1)
+    _, other = points_of(lambda z: unit * square(z / unit), unit * FOLDED, 1, unit=unit)
     assert np.array_equal(points.n_roots, other.n_roots)
-    assert np.allclose(of_folded(other), of_folded(points) - np.log(unit), atol=1e-6)
-
-
-@pytest.mark.parametrize("unit", [1e-6, 1e6])
-def test_units_of_inputs_do_not_matter(unit: float) -> None:
-    _, points = points_of(square, FOLDED, 1)
-    _, other = points_of(lambda z: square(z / unit), FOLDED, 1, unit=unit)
-    assert np.allclose(of_folded(other, unit), of_folded(points), atol=1e-6)
-
-
-def test_the_order_of_specimens_does_not_matter() -> None:
-    _, points = points_of(square, FOLDED, 1)
-    _, other = points_of(square, FOLDED[::-1], 1)
-    assert np.allclose(of_folded(other)[::-1], of_folded(points), atol=5e-3)
+    assert np.allclose(of_folded(other, unit), of_folded(points) - np.log(unit), atol=1e-6)
 
 
 def test_the_order_of_inputs_and_outputs_does_not_matter() -> None:
@@ -486,19 +437,6 @@ def test_the_same_seed_gives_the_same_bits() -> None:
         assert not np.array_equal(getattr(first, name), getattr(third, name))
 
 
-def test_numbers_and_proposal_densities_belong_together() -> None:
-    """log_a is the readings' density minus the proposal's where the error is not known."""
-    values = readings(FOLDED)
-    data = replace(values, error=np.full_like(values.error, 0.01))
-    emulation, roots = emulate(square, data, cube(1), cube(1, 1.5), PointOptions())
-    points = draw_points(
-        emulation, emulation.error, data, roots, cube(1, 1.5), PointOptions(), error_is_known=False
-    )
-    density = data.log_density(points.outputs, emulation.error)
-    exists = np.isfinite(points.log_a)
-    assert np.allclose((density - points.log_proposal)[exists], points.log_a[exists])
-
-
 # -- where there is no response ----------------------------------------------------------------------
 
 
@@ -516,11 +454,6 @@ def test_a_response_of_a_part_of_the_box() -> None:
 def test_a_response_that_hardly_exists_is_refused() -> None:
     with pytest.raises(DesignError, match="got 0 runs with a response of 64, expected at least 8"):
         points_of(lambda z: np.full_like(z, np.nan), FOLDED, 1)
-
-
-def test_two_specimens_are_enough() -> None:
-    _, points = points_of(square, FOLDED[:2], 1)
-    assert np.isfinite(of_folded(points)).all()
 
 
 def test_a_run_with_a_huge_response_and_equal_runs_cost_no_digits() -> None:
