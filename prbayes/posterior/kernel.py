@@ -62,9 +62,9 @@ class Particles(NamedTuple):
 class BatchedKernel(SMC_KERNEL):
     """SMC kernel that computes priors, responses and discrepancies of all particles in one call.
 
-    Independent proposals from a normal fitted to the particles, which forget the past at once,
-    alternate with random-walk proposals, which also move inside separate modes, until the particles
-    are uncorrelated with the previous ones, or their correlation stops falling. Also usable as
+    Independent proposals from a normal fitted to the particles alternate with random-walk
+    proposals, which also move inside separate modes. They stop when the particles are uncorrelated
+    with the previous ones, or their correlation stops falling. Also usable as
     ``pymc.sample_smc(kernel=prbayes.posterior.BatchedKernel)``.
 
     Parameters

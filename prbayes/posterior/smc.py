@@ -139,8 +139,8 @@ def sample_smc(
         count.
     checkpoint : path-like, optional
         A file with the state after every stage: a run that was killed continues there when it is
-        called again, and returns the same draws. Give the propagations a ``store`` as well, so that
-        the search for the optimum computes no response again.
+        called again, and returns the same draws. A ``store`` of the propagations keeps the
+        responses of the search for the optimum.
     random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
 
@@ -322,8 +322,8 @@ def result_of(
     if chains.stopped:
         again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
         text = (
-            f"{chains.stopped}, so that {len(chains.thetas)} of {settings.chains} chains are here, "
-            "and what would have cost responses is left out; call prb.sample_smc with a larger "
+            f"{chains.stopped}: {len(chains.thetas)} of {settings.chains} chains are finished, and "
+            "results that cost responses are left out; call prb.sample_smc with a larger "
             f"budget{again}."
         )
         page = "expensive.md#a-night-is-not-enough"
@@ -397,8 +397,8 @@ def _lost_findings(
                 Finding(
                     "lost-mass",
                     f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
-                    f"{limit:.1%} of the population has no response (NaN), so that they rest on "
-                    "the specimens that have one; repair the response, return +inf for specimens "
+                    f"{limit:.1%} of the population has no response (NaN), and they rest on the "
+                    "specimens that have one; repair the response, return +inf for specimens "
                     "that fail, or narrow the priors.",
                     "expensive.md#when-a-run-fails",
                 )

@@ -78,16 +78,14 @@ def compare(
     Returns
     -------
     xarray.Dataset
-        With dimensions ``result`` and ``hyperparameter``: ``estimate`` (the optimum, or the
-        posterior mean), ``sd`` (the standard error, or the posterior standard deviation),
-        ``lower`` and ``upper`` (an 89% interval: normal, or equal-tailed), ``shift`` (of the
-        estimate from that of the first result, in this
-        result's sd); and by result: ``n_responses`` and ``seconds``, NaN if a result does not have
-        them, and the discrepancy of the estimate's population under each metric, by the metric's
-        class, with the simulator's name before it if there are several; NaN where stored responses
-        do not support it. Of a simulator with the log-likelihood by specimen, populations are
-        emulated, and ``LogLikelihood by specimen`` is minus its mean over the specimens. A notebook
-        shows it as a table.
+        By ``result`` and ``hyperparameter``: ``estimate`` (the optimum, or the posterior mean),
+        ``sd`` (the standard error, or the posterior standard deviation), ``lower`` and ``upper``
+        (an 89% interval: normal, or equal-tailed), and ``shift`` (of the estimate from that of the
+        first result, in sd). By ``result``: ``n_responses`` and ``seconds``, and the discrepancy of
+        the estimate's population by the metric's class, after the simulator's name if there are
+        several. Scores are NaN where stored responses do not support the population. With the
+        log-likelihood by specimen populations are emulated, and ``LogLikelihood by specimen`` is
+        minus its mean over the specimens. A notebook shows a table.
 
     Raises
     ------

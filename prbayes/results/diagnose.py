@@ -113,18 +113,16 @@ class Diagnosis:
 def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) -> Diagnosis:
     """Report in sentences what is wrong with a result of any sampler or optimiser, and what to do.
 
-    It reports what is not identified; whether an optimiser converged; R-hat and effective sample
-    size of draws, by ArviZ; how many draws differ; how far the particles of `sample_smc` moved in
-    its last stage; whether the stored responses of `Reweighted` supported the answer; and, of
-    optima on stored responses, whether the data can come from the best population, by refits
-    (p < .01). If they cannot, notes name the outputs, and the correlations of two outputs, that
-    misfit. No response is computed. Notes also list what was not tested.
+    Findings are about identification, the convergence of an optimiser, and the support of the
+    answer by the stored responses of `Reweighted`. For draws they are about R-hat and effective
+    sample size (by ArviZ), equal draws, and moves of `sample_smc` in its last stage. Optima on
+    stored responses are refitted: can the data come from the best population (p < .01)? Notes name
+    the outputs, and the correlations of two outputs, that misfit, and tests that were not run. No
+    response is computed.
 
-    With the log-likelihood by specimen: a test of the family of the population of the inputs, with
-    its power at this number of specimens; of draws, whether chains are in different modes, the
-    conflict of prior and data, and specimens on which the posterior depends (Pareto k, where the
-    result has a log-likelihood by specimen). Both tests of draws need the optimum of the
-    likelihood, which is computed for them.
+    With the log-likelihood by specimen, the family of the population of the inputs is tested. For
+    draws it reports chains in different modes, conflicts of prior and data, and specimens on which
+    the posterior depends (Pareto k). The optimum that these need is computed.
 
     Parameters
     ----------
