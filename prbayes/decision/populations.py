@@ -113,9 +113,9 @@ class Populations:
         simulator = serving(simulators, responses)
         if simulator is None:
             raise TypeError(
-                f"{self.caller}: {responses.name}: got inputs of which no simulator of the model "
-                "has stored responses, expected the .dist() objects of one with prb.Reweighted(), "
-                "and constants"
+                f"{self.caller}: {responses.name}: got inputs without stored responses in any "
+                "simulator of the model, expected the .dist() objects of one with "
+                "prb.Reweighted(), and constants"
             )
         k = simulators.index(simulator)
         if simulator.is_emulated:
@@ -290,7 +290,7 @@ def _sobol_thetas(optimum: Optimum, n: int, caller: str) -> Floats:
         is_known = np.isfinite(np.diag(covariance))
         unknown = [name for name, is_ok in zip(optimum.names, is_known, strict=True) if not is_ok]
         raise ValueError(
-            f"{caller}: got an optimum that says nothing of the uncertainty of {unknown}, expected "
+            f"{caller}: got an optimum without the uncertainty of {unknown}, expected "
             "a standard error of each; pass the posterior of prb.sample_smc"
         )
     z = ndtri(sobol(n, optimum.theta.size, seed=0))
