@@ -232,8 +232,8 @@ class Discrepancy(ABC):
         """Return the map from weights of stored responses, (n,) or (n, m), to features.
 
         By default the responses themselves. A metric whose features are a fast function of the
-        weights returns a map that is computed once, equal to `features` up to rounding. ``most`` is the
-        largest size of a matrix where a smaller form exists.
+        weights returns a map that is computed once, equal to `features` up to rounding. ``most`` is
+        the largest size of a matrix where a smaller form exists.
         """
         return StoredBasis((simulated,), self)
 
