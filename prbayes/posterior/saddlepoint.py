@@ -197,7 +197,8 @@ def estimate_likelihood(
         precision = _likelihood_spread(evaluator, point, options) * np.sqrt(n_observed)
         scale = 100 / np.maximum(precision, 100) * hyperparameters.prior_sd
     else:
-        order = [optimum.names.index(name) for name in hyperparameters.names]
+        names = optimum.evaluator.hyperparameters.names
+        order = [names.index(name) for name in hyperparameters.names]
         errors = np.sqrt(np.diag(optimum.covariance))[order]
         scale = np.minimum(100 * errors, hyperparameters.prior_sd)
     return EstimateLikelihood(

@@ -34,7 +34,8 @@ from prbayes.model.parameters import (
     table_elements,
 )
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
-from prbayes.optimize.minimize import Minimisation, find_optimum
+from prbayes.optimize.minimize import find_optimum
+from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import (
     NO_RESPONSE,
     SMALLEST_SHARE,

@@ -28,7 +28,7 @@ from prbayes.model.evaluator import TOLERABLE, shortcoming
 from prbayes.model.fingerprint import (
     Level,
     as_attributes,
-    identity_of_model,
+    identity_of,
     require_same_responses,
 )
 from prbayes.model.locking import locked
@@ -197,7 +197,7 @@ def predict(
         "random_seed": str(seed),
         "findings": as_json(findings_of(response)),
         **_calibration_attributes(result, model),
-        **as_attributes(identity_in(result) or identity_of_model(model)),
+        **as_attributes(identity_in(result) or identity_of(model)),
         **versions(),
     }
     return _labelled(drawn.values, responses, coords, n_samples).rename(label).assign_attrs(attrs)
