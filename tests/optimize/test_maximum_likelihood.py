@@ -105,12 +105,12 @@ def test_a_folded_response_has_two_modes(codes: list[str]) -> None:
     optimum = fit(folded_model())
     assert codes == ["second-mode"]
     assert "of the posterior's mass" in optimum.findings[0].text
-    (rival,) = optimum.local_optima
-    assert rival["point"]["mu"] == pytest.approx(-optimum.point["mu"], abs=1e-3)
-    assert rival["point"]["sigma"] == pytest.approx(optimum.point["sigma"], abs=1e-3)
+    (mirror,) = optimum.local_optima
+    assert mirror["point"]["mu"] == pytest.approx(-optimum.point["mu"], abs=1e-3)
+    assert mirror["point"]["sigma"] == pytest.approx(optimum.point["sigma"], abs=1e-3)
     # The roots of each specimen are weighted by masses that are right to .01.
-    assert rival["weight"] == pytest.approx(0.5, abs=0.02)
-    assert rival["comparable"]
+    assert mirror["weight"] == pytest.approx(0.5, abs=0.02)
+    assert mirror["comparable"]
 
 
 def test_a_start_selects_the_mode(codes: list[str]) -> None:
