@@ -240,7 +240,7 @@ def test_other_optima_are_reported(calibrated: Any) -> None:
     assert second.endswith("the data fit it less well; a posterior gives its weight.")
     # A place of many elements is described by scalars alone
     for size, beginning in ((7, "mu = 2.000, w[0]"), (8, "mu = 2.000, with")):
-        point = {"mu": 2.0, "w": np.ones(size)}
+        point = xr.Dataset({"mu": 2.0, "w": ("k", np.ones(size))}).data_vars
         names = ["mu", *(f"w[{i}]" for i in range(size))]
         rival = {"discrepancy": 0.1, "comparable": False}
         assert f"is at {beginning}" in _other_optimum(rival, point, names)
