@@ -24,7 +24,7 @@ from prbayes.response.response import Responses
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
-    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|AdjointOp|Binned|OpaqueOp|abc_d)",
+    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|Binned|OpaqueOp|abc_d)",
 )
 
 
@@ -129,12 +129,12 @@ class DensityOp(OwnOp):
                 "use GaussianKDE, or prb.Reweighted"
             )
         sample, weights = inputs
-        slope = AdjointOp(self.cells, for_sample=True)(sample, *cotangents)
-        value = AdjointOp(self.cells, for_sample=False)(sample, *cotangents)
+        slope = CotangentOp(self.cells, for_sample=True)(sample, *cotangents)
+        value = CotangentOp(self.cells, for_sample=False)(sample, *cotangents)
         return [weights * slope, value]
 
 
-class AdjointOp(OwnOp):
+class CotangentOp(OwnOp):
     """A cotangent of a density at its sample, or its derivative: (..., n), (..., m) -> (..., n)."""
 
     __props__ = ("cells", "for_sample")
@@ -179,7 +179,7 @@ class BinnedAdjointOp(OwnOp):
     event_ndims = (2, 1)
     event_shape = (None,)
     supported = BinnedOp.supported
-    no_gradient = AdjointOp.no_gradient
+    no_gradient = CotangentOp.no_gradient
 
     def __init__(self, densities: DensitySum) -> None:
         self.densities = densities

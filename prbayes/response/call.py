@@ -241,11 +241,7 @@ def checked(
     arguments: Sequence[Any],
     outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> tuple[Floats, Outputs | None]:
-    """Return a response's result as floats, shape (*batch, *event), or raise `ResponseError`.
-
-    If one output of a point is NaN, all of its outputs are. Outputs that are not known are those of
-    the result, if it is a mapping.
-    """
+    """Return a result as floats, (*batch, *event), and its outputs, or raise `ResponseError`."""
     try:
         if isinstance(result, Mapping):
             outputs = outputs or outputs_of_result(result, len(batch))
@@ -285,7 +281,7 @@ def checked(
             f"{count} per specimen; {remedy}"
         )
     values = array.astype(np.float64)
-    if expected:
+    if expected:  # a point with an output that is NaN has no response
         values[np.isnan(values).any(axis=-1)] = np.nan
     return values, outputs
 
@@ -414,10 +410,7 @@ def respond(
 
 
 def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
-    """Compute one stored response again, once for a store without a version.
-
-    The function, or its variables, may have changed since the response was stored.
-    """
+    """Compute a stored response again, once: the function or its variables may have changed."""
     store = settings.store
     if store is None or store.verified:
         return
@@ -474,12 +467,10 @@ def _stored(settings: CallSettings, keys: Floats) -> tuple[Floats, Rows, dict[in
 def _add_to_store(
     store: Store, keys: Floats, finished: Sequence[Finished], *, is_last: bool, tolerant: bool
 ) -> None:
-    """Store finished chunks in one transaction, since each waits for the disk.
-
-    After the last try NaN is a result, too, except in a chunk that a failure ended.
-    """
+    """Store finished chunks in one transaction, since each waits for the disk."""
     parts = []
     for rows, chunk in finished:
+        # After the last try NaN is a result, too, except in a chunk that a failure ended.
         is_complete = tolerant or not chunk.raised
         stored = np.flatnonzero(~is_missing(chunk.values) | (is_last and is_complete))
         if stored.size:

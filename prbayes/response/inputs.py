@@ -114,10 +114,7 @@ class Inputs:
 
 
 def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
-    """Sort the inputs of a response into aleatory, epistemic and constant ones.
-
-    One has to be aleatory, and one to depend on a model variable.
-    """
+    """Sort the inputs of a response into aleatory, epistemic and constant ones, or raise."""
     model_variables: set[Variable] = set(model.basic_RVs)
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
