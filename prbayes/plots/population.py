@@ -189,10 +189,7 @@ def margins(evaluator: Evaluator) -> list[Margin]:
 
 
 def select_margins(available: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:
-    """Return margins by name, with or without index, or by ``.dist()``; all by default.
-
-    Raise a `KeyError` if there is no such input.
-    """
+    """Return margins by name, with or without index, or by ``.dist()``; all by default."""
     if inputs is None:
         return available
     if isinstance(inputs, str | TensorVariable):

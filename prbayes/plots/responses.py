@@ -278,10 +278,7 @@ def _finite_range(values: Floats) -> Limits:
 
 
 def _joined(x: Floats, rows: Floats) -> Floats:
-    """Return several lines, (n, m), as one with gaps between them; only finite values are drawn.
-
-    A line continues after a value that was not measured, and ends where the specimen has failed.
-    """
+    """Return lines, (n, m), as one with gaps; a line continues after missing values."""
     points = [np.column_stack([x, row]) for row in rows]
     return with_gaps([line[np.isfinite(line[:, 1])] for line in points])
 
@@ -382,10 +379,7 @@ def is_curve(outputs: Outputs) -> bool:
 
 
 def quantiles(values: Floats, weights: Floats, levels: Floats) -> Floats:
-    """Return quantiles of outputs of populations, (P, n, m), (P, n), (L,) -> (P, L, m).
-
-    A specimen without a response is left out; one that failed is above all others.
-    """
+    """Return quantiles of outputs, (P, n, m), (P, n), (L,) -> (P, L, m), without NaN."""
     populations, _, m = values.shape
     out = np.empty((populations, len(levels), m))
     is_shared = values.strides[0] == 0  # the same values for all populations, sorted once

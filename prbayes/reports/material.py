@@ -122,11 +122,7 @@ def gather(
     validation: Any = None,
     labels: Mapping[str, str] | None = None,
 ) -> Material:
-    """Check results, and derive the missing ones.
-
-    Raise a `TypeError` or `ValueError` if a result is of another kind, or of other populations or
-    data than the model or the first result.
-    """
+    """Check results, and derive the missing ones."""
     optima = _by_label(optimum, "optimum")
     posteriors = _by_label(posterior, "posterior")
     tests = _by_label(validity, "validity")

@@ -1,13 +1,11 @@
 """The u-values of a validity test against their envelope."""
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import arviz as az
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 import prbayes as prb
 from prbayes.plots.validity import _between, in_directions
@@ -72,7 +70,7 @@ def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
         assert not path.contains_points(np.column_stack([v, high + 0.03]))[high < 0.96].any()
 
 
-def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> None:
+def test_several_tests_of_different_sizes_get_a_panel_each() -> None:
     small = prb.area_test(FRESH[:7], PREDICTED, null=QUICK)
     pc = prb.plot_validity({"all": validity(), "some": small})
     axes = pc.viz["plot"]
@@ -81,9 +79,6 @@ def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> No
         "share of 20 values",
         "share of 7 values",
     ]
-    pc.savefig(tmp_path / "v.png")
-    image = imread(tmp_path / "v.png")[..., :3]
-    assert (image.min(axis=2) < 0.9).mean() > 0.05
 
 
 def test_refusals() -> None:
