@@ -122,7 +122,9 @@ def test_a_report_computes_no_response(calls: Calls, section: Any) -> None:
     )
 
 
-@pytest.mark.parametrize("lacking", ["no Python package graphviz", "no program dot", "a name"])
+@pytest.mark.parametrize(
+    "lacking", ["no Python package graphviz", "no program dot", "does not take a name"]
+)
 def test_without_graphviz_there_is_no_graph(
     lacking: str,
     monkeypatch: pytest.MonkeyPatch,
