@@ -380,9 +380,20 @@ def respond(
     """
     policy = settings.on_failure
     _verify_store(settings, points, tally)
-    keys = points.keys() if settings.store is not None else np.empty((len(points), 0))
-    values, missing, failed = _stored(settings, keys)
+    event = () if settings.outputs is None else settings.outputs.event
+    values, missing = np.full((len(points), *event), np.nan), np.arange(len(points))
+    failed: dict[int, str] = {}
     raised: dict[int, str] = {}
+    if settings.store is not None:
+        keys = points.keys()
+        values, is_stored = settings.store.find(keys)
+        if settings.outputs is not None:
+            values = values.reshape(len(keys), *event)
+        failed = settings.store.failed(keys)
+        if settings.retry_failed or not isinstance(policy.final, Replace):
+            is_stored[list(failed)] = False
+            failed = {}
+        missing = np.flatnonzero(~is_stored)
     for attempt in range(policy.tries):
         is_last = attempt == policy.tries - 1
         tolerant = isinstance(policy.final, Replace) or not is_last
@@ -447,21 +458,6 @@ def _numbers_text(values: Floats, digits: int = 10) -> str:
     if values.size == 1:
         return text
     return f"({text}, ...)" if values.size > 6 else f"({text})"
-
-
-def _stored(settings: CallSettings, keys: Floats) -> tuple[Floats, Rows, dict[int, str]]:
-    """Return the stored responses, the rows to compute, and the reasons of stored failures."""
-    if settings.store is None:
-        event = () if settings.outputs is None else settings.outputs.event
-        return np.full((len(keys), *event), np.nan), np.arange(len(keys)), {}
-    values, is_stored = settings.store.find(keys)
-    if settings.outputs is not None:
-        values = values.reshape(len(keys), *settings.outputs.event)
-    failed = settings.store.failed(keys)
-    if settings.retry_failed or not isinstance(settings.on_failure.final, Replace):
-        is_stored[list(failed)] = False
-        failed = {}
-    return values, np.flatnonzero(~is_stored), failed
 
 
 def _add_to_store(

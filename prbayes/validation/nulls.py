@@ -100,9 +100,9 @@ def judge_by_replicates(
 
 @dataclass(frozen=True)
 class PosteriorNull(Null):
-    """The specimens come from one of the posterior's populations, nobody knows which.
+    """The specimens come from one unknown population of the posterior.
 
-    u-values are taken in the pool of all.
+    u-values are taken in the pool of all populations.
 
     Each replicate takes one draw of the posterior, the same under all conditions, and all its
     values from that population; a specimen that was measured several times is one sample.
@@ -351,7 +351,9 @@ class JointNull(Null):
 
     def _u_values(self, case: Case) -> Floats:
         """Return u-values of the replicates, (r, n)."""
-        require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
+        require_same(
+            case.identity, self.optimum.search.identity, "JointNull: predicted", Level.OPTIMUM
+        )
         evaluator = self.optimum.evaluator
         sampling = self.optimum.sampling()
         bounds = evaluator.reweighted.values()
