@@ -221,14 +221,14 @@ def test_the_width_of_the_draws_is_explained(
 
 
 def test_other_optima_are_reported(calibrated: Any) -> None:
-    rivals = tuple(
+    others = tuple(
         {"point": {"mu": mu}, "discrepancy": 0.25, "comparable": comparable}
         for mu, comparable in ((-1.5, True), (3.0, False))
     )
     search = dataclasses.replace(
         calibrated.optimum.search, result=Result.FAILED, details="It stopped."
     )
-    optimum = dataclasses.replace(calibrated.optimum, rivals=rivals, search=search)
+    optimum = dataclasses.replace(calibrated.optimum, local_optima=others, search=search)
     (section,) = optima(gather(optimum=optimum))
     ended, first, second, _ = section.text
     assert ended.startswith("The optimiser did not converge after ")
