@@ -130,9 +130,6 @@ def outcome(monkeypatch: pytest.MonkeyPatch) -> Callable[[pm.Model], list[str]]:
     return run
 
 
-# -- reported or refused ---------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Trap:
     """A model with a trap and a clean one, from a random generator.
@@ -340,9 +337,6 @@ def test_errors_come_before_further_runs() -> None:
             )
         )
     assert sum(runs) <= 64 + 2  # two single ones: a specimen by itself has the same response
-
-
-# -- repaired --------------------------------------------------------------------------------
 
 
 def shift(
@@ -639,9 +633,6 @@ def test_the_posterior_is_exact_in_twenty_data_sets(name: str) -> None:
     assert np.sum(np.array(shifts) <= 0.1) >= 19, np.sort(shifts)[-3:]
 
 
-# -- families, conflicts and sizes, on arrays ------------------------------------------------
-
-
 def skewed(rng: np.random.Generator, n: int) -> Floats:
     return (rng.gamma(4, 1, n) - 4) / 2
 
@@ -753,9 +744,6 @@ def test_power_and_size_of_the_conflict() -> None:
     rng = np.random.default_rng(14)
     share = np.mean([bool(conflict(rng, 0.0)) for _ in range(200)])
     assert share <= 0.06 + 4 * 0.017  # Holm: at most .05, standard error .015
-
-
-# -- size before the fit ---------------------------------------------------------------------
 
 
 @pytest.mark.slow
