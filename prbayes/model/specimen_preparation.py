@@ -191,7 +191,7 @@ def _emulate(
     if likelihood.calls_response:
         emulation = Emulation.of_function(runs, box, bounds, readings, options)
     emulation, roots = emulate(
-        runs, readings, box, bounds, options, n=n, known=emulation, name=name
+        runs, readings, box, bounds, options, n=n, previous=emulation, name=name
     )
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))

@@ -382,10 +382,12 @@ def test_data_of_another_length() -> None:
     assert np.allclose(values(model), exact(observed=Y[:7]), atol=0.03)
 
 
-def test_data_of_another_shape_are_refused() -> None:
+def test_data_of_another_shape_and_two_samples_are_refused() -> None:
     (likelihood,) = specimen_likelihoods(shared()).values()
     with pytest.raises(ValueError, match=r"y: observed: got shape \(20, 1\), expected \('N',\)"):
         likelihood.observing({"y": Y[:, None]})
+    with pytest.raises(TypeError, match=r"prb.LogLikelihood\(density=prb.GaussianKDE\(\)\)"):
+        prb.LogLikelihood()([1.0, 2.0], [1.0, 2.0])
 
 
 def test_what_was_compiled_for_other_data_refuses_them() -> None:
@@ -440,11 +442,6 @@ def test_censored_readings_alone_are_refused() -> None:
     model = build(metric=prb.LogLikelihood(censored=(None, Y.min())))
     with pytest.raises(DesignError, match="got no reading of the output within the limits"):
         model.compile_logp()
-
-
-def test_two_samples_have_no_log_likelihood_by_specimen() -> None:
-    with pytest.raises(TypeError, match=r"prb.LogLikelihood\(density=prb.GaussianKDE\(\)\)"):
-        prb.LogLikelihood()([1.0, 2.0], [1.0, 2.0])
 
 
 @cache

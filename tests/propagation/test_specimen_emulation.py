@@ -158,16 +158,6 @@ def test_a_share_of_failed_searches_is_counted() -> None:
     assert missing_share(find, folded, BOX, specimens(20, 0)) == 0.25
 
 
-def test_units_and_the_order_of_specimens_do_not_matter() -> None:
-    y = specimens(20, 1)
-    expected = missing_share(upper_root, folded, BOX, y)
-    assert missing_share(upper_root, folded, BOX, y[::-1]) == expected
-    scaled = missing_share(
-        lambda v: 1e3 * upper_root(1e6 * v), lambda x: 1e-6 * folded(1e-3 * x), 1e3 * BOX, 1e-6 * y
-    )
-    assert scaled == expected
-
-
 def test_only_responses_near_the_data_count() -> None:
     sizes: list[int] = []
 
