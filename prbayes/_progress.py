@@ -51,7 +51,7 @@ def _console() -> Console:
     return Console(stderr=True, force_jupyter=False, force_terminal=forced)
 
 
-CONSOLE = _console()  # one for all bars, so that an inner bar is drawn below an outer one
+CONSOLE = _console()  # one for all bars: an inner bar is drawn below an outer one
 
 
 def live() -> bool:

@@ -1,6 +1,6 @@
 """The command line: ``python -m prbayes report results.nc``."""
 
-# Heavy modules are imported where they are used, so that help and mistakes are answered at once.
+# Heavy modules are imported where they are used: help and mistakes are answered at once.
 
 from __future__ import annotations
 

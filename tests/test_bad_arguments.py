@@ -199,7 +199,7 @@ BY_NAME: dict[str, tuple[Any, ...]] = {
     "max_lost": (1.0, -0.1, np.nan, "a", None, True, False),
     "max_seconds": POSITIVE,
     "metric": NO_METRIC,
-    "model": (3, "model", bare, pm.Model, optimum),
+    "model": (3, "model", bare),
     "observed": NEW_DATA,
     "on_failure": ("abort", prb.response.Abort, None, 3),
     "optimum": (3, "optimum", posterior, model, {"mu": 1.0}, None),
@@ -283,7 +283,6 @@ def report(**settings: Any) -> prb.Report:
 ON_MODEL = {"model": model}
 SMALL = {"model": model, "optimum": optimum, "draws": 20, "chains": 1, **QUIET}
 TIMEOUT = (*POSITIVE[:-2], 5.0)  # without processes
-PICTURE_MODEL = (3, "model")
 TABLE: dict[str, Row] = {
     "Simulator": Row(
         call=simulator,
@@ -426,16 +425,13 @@ TABLE: dict[str, Row] = {
     "compare": Row(
         {"results": results, **ON_MODEL},
         results=(None, {}, 3, "a", {"a": "b"}, {"a": None}, {"a": xr.DataTree()}, {"": 3}),
-        model=PICTURE_MODEL,
         metrics=("area", ["area"], [prb.AreaMetric], 3, [None]),
     ),
-    "diagnose": Row({"result": optimum}, model=(3, "model", bare)),
+    "diagnose": Row({"result": optimum}),
     "predict": Row(
         {**ON_MODEL, **QUIET},
         call=with_inputs(prb.predict, "result", "response"),
         input=NO_INPUT,
-        response=(3, "line", None),
-        model=(3, "model", bare),
         n_samples=(*COUNT, 1),
         name=(3, "", True),
     ),
@@ -450,14 +446,12 @@ TABLE: dict[str, Row] = {
     "sensitivity": Row(
         {"result": posterior, "quantity": mean, **ON_MODEL},
         quantity=(None, "mean", 3, prb.decision.Mean, np.mean),
-        model=(3, "model", bare),
         n_samples=(*COUNT, 31),
     ),
     "plan": Row(
         {"result": posterior, "candidates": same_condition, **ON_MODEL},
         candidates=(None, {}, 3, {"a": 3}, {3: prb.decision.Condition(line)}, [1]),
         k=(*COUNT[:-1], [], [0], "ab"),
-        model=(3, "model", bare),
         quantity=("mean", 3, prb.decision.Mean),
         target=({}, 3, {"tau": 1.0}, {"mu": 0.0}, {"mu": "a"}, {"quantity": 1.0}),
     ),
@@ -465,8 +459,6 @@ TABLE: dict[str, Row] = {
         ON_MODEL,
         call=with_inputs(prb.exceedance, "result", "response", "limit"),
         input=NO_INPUT,
-        response=(3, "line", None),
-        model=(3, "model", bare),
         n_draws=(*COUNT, 1),
         points=(-1, 5, 1.5, "a", None, True),
         requirement=("a", 0, 2.0),
@@ -476,8 +468,6 @@ TABLE: dict[str, Row] = {
         ON_MODEL,
         call=with_inputs(prb.decision.p_box, "result", "response"),
         input=NO_INPUT,
-        response=(3, "line", None),
-        model=(3, "model", bare),
         n_draws=(*COUNT, 1),
         steps=(*COUNT, 1),
     ),
@@ -515,7 +505,6 @@ TABLE: dict[str, Row] = {
     ),
     "Surrogate.fit": Row(
         {"response": line, "inputs": {"x": (0.0, 1.0)}, "n": 20, **QUIET},
-        response=(3, "line", None),
         inputs=(
             *({}, [], 3, "ab", None, {"x": (1, 0)}, {"x": (1, 1)}, {"x": (0, np.inf)}),
             *({"x": (0, np.nan)}, {"x": "ab"}, {"x": 3.0}, {"x": None}, {"x": (0, True)}),
@@ -546,7 +535,6 @@ TABLE: dict[str, Row] = {
         sections=(3, [1], "text", [None]),
         author=(3, None, ["a"]),
         date=(3, None, 2024.5),
-        model=PICTURE_MODEL,
         optimum=(3, "optimum", {"a": 3}, xr.DataTree(), comparison),
         posterior=(3, "posterior", {"a": 3}, xr.DataTree(), optimum),
         validity=(3, "test", {"a": 3}, comparison),
@@ -589,7 +577,6 @@ TABLE: dict[str, Row] = {
     ),
     "plot_landscape": Row(
         {"optimum": optimum},
-        model=PICTURE_MODEL,
         pair=(("mu", "zz"), ("mu", "mu"), (), 3, {3}),
         points=(0, -1, 1.5, "a", True),
         responses=(-1, 1.5, "a", True, None),
@@ -598,7 +585,6 @@ TABLE: dict[str, Row] = {
     "plot_outputs": Row(
         {"result": of_two_outputs, "model": two_outputs},
         result=(None, 3, "result", xr.DataTree(), []),
-        model=PICTURE_MODEL,
         simulator=(3, "zz", ["y"]),
         outputs=(3, "zz", [], [3], ["zz", "y"]),
         before=("prior", 3, {"zz": 1.0}),
@@ -606,19 +592,16 @@ TABLE: dict[str, Row] = {
     ),
     "plot_population": Row(
         {"result": posterior, **ON_MODEL},
-        model=PICTURE_MODEL,
         inputs=(3, "zz", [], [3], ["zz"]),
         n_draws=SOME,
     ),
     "plot_posterior": Row(
         {"posterior": posterior, **ON_MODEL},
         posterior=BY_NAME["result"],
-        model=PICTURE_MODEL,
         optimum=(3, "a", posterior),
     ),
     "plot_responses": Row(
         {"result": posterior, **ON_MODEL},
-        model=PICTURE_MODEL,
         before=("prior", 3, {"zz": 1.0}, {"mu": "a"}),
         n_draws=SOME,
     ),
@@ -648,6 +631,8 @@ def refused(name: str) -> dict[str, tuple[Any, ...]]:
                 bad[parameter.name] = bad_values(parameter.name, str(parameter.annotation))
             elif parameter.name == "pc_kwargs" and name != "plot_validity":
                 bad["figsize"] = BY_NAME["figsize"]
+        if "figsize" in bad or name in ("compare", "Report"):
+            bad = {key: v[:2] if key == "model" else v for key, v in bad.items()}
     return bad | row.bad
 
 

@@ -1,4 +1,4 @@
-"""Every public thing travels by plain `pickle`: the table has to name all of them."""
+"""Every public object has a plain `pickle`: the table has to name all of them."""
 
 from __future__ import annotations
 
@@ -18,15 +18,6 @@ import prbayes as prb
 from prbayes.model.random_variable import nodes
 
 QUIET: dict[str, Any] = {"progressbar": False}
-
-
-def public_classes() -> dict[str, type]:
-    found = {}
-    for name in prb.__all__:
-        value = getattr(prb, name)
-        inner = value.__all__ if isinstance(value, ModuleType) else ()
-        found |= {f"{name}.{each}": getattr(value, each) for each in inner} or {name: value}
-    return {name: value for name, value in found.items() if isinstance(value, type)}
 
 
 @cache
@@ -50,11 +41,7 @@ def surrogate() -> prb.Surrogate:
     return prb.Surrogate.fit(np.square, {"x": (0, 1)}, 20, **QUIET).with_error()
 
 
-def target(metric: Any) -> Any:
-    return metric.against(np.arange(9.0))
-
-
-# What each public class makes; of those that are only derived from, one that is derived.
+# An object of each public class, or of a class that derives from it.
 MAKE: dict[str, Callable[[], Any]] = {
     "AreaMetric": prb.AreaMetric,
     "Diagnosis": lambda: prb.diagnose(optimum()),
@@ -75,9 +62,9 @@ MAKE: dict[str, Callable[[], Any]] = {
     "Surrogate": surrogate,
     "abc_distance": lambda: prb.abc_distance(prb.AreaMetric()),
     "decision.Interval": lambda: prb.decision.Interval(0.9, 1.1),
-    "metrics.DensityDiscrepancy": lambda: target(prb.KullbackLeibler()),
+    "metrics.DensityDiscrepancy": lambda: prb.KullbackLeibler().against(np.arange(9.0)),
     "metrics.DensityEstimator": lambda: prb.Histogram(4),
-    "metrics.Discrepancy": lambda: target(prb.AreaMetric()),
+    "metrics.Discrepancy": lambda: prb.AreaMetric().against(np.arange(9.0)),
     "metrics.Minimum": lambda: prb.metrics.Minimum.QUADRATIC,
     "propagation.DesignError": lambda: prb.propagation.DesignError("y: too thin"),
     "propagation.Propagation": lambda: prb.Fresh(16),
@@ -102,7 +89,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "validation.PosteriorNull": lambda: prb.validation.PosteriorNull(19),
     "validation.ValidityTest": lambda: prb.area_test([1.0, 1.5, 2.0], predicted(), **QUIET),
 }
-# What is at work inside a model, and goes with it.
+# Objects inside a model, which are pickled with it.
 INSIDE = {
     "decision.Condition",
     "decision.Exceedance",
@@ -127,11 +114,17 @@ RESULTS: dict[str, Callable[[], Any]] = {
 
 
 def test_the_table_has_all_public_classes() -> None:
-    assert set(MAKE) | INSIDE | {"response.Store"} == set(public_classes())
+    objects: dict[str, object] = {}
+    for name in prb.__all__:
+        value = getattr(prb, name)
+        inner = value.__all__ if isinstance(value, ModuleType) else ()
+        objects |= {f"{name}.{key}": getattr(value, key) for key in inner} or {name: value}
+    classes = {name for name, value in objects.items() if isinstance(value, type)}
+    assert set(MAKE) | INSIDE | {"response.Store"} == classes
 
 
 @pytest.mark.parametrize("name", MAKE | RESULTS)
-def test_it_comes_back_from_plain_pickle(name: str) -> None:
+def test_objects_come_back_from_a_plain_pickle(name: str) -> None:
     made = (MAKE | RESULTS)[name]()
     back = pickle.loads(pickle.dumps(made))
     assert type(back) is type(made)
@@ -141,13 +134,10 @@ def test_it_comes_back_from_plain_pickle(name: str) -> None:
         assert repr(back) == repr(made)
 
 
-def test_functions_travel_by_their_names() -> None:
+def test_functions_and_stores_have_a_plain_pickle(tmp_path: Any) -> None:
     functions = [getattr(prb, name) for name in prb.__all__]
     for function in filter(inspect.isfunction, functions):
         assert pickle.loads(pickle.dumps(function)) is function
-
-
-def test_a_store_travels_without_what_it_has_open(tmp_path: Any) -> None:
     store = prb.response.Store(tmp_path, "y", columns=1)
     store.add(np.array([[1.0]]), np.array([2.0]))
     assert len(pickle.loads(pickle.dumps(store))) == 1

@@ -6,7 +6,6 @@ from importlib.resources import files
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 __all__ = ["crack_growth", "virkler"]
 
@@ -45,33 +44,23 @@ def crack_growth() -> xr.Dataset:
     >>> lengths.sizes["specimen"], round(float(lengths.max()), 2)
     (21, 1.19)
     """
-    specimen, million_cycles, table = _table("crack_growth.csv")
-    return xr.Dataset(
-        {
-            "crack_length_inch": (
-                ("specimen", "million_cycles"),
-                table,
-                {"long_name": "crack length", "units": "inch"},
-            )
-        },
-        coords={
-            "specimen": specimen,
-            "million_cycles": ("million_cycles", million_cycles, {"units": "million cycles"}),
-        },
-        attrs={
-            "description": (
-                "Fatigue crack growth in metal: crack length of 21 specimens, read every 10 000 "
-                "cycles to 0.01 inch, until 1.60 inch (failure) or 120 000 cycles; NaN after "
-                "failure"
-            ),
-            "source": (
-                "C. J. Lu and W. Q. Meeker (1993), Using degradation measures to estimate a "
-                "time-to-failure distribution, Technometrics 35(2), 161-174, Table 1; values read "
-                "from figure 4.5.2 of J. L. Bogdanoff and F. Kozin (1985), Probabilistic Models of "
-                "Cumulative Damage, Wiley"
-            ),
-            "notch_inch": 0.90,
-        },
+    return _dataset(
+        "crack_growth.csv",
+        "crack_length_inch",
+        {"long_name": "crack length", "units": "inch"},
+        "million_cycles",
+        {"units": "million cycles"},
+        description=(
+            "Fatigue crack growth in metal: crack length of 21 specimens, read every 10 000 cycles "
+            "to 0.01 inch, until 1.60 inch (failure) or 120 000 cycles; NaN after failure"
+        ),
+        source=(
+            "C. J. Lu and W. Q. Meeker (1993), Using degradation measures to estimate a "
+            "time-to-failure distribution, Technometrics 35(2), 161-174, Table 1; values read from "
+            "figure 4.5.2 of J. L. Bogdanoff and F. Kozin (1985), Probabilistic Models of "
+            "Cumulative Damage, Wiley"
+        ),
+        notch_inch=0.90,
     )
 
 
@@ -107,46 +96,44 @@ def virkler() -> xr.Dataset:
     >>> round(float(lengths.mean()), 2), round(float(lengths.std(ddof=1)), 2)
     (27.61, 3.01)
     """
-    specimen, kilocycles, table = _table("virkler.csv")
-    return xr.Dataset(
-        {
-            "half_crack_length_mm": (
-                ("specimen", "kilocycles"),
-                table,
-                {"long_name": "half crack length", "units": "mm"},
-            )
-        },
-        coords={
-            "specimen": specimen,
-            "kilocycles": ("kilocycles", kilocycles, {"units": "1000 cycles"}),
-        },
-        attrs={
-            "description": (
-                "Fatigue crack growth in 2024-T3 aluminium: half crack length of 68 specimens "
-                "every 20 000 cycles, from 9 mm at the beginning; NaN beyond 36.6 mm"
-            ),
-            "source": (
-                "D. A. Virkler, B. M. Hillberry and P. K. Goel (1979), The statistical nature of "
-                "fatigue crack propagation, J. Eng. Mater. Technol. 101, 148-153; read by W. "
-                "Richards (CC0) from figure 4.5.3 of J. L. Bogdanoff and F. Kozin (1985), "
-                "Probabilistic Models of Cumulative Damage, Wiley"
-            ),
-            "start_mm": 9.0,
-            "end_mm": 36.6,
-        },
+    return _dataset(
+        "virkler.csv",
+        "half_crack_length_mm",
+        {"long_name": "half crack length", "units": "mm"},
+        "kilocycles",
+        {"units": "1000 cycles"},
+        description=(
+            "Fatigue crack growth in 2024-T3 aluminium: half crack length of 68 specimens every "
+            "20 000 cycles, from 9 mm at the beginning; NaN beyond 36.6 mm"
+        ),
+        source=(
+            "D. A. Virkler, B. M. Hillberry and P. K. Goel (1979), The statistical nature of "
+            "fatigue crack propagation, J. Eng. Mater. Technol. 101, 148-153; read by W. Richards "
+            "(CC0) from figure 4.5.3 of J. L. Bogdanoff and F. Kozin (1985), Probabilistic Models "
+            "of Cumulative Damage, Wiley"
+        ),
+        start_mm=9.0,
+        end_mm=36.6,
     )
 
 
-def _table(name: str) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """Return specimens, abscissas and a table of a file with both and a value in each line.
-
-    NaN where there is no line.
-    """
-    with files(__package__).joinpath(name).open(encoding="utf-8") as file:
-        columns = np.loadtxt(file, delimiter=",", skiprows=1, unpack=True)
-    specimens, abscissas, values = columns
+def _dataset(
+    file_name: str,
+    variable: str,
+    units: dict[str, str],
+    dim: str,
+    dim_units: dict[str, str],
+    **attrs: object,
+) -> xr.Dataset:
+    """Return a file with a specimen, an abscissa and a value in each line; NaN without a line."""
+    with files(__package__).joinpath(file_name).open(encoding="utf-8") as file:
+        specimens, abscissas, values = np.loadtxt(file, delimiter=",", skiprows=1, unpack=True)
     specimen, row = np.unique(specimens.astype(int), return_inverse=True)
     abscissa, column = np.unique(abscissas, return_inverse=True)
     table = np.full((specimen.size, abscissa.size), np.nan)
     table[row, column] = values
-    return specimen, abscissa, table
+    return xr.Dataset(
+        {variable: (("specimen", dim), table, units)},
+        coords={"specimen": specimen, dim: (dim, abscissa, dim_units)},
+        attrs=attrs,
+    )

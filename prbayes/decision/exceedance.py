@@ -206,6 +206,7 @@ def exceedance(
 
 
 def _verdict(table: xr.Dataset, requirement: float) -> str:
+    """Return whether a requirement is met by the whole interval, by none of it, or by a part."""
     if table["upper"] <= requirement:
         return "met"
     return "not met" if table["lower"] > requirement else "not decided"
@@ -333,10 +334,12 @@ class _Normal:
     root: Floats  # (D, D): lower Cholesky factor of the covariance
 
     def draw(self, n: int, rng: np.random.Generator) -> Floats:
+        """Return n draws, (n, D)."""
         z = rng.standard_normal((n, self.mean.size))
         return np.asarray(self.mean + z @ self.root.T)
 
     def log_density(self, z: Floats) -> Floats:
+        """Return the log-density, (n, D) -> (n,)."""
         standard = np.linalg.solve(self.root, (z - self.mean).T).T
         return log_normal(standard) - float(np.log(np.diag(self.root)).sum())
 
@@ -380,18 +383,8 @@ def rare_event(
     .. math:: P_j = \frac{1}{n} \sum_i 1[y_i > c] \frac{p(x_i | \theta_j)}{p(x_i | \theta_*)}
         \frac{\phi(z_i)}{q(z_i)}
 
-    Parameters
-    ----------
-    transform : InverseTransform
-        Of the central population.
-    parents : sequence of ndarray, shapes (k, *shape)
-        Of the populations.
-    respond : callable
-        Normal numbers (n, D) -> responses (n,).
-    limit : float
-    size : int
-        Number of responses to compute.
-    rng : Generator
+    ``transform`` is that of the central population, ``parents`` are those of the k populations,
+    ``respond`` maps normal numbers (n, D) to responses (n,), and ``size`` is the number of these.
 
     References
     ----------
@@ -412,7 +405,10 @@ def rare_event(
         n = min(step, remaining)
         batches.append(_draw_points(proposals, n, transform, parents, respond, rng))
         remaining -= n
-        level = min(_elite_quantile(batches[-1].values, limit), limit)
+        # The level that the highest fifth of responses exceeds, as is usual for the method.
+        values = batches[-1].values[~np.isnan(batches[-1].values)]
+        elite = float(np.quantile(values, 1 - 0.2, method="lower")) if values.size else limit
+        level = min(elite, limit)
         proposals = _cross_entropy_proposals(_concatenated(batches), level, limit) or proposals
     search = _concatenated(batches)
     # The proposals do not depend on the final points, whose mean is unbiased. One point in ten
@@ -459,6 +455,7 @@ def _draw_points(
 
 
 def _concatenated(batches: Sequence[_Points]) -> _Points:
+    """Return the points of all batches."""
     return _Points(
         sizes=[size for batch in batches for size in batch.sizes],
         proposals=[proposal for batch in batches for proposal in batch.proposals],
@@ -466,12 +463,6 @@ def _concatenated(batches: Sequence[_Points]) -> _Points:
         values=np.concatenate([batch.values for batch in batches]),
         log_ratio=np.concatenate([batch.log_ratio for batch in batches], axis=1),
     )
-
-
-def _elite_quantile(values: Floats, limit: float) -> float:
-    """Return the level that the highest fifth of responses exceeds, as is usual for the method."""
-    values = values[~np.isnan(values)]
-    return float(np.quantile(values, 1 - 0.2, method="lower")) if values.size else limit
 
 
 def _cross_entropy_proposals(points: _Points, level: float, limit: float) -> list[_Normal]:

@@ -252,6 +252,7 @@ class _Forecast:
         return sd
 
     def _quantity_sd(self, thetas: Floats) -> float:
+        """Return the standard deviation of the quantity."""
         assert self.quantity is not None
         assert self.sample is not None
         values = self.sample.evaluate(self.quantity, thetas)

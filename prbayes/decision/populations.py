@@ -96,22 +96,18 @@ class Populations:
     def sample(
         self, response: Callable[..., Any], inputs: Sequence[Any], output: Any, **calling: Any
     ) -> ResponseSample:
-        """Return one output of a response at the design's specimens; compute it where unknown.
-
-        Raises
-        ------
-        TypeError
-            If no simulator has stored or emulated specimens of these inputs.
-        DesignError
-            If the design does not support the populations, or too many responses are NaN.
-        """
+        """Return one output of a response at the design's specimens, computed where unknown."""
         sample = self.sample_of_all_outputs(response, inputs, **calling)
         return replace(sample, column=output_column(sample.responses, sample.outputs, output))
 
     def sample_of_all_outputs(
         self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
     ) -> ResponseSample:
-        """Return all outputs of a response at the design's specimens, as `sample` does."""
+        """Return all outputs of a response at the design's specimens.
+
+        Raises TypeError if no simulator has specimens of these inputs, and DesignError if the
+        design does not support the populations, or too many responses are NaN.
+        """
         responses = self.responses(response, inputs, **calling)
         simulators = self.evaluator.simulators
         simulator = serving(simulators, responses)

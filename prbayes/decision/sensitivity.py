@@ -369,6 +369,7 @@ def _complete_pairs(a: Floats, b: Floats) -> tuple[Floats, Floats]:
 
 
 def _ratio(part: Floats, variance: Floats) -> Floats:
+    """Return a share of a variance; NaN of none."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(variance > 0, part / variance, np.nan)
 

@@ -609,10 +609,7 @@ def _best(
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:
     """Raise if an argument of `Surrogate.fit` is not of its kind."""
-    if not callable(response):
-        raise TypeError(
-            f"{name}: response: got {type(response).__name__}, expected a function of the inputs"
-        )
+    refuse_uncallable(name, response)
     is_regressor = hasattr(model, "fit") and hasattr(model, "predict")
     is_surface = isinstance(model, Surface) or is_regressor
     if isinstance(model, type) or not is_surface:

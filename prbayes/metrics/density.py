@@ -167,10 +167,12 @@ class GaussianKDE(DensityEstimator):
         below = mass[np.clip(reach - nodes, 0, mass.size - 1)]
         tight = 2 * np.sqrt(np.pi) * h  # the integral of a kernel's square is 1 / tight
         centers = low + step * np.arange(n_nodes, dtype=np.float64)
+        widths = np.r_[np.full(n_nodes, step), tight, tight]
         return KernelCells(
-            widths=np.r_[np.full(n_nodes, step), tight, tight],
+            widths=widths,
             centers=centers,
             smooth=True,
+            floor=_FLOOR / widths.sum(),
             bandwidth=h,
             step=step,
             kernel=kernel,
@@ -225,10 +227,12 @@ class Histogram(DensityEstimator):
             n_bins = np.ceil((high - low) / bin_width) if bin_width > 0 else _MAX_CELLS
             bins = int(np.clip(n_bins, 5, _MAX_CELLS))
         width = (high - low) / bins
+        widths = np.full(bins + 2, width)
         return BinCells(
-            widths=np.full(bins + 2, width),
+            widths=widths,
             centers=low + width * (np.arange(bins, dtype=np.float64) + 0.5),
             smooth=False,
+            floor=_FLOOR / widths.sum(),
         )
 
 
@@ -309,17 +313,12 @@ class DensityDiscrepancy(Discrepancy):
         """One: divergences and log densities have no units."""
         return 1.0
 
-    @property
-    def floor(self) -> Any:
-        """The density of the floor, which has 1e-9 of the mass in all cells."""
-        return _FLOOR / self.cells.widths.sum()
-
     def floored(self, density: Any, floor: Any = None) -> Any:
         """Mix a density with 1e-9 of the uniform density over all cells: the package's only floor.
 
         It bounds logarithms at log(1e-9 / length) where a population leaves the observed values.
         """
-        return (1 - _FLOOR) * density + (self.floor if floor is None else floor)
+        return (1 - _FLOOR) * density + (self.cells.floor if floor is None else floor)
 
 
 class CellwiseDiscrepancy(DensityDiscrepancy):

@@ -170,7 +170,7 @@ class DivergenceDiscrepancy(CellwiseDiscrepancy):
     @property
     def constants(self) -> tuple[Any, ...]:
         """The observed density, the floor of the simulated one, and the widths."""
-        return self.floored(self.density), self.floor, self.cells.widths
+        return self.floored(self.density), self.cells.floor, self.cells.widths
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return the integral of a log(a / b), (a, b) = (q, p) forward, (p, q) in reverse."""

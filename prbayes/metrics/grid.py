@@ -40,6 +40,7 @@ class Cells(ABC):
     widths: Floats  # (m,): length of each cell; of the outer two, as documented by the estimator
     centers: Floats  # (m - 2,): positions of the inner cells, in units of the response
     smooth: bool  # whether the density has derivatives with respect to the sample's values
+    floor: float  # the density of a small share of the mass, spread evenly over all cells
 
     @abstractmethod
     def density(self, sample: Floats, weights: Floats) -> Floats:
@@ -49,22 +50,12 @@ class Cells(ABC):
         """Return A, shape (n, m), with ``density(sample, w) == w @ A``."""
         return self.density(sample[:, None], np.ones(1))
 
+    @abstractmethod
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return r such that ``r @ g`` is the weighted mean at points of g, given on the cells.
 
         Shapes (n,), (..., n) -> (..., m).
         """
-        # In blocks, to limit the memory of the matrix of points by cells.
-        step = max(1, AT_ONCE // self.widths.size)
-        total = self._reading(points[:step], weights[..., :step])
-        for start in range(step, points.size, step):
-            block = slice(start, start + step)
-            total = total + self._reading(points[block], weights[..., block])
-        return total
-
-    @abstractmethod
-    def _reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return the reading of a block of points."""
 
     @abstractmethod
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
@@ -120,34 +111,36 @@ class KernelCells(Cells):
         density = np.concatenate([inner, outside / self.widths[-1]], axis=-1)
         return density.reshape(*batch, nodes + 2)
 
-    def _reading(self, points: Floats, weights: Floats) -> Floats:
+    def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return cubic convolution weights (Keys 1981), which are exact for parabolas.
 
         Points off the grid are read at the cell of the mass on their side.
         """
-        # A point is a node and a fraction of a step beyond it.
-        t = points / self.step - self.low
         last = self.centers.size - 2
-        below = t < 1
-        above = t >= last
-        inside = (t >= 1) & (t < last)
-        t = np.where(inside, t, 1.0)
-        node = t.astype(np.intp)
-        t -= node
-        s = 1 - t
-        keys = (
-            -t * s**2 / 2,
-            1 - 2.5 * t**2 + 1.5 * t**3,
-            1 - 2.5 * s**2 + 1.5 * s**3,
-            -s * t**2 / 2,
-        )
-        row = np.arange(points.size)
-        matrix = np.zeros((points.size, self.widths.size))
-        for k, contribution in enumerate(keys):
-            matrix[row, node - 1 + k] += np.where(inside, contribution, 0.0)
-        matrix[below, -2] = 1.0
-        matrix[above, -1] = 1.0
-        return product(weights, matrix)
+        total: Any = 0.0
+        for block in _blocks(points.size, self.widths.size):
+            # A point is a node and a fraction of a step beyond it.
+            t = points[block] / self.step - self.low
+            inside = (t >= 1) & (t < last)
+            below, above = t < 1, t >= last
+            t = np.where(inside, t, 1.0)
+            node = t.astype(np.intp)
+            t -= node
+            s = 1 - t
+            keys = (
+                -t * s**2 / 2,
+                1 - 2.5 * t**2 + 1.5 * t**3,
+                1 - 2.5 * s**2 + 1.5 * s**3,
+                -s * t**2 / 2,
+            )
+            row = np.arange(t.size)
+            matrix = np.zeros((t.size, self.widths.size))
+            for k, contribution in enumerate(keys):
+                matrix[row, node - 1 + k] += np.where(inside, contribution, 0.0)
+            matrix[below, -2] = 1.0
+            matrix[above, -1] = 1.0
+            total = total + product(weights[..., block], matrix)
+        return np.asarray(total)
 
     def adjoint(self, sample: Floats, cotangent: Floats, *, for_sample: bool = False) -> Floats:
         """Return the smoothed cotangent at the sample, or its derivative there."""
@@ -181,6 +174,12 @@ class KernelCells(Cells):
         return out.reshape(*batch, n)
 
 
+def _blocks(n: int, m: int) -> list[slice]:
+    """Return blocks of n points whose matrices with m columns fit into memory."""
+    step = max(1, AT_ONCE // m)
+    return [slice(start, start + step) for start in range(0, max(1, n), step)]
+
+
 @dataclass(frozen=True, eq=False)
 class BinCells(Cells):
     """Equal bins, closed on the left, the last one on both sides."""
@@ -196,9 +195,12 @@ class BinCells(Cells):
         counts = np.bincount(cell.ravel(), w.ravel(), rows * cells).reshape(*batch, cells)
         return cast(Floats, counts[..., :-1] / self.widths[0])
 
-    def _reading(self, points: Floats, weights: Floats) -> Floats:
+    def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return the weight of the points in each bin."""
-        return np.asarray(weights @ self.basis(points) * self.widths)
+        total: Any = 0.0
+        for block in _blocks(points.size, self.widths.size):
+            total = total + weights[..., block] @ self.basis(points[block]) * self.widths
+        return np.asarray(total)
 
     def _cell(self, sample: Floats) -> NDArray[np.intp]:
         """Return cell numbers: bins, then below, above, and NaN."""

@@ -223,7 +223,7 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     @property
     def constants(self) -> tuple[Any, ...]:
         """The floor of the density, and the reading at the observed values."""
-        return self.floor, self.reading
+        return self.cells.floor, self.reading
 
     def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return the terms of minus the weighted mean of log p at the observed values."""

@@ -16,10 +16,7 @@ def cross(theta: Floats, step: Floats) -> Floats:
 
 
 def slopes(values: Floats, step: Floats) -> Floats:
-    """Return central differences of values at a cross, (1 + 2 d, ...) -> (..., d).
-
-    Where one of two neighbours is not finite, as at the edge of a support, they are one-sided.
-    """
+    """Return central differences at a cross, (1 + 2 d, ...) -> (..., d), one-sided at an edge."""
     last = np.moveaxis(values, 0, -1)
     center, up, down = np.split(last, [1, 1 + step.size], axis=-1)
     with np.errstate(invalid="ignore"):
@@ -34,10 +31,7 @@ def slopes(values: Floats, step: Floats) -> Floats:
 def differences(
     values: Callable[[Floats], Floats], step: Floats
 ) -> Callable[[Floats], tuple[float, Floats, int]]:
-    """Return a function of theta that returns value, gradient by differences, and evaluations.
-
-    ``values`` maps thetas (P, d) to values (P,); ``step`` has shape (d,).
-    """
+    """Return a function of theta that returns value, gradient by differences, and evaluations."""
 
     def function(theta: Floats) -> tuple[float, Floats, int]:
         at_points = values(cross(theta, step))
@@ -47,10 +41,7 @@ def differences(
 
 
 def stencil(r: int) -> Floats:
-    """Return the cross of unit steps around zero, then the four corners of each pair of axes.
-
-    Shape (1 + 2 r + 2 r (r - 1), r).
-    """
+    """Return a cross of unit steps around zero, then four corners of each pair of axes, (s, r)."""
     unit = np.eye(r)
     rows = list(cross(np.zeros(r), np.ones(r)))
     for i, j in zip(*np.tril_indices(r, -1), strict=True):

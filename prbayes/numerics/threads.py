@@ -21,11 +21,7 @@ def _algebra() -> Any:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Do linear algebra in one thread, inside or in the function that this decorates.
-
-    Several gain little on matrices of a few hundred rows, and take ten times as long on a busy
-    machine.
-    """
+    """Do linear algebra in one thread, as several are ten times slower on a busy machine."""
     if not _setting.acquire(blocking=False):
         yield
         return

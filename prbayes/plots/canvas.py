@@ -34,7 +34,7 @@ Ticks = tuple[list[float], list[str]]  # positions and labels
 
 
 def refuse_look(labels: object, pc_kwargs: Mapping[str, Any]) -> None:
-    """Raise if labels are no texts by name, or the size is none, before anything is computed."""
+    """Raise if labels are not texts by name, or the size is wrong, before anything is computed."""
     if labels is not None:
         texts(labels, "labels")
     if "backend" in pc_kwargs:
@@ -42,15 +42,9 @@ def refuse_look(labels: object, pc_kwargs: Mapping[str, Any]) -> None:
             f"backend: got {called(pc_kwargs['backend'])}, expected none: pictures are drawn by "
             "Matplotlib"
         )
-    _figure_size(pc_kwargs.get("figsize"))
-
-
-def _figure_size(figsize: Any) -> tuple[float, float] | None:
-    """Return width and height in inches, or raise if they are not two positive numbers."""
-    if figsize is None:
-        return None
+    figsize = pc_kwargs.get("figsize")
     try:
-        width, height = map(float, figsize)
+        width, height = (1.0, 1.0) if figsize is None else map(float, figsize)
     except (TypeError, ValueError):
         width = height = np.nan
     if not (0 < width < np.inf and 0 < height < np.inf):
@@ -58,7 +52,6 @@ def _figure_size(figsize: Any) -> tuple[float, float] | None:
             f"figsize: got {figsize!r:.60}, expected width and height of the picture in inches, "
             "such as (8, 5)"
         )
-    return width, height
 
 
 class Canvas:
@@ -68,44 +61,36 @@ class Canvas:
     """
 
     def __init__(
-        self, panels: Sequence[str], *, size: tuple[float, float], pc_kwargs: dict[str, Any]
+        self, names: Sequence[str], *, size: tuple[float, float], pc_kwargs: dict[str, Any]
     ) -> None:
         # Three panels a row; four make a square.
-        n = len(panels)
+        n = len(names)
         settings = {"cols": ["__variable__"], "col_wrap": 2 if n == 4 else 3, **pc_kwargs}
         columns = min(n, settings["col_wrap"])
         rows = -(-n // columns)
         figure = {
-            "figsize": _figure_size(settings.pop("figsize", None))
-            or (size[0] * columns, size[1] * rows),
+            "figsize": settings.pop("figsize", None) or (size[0] * columns, size[1] * rows),
             "figsize_units": "inches",
             "layout": "constrained",  # makes room for the legend
         }
         settings["figure_kwargs"] = figure | settings.get("figure_kwargs", {})
         arviz: Any = import_module("arviz")
-        data = xr.Dataset({name: (f"{name} point", np.zeros(2)) for name in panels})
+        data = xr.Dataset({name: (f"{name} point", np.zeros(2)) for name in names})
         self._collection = arviz.PlotCollection.wrap(data, backend="matplotlib", **settings)
         library = import_module("arviz_plots.backend.matplotlib")
-        self._panels = {
-            name: Panel(library, self._collection.get_target(name, {})) for name in panels
-        }
-
-    def panel(self, name: str) -> Panel:
-        """Return the panel of a name, to draw on."""
-        return self._panels[name]
+        targets = {name: self._collection.get_target(name, {}) for name in names}
+        self.panels = {name: Panel(library, target) for name, target in targets.items()}
 
     def finish(self) -> Any:
         """Return the `PlotCollection`, with a legend, and the artists by visual and panel."""
         by_visual: dict[str, dict[str, Any]] = {}
-        for name, panel in self._panels.items():
+        for name, panel in self.panels.items():
             for visual, artist in panel.artists.items():
-                cell = np.empty((), dtype=object)
-                cell[()] = artist
-                by_visual.setdefault(visual, {})[name] = ((), cell)
+                by_visual.setdefault(visual, {})[name] = ((), np.array(artist, dtype=object))
         for visual, artists in by_visual.items():
             self._collection.viz[visual] = xr.DataTree(xr.Dataset(artists))
         figure = self._collection.viz["figure"].item()
-        draw_legend(figure, [panel.target for panel in self._panels.values()])
+        draw_legend(figure, [panel.target for panel in self.panels.values()])
         return self._collection
 
 
@@ -139,24 +124,18 @@ class Panel:
     def line(
         self,
         visual: str,
-        x: Any,
-        y: Any,
+        xy: Any,
         color: str,
         *,
         style: str = SOLID,
         width: float | None = 1.8,
         legend: str = "",
     ) -> None:
-        """Draw a line; without a width, that of Matplotlib's settings."""
-        look: dict[str, Any] = {} if width is None else {"width": width}
-        self.artists[visual] = self.library.line(
-            *map(np.asarray, (x, y)),
-            self.target,
-            color=color,
-            linestyle=style,
-            label=legend,
-            **look,
-        )
+        """Draw a line through places x and y; without a width, that of Matplotlib's settings."""
+        look: dict[str, Any] = {"color": color, "linestyle": style, "label": legend}
+        if width is not None:
+            look["width"] = width
+        self.artists[visual] = self.library.line(*map(np.asarray, xy), self.target, **look)
 
     def band(
         self,
@@ -176,48 +155,18 @@ class Panel:
     def points(
         self,
         visual: str,
-        x: Any,
-        y: Any,
+        xy: Any,
         color: str,
         *,
         marker: str = CIRCLE,
         size: float = 30,
         legend: str = "",
     ) -> None:
-        """Draw markers of an area, in square points."""
-        places = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
+        """Draw markers of an area, in square points, at places x and y."""
+        places = np.broadcast_arrays(*map(np.atleast_1d, xy))
         self.artists[visual] = self.library.scatter(
             *places, self.target, color=color, marker=marker, size=size, label=legend
         )
-
-    def heights(
-        self,
-        visual: str,
-        axes: tuple[Floats, Floats],
-        z: Floats,
-        levels: Floats,
-        ticks: Ticks,
-        name: str,
-    ) -> None:
-        """Draw heights, (x, y), as colours from dark to light with contours and a colour bar.
-
-        Heights above the last level have its colour. The bar has the ticks and the name.
-        """
-        filled = self.library.contourf(
-            *axes, np.minimum(z, levels[-1]), self.target, levels=levels, cmap="cividis", alpha=0.45
-        )
-        lines = self.library.contour(
-            *axes, z, self.target, levels=levels[1:-1], color=GREY, alpha=0.6
-        )
-        self.artists.update({visual: filled, f"{visual}_lines": lines})
-        bar = self.target.figure.colorbar(filled, ax=self.target)
-        places, labels = ticks
-        bar.set_ticks(places, labels=labels)
-        bar.set_label(name)
-
-    def blank(self) -> None:
-        """Leave the panel empty, without axes."""
-        self.target.set_axis_off()
 
     def axes(
         self,
@@ -253,34 +202,19 @@ def round_ticks(low: float, high: float) -> Ticks:
     return places.tolist(), ["0" if abs(x) < step / 2 else f"{x:.12g}" for x in places]
 
 
-def spans_decades(values: Floats) -> bool:
-    """Return whether logarithms show values better: all are positive, the largest 20 times more."""
+def scale_by_decades(target: Any, values: Floats) -> None:
+    """Make the y axis logarithmic if all values are positive and the largest is 20 times more."""
     finite = values[np.isfinite(values)]
-    if not finite.size or finite.min() <= 0:
-        return False
-    return bool(finite.max() > 20 * finite.min())
+    if not finite.size or finite.min() <= 0 or finite.max() <= 20 * finite.min():
+        return
+    from matplotlib.ticker import LogLocator, NullLocator
 
-
-def log_ticks(values: Floats) -> Ticks:
-    """Return ticks of positive values: positions as base-10 logarithms, labels of the values."""
-    finite = values[np.isfinite(values)]
-    logs = np.log10(finite[finite > 0])
-    low = logs.min()
-    high = logs.max()
-    # At most six powers of ten; 1, 2, 5 within two decades.
-    powers = np.arange(np.floor(low), np.ceil(high) + 1)
-    step = -(-powers.size // 6)
-    factors = (1, 2, 5) if high - low < 2 else (1,)
-    margin = 0.05 * (high - low) + 1e-9  # the axis reaches a little beyond the values
-    places: list[float] = []
-    labels: list[str] = []
-    for power in powers[::step]:
-        for factor in factors:
-            place = power + np.log10(factor)
-            if low - margin <= place <= high + margin:
-                places.append(float(place))
-                labels.append(f"{factor * 10.0**power:g}")
-    return places, labels
+    # At most seven powers of ten; 1, 2, 5 within two decades.
+    factors = (1.0, 2.0, 5.0) if finite.max() < 100 * finite.min() else (1.0,)
+    target.set_yscale("log")
+    target.yaxis.set_major_locator(LogLocator(subs=factors, numticks=6))
+    target.yaxis.set_major_formatter("{x:g}")
+    target.yaxis.set_minor_locator(NullLocator())
 
 
 # -- labels of variables, statistics and metrics ---------------------------------------------
@@ -337,7 +271,11 @@ def refuse_labels(
     names = list(dict.fromkeys(shown))
     allowed = {*names, *map(variable_of, names), *STATISTIC_LABELS, *METRIC_LABELS}
     if evaluator is not None:
-        allowed |= _names_of_model(evaluator)
+        allowed |= set(map(str, evaluator.model.named_vars))
+        for node in evaluator.simulators:
+            allowed |= {node.name, node.outputs.dim, *map(str, node.outputs.names)}
+            inputs = set(map(variable_of, aleatory_names(node.inputs, node.responses.function)))
+            allowed |= inputs | {f"{name} of {node.name}" for name in inputs}
     unknown = [name for name in labels if not {name, variable_of(name)} & allowed]
     if unknown and (evaluator is not None or len(unknown) == len(labels)):
         more = ", ..." if len(names) > 12 else ""
@@ -345,13 +283,3 @@ def refuse_labels(
             f"labels: got {unknown[0]!r:.60}, which is no name of what is shown; expected some of "
             f"{', '.join(names[:12])}{more}"
         )
-
-
-def _names_of_model(evaluator: Evaluator) -> set[str]:
-    """Return the names of variables, simulators, outputs and inputs, which may have labels."""
-    names = set(map(str, evaluator.model.named_vars))
-    for node in evaluator.simulators:
-        names |= {node.name, node.outputs.dim, *map(str, node.outputs.names)}
-        for name in aleatory_names(node.inputs, node.responses.function):
-            names |= {variable_of(name), f"{variable_of(name)} of {node.name}"}
-    return names

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Floats, flag
+from prbayes._validate import flag
 from prbayes.plots.canvas import (
     BLUE,
     DOTTED,
@@ -97,24 +97,27 @@ def plot_comparison(
 
     canvas = Canvas(names, size=(4.8, 1.6 + 0.34 * n), pc_kwargs=pc_kwargs)
     for name in names:
-        panel = canvas.panel(name)
+        panel = canvas.panels[name]
         if scores:
             values = comparison[name].values
             finite = np.isfinite(values)
-            panel.points("score", values[finite], rows[finite], BLUE, size=45)
+            panel.points("score", (values[finite], rows[finite]), BLUE, size=45)
         else:
             row = comparison.sel(hyperparameter=name)
             values = np.concatenate([row.lower, row.upper, row.estimate])
             if n > 1:  # a line through the first result, for comparison
                 first = np.repeat(row.estimate.values[:1], 2)
                 text = f"estimate of {texts[0]}"
-                panel.line("first", first, limits, GREY, style=DOTTED, width=1.2, legend=text)
+                panel.line("first", (first, limits), GREY, style=DOTTED, width=1.2, legend=text)
             for i, ends in enumerate(np.column_stack([row.lower, row.upper])):
                 if np.isfinite(ends).all():
                     y = np.repeat(rows[i], 2)
-                    panel.line(f"interval_{i}", ends, y, BLUE, width=3, legend=interval)
-            panel.points("estimate", row.estimate.values, rows, INK, size=45, legend="estimate")
-        xlim = _axis_limits(values)
+                    panel.line(f"interval_{i}", (ends, y), BLUE, width=3, legend=interval)
+            panel.points("estimate", (row.estimate.values, rows), INK, size=45, legend="estimate")
+        finite = values[np.isfinite(values)]
+        low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+        margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)  # for markers
+        xlim = float(low - margin), float(high + margin)
         panel.axes(
             x=named(name, METRIC_LABELS | dict(labels or {})),
             xlim=xlim,
@@ -123,11 +126,3 @@ def plot_comparison(
             yticks=(rows.tolist(), texts),
         )
     return canvas.finish()
-
-
-def _axis_limits(values: Floats) -> tuple[float, float]:
-    """Return the range of all finite values with a margin for markers."""
-    finite = values[np.isfinite(values)]
-    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-    margin = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)
-    return float(low - margin), float(high + margin)

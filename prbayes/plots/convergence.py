@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._validate import Floats
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,
@@ -21,12 +20,10 @@ from prbayes.plots.canvas import (
     STATISTIC_LABELS,
     VERMILION,
     Canvas,
-    Panel,
-    log_ticks,
     named,
     refuse_labels,
     refuse_look,
-    spans_decades,
+    scale_by_decades,
 )
 from prbayes.plots.landscape import (
     check_optimum,
@@ -91,39 +88,31 @@ def plot_optimizer(
     refuse_labels(labels, hyperparameters, evaluator=optimum.evaluator)
     canvas = Canvas(["discrepancy", *hyperparameters], size=(4.6, 3.4), pc_kwargs=pc_kwargs)
     evaluations = optimum.search.trace["evaluations"].astype(np.float64)
-    _draw_objective(canvas.panel("discrepancy"), optimum, evaluations)
-    ends = evaluations[[0, -1]]
-    for name in hyperparameters:
-        panel = canvas.panel(name)
-        panel.line("path", evaluations, path[name], GREY, width=0.8)
-        panel.points("asked", evaluations, path[name], GREY, size=16, legend="evaluated")
-        level = np.repeat(final[name], 2)
-        panel.line("optimum", ends, level, VERMILION, style=DASHED, legend="optimum")
-        panel.axes(x="evaluations", y=named(name, labels))
-    return canvas.finish()
 
-
-def _draw_objective(panel: Panel, optimum: Optimum, evaluations: Floats) -> None:
-    """Draw the objective of each point, and the lowest so far."""
-    # Recomputed with the final design and scales, where that costs no response
+    # The objective, recomputed with the final design and scales where that costs no response
     is_free = not optimum.evaluator.responses_per_theta
     values = optimum.search.trace["discrepancy"]
     if is_free:
         values = objective(optimum, optimum.evaluator, optimum.search.trace["theta"])
-    values = np.where(np.isfinite(values), values, np.nan)
-    best = np.fmin.accumulate(values)
-    ticks = None
-    if spans_decades(values):
-        ticks = log_ticks(values)
-        values = np.log10(values)
-        best = np.log10(best)
     finite = np.isfinite(values)
-    x = evaluations[finite]
-    panel.points("asked", x, values[finite], GREY, size=16, legend="evaluated")
+    x, values = evaluations[finite], values[finite]
+    panel = canvas.panels["discrepancy"]
+    panel.points("asked", (x, values), GREY, size=16, legend="evaluated")
     # Values of different scales cannot be compared
     if is_free or len(optimum.scales) == 1:
-        panel.line("best", x, best[finite], BLUE, legend="lowest so far")
-    panel.axes(x="evaluations", y=objective_label(optimum), yticks=ticks)
+        panel.line("best", (x, np.minimum.accumulate(values)), BLUE, legend="lowest so far")
+    panel.axes(x="evaluations", y=objective_label(optimum))
+    scale_by_decades(panel.target, values)
+
+    for name in hyperparameters:
+        panel = canvas.panels[name]
+        panel.line("path", (evaluations, path[name]), GREY, width=0.8)
+        panel.points("asked", (evaluations, path[name]), GREY, size=16, legend="evaluated")
+        level = np.repeat(final[name], 2)
+        ends = evaluations[[0, -1]]
+        panel.line("optimum", (ends, level), VERMILION, style=DASHED, legend="optimum")
+        panel.axes(x="evaluations", y=named(name, labels))
+    return canvas.finish()
 
 
 def plot_stages(
@@ -170,25 +159,12 @@ def plot_stages(
     True
     """
     refuse_look(labels, pc_kwargs)
-    statistics = _read_statistics(posterior)
-    refuse_labels(labels, statistics)
-    canvas = Canvas(list(statistics), size=(4.6, 3.4), pc_kwargs=pc_kwargs)
-    for name, values in statistics.items():
-        label = named(name, STATISTIC_LABELS | dict(labels or {}))
-        _draw_statistic(canvas.panel(name), values, label)
-    return canvas.finish()
-
-
-def _read_statistics(posterior: xr.DataTree) -> dict[str, xr.DataArray]:
-    """Return the statistics by stage, (chains, stages); those of one stage only come last.
-
-    NaN is unknown, or after the last stage of a chain.
-    """
     if not isinstance(posterior, xr.DataTree) or "sample_stats" not in posterior:
         raise TypeError(
             f"plot_stages: posterior: got {type(posterior).__name__}, expected the DataTree of "
             "prb.sample_smc, with sample_stats"
         )
+    # NaN is unknown, or after the last stage of a chain
     statistics = {
         str(name): values.transpose("chain", "stage").astype(np.float64)
         for name, values in posterior["sample_stats"].data_vars.items()
@@ -199,37 +175,32 @@ def _read_statistics(posterior: xr.DataTree) -> dict[str, xr.DataArray]:
             "plot_stages: got sample_stats without dims (chain, stage), expected those of "
             "prb.sample_smc"
         )
-    return dict(sorted(statistics.items(), key=lambda item: _is_of_one_stage(item[1].values)))
-
-
-def _is_of_one_stage(rows: Floats) -> bool:
-    return bool((np.isfinite(rows).sum(axis=1) <= 1).all())
-
-
-def _draw_statistic(panel: Panel, values: xr.DataArray, label: str) -> None:
-    """Draw a statistic of each chain: by stage, or by chain if it is known once."""
-    rows = values.values
-    chains = [str(chain) for chain in values.chain.values.tolist()]
-    is_once = _is_of_one_stage(rows)
-    ticks = None
-    if values.name == "beta" and spans_decades(rows):
-        # Beta starts at a small value and grows by orders of magnitude
-        ticks = log_ticks(rows)
-        rows = np.log10(rows)
+    refuse_labels(labels, statistics)
+    # Those of one stage only come last
+    is_once = {name: values.count("stage").values.max() <= 1 for name, values in statistics.items()}
+    names = sorted(statistics, key=lambda name: is_once[name])
+    canvas = Canvas(names, size=(4.6, 3.4), pc_kwargs=pc_kwargs)
     # Chains differ in colour and in style; five times four before they repeat
     styles = (SOLID, DASHED, DOTTED, DASHDOT)
-    for c, (chain, row) in enumerate(zip(chains, rows, strict=True)):
-        visual = f"chain_{chain}"
-        color = CYCLE[c % len(CYCLE)]
-        stages = np.flatnonzero(np.isfinite(row))
-        if is_once:
-            panel.points(visual, [c + 1.0], row[stages][-1:], color, size=45)
-        else:
-            style = styles[c % len(styles)]
-            text = f"chain {chain}"
-            panel.line(visual, stages + 1.0, row[stages], color, style=style, legend=text)
-    names = chains if is_once else [str(stage + 1) for stage in range(rows.shape[1])]
-    step = -(-len(names) // 10)  # at most ten ticks
-    places = [float(place + 1) for place in range(0, len(names), step)]
-    x = "chain" if is_once else "stage"
-    panel.axes(x=x, y=label, xticks=(places, names[::step]), yticks=ticks)
+    for name in names:
+        panel = canvas.panels[name]
+        rows = statistics[name].values
+        chains = [str(chain) for chain in statistics[name].chain.values.tolist()]
+        for c, (chain, row) in enumerate(zip(chains, rows, strict=True)):
+            visual = f"chain_{chain}"
+            color = CYCLE[c % len(CYCLE)]
+            stages = np.flatnonzero(np.isfinite(row))
+            if is_once[name]:
+                panel.points(visual, ([c + 1.0], row[stages][-1:]), color, size=45)
+            else:
+                look: Any = {"style": styles[c % len(styles)], "legend": f"chain {chain}"}
+                panel.line(visual, (stages + 1.0, row[stages]), color, **look)
+        ticks = chains if is_once[name] else [str(stage + 1) for stage in range(rows.shape[1])]
+        step = -(-len(ticks) // 10)  # at most ten
+        places = [float(place + 1) for place in range(0, len(ticks), step)]
+        y = named(name, STATISTIC_LABELS | dict(labels or {}))
+        x = "chain" if is_once[name] else "stage"
+        panel.axes(x=x, y=y, xticks=(places, ticks[::step]))
+        if name == "beta":  # starts at a small value and grows by orders of magnitude
+            scale_by_decades(panel.target, rows)
+    return canvas.finish()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from prbayes._stats import cumulated, distribution_function, quantile
+from prbayes._stats import cumulated, quantile
 from prbayes._validate import Floats
 from prbayes.metrics.density import GaussianKDE, Histogram, silverman
 
@@ -25,20 +24,14 @@ def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, F
             yield row[used], w[used] / w[used].sum()
 
 
-def typical_bandwidth(values: Floats, weights: Floats) -> float:
-    """Return the median of Silverman's bandwidths of weighted samples, shapes (P, n).
-
-    Values that are not finite are left out. The effective number of values is that of the weights:
-    uneven weights are smoothed more.
-    """
-    bandwidths = [silverman(row, w) for row, w in _finite_samples(values, weights)]
-    return float(np.median(bandwidths)) if bandwidths else 0.0
-
-
 def smooth_densities(values: Floats, weights: Floats, grid: Floats) -> Floats:
-    """Return densities, shape (P, g), of weighted samples, (P, n), smoothed by one bandwidth."""
-    # The bandwidths of 40 samples suffice for their median.
-    bandwidth = typical_bandwidth(values[:40], weights[:40])
+    """Return densities, shape (P, g), of weighted samples, (P, n), smoothed by one bandwidth.
+
+    It is the median of Silverman's bandwidths of 40 samples, for the effective numbers of values.
+    """
+    samples = _finite_samples(values[:40], weights[:40])
+    bandwidths = [silverman(row, w) for row, w in samples]
+    bandwidth = float(np.median(bandwidths)) if bandwidths else 0.0
     return densities(values, weights, grid, bandwidth)
 
 
@@ -80,11 +73,6 @@ def bounded_density(draws: Floats, grid: Floats) -> Floats:
     mirrored = np.concatenate([draws, 2 * low - draws, 2 * high - draws])
     density = densities(mirrored, np.tile(weights, 3), grid, bandwidth)
     return np.where((grid >= low) & (grid <= high), density, 0.0)
-
-
-def distribution_functions(values: Floats, weights: Floats, grid: Floats) -> Floats:
-    """Return the weight of values, shape (P, n), not above each point of a grid: (P, g)."""
-    return np.ascontiguousarray(distribution_function(values, weights, grid))
 
 
 def pointwise_band(curves: Floats, prob: float) -> tuple[Floats, Floats]:
@@ -177,47 +165,6 @@ def steps(values: Floats, heights: Floats, low: float, high: float) -> tuple[Flo
 # -- highest-density regions in a plane ------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class White:
-    """Coordinates in which weighted points have unit covariance."""
-
-    center: Floats  # (2,)
-    axes: Floats  # (2, 2): a column is a unit step along one of them
-
-    @classmethod
-    def of(cls, points: Floats, weights: Floats) -> White:
-        """Return the coordinates of points, (n, 2), with weights of sum 1.
-
-        The tails beyond 1% at either end are clipped: where responses diverge, a few specimens
-        would decide the width.
-        """
-        clipped = []
-        for column in points.T:
-            order = np.argsort(column, kind="stable")
-            low, high = np.searchsorted(np.cumsum(weights[order]), [0.01, 0.99])
-            ends = column[order[[low, min(high, column.size - 1)]]]
-            clipped.append(np.clip(column, ends[0], ends[1]))
-        points = np.column_stack(clipped)
-        center = weights @ points
-        deviations = points - center
-        spread = np.sqrt(weights @ deviations**2)
-        unit = np.where(spread > 0, spread, 1.0)
-        scaled = deviations / unit
-        covariance = scaled.T @ (weights[:, None] * scaled)
-        variances, vectors = np.linalg.eigh(covariance)
-        # Points on a line have a region too, thinner than its outline.
-        least = max(float(variances[-1]), 1e-300) * 1e-3**2
-        return cls(center, unit[:, None] * vectors * np.sqrt(np.maximum(variances, least)))
-
-    def of_points(self, points: Floats) -> Floats:
-        """Return coordinates of points, (n, 2)."""
-        return np.linalg.solve(self.axes, (points - self.center).T).T
-
-    def points(self, coordinates: Floats) -> Floats:
-        """Return the points of coordinates, (n, 2)."""
-        return self.center + coordinates @ self.axes.T
-
-
 def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[Floats]:
     """Return for each probability the outline of the smallest region that contains it.
 
@@ -237,42 +184,53 @@ def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[
     list of ndarray, shape (2, k)
         Lines one after the other, with NaN between them.
     """
+    from matplotlib.figure import Figure  # heavy, and only needed for pictures
+
+    # Coordinates in which the points have unit covariance: a column of ``axes`` is a unit step.
+    # The tails beyond 1% at either end are clipped: where responses diverge, a few specimens
+    # would decide the width.
     w = weights / weights.sum()
-    white = White.of(points, w)
+    clipped = []
+    for column in points.T:
+        order = np.argsort(column, kind="stable")
+        low, high = np.searchsorted(np.cumsum(w[order]), [0.01, 0.99])
+        ends = column[order[[low, min(high, column.size - 1)]]]
+        clipped.append(np.clip(column, ends[0], ends[1]))
+    central = np.column_stack(clipped)
+    center = w @ central
+    deviations = central - center
+    spread = np.sqrt(w @ deviations**2)
+    unit = np.where(spread > 0, spread, 1.0)
+    scaled = deviations / unit
+    variances, vectors = np.linalg.eigh(scaled.T @ (w[:, None] * scaled))
+    # Points on a line have a region too, thinner than its outline.
+    least = max(float(variances[-1]), 1e-300) * 1e-3**2
+    axes = unit[:, None] * vectors * np.sqrt(np.maximum(variances, least))
+    x, y = np.linalg.solve(axes, (points - center).T)
+
     # Cells on a plane of 4.2 standard deviations: 2e-4 of a normal population are beyond. A cell is
     # a fifth of the narrowest kernel for which the plane matters.
     edges = np.linspace(-4.2, 4.2, 161)
-    x, y = white.of_points(points).T
     masses, *_ = np.histogram2d(x, y, bins=[edges, edges], weights=w)
     bandwidth = np.sum(w**2) ** (1 / 6)  # n ** (-1 / 6)
     density = gaussian_filter(masses, bandwidth / (edges[1] - edges[0]), mode="constant")
 
-    deflation = 1 / np.sqrt(1 + bandwidth**2)
+    # The density above which a probability lies, and the lines of this height
+    descending = np.sort(density.ravel())[::-1]
+    last = np.count_nonzero(descending) - 1
     middles = (edges[:-1] + edges[1:]) / 2
+    deflation = 1 / np.sqrt(1 + bandwidth**2)
     joined = []
     for prob in probs:
-        lines = _contour(middles, density, _threshold(density, prob))
-        joined.append(_joined([white.points(deflation * line) for line in lines]))
+        level = descending[min(np.searchsorted(np.cumsum(descending), prob), last)]
+        contours = Figure().add_subplot().contour(middles, middles, density.T, levels=[level])
+        lines = [deflation * np.asarray(line) for line in contours.allsegs[0] if len(line) > 1]
+        joined.append(with_gaps([center + line @ axes.T for line in lines]))
     return joined
 
 
-def _threshold(density: Floats, prob: float) -> float:
-    """Return the density above which a probability lies, of a density that sums to at most one."""
-    descending = np.sort(density.ravel())[::-1]
-    last = np.count_nonzero(descending) - 1
-    return float(descending[min(np.searchsorted(np.cumsum(descending), prob), last)])
-
-
-def _contour(middles: Floats, density: Floats, level: float) -> list[Floats]:
-    """Return lines of one height, (k, 2) each, of a density over (x, y)."""
-    from matplotlib.figure import Figure  # heavy, and only needed for pictures
-
-    contours = Figure().add_subplot().contour(middles, middles, density.T, levels=[level])
-    return [np.asarray(line) for line in contours.allsegs[0] if len(line) > 1]
-
-
-def _joined(lines: list[Floats]) -> Floats:
-    """Return lines, (k, 2) each, as one with gaps: (2, k)."""
+def with_gaps(lines: Sequence[Floats]) -> Floats:
+    """Return lines, (k, 2) each, as one with NaN between them: (2, k)."""
     gap = np.full((1, 2), np.nan)
     parts = [part for line in lines for part in (line, gap)]
     return np.concatenate(parts[:-1]).T if parts else np.empty((2, 0))

@@ -78,7 +78,14 @@ def read_result(
     values = [points[str(rv.name)] for rv in evaluator.model.free_RVs]
     thetas = evaluator.hyperparameters.thetas_of(values)
     if isinstance(result, Optimum):
-        around = _around(result, evaluator, thetas[0], n_draws, free=free)
+        around = thetas[:0]
+        if np.isfinite(result.covariance).all():
+            draws = np.random.default_rng(0).multivariate_normal(
+                thetas[0], result.covariance, size=n_draws, method="eigh"
+            )
+            in_support = evaluator.hyperparameters.in_support
+            ok = in_support(draws) if free else supported(evaluator, draws)
+            around = draws[ok] if ok.mean() > 0.5 else around
         return Ensemble(evaluator, thetas, around, "optimum", "standard error")
     if not free:
         ok = supported(evaluator, thetas)
@@ -108,85 +115,71 @@ def supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
     return out
 
 
-def _around(
-    optimum: Optimum, evaluator: Evaluator, center: Floats, n_draws: int, *, free: bool
-) -> Floats:
-    """Draw from the optimum's sampling distribution, unless it is unknown or unsupported."""
-    nothing = np.empty((0, center.size))
-    if not np.isfinite(optimum.covariance).all():
-        return nothing
-    rng = np.random.default_rng(0)
-    draws = rng.multivariate_normal(center, optimum.covariance, size=n_draws, method="eigh")
-    ok = evaluator.hyperparameters.in_support(draws) if free else supported(evaluator, draws)
-    return draws[ok] if ok.mean() > 0.5 else nothing
-
-
 def read_before(
     result: Optimum | xr.DataTree,
     evaluator: Evaluator,
     before: Mapping[str, Any] | bool | None,
+    caller: str,
 ) -> tuple[Floats, str]:
     """Return theta before a calibration, shape (1, d) or (0, d) for none, and its name.
 
     By default it is the optimiser's first point, if the optimiser was given a start or did not
-    screen for one; otherwise the prior's initial point, where PyMC's samplers start.
+    screen for one; otherwise the prior's initial point, where PyMC's samplers start. A point that
+    stored responses do not support is left out, with a finding.
     """
+    theta = evaluator.hyperparameters.initial[None]
     if before is False:
-        return np.empty((0, evaluator.hyperparameters.size)), ""
+        return theta[:0], ""
     if isinstance(before, Mapping):
         try:
-            return evaluator.hyperparameters.unconstrained(dict(before))[None], "as given"
+            theta = evaluator.hyperparameters.unconstrained(dict(before))[None]
         except (KeyError, TypeError, ValueError) as error:
             raise type(error)(f"before: {error.args[0]}") from None
-    if before not in (None, True):
+        name = "as given"
+    elif before not in (None, True):
         raise TypeError(
             f"before: got {type(before).__name__}, expected a dict with a value for each "
             "hyperparameter, None or False"
         )
-    if isinstance(result, Optimum) and not result.search.n_screened:
-        path = result.search.trace.get("theta")
-        if path is not None and len(path):
-            return path[:1], "optimiser's first point"
-    return evaluator.hyperparameters.initial[None], "prior's initial point"
+    else:
+        name = "prior's initial point"
+        if isinstance(result, Optimum) and not result.search.n_screened:
+            path = result.search.trace.get("theta")
+            if path is not None and len(path):
+                theta, name = path[:1], "optimiser's first point"
+    if not supported(evaluator, theta)[0]:
+        reason = "left out, because stored responses do not reach there."
+        report(Finding("population-left-out", f"{caller}: before ({name}): {reason}"))
+        theta = theta[:0]
+    return theta, name
 
 
-def if_supported(evaluator: Evaluator, theta: Floats, name: str) -> Floats:
-    """Return theta, (0 or 1, d), or none and a finding if stored responses do not support it."""
-    if not len(theta) or supported(evaluator, theta)[0]:
-        return theta
-    text = f"{name}: left out, because stored responses do not reach there."
-    report(Finding("population-left-out", text))
-    return theta[:0]
+def middle_of(curves: Floats, ensemble: Ensemble) -> Floats:
+    """Return the optimum's curve, (g,), or the mean of the posterior's, (P, g)."""
+    return curves[0] if len(ensemble.center) else curves.mean(axis=0)
 
 
-@dataclass(frozen=True, eq=False)
-class Calibrated:
-    """The calibrated curve, shape (g,), and the two sides of its band, if there is one."""
+def draw_calibrated(
+    panel: Panel,
+    grid: Floats,
+    curves: Floats,
+    ensemble: Ensemble,
+    prob: float,
+    *,
+    name: str = "calibrated",
+    alpha: float = 0.25,
+) -> float:
+    """Draw the middle of curves, (P, g), of ``ensemble.every`` in its band; return the top.
 
-    middle: Floats
-    band: tuple[Floats, Floats] | None
-
-    @classmethod
-    def of(cls, curves: Floats, ensemble: Ensemble, prob: float) -> Calibrated:
-        """Summarise curves, (P, g), of ``ensemble.every``.
-
-        The middle is the optimum's curve, or else the mean of the posterior's; the band contains
-        the share ``prob`` of the draws' curves at each point.
-        """
-        n = len(ensemble.center)
-        middle = curves[0] if n else curves[n:].mean(axis=0)
-        return cls(middle, pointwise_band(curves[n:], prob) if len(curves) > n else None)
-
-    @property
-    def top(self) -> float:
-        """The largest value."""
-        top = float(self.middle.max())
-        return top if self.band is None else max(top, float(self.band[1].max()))
-
-    def draw(self, panel: Panel, grid: Floats, ensemble: Ensemble, prob: float) -> None:
-        """Draw the calibrated curve in its band."""
-        if self.band is not None:
-            text = f"{prob:.0%} band of the {ensemble.spread}"
-            panel.band("band", grid, self.band, BLUE, legend=text)
-        text = f"calibrated: {ensemble.label}"
-        panel.line("after", grid, self.middle, BLUE, width=2.2, legend=text)
+    The band contains the share ``prob`` of the draws' curves at each point.
+    """
+    middle = middle_of(curves, ensemble)
+    top = float(middle.max())
+    spread = curves[len(ensemble.center) :]
+    if len(spread):
+        sides = pointwise_band(spread, prob)
+        top = max(top, float(sides[1].max()))
+        text = f"{prob:.0%} band of the {ensemble.spread}"
+        panel.band("band", grid, sides, BLUE, alpha=alpha, legend=text)
+    panel.line("after", (grid, middle), BLUE, width=2.2, legend=f"{name}: {ensemble.label}")
+    return top

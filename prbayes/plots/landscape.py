@@ -20,6 +20,7 @@ from prbayes.plots.canvas import (
     BLUE,
     CROSS,
     DIAMOND,
+    GREY,
     INK,
     VERMILION,
     Canvas,
@@ -104,7 +105,14 @@ def plot_landscape(
         points = 161 if len(names) == 1 else 41  # contours look smooth, in about a second
     else:
         points = positive_integer(points, "points", minimum=5)  # fewer show no bowl
-    _check_cost(evaluator, points ** len(names), responses)
+    n_points = points ** len(names)
+    cost = n_points * evaluator.responses_per_theta
+    if cost > responses:
+        raise ValueError(
+            f"plot_landscape: got responses={responses}, expected at least {cost}: {n_points} "
+            f"points with {evaluator.responses_per_theta} responses each; pass responses={cost}, "
+            "fewer points, or use prb.Reweighted(), whose pictures cost none"
+        )
 
     surface = landscape(optimum, evaluator, names, points)
     if not np.isfinite(surface.heights).any():
@@ -114,17 +122,15 @@ def plot_landscape(
         )
     fixed = [named(name, labels) for name in hyperparameters if name not in names]
     title = f"{', '.join(fixed)} fixed at the optimum" if fixed else ""
-    objective = objective_label(optimum)
     canvas = Canvas(["landscape"], size=(6.4, 5.4), pc_kwargs=pc_kwargs)
-    panel = canvas.panel("landscape")
-    x = named(names[0], labels)
+    panel = canvas.panels["landscape"]
+    texts = [*(named(name, labels) for name in names), objective_label(optimum)]
     xlim, *ylim = [(float(axis[0]), float(axis[-1])) for axis in surface.axes]
     if len(names) == 1:
         _draw_curve(panel, surface, alone=not fixed)
-        panel.axes(x=x, y=objective, title=title, xlim=xlim)
     else:
-        _draw_plane(panel, surface, objective)
-        panel.axes(x=x, y=named(names[1], labels), title=title, xlim=xlim, ylim=ylim[0])
+        _draw_plane(panel, surface, texts[-1])
+    panel.axes(x=texts[0], y=texts[1], title=title, xlim=xlim, ylim=ylim[0] if ylim else None)
     return canvas.finish()
 
 
@@ -157,28 +163,32 @@ def _axis_names(pair: Sequence[str] | None, hyperparameters: list[str]) -> list[
     return names
 
 
-def _check_cost(evaluator: Evaluator, n_points: int, responses: int) -> None:
-    """Raise if the picture would compute more responses than allowed."""
-    cost = n_points * evaluator.responses_per_theta
-    if cost > responses:
-        raise ValueError(
-            f"plot_landscape: got responses={responses}, expected at least {cost}: {n_points} "
-            f"points with {evaluator.responses_per_theta} responses each; pass responses={cost}, "
-            "fewer points, or use prb.Reweighted(), whose pictures cost none"
-        )
-
-
 def _draw_plane(panel: Panel, surface: Landscape, objective: str) -> None:
     """Draw the objective over two hyperparameters, with the path and a colour bar."""
-    roots, low, high = rooted(surface.heights)
-    first, second = surface.axes
+    # Even levels of the root are evenly spaced around an optimum where heights are a parabola.
+    finite = surface.heights[np.isfinite(surface.heights)]
+    low = float(finite.min())
+    high = float(np.quantile(finite, 0.9))
+    roots = np.sqrt(np.maximum(surface.heights - low, 0.0) / max(high - low, 1e-300))
     levels = np.linspace(0, 1, 11)
+    filled = panel.library.contourf(
+        *surface.axes,
+        np.minimum(roots, levels[-1]),
+        panel.target,
+        levels=levels,
+        cmap="cividis",
+        alpha=0.45,
+    )
+    lines = panel.library.contour(
+        *surface.axes, roots, panel.target, levels=levels[1:-1], color=GREY, alpha=0.6
+    )
+    panel.artists.update(landscape=filled, landscape_lines=lines)
+    bar = panel.target.figure.colorbar(filled, ax=panel.target)
     places = levels[::2]
-    ticks = (places.tolist(), distinct_texts(low + places**2 * (high - low)))
-    panel.heights("landscape", (first, second), roots, levels, ticks, objective)
-    x, y = surface.path.T
-    panel.line("path", x, y, INK, width=1.0)
-    _draw_marks(panel, (x, y), surface.optimum.T, surface.local_optima.T)
+    bar.set_ticks(places.tolist(), labels=distinct_texts(low + places**2 * (high - low)))
+    bar.set_label(objective)
+    panel.line("path", surface.path.T, INK, width=1.0)
+    _draw_marks(panel, surface.path.T, surface.optimum.T, surface.local_optima.T)
 
 
 def distinct_texts(values: Floats) -> list[str]:
@@ -205,7 +215,7 @@ def _draw_curve(panel: Panel, surface: Landscape, *, alone: bool) -> None:
         at = at[(at >= x[0]) & (at <= x[-1])]
         return np.stack([at, np.interp(at, x, heights)])
 
-    panel.line("landscape", x, heights, BLUE)
+    panel.line("landscape", (x, heights), BLUE)
     path = on_curve(surface.path) if alone else None
     local_optima = surface.local_optima if alone else surface.local_optima[:0]
     _draw_marks(panel, path, on_curve(surface.optimum), on_curve(local_optima))
@@ -214,21 +224,14 @@ def _draw_curve(panel: Panel, surface: Landscape, *, alone: bool) -> None:
 def _draw_marks(panel: Panel, path: Any, optimum: Floats, local_optima: Floats) -> None:
     """Mark points of the path, the optimum and other optima, shape (2, m) each."""
     if path is not None:
-        x, y = path
-        panel.points("asked", x, y, INK, size=14, legend="path of the optimiser")
-    x, y = optimum
-    panel.points("optimum", x, y, VERMILION, marker=DIAMOND, size=90, legend="optimum")
+        panel.points("asked", path, INK, size=14, legend="path of the optimiser")
+    panel.points("optimum", optimum, VERMILION, marker=DIAMOND, size=90, legend="optimum")
     if local_optima.size:
-        x, y = local_optima
-        panel.points("rivals", x, y, VERMILION, marker=CROSS, size=70, legend="other optima")
+        look: dict[str, Any] = {"marker": CROSS, "size": 70, "legend": "other optima"}
+        panel.points("rivals", local_optima, VERMILION, **look)
 
 
 # -- the objective and its values on a grid --------------------------------------------------
-
-
-# Half-width of an axis in standard errors: the normal approximation has a probability of 6e-5
-# beyond.
-_STANDARD_ERRORS = 4.0
 
 
 def check_optimum(optimum: Any, caller: str) -> None:
@@ -287,54 +290,9 @@ class Landscape:
     optimum: Floats  # (1, 1 or 2)
 
 
-@dataclass(frozen=True, eq=False)
-class _Plane:
-    """The plane along one or two hyperparameters through an optimum."""
-
-    evaluator: Evaluator
-    names: list[str]  # of the hyperparameters along the axes
-    center: dict[str, Floats]  # (1,): the optimum, by element name
-    shapes: dict[str, tuple[int, ...]]  # of the free variables
-
-    @classmethod
-    def of(cls, optimum: Optimum, evaluator: Evaluator, names: list[str]) -> _Plane:
-        center = optimum.theta[None]
-        values = evaluator.hyperparameters.constrained(center)
-        shapes = {str(rv.name): values[str(rv.name)].shape[1:] for rv in evaluator.model.free_RVs}
-        return cls(evaluator, names, free_elements(evaluator, center), shapes)
-
-    def thetas(self, places: Floats) -> Floats:
-        """Return thetas of places, shape (P, 1 or 2); NaN outside the priors' support."""
-        n = len(places)
-        columns: dict[str, list[Floats]] = {}
-        for name, value in self.center.items():
-            is_axis = name in self.names
-            column = places[:, self.names.index(name)] if is_axis else np.repeat(value, n)
-            columns.setdefault(variable_of(name), []).append(column)
-        values = [
-            np.column_stack(columns[variable]).reshape(n, *shape)
-            for variable, shape in self.shapes.items()
-        ]
-        with np.errstate(all="ignore"):
-            return self.evaluator.hyperparameters.thetas_of(values)
-
-    def within_support(self, name: str, end: float) -> float:
-        """Return how far an axis can go from the optimum towards an end within the support."""
-        # The axis ends short of the support's end by less than a 32nd.
-        steps = np.linspace(self.center[name][0], end, 33)
-        places = np.tile(_columns(self.center, self.names), (steps.size, 1))
-        places[:, self.names.index(name)] = steps
-        thetas = self.thetas(places)
-        ok = np.isfinite(thetas).all(axis=1)
-        ok[ok] = self.evaluator.hyperparameters.in_support(thetas[ok])
-        outside = np.flatnonzero(~ok)
-        last = max(outside[0] - 1, 0) if outside.size else -1
-        return float(steps[last])
-
-
 def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: int) -> Landscape:
     """Evaluate the objective on a grid of ``points`` along each of one or two hyperparameters."""
-    plane = _Plane.of(optimum, evaluator, names)
+    center = free_elements(evaluator, optimum.theta[None])
     path = free_elements(evaluator, optimum.search.trace["theta"])
     local_optima = np.array([rival["theta"] for rival in optimum.rivals])
     rivals = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
@@ -346,53 +304,42 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
         # The path beyond the prior's bulk, ten draws at each end, does not widen the axis.
         bulk = np.quantile(prior[name], (0.01, 0.99))
         marked = np.append(np.clip(path[name], *bulk), rivals[name])
-        error = errors[name]
-        if not (np.isfinite(error) and error > 0):  # unknown: an axis as wide as the prior
-            error = float((bulk[1] - bulk[0]) / (2 * _STANDARD_ERRORS))
-        low, high = _ends(plane.center[name], error, marked)
-        low = plane.within_support(name, low)
-        high = plane.within_support(name, high)
-        axes.append(np.linspace(low, high, points))
+        # Four standard errors: the normal approximation has a probability of 6e-5 beyond.
+        reach = 4 * errors[name]
+        if not 0 < reach < np.inf:  # unknown: an axis as wide as the prior
+            reach = float(bulk[1] - bulk[0]) / 2
+        first, last = center[name][0] - reach, center[name][0] + reach
+        # All marked points are within, by about the size of a marker.
+        margin = 0.04 * (max(last, marked.max()) - min(first, marked.min()))
+        ends = []
+        for end in (min(first, marked.min() - margin), max(last, marked.max() + margin)):
+            # Within the support of the priors, short of its end by less than a 32nd.
+            steps = np.linspace(center[name][0], end, 33)
+            thetas = _thetas_at(evaluator, center | {name: steps})
+            ok = np.isfinite(thetas).all(axis=1)
+            ok[ok] = evaluator.hyperparameters.in_support(thetas[ok])
+            ends.append(end if ok.all() else float(steps[max(int(np.argmin(ok)) - 1, 0)]))
+        axes.append(np.linspace(ends[0], ends[1], points))
 
     coordinates = np.meshgrid(*axes, indexing="ij")
-    thetas = plane.thetas(np.column_stack([c.ravel() for c in coordinates]))
+    on_grid = {name: x.ravel() for name, x in zip(names, coordinates, strict=True)}
+    thetas = _thetas_at(evaluator, center | on_grid)
     ok = supported(evaluator, thetas)
     heights = np.full(len(thetas), np.nan)
     heights[ok] = objective(optimum, evaluator, thetas[ok])
     heights[~np.isfinite(heights)] = np.nan
-    return Landscape(
-        axes,
-        heights.reshape(coordinates[0].shape),
-        path=_columns(path, names),
-        local_optima=_columns(rivals, names),
-        optimum=_columns(plane.center, names),
-    )
+    marks = [np.stack([x[name] for name in names], axis=-1) for x in (path, rivals, center)]
+    return Landscape(axes, heights.reshape(coordinates[0].shape), *marks)
 
 
-def _ends(center: Floats, error: float, marked: Floats) -> tuple[float, float]:
-    """Return the ends of an axis: beyond some standard errors, and beyond all marked points."""
-    reach = _STANDARD_ERRORS * error
-    first = center[0] - reach
-    last = center[0] + reach
-    lowest = marked.min()
-    highest = marked.max()
-    # About the size of a marker.
-    margin = 0.04 * (max(last, highest) - min(first, lowest))
-    return min(first, lowest - margin), max(last, highest + margin)
-
-
-def _columns(elements: dict[str, Floats], names: list[str]) -> Floats:
-    """Return the elements of some names side by side, shape (m, names)."""
-    return np.stack([elements[name] for name in names], axis=-1)
-
-
-def rooted(heights: Floats) -> tuple[Floats, float, float]:
-    """Return roots of heights above the lowest, 1 at their .9 quantile; lowest and quantile.
-
-    Even levels of the root are evenly spaced around an optimum where heights are a parabola.
-    """
-    finite = heights[np.isfinite(heights)]
-    low = float(finite.min())
-    high = float(np.quantile(finite, 0.9))
-    above = np.maximum(heights - low, 0.0)
-    return np.sqrt(above / max(high - low, 1e-300)), low, high
+def _thetas_at(evaluator: Evaluator, elements: dict[str, Floats]) -> Floats:
+    """Return thetas of elements by name, (n,) or (1,) each; NaN outside the priors' support."""
+    hyperparameters = evaluator.hyperparameters
+    columns: dict[str, list[Floats]] = {}
+    for name, column in zip(elements, np.broadcast_arrays(*elements.values()), strict=True):
+        columns.setdefault(variable_of(name), []).append(column)
+    shapes = hyperparameters.constrained(hyperparameters.initial[None])
+    names = [str(rv.name) for rv in evaluator.model.free_RVs]
+    values = [np.column_stack(columns[x]).reshape(-1, *shapes[x].shape[1:]) for x in names]
+    with np.errstate(all="ignore"):
+        return hyperparameters.thetas_of(values)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ from prbayes.plots.canvas import (
     round_ticks,
 )
 from prbayes.plots.curves import axis_range, central_range, outlines
-from prbayes.plots.ensemble import if_supported, read_before, read_result
+from prbayes.plots.ensemble import read_before, read_result
 from prbayes.plots.responses import Output, outputs_of
 
 # Most outputs of one picture: the pairs of more are too small to be read.
@@ -116,14 +115,19 @@ def plot_outputs(
     refuse_look(labels, pc_kwargs)
     ensemble = read_result(result, model, "prb.plot_outputs", n_draws)
     evaluator = ensemble.evaluator
-    start, text = read_before(result, evaluator, before)
+    start, text = read_before(result, evaluator, before, "plot_outputs")
     k = _simulator_index(evaluator, simulator)
     columns = _shown_outputs(evaluator, k, outputs)
     refuse_labels(labels, evaluator.simulators[k].outputs.names, evaluator=evaluator)
-    start = if_supported(evaluator, start, f"plot_outputs: before ({text})")
-    population = _Population.of(evaluator, ensemble.mixture, k)
-    earlier = _Population.of(evaluator, start, k) if len(start) else None
-    limits = [_axis_limits(output, population, earlier) for output in columns]
+    calibrated = _mixture(evaluator, ensemble.mixture, k)
+    earlier = _mixture(evaluator, start, k) if len(start) else None
+    limits = []
+    for output in columns:
+        # A normal population's region of 89% contains all but 1.8% of one output.
+        widest = None if earlier is None else _range(output, earlier, tail=0.02)
+        observed, _ = output.measured()
+        range_ = axis_range(observed, _range(output, calibrated, tail=0.01), widest, margin=0.04)
+        limits.append(range_)
 
     # A triangle of pairs: one column less than outputs, and one row
     size = len(columns) - 1
@@ -136,23 +140,27 @@ def plot_outputs(
     canvas = Canvas(
         list(names.values()), size=(side, side), pc_kwargs={"col_wrap": size, **pc_kwargs}
     )
-    calibrated = f"calibrated: {ensemble.label}, 50% and {INTERVAL:.0%}"
+    legend = f"calibrated: {ensemble.label}, 50% and {INTERVAL:.0%}"
     for (i, j), name in names.items():
-        panel = canvas.panel(name)
+        panel = canvas.panels[name]
         if j > i:
-            panel.blank()
+            panel.target.set_axis_off()
             continue
         x = columns[j]
         y = columns[i + 1]
         if earlier is not None:
-            earlier.draw(panel, "before", (x, y), VERMILION, DASHED, f"before: {text}")
-        correlation = population.draw(panel, "after", (x, y), BLUE, SOLID, calibrated)
-        titles = [_written(_draw_measured(panel, x, y)), _written(correlation)]
+            points = _finite_pairs(x, y, *earlier)
+            _draw_regions(panel, "before", points, VERMILION, DASHED, f"before: {text}")
+        points = _finite_pairs(x, y, *calibrated)
+        _draw_regions(panel, "after", points, BLUE, SOLID, legend)
+        measured = _finite_pairs(x, y, x.node.observed, x.node.weights)
+        panel.points("measured", measured[0].T, INK, size=14, legend="measured")
+        correlations = [_written(rank_correlation(*pairs)) for pairs in (measured, points)]
         # Names on the left and below all panels
         panel.axes(
             x=x.text(labels) if i == size - 1 else "",
             y=y.text(labels) if j == 0 else "",
-            title=f"rank correlation\nmeasured {titles[0]}, calibrated {titles[1]}",
+            title="rank correlation\nmeasured {}, calibrated {}".format(*correlations),
             xlim=limits[j],
             ylim=limits[i + 1],
             xticks=round_ticks(*limits[j]),
@@ -184,7 +192,12 @@ def _shown_outputs(evaluator: Evaluator, k: int, labels: Sequence[Any] | None) -
     node = evaluator.simulators[k]
     columns = outputs_of(node, alone=len(evaluator.simulators) == 1)
     if labels is None:
-        varying = [output for output in columns if _varies(output)]
+        varying = []  # by more than rounding
+        for output in columns:
+            observed, _ = output.measured()
+            finite = observed[np.isfinite(observed)]
+            if np.ptp(finite) > 1e-9 * np.abs(finite).max():
+                varying.append(output)
         columns = varying if len(varying) > 1 else columns
         if len(columns) <= 5:
             return columns
@@ -211,74 +224,42 @@ def _shown_outputs(evaluator: Evaluator, k: int, labels: Sequence[Any] | None) -
     return [columns[i] for i in indices]
 
 
-def _varies(output: Output) -> bool:
-    """Return whether specimens differ in an output, by more than rounding."""
-    observed, _ = output.measured()
-    finite = observed[np.isfinite(observed)]
-    return bool(np.ptp(finite) > 1e-9 * np.abs(finite).max())
+def _mixture(evaluator: Evaluator, thetas: Floats, k: int) -> tuple[Floats, Floats]:
+    """Return specimens of the k-th simulator's mixture of populations: (n, m), weights (n,)."""
+    values, weights = evaluator.populations(thetas, k)
+    if evaluator.simulators[k].reweighted is not None:  # all populations have the same points
+        values = values[0]
+        weights = weights.mean(axis=0)
+    else:
+        values = values.reshape(-1, values.shape[-1])
+        weights = weights.ravel() / len(thetas)
+    has_response = (weights > 0) & ~np.isnan(values).any(axis=-1)
+    return values[has_response], weights[has_response]
 
 
-@dataclass(frozen=True, eq=False)
-class _Population:
-    """Specimens of one population, or of the mixture of several: (n, m), with weights (n,)."""
-
-    values: Floats
-    weights: Floats
-
-    @classmethod
-    def of(cls, evaluator: Evaluator, thetas: Floats, k: int) -> _Population:
-        """Return the k-th simulator's mixture of populations at thetas."""
-        values, weights = evaluator.populations(thetas, k)
-        if evaluator.simulators[k].reweighted is not None:  # all populations have the same points
-            values = values[0]
-            weights = weights.mean(axis=0)
-        else:
-            values = values.reshape(-1, values.shape[-1])
-            weights = weights.ravel() / len(thetas)
-        has_response = (weights > 0) & ~np.isnan(values).any(axis=-1)
-        return cls(values[has_response], weights[has_response])
-
-    def range_of(self, output: Output, tail: float) -> Limits:
-        """Return the range of all but the outermost values of an output."""
-        return central_range(output.of(self.values)[None], self.weights[None], tail=tail)
-
-    def draw(
-        self,
-        panel: Panel,
-        visual: str,
-        pair: tuple[Output, Output],
-        color: str,
-        style: str,
-        text: str,
-    ) -> float:
-        """Draw the outlines of regions; return the rank correlation of the two outputs."""
-        points = np.column_stack([output.of(self.values) for output in pair])
-        finite = np.isfinite(points).all(axis=1)
-        points = points[finite]
-        weights = self.weights[finite]
-        if len(points) < 2:
-            return np.nan
-        probs = (0.5, INTERVAL)
-        for prob, (x, y) in zip(probs, outlines(points, weights, probs), strict=True):
-            name = f"{visual}_{100 * prob:.0f}"
-            panel.line(name, x, y, color, style=style, width=1.5, legend=text)
-        return rank_correlation(points, weights)
+def _range(output: Output, population: tuple[Floats, Floats], tail: float) -> Limits:
+    """Return the range of all but the outermost values of an output."""
+    values, weights = population
+    return central_range(output.of(values)[None], weights[None], tail=tail)
 
 
-def _axis_limits(output: Output, population: _Population, earlier: _Population | None) -> Limits:
-    # A normal population's region of 89% contains all but 1.8% of one output.
-    widest = None if earlier is None else earlier.range_of(output, tail=0.02)
-    observed, _ = output.measured()
-    return axis_range(observed, population.range_of(output, tail=0.01), widest, margin=0.04)
-
-
-def _draw_measured(panel: Panel, x: Output, y: Output) -> float:
-    """Draw the specimens that have both outputs; return their rank correlation."""
-    points = np.column_stack([x.of(x.node.observed), y.of(x.node.observed)])
+def _finite_pairs(x: Output, y: Output, values: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Return the points, (n, 2), that have two outputs, and their weights."""
+    points = np.column_stack([x.of(values), y.of(values)])
     finite = np.isfinite(points).all(axis=1)
-    points = points[finite]
-    panel.points("measured", points[:, 0], points[:, 1], INK, size=14, legend="measured")
-    return rank_correlation(points, x.node.weights[finite])
+    return points[finite], weights[finite]
+
+
+def _draw_regions(
+    panel: Panel, visual: str, sample: tuple[Floats, Floats], color: str, style: str, text: str
+) -> None:
+    """Draw the outlines of regions of a weighted sample of points."""
+    if len(sample[0]) < 2:
+        return
+    probs = (0.5, INTERVAL)
+    for prob, line in zip(probs, outlines(*sample, probs), strict=True):
+        name = f"{visual}_{100 * prob:.0f}"
+        panel.line(name, line, color, style=style, width=1.5, legend=text)
 
 
 def _written(r: float) -> str:
@@ -290,22 +271,15 @@ def _written(r: float) -> str:
 
 
 def rank_correlation(points: Floats, weights: Floats) -> float:
-    """Return the correlation of the ranks of weighted points, (n, 2)."""
+    """Return the correlation of the ranks of weighted points, (n, 2); NaN if it is unknown."""
+    if len(points) < 2:
+        return np.nan
     ranks = []
     for column in points.T:
         # The weight below each value, and half of that of equal ones
         _, place = np.unique(column, return_inverse=True)
         mass = np.bincount(place, weights)
         ranks.append((np.cumsum(mass) - mass / 2)[place])
-    return correlation(np.column_stack(ranks), weights)
-
-
-def correlation(points: Floats, weights: Floats) -> float:
-    """Return the correlation of weighted points, (n, 2); NaN if a coordinate does not vary."""
-    if not weights.size:
-        return np.nan
-    w = weights / weights.sum()
-    deviations = points - w @ points
-    (first, product), (_, second) = deviations.T @ (w[:, None] * deviations)
+    (first, product), (_, second) = np.cov(ranks, aweights=weights, ddof=0)
     scale = np.sqrt(first * second)
     return float(product / scale) if scale > 0 else np.nan

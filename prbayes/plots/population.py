@@ -29,7 +29,7 @@ from prbayes.plots.canvas import (
     refuse_look,
 )
 from prbayes.plots.curves import GRID_POINTS, central_range, outlines, smooth_densities
-from prbayes.plots.ensemble import Calibrated, Ensemble, read_result
+from prbayes.plots.ensemble import Ensemble, draw_calibrated, read_result
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import MVNORMAL, PopulationSampler
 from prbayes.response.inputs import Inputs, aleatory_names
@@ -102,13 +102,13 @@ def plot_population(
     pairs = _pairs(shown)
     canvas = Canvas([*names, *pairs], size=(4.6, 3.9), pc_kwargs=pc_kwargs)
     for margin in shown:
-        panel = canvas.panel(margin.name)
+        panel = canvas.panels[margin.name]
         grid, curves = densities[margin.name]
-        Calibrated.of(curves, ensemble, prob).draw(panel, grid, ensemble, prob)
+        draw_calibrated(panel, grid, curves, ensemble, prob)
         y = "probability" if margin.discrete else "density"
         panel.axes(x=named(margin.name, labels), y=y)
     for name, (first, second) in pairs.items():
-        panel = canvas.panel(name)
+        panel = canvas.panels[name]
         correlation = _draw_pair(panel, ensemble, first, second, prob)
         title = f"correlation {correlation:.2f}"
         panel.axes(x=named(first.name, labels), y=named(second.name, labels), title=title)
@@ -128,22 +128,16 @@ def _pairs(shown: list[Margin]) -> dict[str, tuple[Margin, Margin]]:
 
 def _draw_pair(panel: Panel, ensemble: Ensemble, x: Margin, y: Margin, prob: float) -> float:
     """Draw outlines of regions of the calibrated population; return the correlation within it."""
-    thetas = ensemble.mixture
-    evaluator = ensemble.evaluator
-    sampler = PopulationSampler(evaluator.simulators[x.node].inputs)
-    roots = evaluator.roots(thetas, x.node)
     # 200 000 specimens in all make a smooth line.
-    n = max(2, 200_000 // len(thetas))
-    aleatory, _ = sampler(roots, n, np.random.default_rng(0))
-    values: Any = aleatory[x.position]  # (P, n, *event)
-    points = np.column_stack([values[(..., *margin.index)].ravel() for margin in (x, y)])
+    n = max(2, 200_000 // len(ensemble.mixture))
+    draws = _draws(ensemble.evaluator, x.node, ensemble.mixture, n, seed=0)
+    points = np.column_stack([_values(draws, margin).ravel() for margin in (x, y)])
     points = points[np.isfinite(points).all(axis=1)]
     weights = np.full(len(points), 1 / len(points))
-    regions = {"half": (0.5, DASHED), "region": (prob, SOLID)}
-    lines = outlines(points, weights, tuple(p for p, _ in regions.values()))
-    for (visual, (p, style)), (across, up) in zip(regions.items(), lines, strict=True):
+    half, region = outlines(points, weights, (0.5, prob))
+    for visual, p, line, style in (("half", 0.5, half, DASHED), ("region", prob, region, SOLID)):
         text = f"{p:.0%} of the calibrated population: {ensemble.label}"
-        panel.line(visual, across, up, BLUE, style=style, width=1.5, legend=text)
+        panel.line(visual, line, BLUE, style=style, width=1.5, legend=text)
     correlations: Any = np.corrcoef(points.T)
     return float(correlations[0, 1])
 
@@ -231,16 +225,10 @@ def margin_densities(
     several groups have one grid.
     """
     nodes = sorted({margin.node for margin in shown})
-    samplers = {k: PopulationSampler(evaluator.simulators[k].inputs) for k in nodes}
-    roots = {k: evaluator.roots(thetas, k) for k in nodes}
-
     # The range of each axis, from specimens of some populations
     ranges: dict[Any, tuple[float, float]] = {}
-    step = max(1, len(thetas) // 40)
-    few = {
-        k: samplers[k]([root[::step] for root in roots[k]], 400, np.random.default_rng(0))[0]
-        for k in nodes
-    }
+    some = thetas[:: max(1, len(thetas) // 40)]
+    few = {k: _draws(evaluator, k, some, 400, seed=0) for k in nodes}
     for margin in shown:
         values = _values(few[margin.node], margin)
         first, last = central_range(values, np.full(values.shape, 1 / values.shape[1]), tail=0.002)
@@ -251,15 +239,14 @@ def margin_densities(
     densities = {}
     for margin in shown:
         k = margin.node
-        inputs = evaluator.simulators[k].inputs
         low, high = ranges[margin.axis]
         grid = np.linspace(low, high, GRID_POINTS)
         if margin.discrete:
             grid = np.arange(np.floor(low), np.ceil(high) + 1)
-        y = None if inputs.nested else _exact(inputs, margin, roots[k], grid)
+        y = _exact(evaluator.simulators[k].inputs, margin, evaluator.roots(thetas, k), grid)
         if y is None:
             if k not in many:
-                many[k] = samplers[k](roots[k], 1600, np.random.default_rng(1))[0]
+                many[k] = _draws(evaluator, k, thetas, 1600, seed=1)
             values = _values(many[k], margin)
             if margin.discrete:
                 y = np.column_stack([(values == x).mean(axis=1) for x in grid])
@@ -270,38 +257,38 @@ def margin_densities(
     return densities
 
 
+def _draws(evaluator: Evaluator, k: int, thetas: Floats, n: int, seed: int) -> Any:
+    """Return n specimens of each population of the k-th simulator's aleatory inputs."""
+    sampler = PopulationSampler(evaluator.simulators[k].inputs)
+    return sampler(evaluator.roots(thetas, k), n, np.random.default_rng(seed))[0]
+
+
 def _values(draws: Any, margin: Margin) -> Floats:
     """Return the draws of a margin, shape (P, n)."""
-    element = (slice(None), slice(None), *margin.index)
-    return np.asarray(draws[margin.position][element], dtype=np.float64)
+    return np.asarray(draws[margin.position][(..., *margin.index)], dtype=np.float64)
 
 
 def _exact(inputs: Inputs, margin: Margin, roots: list[Floats], grid: Floats) -> Floats | None:
     """Return the densities, shape (P, g), or None where PyMC has no density of one element."""
+    if inputs.nested:
+        return None
     symbols = inputs.placeholders()
     dists, *_ = inputs.rebuilt(symbols)
     dist: Any = dists[margin.position]
     x = pt.lvector("x") if margin.discrete else pt.dvector("x")
-    logp = _log_density(dist, margin.index, x)
-    if logp is None:
-        return None
+    if isinstance(dist.owner.op, MVNORMAL):
+        mean, covariance = dist.owner.op.dist_params(dist.owner)
+        (i,) = margin.index
+        logp = pm.logp(pm.Normal.dist(mean[i], pt.sqrt(covariance[i, i])), x)
+    else:  # all elements at the same value
+        columns = pt.shape_padright(x, dist.type.ndim)
+        try:
+            logp = pm.logp(dist, columns + pt.zeros_like(dist), warn_rvs=False)
+        except NotImplementedError:
+            return None
+        if logp.type.ndim != 1 + dist.type.ndim:
+            return None  # a density of all elements together
+        logp = logp[(slice(None), *margin.index)]
     function = compile_batched(symbols, [pt.exp(logp)], extra=[x])
     (density,) = function(*roots, grid.astype(x.dtype))
     return np.broadcast_to(np.nan_to_num(density), (len(roots[0]), grid.size))
-
-
-def _log_density(dist: Any, index: tuple[int, ...], x: Any) -> Any:
-    """Return the log-density of an element at x, shape (g,), or None where there is none."""
-    if isinstance(dist.owner.op, MVNORMAL):
-        mean, covariance = dist.owner.op.dist_params(dist.owner)
-        (i,) = index
-        return pm.logp(pm.Normal.dist(mean[i], pt.sqrt(covariance[i, i])), x)
-    # All elements at the same value
-    columns = pt.shape_padright(x, dist.type.ndim)
-    try:
-        logp = pm.logp(dist, columns + pt.zeros_like(dist), warn_rvs=False)
-    except NotImplementedError:
-        return None
-    if logp.type.ndim != 1 + dist.type.ndim:
-        return None  # a density of all elements together
-    return logp[(slice(None), *index)]

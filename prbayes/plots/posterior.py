@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -105,22 +104,6 @@ def plot_posterior(
     ['mu']
     """
     refuse_look(labels, pc_kwargs)
-    _check_results(posterior, optimum, model)
-    share(prob, "prob")
-    evaluator = None if model is None else Evaluator.of(model)
-    hyperparameters = _read_hyperparameters(posterior, optimum, evaluator)
-    names = _select(list(hyperparameters), var_names)
-    refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
-    canvas = Canvas(names, size=(4.6, 3.6), pc_kwargs=pc_kwargs)
-    for name in names:
-        panel = canvas.panel(name)
-        top = _draw(panel, hyperparameters[name], prob)
-        panel.axes(x=named(name, labels), y="density", yticks=round_ticks(0.0, top))
-    return canvas.finish()
-
-
-def _check_results(posterior: Any, optimum: Any, model: pm.Model | None) -> None:
-    """Raise for results of another kind, an optimum of other populations, and other priors."""
     if not isinstance(posterior, xr.DataTree) or "posterior" not in posterior:
         raise TypeError(
             f"plot_posterior: got {type(posterior).__name__}, expected a DataTree with a "
@@ -135,6 +118,39 @@ def _check_results(posterior: Any, optimum: Any, model: pm.Model | None) -> None
     require_together(identities, "plot_posterior")
     if model is not None:
         require_of_model(posterior, model, "plot_posterior", Level.PRIORS)
+    share(prob, "prob")
+    evaluator = None if model is None else Evaluator.of(model)
+
+    # Elements of the variables that posterior, optimum and model share
+    stacked = stacked_draws(posterior["posterior"])
+    draws = split_elements(stacked)
+    shared = {name for name in table_elements(stacked) if np.ptp(draws[name]) > 0}
+    best, errors = {}, {}
+    if optimum is not None:
+        best = single_elements(labelled(optimum.evaluator, optimum.point, {}).data_vars)
+        errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
+        shared &= set(best)
+    prior: dict[str, Floats] = {}
+    if evaluator is not None:
+        # 4000 draws give a normal density's peak within 2%.
+        thetas = evaluator.hyperparameters.prior_thetas(4000, 0)
+        values = evaluator.hyperparameters.constrained(thetas)
+        prior = split_elements(labelled(evaluator, values, {"draw": len(thetas)}).data_vars)
+        shared &= set(prior)
+    if not shared:
+        raise ValueError(
+            f"plot_posterior: got a posterior of {list(draws)}, expected hyperparameters of "
+            "optimum and model"
+        )
+    names = _select([name for name in draws if name in shared], var_names)
+    refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
+    canvas = Canvas(names, size=(4.6, 3.6), pc_kwargs=pc_kwargs)
+    for name in names:
+        panel = canvas.panels[name]
+        estimate = (best[name], errors.get(name, np.nan)) if name in best else None
+        top = _draw(panel, draws[name], prior.get(name), estimate, prob)
+        panel.axes(x=named(name, labels), y="density", yticks=round_ticks(0.0, top))
+    return canvas.finish()
 
 
 def _select(names: list[str], var_names: Sequence[str] | None) -> list[str]:
@@ -150,63 +166,23 @@ def _select(names: list[str], var_names: Sequence[str] | None) -> list[str]:
     return [name for name in names if {name, variable_of(name)} & set(selection)]
 
 
-@dataclass(frozen=True, eq=False)
-class _Hyperparameter:
-    """Posterior draws, (n,), prior draws, the optimum and its standard error, where known."""
+def _draw(
+    panel: Panel,
+    draws: Floats,
+    prior: Floats | None,
+    estimate: tuple[float, float] | None,
+    prob: float,
+) -> float:
+    """Draw densities, and intervals below them; return the top of the posterior.
 
-    draws: Floats
-    prior: Floats | None
-    best: float | None
-    error: float | None
-
-
-def _read_hyperparameters(
-    posterior: xr.DataTree, optimum: Optimum | None, evaluator: Evaluator | None
-) -> dict[str, _Hyperparameter]:
-    """Return the elements that posterior, optimum and model share."""
-    stacked = stacked_draws(posterior["posterior"])
-    draws = split_elements(stacked)
-    shared = {name for name in table_elements(stacked) if np.ptp(draws[name]) > 0}
-    best, errors = {}, {}
-    if optimum is not None:
-        best = single_elements(labelled(optimum.evaluator, optimum.point, {}).data_vars)
-        errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
-        shared &= set(best)
-    prior: dict[str, Floats] = {}
-    if evaluator is not None:
-        # 4000 draws give a normal density's peak within 2%.
-        thetas = evaluator.hyperparameters.prior_thetas(4000, 0)
-        values = labelled(
-            evaluator, evaluator.hyperparameters.constrained(thetas), {"draw": len(thetas)}
-        )
-        prior = split_elements(values.data_vars)
-        shared &= set(prior)
-    if not shared:
-        raise ValueError(
-            f"plot_posterior: got a posterior of {list(draws)}, expected hyperparameters of "
-            "optimum and model"
-        )
-    hyperparameters = {}
-    for name in [name for name in draws if name in shared]:
-        error = errors.get(name, np.nan)
-        hyperparameters[name] = _Hyperparameter(
-            draws=draws[name],
-            prior=prior.get(name),
-            best=best.get(name),
-            error=error if np.isfinite(error) and error > 0 else None,
-        )
-    return hyperparameters
-
-
-def _draw(panel: Panel, hyperparameter: _Hyperparameter, prob: float) -> float:
-    """Draw densities, and the intervals below them; return the top of the posterior."""
-    draws = hyperparameter.draws
-    best = hyperparameter.best
-    error = hyperparameter.error
+    The estimate is the optimum and its standard error.
+    """
     low = float(draws.min())
     high = float(draws.max())
-    if best is not None:
-        reach = 3 * (error or 0.0)
+    best, error = estimate or (0.0, np.nan)
+    has_error = 0 < error < np.inf
+    if estimate is not None:
+        reach = 3 * error if has_error else 0.0
         low = min(low, best - reach)
         high = max(high, best + reach)
     grid = np.linspace(low, high, 301)
@@ -215,23 +191,21 @@ def _draw(panel: Panel, hyperparameter: _Hyperparameter, prob: float) -> float:
     # Far enough apart that the diamond of one does not touch the dot of the other
     posterior_row, optimum_row = np.array([-0.07, -0.15]) * top
 
-    if hyperparameter.prior is not None:
-        prior = bounded_density(hyperparameter.prior, grid)
-        panel.line("prior", grid, prior, GREY, style=DOTTED, legend="prior")
-    panel.line("posterior", grid, density, BLUE, width=2.2, legend="posterior")
+    if prior is not None:
+        density_before = bounded_density(prior, grid)
+        panel.line("prior", (grid, density_before), GREY, style=DOTTED, legend="prior")
+    panel.line("posterior", (grid, density), BLUE, width=2.2, legend="posterior")
     levels = central_levels(prob)
     row = np.repeat(posterior_row, 2)
     text = f"{prob:.0%} intervals"
-    panel.line("interval", np.quantile(draws, levels), row, BLUE, width=3, legend=text)
-    mean = draws.mean()
-    panel.points("mean", mean, posterior_row, BLUE, size=90, legend="posterior mean")
-    if best is None:
-        return top
-    if error is not None:
+    panel.line("interval", (np.quantile(draws, levels), row), BLUE, width=3, legend=text)
+    panel.points("mean", (draws.mean(), posterior_row), BLUE, size=90, legend="posterior mean")
+    if has_error:
         normal = norm(best, error)
         text = "normal with the optimum's standard error"
-        panel.line("normal", grid, normal.pdf(grid), VERMILION, style=DASHED, legend=text)
-        panel.line("stderr", normal.ppf(levels), np.repeat(optimum_row, 2), VERMILION, width=3)
-    look: dict[str, Any] = {"marker": DIAMOND, "size": 110, "legend": "optimum"}
-    panel.points("optimum", best, optimum_row, VERMILION, **look)
+        panel.line("normal", (grid, normal.pdf(grid)), VERMILION, style=DASHED, legend=text)
+        panel.line("stderr", (normal.ppf(levels), np.repeat(optimum_row, 2)), VERMILION, width=3)
+    if estimate is not None:
+        look: dict[str, Any] = {"marker": DIAMOND, "size": 110, "legend": "optimum"}
+        panel.points("optimum", (best, optimum_row), VERMILION, **look)
     return top

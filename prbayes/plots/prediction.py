@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._stats import INTERVAL
+from prbayes._stats import INTERVAL, distribution_function
 from prbayes._validate import share
-from prbayes.plots.canvas import BLUE, INK, Canvas, Panel, named, refuse_labels, refuse_look
+from prbayes.plots.canvas import BLUE, INK, Canvas, named, refuse_labels, refuse_look
 from prbayes.plots.curves import (
     GRID_POINTS,
     axis_range,
     central_range,
-    distribution_functions,
     pointwise_band,
     staircase,
 )
-from prbayes.validation.conditions import Comparable, comparables
+from prbayes.validation.conditions import comparables
 
 
 def plot_prediction(
@@ -79,24 +78,19 @@ def plot_prediction(
     refuse_labels(labels, names)
     canvas = Canvas(names, size=(5.0, 3.9), pc_kwargs=pc_kwargs)
     for pair in pairs:
-        panel = canvas.panel(pair.name)
-        _draw(panel, pair, prob)
-        failed = np.count_nonzero(np.isinf(pair.measured))
-        title = f"{pair.measured.size} measured values" + (f", {failed} failed" if failed else "")
+        panel = canvas.panels[pair.name]
+        measured = pair.measured
+        weights = pair.weights
+        limits = axis_range(measured, central_range(pair.predicted, weights, tail=0.005), None)
+        grid = np.linspace(*limits, GRID_POINTS)
+        curves = distribution_function(pair.predicted, weights, grid)
+        if len(curves) > 1:
+            text = f"{prob:.0%} of the populations"
+            panel.band("band", grid, pointwise_band(curves, prob), BLUE, legend=text)
+        panel.line("predicted", (grid, curves.mean(axis=0)), BLUE, width=2.2, legend="predicted")
+        steps = staircase(measured, np.full(measured.size, 1 / measured.size), *limits)
+        panel.line("measured", steps, INK, width=1.4, legend="measured")
+        failed = np.count_nonzero(np.isinf(measured))
+        title = f"{measured.size} measured values" + (f", {failed} failed" if failed else "")
         panel.axes(x=named(pair.name, labels), y="share of specimens", title=title)
     return canvas.finish()
-
-
-def _draw(panel: Panel, pair: Comparable, prob: float) -> None:
-    """Draw the band and the curve of the prediction, and the steps of the measured values."""
-    weights = pair.weights
-    limits = axis_range(pair.measured, central_range(pair.predicted, weights, tail=0.005), None)
-    grid = np.linspace(*limits, GRID_POINTS)
-    curves = distribution_functions(pair.predicted, weights, grid)
-    if len(curves) > 1:
-        text = f"{prob:.0%} of the populations"
-        panel.band("band", grid, pointwise_band(curves, prob), BLUE, legend=text)
-    panel.line("predicted", grid, curves.mean(axis=0), BLUE, width=2.2, legend="predicted")
-    equal = np.full(pair.measured.size, 1 / pair.measured.size)
-    steps = staircase(pair.measured, equal, grid[0], grid[-1])
-    panel.line("measured", *steps, INK, width=1.4, legend="measured")

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 
-from prbayes._stats import INTERVAL
+from prbayes._stats import INTERVAL, distribution_function
 from prbayes._validate import Floats, flag, share
 from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.locking import locked
@@ -25,7 +24,6 @@ from prbayes.plots.canvas import (
     Canvas,
     Limits,
     Panel,
-    Ticks,
     named,
     refuse_labels,
     refuse_look,
@@ -35,12 +33,18 @@ from prbayes.plots.curves import (
     axis_range,
     central_levels,
     central_range,
-    distribution_functions,
     histogram,
     smooth_densities,
     staircase,
+    with_gaps,
 )
-from prbayes.plots.ensemble import Calibrated, Ensemble, if_supported, read_before, read_result
+from prbayes.plots.ensemble import (
+    Ensemble,
+    draw_calibrated,
+    middle_of,
+    read_before,
+    read_result,
+)
 from prbayes.response.outputs import Outputs
 
 
@@ -126,127 +130,160 @@ def plot_responses(
     share(prob, "prob")
     ensemble = read_result(result, model, "prb.plot_responses", n_draws)
     evaluator = ensemble.evaluator
-    start, text = read_before(result, evaluator, before)
-    start = if_supported(evaluator, start, f"plot_responses: before ({text})")
+    start, text = read_before(result, evaluator, before, "plot_responses")
     by_simulator = panels_of(evaluator.simulators)
     names = [output.name for panels in by_simulator for output in panels]
     refuse_labels(labels, names, evaluator=evaluator)
     has_lines = any(in_one_panel(node.outputs) for node in evaluator.simulators)
     size = (7.2, 4.8) if has_lines else (5.4, 4.2)
     canvas = Canvas(names, size=size, pc_kwargs=pc_kwargs)
-    picture = _Picture(ensemble, text, prob, labels, ecdf=ecdf)
     limits: dict[str, Limits] = {}  # by axis: panels of groups have one
     contents = []
     for k, panels in enumerate(by_simulator):
-        populations = evaluator.populations(ensemble.every, k)
+        values, weights = evaluator.populations(ensemble.every, k)
         earlier = evaluator.populations(start, k) if len(start) else None
         for output in panels:
-            sample = _Sample.of(output, populations)
-            first = None if earlier is None else _Sample.of(output, earlier)
+            sample = output.of(values), weights
+            first = None if earlier is None else (output.of(earlier[0]), earlier[1])
             contents.append((output, sample, first))
-            if sample.values.ndim == 2:
-                low, high = _axis_limits(output, sample, first)
+            if sample[0].ndim == 2:
+                # More of the population before is beyond the axis
+                widest = None if first is None else central_range(*first, tail=0.05)
+                observed, _ = output.measured()
+                low, high = axis_range(observed, central_range(*sample, tail=0.005), widest)
                 least, most = limits.get(output.axis, (low, high))
                 limits[output.axis] = min(low, least), max(high, most)
     for output, sample, first in contents:
-        panel = canvas.panel(output.name)
-        if sample.values.ndim == 2:
-            picture.distribution(panel, output, sample, first, limits[output.axis])
+        draw = _Drawing(canvas.panels[output.name], ensemble, text, prob, output.text(labels))
+        if sample[0].ndim == 2:
+            draw.distribution(output, sample, first, limits[output.axis], ecdf=ecdf)
         else:
-            picture.lines(panel, output, sample, first)
+            draw.lines(output, sample, first)
     return canvas.finish()
 
 
 @dataclass(frozen=True, eq=False)
-class _Sample:
-    """Responses and weights of populations, shape (P, n) each; of outputs, values (P, n, m)."""
+class _Drawing:
+    """Measured responses and populations in a panel.
 
-    values: Floats
-    weights: Floats
+    Populations are responses and weights, shape (P, n) each; of outputs, responses (P, n, m).
+    """
 
-    @classmethod
-    def of(cls, output: Output, populations: tuple[Floats, Floats]) -> _Sample:
-        values, weights = populations
-        return cls(output.of(values), weights)
-
-    def curves(self, grid: Floats, *, ecdf: bool) -> Floats:
-        """Return distribution functions or densities on a grid, shape (P, g)."""
-        function = distribution_functions if ecdf else smooth_densities
-        return function(self.values, self.weights, grid)
-
-
-def _axis_limits(output: Output, sample: _Sample, earlier: _Sample | None) -> Limits:
-    """Return the range of the axis; more of the population before is beyond it."""
-    widest = None if earlier is None else central_range(earlier.values, earlier.weights, tail=0.05)
-    observed, _ = output.measured()
-    return axis_range(observed, central_range(sample.values, sample.weights, tail=0.005), widest)
-
-
-@dataclass(frozen=True, eq=False)
-class _Picture:
-    """Settings that all panels share."""
-
+    panel: Panel
     ensemble: Ensemble
     start: str  # name of the population before
     prob: float
-    labels: Mapping[str, str] | None
-    ecdf: bool
+    text: str  # label of the responses
 
     def distribution(
         self,
-        panel: Panel,
         output: Output,
-        sample: _Sample,
-        earlier: _Sample | None,
+        population: tuple[Floats, Floats],
+        earlier: tuple[Floats, Floats] | None,
         limits: Limits,
+        *,
+        ecdf: bool,
     ) -> None:
         """Draw the distribution of one output: data first, then the populations."""
+        panel = self.panel
         observed, weights = output.measured()
         grid = np.linspace(*limits, GRID_POINTS)
-        curves = sample.curves(grid, ecdf=self.ecdf)
-        calibrated = Calibrated.of(curves, self.ensemble, self.prob)
-        if self.ecdf:
-            x, y = staircase(observed, weights, *limits)
-            panel.line("measured", x, y, INK, width=1.4, legend="measured")
+        curves_of = distribution_function if ecdf else smooth_densities
+        if ecdf:
+            top = 1.0
+            stairs = staircase(observed, weights, *limits)
+            panel.line("measured", stairs, INK, width=1.4, legend="measured")
         else:
             x, y = histogram(observed, weights)
-            panel.line("measured", x, y, INK, width=0.9, legend="measured")
+            top = float(y.max())
+            panel.line("measured", (x, y), INK, width=0.9, legend="measured")
             finite = observed[np.isfinite(observed)]
-            panel.points("rug", finite, 0.0, INK, marker="|", size=60)
-        top = max(1.0 if self.ecdf else float(y.max()), calibrated.top)
-        ylim = None
+            panel.points("rug", (finite, 0.0), INK, marker="|", size=60)
+        before = np.zeros(1)
         if earlier is not None:
-            (curve,) = earlier.curves(grid, ecdf=self.ecdf)
+            (before,) = curves_of(*earlier, grid)
             text = f"before: {self.start}"
-            panel.line("before", grid, curve, VERMILION, style=DASHED, legend=text)
-            if curve.max() > 2 * top:  # a narrow peak before would dwarf all other curves
-                ylim = (-0.05 * top, 2 * top)
-        calibrated.draw(panel, grid, self.ensemble, self.prob)
+            panel.line("before", (grid, before), VERMILION, style=DASHED, legend=text)
+        curves = curves_of(*population, grid)
+        top = max(top, draw_calibrated(panel, grid, curves, self.ensemble, self.prob))
+        # A narrow peak before would dwarf all other curves
+        ylim = (-0.05 * top, 2 * top) if before.max() > 2 * top else None
         failed = np.count_nonzero(np.isinf(observed))
         panel.axes(
-            x=output.text(self.labels),
-            y="share of specimens" if self.ecdf else "density",
+            x=self.text,
+            y="share of specimens" if ecdf else "density",
             title=f"{observed.size} measured values" + (f", {failed} failed" if failed else ""),
             xlim=limits,
             ylim=ylim,
         )
 
-    def lines(self, panel: Panel, output: Output, sample: _Sample, earlier: _Sample | None) -> None:
-        """Draw all outputs, a line for each specimen."""
-        axis = Axis.of(output)
-        start = None
-        if earlier is not None:
-            (start,) = quantiles(earlier.values, earlier.weights, LEVELS)
-        lines = quantiles(sample.values, sample.weights, LEVELS)
-        ylim = draw_lines(panel, axis, self.ensemble, lines, start, self.prob, self.start)
+    def lines(
+        self,
+        output: Output,
+        population: tuple[Floats, Floats],
+        earlier: tuple[Floats, Floats] | None,
+    ) -> None:
+        """Draw a line over all outputs for each specimen; median and most of the population."""
+        panel = self.panel
+        outputs = output.node.outputs
         observed = output.node.observed
+        y = self.text
+        if is_curve(outputs):
+            places = np.array(outputs.labels, dtype=np.float64)
+            order = np.argsort(places)
+            center, unit = np.zeros(places.size), np.ones(places.size)
+            xticks = None
+        else:  # outputs with names, each in its own spread
+            order = np.arange(len(outputs.labels))
+            places = order.astype(np.float64)
+            finite = np.where(np.isfinite(observed), observed, np.nan)
+            spread = np.nanstd(finite, axis=0)
+            center, unit = np.nanmean(finite, axis=0), np.where(spread > 0, spread, 1.0)
+            xticks = (places.tolist(), list(outputs.names))
+            y += ", standard deviations from the mean"
+        x = places[order]
+        measured = ((observed - center) / unit)[:, order]
+        lines = ((quantiles(*population, LEVELS) - center) / unit)[..., order]
+        before = np.empty((0, x.size))
+        if earlier is not None:
+            before = ((quantiles(*earlier, LEVELS)[0] - center) / unit)[:, order]
+
+        widest = None if earlier is None else _finite_range(before)
+        low, high = axis_range(measured, _finite_range(np.median(lines, axis=0)), widest)
+        # Lines leave the picture where the specimens have failed.
+        room = high - low
+        lines = np.clip(lines, low - room, high + room)
+        lower, upper = (middle_of(lines[:, i], self.ensemble) for i in (0, 2))
+        text = f"{INTERVAL:.0%} of the calibrated population"
+        panel.band("population", x, (lower, upper), BLUE, alpha=0.25, legend=text)
+        panel.line("measured", _joined(x, measured), GREY, width=0.5, legend="measured")
+        if earlier is not None:
+            text = f"before: {self.start}"
+            line = _joined(x, np.clip(before, low - room, high + room))
+            panel.line("before", line, VERMILION, style=DASHED, legend=text)
+        median: Any = {"name": "median, calibrated", "alpha": 0.55}
+        draw_calibrated(panel, x, lines[:, 1], self.ensemble, self.prob, **median)
+
         incomplete = np.count_nonzero(np.isnan(observed).any(axis=1))
         failed = np.count_nonzero(np.isinf(observed).any(axis=1))
         title = f"{len(observed)} measured specimens"
         title += f", {incomplete} incomplete" if incomplete else ""
         title += f", {failed} failed" if failed else ""
-        x, y = axis.texts(self.labels)
-        panel.axes(x=x, y=y, title=title, ylim=ylim, xticks=axis.ticks())
+        panel.axes(x=outputs.dim, y=y, title=title, ylim=(low, high), xticks=xticks)
+
+
+def _finite_range(values: Floats) -> Limits:
+    finite = values[np.isfinite(values)]
+    return float(finite.min(initial=np.inf)), float(finite.max(initial=-np.inf))
+
+
+def _joined(x: Floats, rows: Floats) -> Floats:
+    """Return several lines, (n, m), as one with gaps between them; only finite values are drawn.
+
+    A line continues after a value that was not measured, and ends where the specimen has failed.
+    """
+    points = [np.column_stack([x, row]) for row in rows]
+    return with_gaps([line[np.isfinite(line[:, 1])] for line in points])
 
 
 # -- outputs in panels of their own, or as lines in one panel --------------------------------
@@ -344,50 +381,6 @@ def is_curve(outputs: Outputs) -> bool:
     return m > 2 and are_numbers and len(set(labels)) == m and not are_counted
 
 
-# -- lines -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """Places and units of outputs along an axis: with names, each output in its own spread."""
-
-    output: Output
-    places: Floats  # (m,)
-    order: NDArray[np.intp]  # (m,): of the places
-    center: Floats  # (m,)
-    unit: Floats  # (m,)
-
-    @classmethod
-    def of(cls, output: Output) -> Axis:
-        """Return the axis of all outputs of a simulator."""
-        outputs = output.node.outputs
-        m = len(outputs.labels)
-        if is_curve(outputs):
-            places = np.array(outputs.labels, dtype=np.float64)
-            return cls(output, places, np.argsort(places), np.zeros(m), np.ones(m))
-        observed = output.node.observed
-        finite = np.where(np.isfinite(observed), observed, np.nan)
-        spread = np.nanstd(finite, axis=0)
-        unit = np.where(spread > 0, spread, 1.0)
-        places = np.arange(m, dtype=np.float64)
-        return cls(output, places, np.arange(m), np.nanmean(finite, axis=0), unit)
-
-    def scaled(self, values: Floats) -> Floats:
-        """Return values, (..., m), in the units of the picture, from left to right."""
-        return np.asarray(((values - self.center) / self.unit)[..., self.order])
-
-    def texts(self, labels: Mapping[str, str] | None) -> tuple[str, str]:
-        """Return the labels of the two axes."""
-        outputs = self.output.node.outputs
-        unit = "" if is_curve(outputs) else ", standard deviations from the mean"
-        return outputs.dim, self.output.text(labels) + unit
-
-    def ticks(self) -> Ticks | None:
-        """Return the names of outputs that are not numbers."""
-        outputs = self.output.node.outputs
-        return None if is_curve(outputs) else (self.places.tolist(), list(outputs.names))
-
-
 def quantiles(values: Floats, weights: Floats, levels: Floats) -> Floats:
     """Return quantiles of outputs of populations, (P, n, m), (P, n), (L,) -> (P, L, m).
 
@@ -408,59 +401,3 @@ def quantiles(values: Floats, weights: Floats, levels: Floats) -> Floats:
             at = np.searchsorted(middles, levels * w.sum())
             out[i, :, j] = ascending[np.minimum(at, ascending.size - 1)]
     return out
-
-
-def draw_lines(
-    panel: Panel,
-    axis: Axis,
-    ensemble: Ensemble,
-    lines: Floats,
-    earlier: Floats | None,
-    prob: float,
-    start: str,
-) -> Limits:
-    """Draw measured lines, and the median and most of the population; return the axis' range.
-
-    ``lines``, (P, 3, m), are quantiles at `LEVELS` of the populations of ``ensemble.every``,
-    ``earlier``, (3, m), those of the population called ``start``; the band of the median contains
-    the share ``prob`` of the populations.
-    """
-    x = axis.places[axis.order]
-    measured = axis.scaled(axis.output.node.observed)
-    lines = axis.scaled(lines)
-    earlier = None if earlier is None else axis.scaled(earlier)
-    typical = _finite_range(np.median(lines, axis=0))
-    limits = axis_range(measured, typical, None if earlier is None else _finite_range(earlier))
-    # Lines leave the picture where the specimens have failed.
-    low, high = limits
-    room = high - low
-    lines = np.clip(lines, low - room, high + room)
-    lower, median, upper = (Calibrated.of(lines[:, i], ensemble, prob) for i in range(3))
-    text = f"{INTERVAL:.0%} of the calibrated population"
-    panel.band("population", x, (lower.middle, upper.middle), BLUE, alpha=0.25, legend=text)
-    panel.line("measured", *_joined(x, measured), GREY, width=0.5, legend="measured")
-    if earlier is not None:
-        line = _joined(x, np.clip(earlier, low - room, high + room))
-        panel.line("before", *line, VERMILION, style=DASHED, legend=f"before: {start}")
-    if median.band is not None:
-        text = f"{prob:.0%} band of the {ensemble.spread}"
-        panel.band("band", x, median.band, BLUE, alpha=0.55, legend=text)
-    text = f"median, calibrated: {ensemble.label}"
-    panel.line("after", x, median.middle, BLUE, width=2.2, legend=text)
-    return limits
-
-
-def _finite_range(values: Floats) -> Limits:
-    finite = values[np.isfinite(values)]
-    return float(finite.min(initial=np.inf)), float(finite.max(initial=-np.inf))
-
-
-def _joined(x: Floats, rows: Floats) -> tuple[Floats, Floats]:
-    """Return several lines, (n, m), as one with gaps between them; only finite values are drawn.
-
-    A line continues after a value that was not measured, and ends where the specimen has failed.
-    """
-    finite = [np.isfinite(row) for row in rows]
-    at = [np.append(x[ok], np.nan) for ok in finite]
-    y = [np.append(row[ok], np.nan) for row, ok in zip(rows, finite, strict=True)]
-    return np.concatenate(at)[:-1], np.concatenate(y)[:-1]

@@ -82,9 +82,9 @@ def plot_sensitivity(
     for kind, title in titles.items():
         factors = by_kind[kind]
         rows = n - 1.0 - np.arange(factors.sizes["factor"])
-        panel = canvas.panel(kind)
+        panel = canvas.panels[kind]
         for end in (0.0, 1.0):
-            panel.line(f"end_{end:.0f}", [end, end], limits, GREY, style=DOTTED, width=1.0)
+            panel.line(f"end_{end:.0f}", ([end, end], limits), GREY, style=DOTTED, width=1.0)
         for key, shift, color, marker, text in (
             ("first", 0.12, BLUE, CIRCLE, "by itself"),
             ("total", -0.12, VERMILION, DIAMOND, "with all others known"),
@@ -94,8 +94,8 @@ def plot_sensitivity(
             y = rows + shift
             for i in np.flatnonzero(np.isfinite(indices)):
                 ends = [indices[i] - errors[i], indices[i] + errors[i]]
-                panel.line(f"{key}_{i}", ends, [y[i], y[i]], color, width=2)
-            panel.points(key, indices, y, color, marker=marker, legend=text)
+                panel.line(f"{key}_{i}", (ends, [y[i], y[i]]), color, width=2)
+            panel.points(key, (indices, y), color, marker=marker, legend=text)
         names = [named(str(factor), labels) for factor in factors.factor.values]
         panel.axes(x=title, ylim=limits, yticks=(rows.tolist(), names))
     return canvas.finish()

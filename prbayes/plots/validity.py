@@ -18,10 +18,9 @@ from prbayes.plots.canvas import (
     SOLID,
     VERMILION,
     Canvas,
-    Panel,
     refuse_look,
 )
-from prbayes.plots.curves import steps
+from prbayes.plots.curves import steps, with_gaps
 from prbayes.validation.area_test import ValidityTest
 from prbayes.validation.conditions import DIRECTION
 
@@ -76,13 +75,37 @@ def plot_validity(
     # The panel of a single test has a name too
     canvas = Canvas([name or "u" for name in by_name], size=(4.6, 4.8), pc_kwargs=pc_kwargs)
     for name, test in by_name.items():
-        panel = canvas.panel(name or "u")
+        panel = canvas.panels[name or "u"]
+        color = VERMILION if test.rejected else BLUE
         directions = in_directions(test)
-        title = _title(name, test, "mean area" if directions else "area")
         if directions:
-            _draw_directions(panel, test, directions, title)
+            # Conditions of one output are one line of their own
+            single = test.u_values[~_is_of_direction(test)]
+            lines = [single, *directions] if single.size else directions
+            panel.line("identity", ([0.0, 1.0], [0.0, 1.0]), INK, style=DASHED, width=None)
+            if not test.folded:
+                panel.line("ecdf", _ecdf(lines), color, width=0.8)
+            folded = _ecdf([np.abs(2 * u - 1) for u in (lines if test.folded else directions)])
+            style = SOLID if test.folded else DOTTED
+            panel.line("folded", folded, color, style=style, width=0.8)
+            x = "u-value; dotted: |2u - 1|"
+            y = f"share of values in each of {len(directions)} directions"
+            statistic = "mean area"
         else:
-            _draw(panel, test, title)
+            values = np.abs(2 * test.u_values - 1) if test.folded else test.u_values
+            ecdf = _ecdf([values])
+            panel.band("envelope", *_envelope(test), PALE, alpha=0.4)
+            panel.band("area", *_between(*ecdf), color, alpha=0.4)
+            panel.line("identity", ([0.0, 1.0], [0.0, 1.0]), INK, style=DASHED, width=None)
+            panel.line("ecdf", ecdf, color, width=None)
+            x = "u-value"
+            y = f"share of {values.size} values"
+            statistic = "area"
+        level = f", level {test.alpha:.0%}"
+        first = f"{name}, p = {test.p_value:.2g}" if name else f"p = {test.p_value:.2g}{level}"
+        sign, verdict = (">", "rejected") if test.rejected else ("<", "not rejected")
+        second = f"{statistic} {test.statistic:.3f} {sign} critical {test.critical_value:.3f}"
+        panel.axes(x="|2u - 1|" if test.folded else x, y=y, title=f"{first}\n{second}: {verdict}")
     return canvas.finish()
 
 
@@ -101,53 +124,13 @@ def _is_of_direction(test: ValidityTest) -> NDArray[np.bool_]:
     return np.array([DIRECTION in name for name in test.conditions.tolist()], dtype=bool)
 
 
-def _title(name: str, test: ValidityTest, statistic: str) -> str:
-    first = f"{name}, p = {test.p_value:.2g}"
-    if not name:
-        first = f"p = {test.p_value:.2g}, level {test.alpha:.0%}"
-    sign, verdict = (">", "rejected") if test.rejected else ("<", "not rejected")
-    area = f"{statistic} {test.statistic:.3f}"
-    return f"{first}\n{area} {sign} critical {test.critical_value:.3f}: {verdict}"
-
-
-def _draw(panel: Panel, test: ValidityTest, title: str) -> None:
-    """Draw the ECDF of a test's values, and its distance from the identity."""
-    values = np.abs(2 * test.u_values - 1) if test.folded else test.u_values
-    color = VERMILION if test.rejected else BLUE
-    panel.band("envelope", *_envelope(test), PALE, alpha=0.4)
-    x, y = _ecdf([values])
-    panel.band("area", *_between(x, y), color, alpha=0.4)
-    panel.line("identity", [0.0, 1.0], [0.0, 1.0], INK, style=DASHED, width=None)
-    panel.line("ecdf", x, y, color, width=None)
-    name = "|2u - 1|" if test.folded else "u-value"
-    panel.axes(x=name, y=f"share of {values.size} values", title=title)
-
-
-def _draw_directions(
-    panel: Panel, test: ValidityTest, directions: list[Floats], title: str
-) -> None:
-    """Draw a line for each direction of several outputs."""
-    # Conditions of one output are one line of their own
-    single = test.u_values[~_is_of_direction(test)]
-    lines = [single, *directions] if single.size else directions
-    color = VERMILION if test.rejected else BLUE
-    panel.line("identity", [0.0, 1.0], [0.0, 1.0], INK, style=DASHED, width=None)
-    if not test.folded:
-        panel.line("ecdf", *_ecdf(lines), color, width=0.8)
-    x, y = _ecdf([np.abs(2 * u - 1) for u in (lines if test.folded else directions)])
-    panel.line("folded", x, y, color, style=SOLID if test.folded else DOTTED, width=0.8)
-    name = "|2u - 1|" if test.folded else "u-value; dotted: |2u - 1|"
-    panel.axes(x=name, y=f"share of values in each of {len(directions)} directions", title=title)
-
-
-def _ecdf(samples: Sequence[Floats]) -> tuple[Floats, Floats]:
+def _ecdf(samples: Sequence[Floats]) -> Floats:
     """Return the corners of ECDFs on [0, 1], with a gap between any two."""
-    xs, ys = [], []
+    curves = []
     for values in samples:
-        x, y = steps(np.sort(values), np.arange(values.size + 1) / values.size, 0.0, 1.0)
-        xs.append(np.append(x, np.nan))
-        ys.append(np.append(y, np.nan))
-    return np.concatenate(xs)[:-1], np.concatenate(ys)[:-1]
+        heights = np.arange(values.size + 1) / values.size
+        curves.append(np.column_stack(steps(np.sort(values), heights, 0.0, 1.0)))
+    return with_gaps(curves)
 
 
 def _between(x: Floats, y: Floats) -> tuple[Floats, tuple[Floats, Floats]]:

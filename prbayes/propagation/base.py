@@ -58,10 +58,7 @@ class Missing:
 
     @classmethod
     def of(cls, values: Floats, weights: Floats) -> Missing:
-        """Return the shares of responses, (k, n) or (k, n, m), and their weights, (k, n).
-
-        A specimen failed if an output of it did.
-        """
+        """Return the shares of responses, (k, n) or (k, n, m), with weights (k, n)."""
         is_lost, has_failed = np.isnan(values), np.isposinf(values)
         if values.ndim > weights.ndim:
             is_lost, has_failed = is_lost.any(axis=-1), has_failed.any(axis=-1)
@@ -149,16 +146,10 @@ class Bound(ABC):
 
     @abstractmethod
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
-        """Return responses and weights of the populations at given roots, each of shape (k, n).
-
-        Responses of several outputs have shape (k, n, m).
-        """
+        """Return responses, (k, n) or (k, n, m), and weights, (k, n), at given roots."""
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
-        """Return the discrepancies of the populations at given roots, shape (k,).
-
-        +inf where they are invalid.
-        """
+        """Return the discrepancies of populations at given roots, (k,); +inf of invalid ones."""
         size = len(params[0])
         result = np.full(size, np.inf)
         self.last_missing = Missing(np.full(size, np.nan), np.full(size, np.nan))
@@ -172,10 +163,7 @@ class Bound(ABC):
         return result
 
     def missing(self, params: Sequence[Any]) -> Missing:
-        """Return the shares without numbers of the population at given roots, shapes (1, ...).
-
-        The population that was evaluated last is not computed again.
-        """
+        """Return the shares without numbers of one population, known for that evaluated last."""
         last = self.last_missing
         if last.lost.size == 1 and not np.isnan(last.lost).any():
             return last
@@ -190,10 +178,7 @@ class Bound(ABC):
         return np.broadcast_to(is_valid, len(params[0])).astype(bool)
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
-        """Draw responses of ``size`` specimens at one value of the roots, (size,) or (size, m).
-
-        They are specimens of the population's points, by weight and with replacement.
-        """
+        """Draw responses of specimens, (size,) or (size, m), from the points of one population."""
         roots = [np.asarray(p)[None] for p in params]
         no_response = np.full((size, *self.target.event), np.nan)
         if not self.valid(roots).all():

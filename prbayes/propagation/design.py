@@ -37,10 +37,7 @@ from prbayes.response.response import Responses, deduplicated_responses
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Stored runs, and the points that represent populations by their weights.
-
-    A design that grows is a new record.
-    """
+    """Stored runs, and points whose weights make populations; one that grows is a new record."""
 
     runs: Sample
     mixture: Mixture  # of the runs: their proposal density
@@ -181,10 +178,7 @@ class DesignSampler:
     def resampled(
         self, design: Design, components: Sequence[Floats], emulator: DesignEmulator | None
     ) -> Design:
-        """Return a design whose points support populations: emulated ones, where they are better.
-
-        The surfaces are those of ``emulator``, or selected for these populations.
-        """
+        """Return a design that supports populations, by emulated points where these are better."""
         runs = design.runs
         # The prior, the populations before, and these.
         groups = (*design.groups[:1], *design.groups[1:][-1:], tuple(components))

@@ -201,10 +201,7 @@ def new_specimens(
 def through_inverses(
     label: str, inputs: Inputs, symbols: list[Any], uniforms: list[Any]
 ) -> tuple[list[Any], list[Any]]:
-    """Return aleatory inputs as inverse distribution functions of uniforms, and epistemic ones.
-
-    Raise TypeError if a distribution has no inverse, or depends on another one.
-    """
+    """Return inputs by inverse distribution functions; raise TypeError where there is none."""
     if inputs.nested:
         raise TypeError("no inverse of a conditional distribution")
     dists, epistemic = inputs.rebuilt(symbols)
@@ -214,10 +211,7 @@ def through_inverses(
 
 @dataclass(frozen=True)
 class EmulatedSizes:
-    """Sizes of emulated samples, whose points cost no run.
-
-    The mixture of a sample has few populations beside the prior: each fills its space evenly.
-    """
+    """Sizes of emulated samples, whose points cost no run; few populations fill space evenly."""
 
     first: int = 8192  # points
     largest: int = 65536  # points
@@ -366,10 +360,7 @@ def _for_populations(
 
 
 class CoarseResponse:
-    """A coarse response of a simulator, which costs no run.
-
-    Its values are NaN where it raises, which is logged.
-    """
+    """A coarse response, which costs no run; NaN where it raises, which is logged."""
 
     def __init__(self, function: Callable[..., Any], expensive: Responses, executor: Any) -> None:
         self._responses = Responses(
@@ -383,11 +374,7 @@ class CoarseResponse:
         self._has_values = False
 
     def __call__(self, points: Sequence[Floats]) -> Floats:
-        """Return the outputs at points, (n, m).
-
-        Raise ResponseError if they have another shape than those of the expensive response, or are
-        not finite at any of the points of the first call.
-        """
+        """Return the outputs at points, (n, m); raise ResponseError if none is ever a number."""
         with unlimited():  # the user limits the expensive response
             values = self._responses(points, [])
         self._has_values = self._has_values or bool(np.isfinite(values).any())
@@ -416,10 +403,7 @@ def spread_over(group: Sequence[Floats], count: int) -> list[Floats]:
 
 
 def mixture_of(groups: Sequence[Sequence[Floats]], size: int) -> tuple[list[Floats], Floats]:
-    """Return the populations that an emulated sample is drawn from, and the share of each.
-
-    The first group is the prior; groups have one array of roots, (k, *shape), by root.
-    """
+    """Return the populations of an emulated sample, and their shares; the prior comes first."""
     prior, *posteriors = groups
     if not posteriors:
         count = 384  # more cost time and change nothing

@@ -85,10 +85,7 @@ def _moving_atoms(name: str, dist: TensorVariable, what: str) -> str:
 def refuse_moving_atoms(
     name: str, inputs: Inputs, points: Sequence[Floats], population: NDArray[np.intp]
 ) -> None:
-    """Refuse continuous inputs that have values with probability themselves, which move.
-
-    Such a value repeats among the points, (n, *event), of a single population, numbers (n,).
-    """
+    """Refuse values that repeat among the points, (n, *event), of a single population, (n,)."""
     number = population.max() + 1
     for dist, x in zip(inputs.aleatory, points, strict=True):
         if not dist.dtype.startswith("float"):

@@ -24,15 +24,12 @@ from prbayes.response.response import Responses
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
-    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|AdjointOp|Binned|OpaqueOp|abc_d)",
+    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|Binned|OpaqueOp|abc_d)",
 )
 
 
 class OwnOp(Op):
-    """An operation on arrays (..., *event), which takes leading axes itself.
-
-    Operations are equal if the objects that ``__props__`` names are the same.
-    """
+    """An operation on arrays (..., *event); two are equal if ``__props__`` are the same objects."""
 
     __props__: tuple[str, ...] = ()
     event_ndims: Sequence[int] = (1, 1)  # of the inputs: a sample and its weights
@@ -132,12 +129,12 @@ class DensityOp(OwnOp):
                 "use GaussianKDE, or prb.Reweighted"
             )
         sample, weights = inputs
-        slope = AdjointOp(self.cells, for_sample=True)(sample, *cotangents)
-        value = AdjointOp(self.cells, for_sample=False)(sample, *cotangents)
+        slope = CotangentOp(self.cells, for_sample=True)(sample, *cotangents)
+        value = CotangentOp(self.cells, for_sample=False)(sample, *cotangents)
         return [weights * slope, value]
 
 
-class AdjointOp(OwnOp):
+class CotangentOp(OwnOp):
     """A cotangent of a density at its sample, or its derivative: (..., n), (..., m) -> (..., n)."""
 
     __props__ = ("cells", "for_sample")
@@ -182,7 +179,7 @@ class BinnedAdjointOp(OwnOp):
     event_ndims = (2, 1)
     event_shape = (None,)
     supported = BinnedOp.supported
-    no_gradient = AdjointOp.no_gradient
+    no_gradient = CotangentOp.no_gradient
 
     def __init__(self, densities: DensitySum) -> None:
         self.densities = densities
@@ -224,10 +221,7 @@ def stored_discrepancy(target: Discrepancy, basis: Basis, weights: Any) -> Any:
 
 
 def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
-    """Return the graph of a discrepancy for a sample that depends on theta.
-
-    Shapes (n,), or (n, m) of several outputs, (n,) -> ().
-    """
+    """Return the graph of a discrepancy for a sample (n,) or (n, m) that depends on theta."""
     if not target.metric.symbolic:
         return OpaqueOp(target)(sample, weights)
     parts = target.parts

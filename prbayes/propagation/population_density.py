@@ -54,10 +54,7 @@ _FAMILIES: dict[type, tuple[tuple[Callable[[Floats], Floats], ...], bool]] = {
 
 
 def _coordinates(dist: pt.TensorVariable, values: Floats) -> list[tuple[Floats, bool]] | None:
-    """Return coordinates (c, n) of each element at points (n, *event), and if they are quadratic.
-
-    None if the distribution is no exponential family with a fixed support.
-    """
+    """Return coordinates (c, n) of each element, and if they are quadratic; None without a form."""
     if isinstance(dist.owner.op, MVNORMAL):
         return [(values.T, True)]
     op = dist.owner.op
@@ -192,10 +189,7 @@ class PopulationDensity:
         return PopulationSampler(self.inputs)
 
     def at(self, params: Sequence[Any], points: Sequence[Floats]) -> Callable[[slice], Floats]:
-        """Return log p(x given theta), (k, n), as a function of the rows of the points.
-
-        For roots of shapes (k, *shape), and points (n, *event).
-        """
+        """Return log p(x given theta), (k, n), as a function of the rows of points (n, *event)."""
         previous, form = self._form
         if previous is not points[0]:
             form = ExponentialForm.of(self.inputs.aleatory, points)
@@ -279,10 +273,7 @@ def _log_sum_exp_first(exponents: Floats) -> Floats:
 
 
 def normalise(logs: Floats) -> Floats:
-    """Turn log weights, (S, n), into weights of sum one in place; return their log totals, (S,).
-
-    Rows without weight become NaN.
-    """
+    """Turn log weights, (S, n), into weights in place, NaN without any; return log totals, (S,)."""
     largest = logs.max(axis=1, keepdims=True)
     largest = np.where(np.isfinite(largest), largest, 0.0)
     logs -= largest
@@ -297,11 +288,7 @@ type Normal = tuple[Floats, Floats]  # mean (d,) and lower Cholesky factor of th
 
 
 def fit_normal(z: Floats, log_a: Floats) -> Normal:
-    """Fit a normal population to specimens by EM.
-
-    log p(z) + log_a, both (N, K), is the log of the terms of the likelihoods of N specimens, at
-    points z, (N, K, d).
-    """
+    """Fit a normal population by EM to specimens with likelihood terms exp(log p(z) + log_a)."""
     mean, covariance = _fit(z, log_a)
     return mean[0], np.linalg.cholesky(covariance)[0]
 

@@ -291,10 +291,7 @@ class FreshOp(OwnOp):
         outputs[0][0] = discrepancies.reshape(batch)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Refuse by name.
-
-        Not as NotImplementedError, which PyMC takes as leave to use a slice sampler.
-        """
+        """Refuse; PyMC takes a NotImplementedError as leave to use a slice sampler."""
         raise TypeError(
             f"{self.bound.name}: prb.Fresh draws new responses at every evaluation, so its "
             "log-density is random and has no gradient: pm.sample, pm.find_MAP and gradient "

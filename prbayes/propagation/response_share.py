@@ -37,10 +37,7 @@ class ResponseShare:
     with_response: int  # number of points with a response
 
     def log_share(self, log_p: Floats) -> Floats:
-        """Return log S of log-densities of the points, (..., M) -> (...).
-
-        Zero where no point with a response is in the population.
-        """
+        """Return log S of log-densities of points, (..., M) -> (...); zero without response."""
         terms = log_p + self.log_b
         inside = log_sum_exp(terms[..., : self.with_response])
         return _log_share(inside, log_sum_exp(terms[..., self.with_response :]))

@@ -344,10 +344,7 @@ class ReweightedBound(Bound):
         return float(max(100.0, (15 * root) ** (4 / 3)))
 
     def add(self, components: Sequence[Floats], n: int | None = None) -> None:
-        """Compute more responses, at points from populations at roots, shapes (k, *shape).
-
-        Raise DesignError if data above the inputs have changed since the design was begun.
-        """
+        """Add runs for populations at roots; raise DesignError if data have changed."""
         now = {name: np.array(shared.get_value()) for name, shared in self.inputs.data.items()}
         changed = [name for name in now if not np.array_equal(self._data[name], now[name])]
         if changed:
@@ -487,10 +484,7 @@ class ReweightedBound(Bound):
         return np.broadcast_to(values, weights.shape + values.shape[1:]), weights
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
-        """Return the discrepancies of the populations at given roots, shape (k,).
-
-        +inf where none has support.
-        """
+        """Return the discrepancies of populations at given roots, (k,); +inf without support."""
         sample = self._design.sample
         if self._basis[0] is not target or self._basis[1] is not sample:
             self._basis = (target, sample, target.basis(sample.values))

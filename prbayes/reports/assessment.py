@@ -32,12 +32,10 @@ from prbayes.reports.numbers import (
     probability,
     rows_table,
     sample_sd,
-    shown,
     span,
     with_zeros,
 )
 from prbayes.reports.section import Section
-from prbayes.results.diagnose import Diagnosis
 from prbayes.validation.area_test import ValidityTest, u_values
 from prbayes.validation.conditions import DIRECTION, Comparable, comparables
 
@@ -49,9 +47,28 @@ def diagnostics(m: Material) -> list[Section]:
     sentences: list[tuple[str, str]] = []
     rows: list[dict[str, Any]] = []
     for label, diagnosis in m.diagnoses.items():
-        sentences += [(label, sentence) for sentence in _sentences(diagnosis)]
-        if diagnosis is not None:
-            rows += _support(label, diagnosis.support)
+        if diagnosis is None:
+            missing = "not diagnosed, because that needs the model, which was not given."
+            sentences.append((label, missing))
+            continue
+        clear = diagnosis.all_clear
+        messages = diagnosis.messages or (f"{clear[0].lower()}{clear[1:]}",)
+        texts = (*messages, *diagnosis.notes, *diagnosis.untested)
+        sentences += [(label, sentence) for sentence in texts]
+        support = diagnosis.support
+        for name in support["simulator"].values.tolist() if "weight_ess" in support else []:
+            values = support.sel(simulator=name)
+            low, median = np.quantile(values["weight_ess"].values, [0.05, 0.5])
+            rows.append(
+                {
+                    "result": label,
+                    "simulator": name,
+                    "weight ESS, 5%": f"{low:.0f}",
+                    "median": f"{median:.0f}",
+                    "mean weight": f"{float(values['mean_weight'].median()):.3f}",
+                    "largest lost mass": number(float(values["lost_mass"].max())),
+                }
+            )
     for label, tree in m.posteriors.items():
         sampler = _sampler_sentences(tree, by_specimen=m.is_by_specimen)
         sentences += [(label, sentence) for sentence in sampler]
@@ -68,35 +85,6 @@ def diagnostics(m: Material) -> list[Section]:
         )
         sections.append(Section("Support by stored responses", about, rows_table(rows), level=3))
     return sections
-
-
-def _sentences(diagnosis: Diagnosis | None) -> tuple[str, ...]:
-    if diagnosis is None:
-        return ("not diagnosed, because that needs the model, which was not given.",)
-    clear = diagnosis.all_clear
-    messages = diagnosis.messages or (f"{clear[0].lower()}{clear[1:]}",)
-    return (*messages, *diagnosis.notes, *diagnosis.untested)
-
-
-def _support(label: str, support: xr.Dataset) -> list[dict[str, Any]]:
-    """Return a row for each simulator with stored responses."""
-    if "weight_ess" not in support:
-        return []
-    rows = []
-    for name in support["simulator"].values.tolist():
-        values = support.sel(simulator=name)
-        low, median = np.quantile(values["weight_ess"].values, [0.05, 0.5])
-        rows.append(
-            {
-                "result": label,
-                "simulator": name,
-                "weight ESS, 5%": f"{low:.0f}",
-                "median": f"{median:.0f}",
-                "mean weight": f"{float(values['mean_weight'].median()):.3f}",
-                "largest lost mass": number(float(values["lost_mass"].max())),
-            }
-        )
-    return rows
 
 
 def _sampler_sentences(tree: xr.DataTree, *, by_specimen: bool) -> list[str]:
@@ -206,9 +194,27 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
     }
 
 
+def _validation_pairs(m: Material) -> list[tuple[str, Comparable]]:
+    """Return each condition with measured and predicted values of one output."""
+    return [
+        (condition, pair)
+        for condition, (measured, predicted) in m.validation.items()
+        for pair in comparables({condition: measured}, {condition: predicted}, "Report: validation")
+    ]
+
+
 def _validation_data(m: Material) -> list[Section]:
     """Return measured and predicted responses of specimens that were not used."""
-    rows = [_validation_row(pair, m) for pairs in _validation_pairs(m) for pair in pairs]
+    rows = []
+    for _, pair in _validation_pairs(m):
+        predicted = pair.predicted[~np.isnan(pair.predicted)]
+        levels = [0.5, (1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
+        quantiles = np.quantile(predicted, levels, method="inverted_cdf").tolist()
+        sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
+        median, lower, upper = alike(quantiles, sd)
+        name = {"condition": named(pair.name, m.labels)}
+        interval = {f"{INTERVAL:.0%} from": lower, "to": upper}
+        rows.append(name | described(pair.measured) | {"predicted median": median} | interval)
     if not rows:
         return []
     about = (
@@ -216,30 +222,6 @@ def _validation_data(m: Material) -> list[Section]:
         f"the range with {INTERVAL:.0%} of the predicted responses. ∞ is a failure."
     )
     return [Section("Data of the test", about, rows_table(with_zeros(rows)), level=3)]
-
-
-def _validation_pairs(m: Material) -> list[list[Comparable]]:
-    """Return measured and predicted values of each condition, by output."""
-    return [
-        comparables({condition: measured}, {condition: predicted}, "Report: validation")
-        for condition, (measured, predicted) in m.validation.items()
-    ]
-
-
-def _validation_row(pair: Comparable, m: Material) -> dict[str, Any]:
-    """Return the row of one output under one condition."""
-    predicted = pair.predicted[~np.isnan(pair.predicted)]
-    levels = [0.5, (1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
-    quantiles = np.quantile(predicted, levels, method="inverted_cdf").tolist()
-    sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
-    median, lower, upper = alike(quantiles, sd)
-    return {
-        "condition": named(pair.name, m.labels),
-        **described(pair.measured),
-        "predicted median": median,
-        f"{INTERVAL:.0%} from": lower,
-        "to": upper,
-    }
 
 
 # -- specimens -------------------------------------------------------------------------------
@@ -262,19 +244,16 @@ def specimens(m: Material) -> list[Section]:
 def _measured_rows(m: Material) -> list[dict[str, Any]]:
     """Return a row for each specimen and output of the validation data."""
     rows = []
-    for (condition, (measured, _)), pairs in zip(
-        m.validation.items(), _validation_pairs(m), strict=True
-    ):
-        labels = _specimen_labels(condition, len(measured), m)
-        for pair in pairs:
-            sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
-            values = alike(pair.measured.tolist(), sd)
-            us = u_values(pair.measured, pair.predicted).tolist()
-            name = named(pair.name, m.labels)
-            rows += [
-                {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
-                for label, value, u in zip(labels, values, us, strict=True)
-            ]
+    for condition, pair in _validation_pairs(m):
+        sd = sample_sd(pair.measured[np.isfinite(pair.measured)])
+        values = alike(pair.measured.tolist(), sd)
+        us = u_values(pair.measured, pair.predicted).tolist()
+        name = named(pair.name, m.labels)
+        labels = _specimen_labels(condition, len(m.validation[condition][0]), m)
+        rows += [
+            {"condition": name, "specimen": label, "measured": value, "u": f"{u:.3f}"}
+            for label, value, u in zip(labels, values, us, strict=True)
+        ]
     return rows
 
 
@@ -319,19 +298,31 @@ def origin(m: Material) -> list[Section]:
     """Return versions, seeds, and the cost of the results."""
     if not m.results:
         return []
-    rows = []
+    costs: list[tuple[str, str, Mapping[Any, Any], str]] = []
     versions: dict[str, str] = {}
     for label in m.results:
         attrs = m.attrs(label)
         by = str(attrs.get("sampler", "minimize" if label in m.optima else ""))
-        rows.append(_cost(label, by, attrs, "n_responses"))
-        versions |= _versions(attrs)
+        costs.append((label, by, attrs, "n_responses"))
+        for key, value in attrs.items():
+            name = str(key).removesuffix("_version")
+            # ArviZ records libraries too
+            if name != key and name not in ("inference_library", "creation_library"):
+                versions[name] = str(value)
     for condition, (_, predicted) in m.validation.items():
         label = f"prediction, {named(condition, m.labels)}"
-        rows.append(_cost(label, "predict", predicted.attrs, "responses"))
+        costs.append((label, "predict", predicted.attrs, "responses"))
     for label, table in m.decisions.items():
-        by = CALLED[kind_of_decision(table) or ""]
-        rows.append(_cost(label, by, table.attrs, "responses"))
+        costs.append((label, CALLED[kind_of_decision(table) or ""], table.attrs, "responses"))
+    rows = []
+    for label, by, record, responses in costs:
+        row: dict[str, Any] = {"result": label, "by": by}
+        row["responses"] = str(int(record[responses])) if responses in record else None
+        seconds = record.get("seconds")
+        if seconds is not None:  # to a tenth below ten
+            seconds = f"{seconds:.0f}" if seconds >= 9.95 else f"{seconds:.1f}"
+        seed = record.get("random_seed")
+        rows.append(row | {"seconds": seconds, "seed": None if seed is None else str(seed)})
     text = [
         "Responses are evaluations of the simulated response for one specimen, whatever the number "
         "of its outputs; those of a common design are counted in each."
@@ -340,28 +331,6 @@ def origin(m: Material) -> list[Section]:
         packages = ", ".join(f"{name} {version}" for name, version in versions.items())
         text.append(f"Computed with {packages}.")
     return [Section("Cost and origin", text, rows_table(rows))]
-
-
-def _cost(label: str, by: str, attrs: Mapping[Any, Any], responses: str) -> dict[str, Any]:
-    n, seconds, seed = (attrs.get(key) for key in (responses, "seconds", "random_seed"))
-    return {
-        "result": label,
-        "by": by,
-        "responses": None if n is None else str(int(n)),
-        "seconds": None if seconds is None else shown(float(seconds)),
-        "seed": None if seed is None else str(seed),
-    }
-
-
-def _versions(attrs: Mapping[Any, Any]) -> dict[str, str]:
-    """Return the versions of packages, without the libraries that ArviZ records."""
-    suffix = "_version"
-    return {
-        str(key).removesuffix(suffix): str(value)
-        for key, value in attrs.items()
-        if str(key).endswith(suffix)
-        and str(key).removesuffix(suffix) not in ("inference_library", "creation_library")
-    }
 
 
 # -- summary ---------------------------------------------------------------------------------
@@ -374,7 +343,7 @@ _MOST_NAMES = 6
 def summary(m: Material) -> list[str]:
     """Return the sentences, as paragraphs."""
     paragraphs = [
-        _whole_verdict(m),
+        *_whole_verdict(m),
         _problem(m),
         f"{_answer(m)} {_agreement(m)}",
         _trust(m),
@@ -405,21 +374,19 @@ def answers(m: Material) -> list[dict[str, str]]:
     return rows if len(rows) <= 10 else []
 
 
-def _whole_verdict(m: Material) -> str:
+def _whole_verdict(m: Material) -> list[str]:
     """Return in one sentence whether the calibration may be used."""
     if not m.results:
-        return ""
+        return []
     if m.rejected:
-        return "Verdict: the calibrated model is rejected by new data."
-    if _has_problems(m):
-        return "Verdict: not to be used before the problems under Diagnostics are removed."
-    if not m.tests:
-        return "Verdict: calibrated, and not tested on new data."
-    return "Verdict: calibrated, and not rejected by new data, which does not prove it right."
-
-
-def _has_problems(m: Material) -> bool:
-    return any(diagnosis is not None and not diagnosis.ok for diagnosis in m.diagnoses.values())
+        text = "the calibrated model is rejected by new data."
+    elif m.has_problems:
+        text = "not to be used before the problems under Diagnostics are removed."
+    elif not m.tests:
+        text = "calibrated, and not tested on new data."
+    else:
+        text = "calibrated, and not rejected by new data, which does not prove it right."
+    return [f"Verdict: {text}"]
 
 
 def verdict(label: str, test: ValidityTest, m: Material) -> str:
@@ -471,20 +438,14 @@ def _problem(m: Material) -> str:
         data.append(f"{measured} of {named(name, m.labels)}")
     were = "was" if len(names) == 1 else "were"
     on = f" on {enumerated(data)}" if data else ""
-    metrics = _metrics(m)
-    by = f", by the {enumerated(metrics)}" if metrics else ""
-    return f"{hyperparameters} of the model {were} calibrated{on}{by}."
-
-
-def _metrics(m: Material) -> list[str]:
-    """Return the labels of the metrics, each once."""
-    metrics: list[str] = []
-    if m.description is not None:
-        metrics = [str(s["metric"]) for s in m.description["simulators"]]
-    elif m.calibrations:
+    # The metrics, each once
+    metrics = [str(simulator["metric"]) for simulator in m.simulators]
+    if m.description is None and m.calibrations:
         first = next(iter(m.calibrations.values()))
         metrics = list(map(str, first["metric"].values.tolist()))
-    return list(dict.fromkeys(map(metric_label, metrics)))
+    labels = list(dict.fromkeys(map(metric_label, metrics)))
+    by = f", by the {enumerated(labels)}" if labels else ""
+    return f"{hyperparameters} of the model {were} calibrated{on}{by}."
 
 
 def _answer(m: Material) -> str:
@@ -593,7 +554,7 @@ def next_steps(m: Material) -> list[str]:
     if not m.results:
         return []
     steps = []
-    if _has_problems(m):
+    if m.has_problems:
         steps.append("Remove the problems under Diagnostics: each sentence there says what to do.")
     if not m.tests:
         steps.append(
@@ -617,22 +578,17 @@ def next_steps(m: Material) -> list[str]:
         steps.append(
             "Find the uncertainty of the hyperparameters: prb.sample_smc(optimum=optimum)."
         )
-    if not m.rejected:
-        steps += _decision_steps(m)
-    return [f"{i}. {step}" for i, step in enumerate(steps[:4], 1)]
-
-
-def _decision_steps(m: Material) -> list[str]:
-    """Return the questions of a decision that are open."""
-    kinds = {kind_of_decision(table) for table in m.decisions.values()}
-    steps = []
+    if m.rejected:
+        return [f"{i}. {step}" for i, step in enumerate(steps[:4], 1)]
+    # The questions of a decision that are open
     if any(table.attrs.get("verdict") == "not decided" for table in m.decisions.values()):
         steps.append(
             "A requirement is not decided, as too little is known of the probability: make as many "
             "more specimens as prb.plan says, with prb.decision.Exceedance as its quantity."
         )
+    kinds = {kind_of_decision(table) for table in m.decisions.values()}
     if "risk" not in kinds:
         steps.append("Ask for the probability that a response is beyond its limit: prb.exceedance.")
     if "plan" not in kinds:
         steps.append("Ask what more specimens would change, before they are made: prb.plan.")
-    return steps
+    return [f"{i}. {step}" for i, step in enumerate(steps[:4], 1)]

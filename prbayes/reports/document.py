@@ -5,12 +5,12 @@ from __future__ import annotations
 import base64
 import html
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import pymc as pm
 import xarray as xr
@@ -19,7 +19,7 @@ from prbayes._validate import called, file_path, flag, folder_path, plain_text
 from prbayes.optimize.optimum import Optimum
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import cells
-from prbayes.reports.section import Section
+from prbayes.reports.section import Section, is_broad, kind_of
 from prbayes.reports.sections import sections_of
 from prbayes.validation.area_test import ValidityTest
 
@@ -42,97 +42,8 @@ def visible(text: str) -> str:
     return _INVISIBLE.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
-@dataclass(frozen=True, eq=False)
-class _Document:
-    """A title and sections, with writers."""
-
-    title: str
-    sections: tuple[Section, ...]
-    author: str
-    date: str
-
-    def with_section(self, section: Section, *, after: str | None = None) -> Self:
-        """Return a report with one more section.
-
-        Parameters
-        ----------
-        section : Section
-        after : str, optional
-            Title of the section that it follows, with all its parts; at the end by default.
-
-        Raises
-        ------
-        KeyError
-            If no section has that title.
-        """
-        if not isinstance(section, Section):
-            raise TypeError(f"section: got {called(section)}, expected a prb.reports.Section")
-        place = len(self.sections) if after is None else self._end_of(after, section.level)
-        sections = (*self.sections[:place], section, *self.sections[place:])
-        return replace(self, sections=sections)
-
-    def _end_of(self, title: str, level: int) -> int:
-        """Return the place behind a section, and behind its parts for one of its own level."""
-        titles = [section.title for section in self.sections]
-        if title not in titles:
-            raise KeyError(f"after: got {title!r}, expected the title of a section: {titles}")
-        start = titles.index(title)
-        highest = max(self.sections[start].level, level)
-        for place in range(start + 1, len(titles)):
-            if self.sections[place].level <= highest:
-                return place
-        return len(titles)
-
-    def to_html(self, path: str | PathLike[str]) -> Path:
-        """Write one file with everything, for a browser and for print; return its path."""
-        return _write(file_path(path, "path"), self._html())
-
-    def to_markdown(self, folder: str | PathLike[str]) -> Path:
-        """Write ``report.md``, and pictures as files beside it, into a folder.
-
-        The path of ``report.md`` is returned.
-        """
-        folder = folder_path(folder, "folder")
-        files = [_file_name(i, section) for i, section in enumerate(self.sections, 1)]
-        template = _template("report.md.j2", autoescape=False)
-        text = template.render(report=self, byline=self._byline, cells=cells, files=files)
-        folder.mkdir(parents=True, exist_ok=True)
-        for section, name in zip(self.sections, files, strict=True):
-            if name is not None and section.picture is not None:
-                (folder / name).write_bytes(section.picture)
-        return _write(folder / "report.md", text.rstrip("\n") + "\n")
-
-    @property
-    def _byline(self) -> str:
-        return ", ".join(filter(None, (self.author, self.date)))
-
-    def _html(self) -> str:
-        # The list of contents comes after the summary, which with its parts is a page of its own.
-        chapters = [
-            (i, section.title)
-            for i, section in enumerate(self.sections, 1)
-            if section.level == 2 and i > 1
-        ]
-        style = _template("report.css", autoescape=True).render(running=_in_css(self.title))
-        rendered: str = _template("report.html.j2", autoescape=True).render(
-            report=self,
-            byline=self._byline,
-            style=style,
-            contents=chapters,
-            front=chapters[0][0] - 1 if chapters else len(self.sections),
-            cells=cells,
-            base64=lambda picture: base64.b64encode(picture).decode("ascii"),
-        )
-        return rendered + "\n"
-
-    def _repr_html_(self) -> str:
-        """Show the report in a notebook, in a frame of its own."""
-        text = html.escape(self._html(), quote=True)
-        style = "width: 100%; height: 40rem; border: 0"
-        return f'<iframe sandbox srcdoc="{text}" title="report" style="{style}"></iframe>'
-
-
-class Report(_Document):
+@dataclass(frozen=True, eq=False, init=False)
+class Report:
     """A calibration as a document: the problem, the answer, whether it may be trusted.
 
     The report has sections for the results that are given. It is data: pictures are made once, and
@@ -189,6 +100,11 @@ class Report(_Document):
     ['Summary', 'Model', 'Data']
     """
 
+    title: str
+    sections: tuple[Section, ...]
+    author: str
+    date: str
+
     def __init__(
         self,
         title: str,
@@ -227,21 +143,96 @@ class Report(_Document):
                 raise TypeError(
                     f"Report: sections: got {got}, expected prb.reports.Section objects"
                 )
-        super().__init__(title, contents, author, date)
+        vars(self).update(title=title, sections=contents, author=author, date=date)
+
+    def with_section(self, section: Section, *, after: str | None = None) -> Report:
+        """Return a report with one more section.
+
+        Parameters
+        ----------
+        section : Section
+        after : str, optional
+            Title of the section that it follows, with all its parts; at the end by default.
+
+        Raises
+        ------
+        KeyError
+            If no section has that title.
+        """
+        if not isinstance(section, Section):
+            raise TypeError(f"section: got {called(section)}, expected a prb.reports.Section")
+        place = len(self.sections)
+        if after is not None:
+            titles = [section.title for section in self.sections]
+            if after not in titles:
+                raise KeyError(f"after: got {after!r}, expected the title of a section: {titles}")
+            # Behind the parts of a section as well, for one of its own level
+            start = titles.index(after)
+            highest = max(self.sections[start].level, section.level)
+            behind = range(start + 1, place)
+            place = next((i for i in behind if self.sections[i].level <= highest), place)
+        sections = (*self.sections[:place], section, *self.sections[place:])
+        return replace(self, sections=sections)
+
+    def to_html(self, path: str | PathLike[str]) -> Path:
+        """Write one file with everything, for a browser and for print; return its path."""
+        return _write(file_path(path, "path"), self._html())
+
+    def to_markdown(self, folder: str | PathLike[str]) -> Path:
+        """Write ``report.md``, and pictures as files beside it, into a folder.
+
+        The path of ``report.md`` is returned.
+        """
+        folder = folder_path(folder, "folder")
+        files: list[str | None] = []
+        for i, section in enumerate(self.sections, 1):
+            slug = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")[:40] or "picture"
+            has_picture = section.picture is not None
+            files.append(f"{i:02d}-{slug}.{section.kind}" if has_picture else None)
+        template = _template("report.md.j2", autoescape=False)
+        text = template.render(report=self, byline=self._byline, cells=cells, files=files)
+        folder.mkdir(parents=True, exist_ok=True)
+        for section, name in zip(self.sections, files, strict=True):
+            if name is not None and section.picture is not None:
+                (folder / name).write_bytes(section.picture)
+        return _write(folder / "report.md", text.rstrip("\n") + "\n")
+
+    @property
+    def _byline(self) -> str:
+        return ", ".join(filter(None, (self.author, self.date)))
+
+    def _html(self) -> str:
+        # The list of contents comes after the summary, which with its parts is a page of its own.
+        chapters = [
+            (i, section.title)
+            for i, section in enumerate(self.sections, 1)
+            if section.level == 2 and i > 1
+        ]
+        style = _template("report.css", autoescape=True).render(running=_in_css(self.title))
+        rendered: str = _template("report.html.j2", autoescape=True).render(
+            report=self,
+            byline=self._byline,
+            style=style,
+            contents=chapters,
+            front=chapters[0][0] - 1 if chapters else len(self.sections),
+            cells=cells,
+            kind_of=kind_of,
+            is_broad=is_broad,
+            base64=lambda picture: base64.b64encode(picture).decode("ascii"),
+        )
+        return rendered + "\n"
+
+    def _repr_html_(self) -> str:
+        """Show the report in a notebook, in a frame of its own."""
+        text = html.escape(self._html(), quote=True)
+        style = "width: 100%; height: 40rem; border: 0"
+        return f'<iframe sandbox srcdoc="{text}" title="report" style="{style}"></iframe>'
 
 
 def _write(path: Path, text: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8", newline="\n")
     return path
-
-
-def _file_name(i: int, section: Section) -> str | None:
-    """Return the name of the file with a section's picture, if it has one."""
-    if section.picture is None:
-        return None
-    slug = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")[:40]
-    return f"{i:02d}-{slug or 'picture'}.{section.kind}"
 
 
 # -- templates -------------------------------------------------------------------------------
@@ -253,18 +244,20 @@ def _template(name: str, *, autoescape: bool) -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
-    escape: Callable[[Any], Any] = _visible_text if autoescape else _literal
+    def shown(value: Any) -> Any:
+        if isinstance(value, Markup):
+            return value
+        if not autoescape:
+            return _literal(value)
+        return visible(value) if isinstance(value, str) else value
+
     environment = Environment(
         loader=PackageLoader("prbayes.reports"),
         autoescape=autoescape,
-        finalize=lambda value: value if isinstance(value, Markup) else escape(value),
+        finalize=shown,
         undefined=StrictUndefined,
     )
     return environment.get_template(name)
-
-
-def _visible_text(value: Any) -> Any:
-    return visible(value) if isinstance(value, str) else value
 
 
 def _literal(value: Any) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from importlib import import_module
 from subprocess import CalledProcessError
 from typing import Any
@@ -31,225 +31,89 @@ _log = logging.getLogger("prbayes")
 
 
 @dataclass(frozen=True)
-class Call:
-    """The arguments of a picture."""
-
-    arguments: tuple[Any, ...]
-    keywords: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class NotDrawn:
-    """The reason for a missing picture, as the end of a sentence."""
-
-    reason: str
-
-
-# None where the report does not have the contents of a picture.
-Request = Call | NotDrawn | None
-
-
-@dataclass(frozen=True)
 class Illustration:
     """A picture that a report shows where it has the contents."""
 
-    after: str  # title of the section that it belongs to
     function: Callable[..., Any]  # returns an ArviZ `PlotCollection`
-    request: Callable[[Material], Request]
+    after: str  # title of the section that it belongs to
     title: str
     alt: str
     caption: str
 
 
-# -- arguments of pictures -------------------------------------------------------------------
-
-
-def _first(results: Mapping[str, Any]) -> Any:
-    return next(iter(results.values()), None)
-
-
-def _computes_responses(model: pm.Model) -> bool:
-    """Return whether a draw of the model's simulators computes responses: a report spends none."""
-    return any(not simulator.has_specimens for simulator in population_simulators(model))
-
-
-def _model_labels(m: Material) -> dict[str, Any]:
-    """Return as keywords the labels of the model, which has no conditions of a test."""
-    labels = {name: text for name, text in m.labels.items() if name not in m.validation}
-    return {"labels": labels} if labels else {}
-
-
-def _labels_of(m: Material, names: Iterable[Any]) -> dict[str, Any]:
-    """Return as keywords the labels of names in a picture without a model."""
-    variables = {variable_of(str(name)) for name in names}
-    labels = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
-    return {"labels": labels} if labels else {}
-
-
-def _population(m: Material) -> Request:
-    """Request the population of the first posterior, or else of the first optimum."""
-    # An optimum from a file has no evaluator, hence no population.
-    result = _first(m.posteriors | m.live_optima)
-    if m.model is None or result is None:
-        return None
-    return Call((result,), {"model": m.model, **_model_labels(m)})
-
-
-def _responses(m: Material) -> Request:
-    if m.model is not None and _computes_responses(m.model):
-        return NotDrawn("it would recompute responses; call prb.plot_responses for it")
-    return _population(m)
-
-
-def _outputs(m: Material) -> Request:
-    if not any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values()):
-        return None
-    request = _responses(m)
-    # The picture before has the same reason
-    return None if isinstance(request, NotDrawn) else request
-
-
-def _posterior(m: Material) -> Request:
-    if not m.posteriors:
-        return None
-    posterior = _first(m.posteriors)
-    labels = _model_labels(m)
-    if m.model is None:
-        labels = _labels_of(m, posterior["posterior"].data_vars)
-    return Call((posterior,), {"optimum": _first(m.live_optima), "model": m.model, **labels})
-
-
-def _stages(m: Material) -> Request:
-    posterior = _first(m.posteriors)
-    if posterior is None or "sample_stats" not in posterior:
-        return None
-    return Call((posterior,)) if "stage" in posterior["sample_stats"].dims else None
-
-
-def _optimizer(m: Material) -> Request:
-    return (
-        Call((_first(m.live_optima),), {"col_wrap": 2, **_model_labels(m)})
-        if m.live_optima
-        else None
-    )
-
-
-def _landscape(m: Material) -> Request:
-    if m.model is None or not m.live_optima:
-        return None
-    return Call((_first(m.live_optima),), {"model": m.model, **_model_labels(m)})
-
-
-def _comparison(m: Material) -> Request:
-    if m.comparison is None:
-        return None
-    return Call((m.comparison,), _labels_of(m, m.comparison["hyperparameter"].values))
-
-
-def _validity(m: Material) -> Request:
-    if not m.tests:
-        return None
-    return Call((_first(m.tests) if len(m.tests) == 1 else m.tests,))
-
-
-def _decision(m: Material) -> Request:
-    for table in m.decisions.values():
-        if kind_of_decision(table) == "sensitivity":
-            return Call((table,), _labels_of(m, table["factor"].values))
-    return None
-
-
-def _prediction(m: Material) -> Request:
-    if not m.validation:
-        return None
-    measured = {name: pair[0] for name, pair in m.validation.items()}
-    predicted = {name: pair[1] for name, pair in m.validation.items()}
-    return Call((measured, predicted), _labels_of(m, m.validation))
-
-
 # In the order of the report, and within a section in this order.
-ILLUSTRATIONS = (
-    Illustration(
+ILLUSTRATIONS = {
+    "responses": Illustration(
+        plot_responses,
         after="Data",
-        function=plot_responses,
-        request=_responses,
         title="Measured and calibrated responses",
         alt="Distribution of the measured responses with that of the calibrated population, "
         "one panel per simulator or output.",
         caption="Measured responses and the calibrated population.",
     ),
-    Illustration(
+    "outputs": Illustration(
+        plot_outputs,
         after="Data",
-        function=plot_outputs,
-        request=_outputs,
         title="Pairs of outputs",
         alt="Measured specimens as points, one panel per pair of outputs, with outlines of the "
         "calibrated population.",
         caption="Measured specimens, and regions with 50% and 89% of the calibrated population.",
     ),
-    Illustration(
+    "optimizer": Illustration(
+        plot_optimizer,
         after="Optimum",
-        function=plot_optimizer,
-        request=_optimizer,
         title="Path of the optimiser",
         alt="Objective, and hyperparameters, against the number of evaluations.",
         caption="The objective at the points that the optimiser evaluated.",
     ),
-    Illustration(
+    "landscape": Illustration(
+        plot_landscape,
         after="Optimum",
-        function=plot_landscape,
-        request=_landscape,
         title="Objective around the optimum",
         alt="Objective over the hyperparameters, with the optimum marked.",
         caption="The objective around the optimum.",
     ),
-    Illustration(
+    "posterior": Illustration(
+        plot_posterior,
         after="Posterior",
-        function=plot_posterior,
-        request=_posterior,
         title="Marginal posteriors",
         alt="Posterior density of each hyperparameter, with its interval.",
         caption="Posterior distribution of each hyperparameter after the calibration.",
     ),
-    Illustration(
+    "population": Illustration(
+        plot_population,
         after="Posterior",
-        function=plot_population,
-        request=_population,
         title="Calibrated population of the inputs",
         alt="Distribution of each input over the specimens, with a band for its uncertainty.",
         caption="Variation of the inputs from specimen to specimen.",
     ),
-    Illustration(
+    "stages": Illustration(
+        plot_stages,
         after="Posterior",
-        function=plot_stages,
-        request=_stages,
         title="Stages of the sampler",
         alt="Tempering, acceptance rate and moves against the stages of the sampler, "
         "one line per chain.",
         caption="Stages of the sampler from the prior to the posterior.",
     ),
-    Illustration(
+    "comparison": Illustration(
+        plot_comparison,
         after="Comparison",
-        function=plot_comparison,
-        request=_comparison,
         title="Estimates side by side",
         alt="Estimate and interval of each result, one panel per hyperparameter.",
         caption="Estimates with their intervals.",
     ),
-    Illustration(
+    "prediction": Illustration(
+        plot_prediction,
         after="Validity",
-        function=plot_prediction,
-        request=_prediction,
         title="Measured and predicted responses",
         alt="Distribution functions of the measured responses, as steps, and of the predicted ones "
         "with a band, one panel per condition or output.",
         caption="Specimens that were not used in the calibration, beside their prediction; the "
         "band contains 89% of the populations of the posterior.",
     ),
-    Illustration(
+    "validity": Illustration(
+        plot_validity,
         after="Validity",
-        function=plot_validity,
-        request=_validity,
         title="Distribution of the u-values",
         alt="Step curve of the sorted u-values against the diagonal, "
         "with the area between them, and of one output an acceptance band.",
@@ -259,10 +123,9 @@ ILLUSTRATIONS = (
         "minus the test's level; several outputs have a line for each direction, and no band. "
         "Curves of a rejected model are red.",
     ),
-    Illustration(
+    "sensitivity": Illustration(
+        plot_sensitivity,
         after="Decision",
-        function=plot_sensitivity,
-        request=_decision,
         title="Shares of hyperparameters and inputs",
         alt="Share of each hyperparameter in the variance of the decision quantity, and of each "
         "input in that of the response.",
@@ -270,7 +133,68 @@ ILLUSTRATIONS = (
         "the share that is left when all others are known, with two standard errors to either "
         "side.",
     ),
-)
+}
+
+
+# -- arguments of pictures -------------------------------------------------------------------
+
+
+# Positional and keyword arguments, or the reason for a missing picture as the end of a sentence.
+Request = tuple[tuple[Any, ...], dict[str, Any]] | str
+
+
+def requests(m: Material) -> dict[str, Request]:
+    """Return the arguments of the pictures that the contents of a report allow, by name."""
+    made: dict[str, Request] = {}
+    posterior = next(iter(m.posteriors.values()), None)
+    # An optimum from a file has no evaluator, hence no population.
+    optimum = next(iter(m.live_optima.values()), None)
+    # Labels of the model, which has no conditions of a test
+    of_model = {name: text for name, text in m.labels.items() if name not in m.validation}
+    labels = {"labels": of_model} if of_model else {}
+
+    def labels_of(names: Iterable[Any]) -> dict[str, Any]:
+        """Return as keywords the labels of names in a picture without a model."""
+        variables = {variable_of(str(name)) for name in names}
+        chosen = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
+        return {"labels": chosen} if chosen else {}
+
+    result = optimum if posterior is None else posterior
+    if m.model is not None and result is not None:
+        made["population"] = ((result,), {"model": m.model, **labels})
+    if m.model is not None and _computes_responses(m.model):
+        made["responses"] = "it would recompute responses; call prb.plot_responses for it"
+    elif "population" in made:
+        made["responses"] = made["population"]
+        if any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values()):
+            made["outputs"] = made["population"]
+    if posterior is not None:
+        known = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
+        made["posterior"] = ((posterior,), {"optimum": optimum, "model": m.model, **known})
+        if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
+            made["stages"] = ((posterior,), {})
+    if optimum is not None:
+        made["optimizer"] = ((optimum,), {"col_wrap": 2, **labels})
+        if m.model is not None:
+            made["landscape"] = ((optimum,), {"model": m.model, **labels})
+    if m.comparison is not None:
+        names = m.comparison["hyperparameter"].values
+        made["comparison"] = ((m.comparison,), labels_of(names))
+    if m.tests:
+        made["validity"] = ((m.tests if len(m.tests) > 1 else next(iter(m.tests.values())),), {})
+    tables = [t for t in m.decisions.values() if kind_of_decision(t) == "sensitivity"]
+    if tables:
+        made["sensitivity"] = (tuple(tables[:1]), labels_of(tables[0]["factor"].values))
+    if m.validation:
+        measured = {name: pair[0] for name, pair in m.validation.items()}
+        predicted = {name: pair[1] for name, pair in m.validation.items()}
+        made["prediction"] = ((measured, predicted), labels_of(m.validation))
+    return made
+
+
+def _computes_responses(model: pm.Model) -> bool:
+    """Return whether a draw of the model's simulators computes responses: a report spends none."""
+    return any(not simulator.has_specimens for simulator in population_simulators(model))
 
 
 # -- drawing ---------------------------------------------------------------------------------
@@ -278,47 +202,41 @@ ILLUSTRATIONS = (
 
 def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Section, ...]:
     """Return the sections with pictures after those that they belong to."""
+    made = requests(material)
     illustrated: list[Section] = []
     pictures: list[Section] = []
     for section in sections:
         if section.level == 2:  # pictures come after all parts of the section before
             illustrated += pictures
             pictures = [
-                picture
-                for illustration in ILLUSTRATIONS
-                if illustration.after == section.title
-                for picture in _pictures(illustration, material)
+                _picture(illustration, made[name])
+                for name, illustration in ILLUSTRATIONS.items()
+                if illustration.after == section.title and name in made
             ]
         illustrated.append(section)
     return (*illustrated, *pictures)
 
 
-def _pictures(illustration: Illustration, material: Material) -> list[Section]:
-    """Return a picture, or the reason why it is missing; nothing if there are no contents."""
-    request = illustration.request(material)
-    if request is None:
-        return []
-    picture = request if isinstance(request, NotDrawn) else _drawn(illustration, request)
-    if isinstance(picture, NotDrawn):
-        name = illustration.function.__name__
-        report(Finding("no-picture", f"report: no picture by {name}: {picture.reason}"))
-        text = f"This picture could not be made: {picture.reason}"
-        return [Section(illustration.title, text, level=3)]
-    texts = {"alt": illustration.alt, "caption": illustration.caption}
-    return [Section(illustration.title, picture=picture, level=3, **texts)]
-
-
-def _drawn(illustration: Illustration, call: Call) -> bytes | NotDrawn:
-    pyplot: Any = import_module("matplotlib.pyplot")  # heavy, and partly annotated
-    open_figures = set(pyplot.get_fignums())
-    try:
-        return image(illustration.function(*call.arguments, **call.keywords))
-    except (TypeError, ValueError, NotImplementedError) as error:
-        # Refusals of pictures; and distributions for which PyMC has no formula
-        return NotDrawn(str(error))
-    finally:
-        for figure in set(pyplot.get_fignums()) - open_figures:
-            pyplot.close(figure)
+def _picture(illustration: Illustration, request: Request) -> Section:
+    """Return a picture, or the reason why it is missing."""
+    reason = request
+    if not isinstance(request, str):
+        arguments, keywords = request
+        pyplot: Any = import_module("matplotlib.pyplot")  # heavy, and partly annotated
+        open_figures = set(pyplot.get_fignums())
+        try:
+            picture = image(illustration.function(*arguments, **keywords))
+            texts = {"alt": illustration.alt, "caption": illustration.caption}
+            return Section(illustration.title, picture=picture, level=3, **texts)
+        except (TypeError, ValueError, NotImplementedError) as error:
+            # Refusals of pictures; and distributions for which PyMC has no formula
+            reason = str(error)
+        finally:
+            for figure in set(pyplot.get_fignums()) - open_figures:
+                pyplot.close(figure)
+    name = illustration.function.__name__
+    report(Finding("no-picture", f"report: no picture by {name}: {reason}"))
+    return Section(illustration.title, f"This picture could not be made: {reason}", level=3)
 
 
 # -- the model's graph -----------------------------------------------------------------------

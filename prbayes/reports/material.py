@@ -77,6 +77,13 @@ class Material:
         return dict(_estimates(self.results[label]).attrs)
 
     @property
+    def has_problems(self) -> bool:
+        """Whether a diagnosis found a problem."""
+        return any(
+            diagnosis is not None and not diagnosis.ok for diagnosis in self.diagnoses.values()
+        )
+
+    @property
     def is_by_specimen(self) -> bool:
         """Whether all simulators of all results have the log-likelihood by specimen."""
         flags = [
@@ -90,6 +97,11 @@ class Material:
     def variables(self) -> list[dict[str, Any]]:
         """The variables of the model; none where they are unknown."""
         return [] if self.description is None else list(self.description["variables"])
+
+    @property
+    def simulators(self) -> list[dict[str, Any]]:
+        """The simulators of the model; none where they are unknown."""
+        return [] if self.description is None else list(self.description["simulators"])
 
     @property
     def hyperparameters(self) -> list[str]:
@@ -142,11 +154,18 @@ def gather(
     _require_prior({label: identities[label] for label in posteriors}, model)
     _require_tested(validation, tests)
 
-    description = _stored_description(results) if model is None else describe(model)
+    stored = (from_attributes(_estimates(tree).attrs) for tree in results.values())
+    first = next((text for text in stored if text is not None), None)
+    description = first if model is None else describe(model)
     if comparison is None and len(results) > 1:
         comparison = compare(results | live_optima, model=model)
     observed, outputs = _observed(model, results)
-    _require_labels(labels, model, description, outputs, validation)
+    if labels and (description is not None or model is not None):
+        names = set(validation).union(outputs, *(columns.names for columns in outputs.values()))
+        if description is not None:
+            names |= {str(variable["name"]) for variable in description["variables"]}
+        evaluator = None if model is None else Evaluator.of(model)
+        refuse_labels(labels, sorted(names), evaluator=evaluator)
     return Material(
         model=model,
         description=description,
@@ -158,10 +177,7 @@ def gather(
         observed=observed,
         outputs=outputs,
         diagnoses={
-            label: diagnose(result, model=_model_of(result, model))
-            if _can_be_diagnosed(result, model)
-            else None
-            for label, result in (results | live_optima).items()
+            label: _diagnosis(result, model) for label, result in (results | live_optima).items()
         },
         decisions=decisions,
         validation=dict(validation),
@@ -205,7 +221,16 @@ def _require_kinds(
             f"Report: comparison: got {type(comparison).__name__}, expected the Dataset of "
             "prb.compare"
         )
-    _require_validation(validation)
+    expected = (
+        "expected by condition what was measured and what prb.predict says of it, such as "
+        '{"80 000 cycles": (lengths, prb.predict(...))}'
+    )
+    if not isinstance(validation, Mapping):
+        raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
+    for condition, pair in validation.items():
+        if not isinstance(condition, str) or not isinstance(pair, tuple) or len(pair) != 2:
+            raise TypeError(f"Report: validation: {condition}: got {called(pair)}, {expected}")
+        comparables({condition: pair[0]}, {condition: pair[1]}, "Report: validation")
     if labels is not None:
         texts(labels, "Report: labels")
     names = sorted(set(optima) & set(posteriors))
@@ -221,20 +246,6 @@ def _require_kinds(
             )
     for label, tree in posteriors.items():
         _require_group(label, tree, "posterior", ("chain", "draw"), "prb.sample_smc")
-
-
-def _require_validation(validation: Any) -> None:
-    """Raise if it is no mapping of conditions to measured and predicted responses."""
-    expected = (
-        "expected by condition what was measured and what prb.predict says of it, such as "
-        '{"80 000 cycles": (lengths, prb.predict(...))}'
-    )
-    if not isinstance(validation, Mapping):
-        raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
-    for condition, pair in validation.items():
-        if not isinstance(condition, str) or not isinstance(pair, tuple) or len(pair) != 2:
-            raise TypeError(f"Report: validation: {condition}: got {called(pair)}, {expected}")
-        comparables({condition: pair[0]}, {condition: pair[1]}, "Report: validation")
 
 
 def _require_group(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: str) -> None:
@@ -273,41 +284,20 @@ def _require_tested(
         tested += [test.u_values[test.conditions == name] for name in np.unique(test.conditions)]
     for condition, (measured, predicted) in validation.items():
         u = u_values({condition: measured}, {condition: predicted})
-        if tested and not any(_are_alike(u, values) for values in tested):
+        # Up to rounding and ties, in their order: rounded data change half of the values by far
+        # less than .02; other data are .3 apart on average.
+        distances = [
+            np.median(np.abs(values - known))
+            for values in (u, np.abs(2 * u - 1))
+            for known in tested
+            if known.shape == u.shape
+        ]
+        if tested and not min(distances, default=1.0) < 0.02:
             raise ValueError(
                 f"Report: validation: {condition}: got {u.size} values other than those of the "
                 f"tests in validity=, expected what prb.area_test was given; test them too, or "
                 "leave validity= out"
             )
-
-
-def _are_alike(u: Floats, tested: Floats) -> bool:
-    """Return whether u-values are those of a test, up to rounding and ties, in their order.
-
-    Rounded data change half of the values by far less than .02; other data are .3 apart on average.
-    """
-    return u.shape == tested.shape and any(
-        np.median(np.abs(values - tested)) < 0.02 for values in (u, np.abs(2 * u - 1))
-    )
-
-
-def _require_labels(
-    labels: Mapping[str, str] | None,
-    model: pm.Model | None,
-    description: dict[str, Any] | None,
-    outputs: Mapping[str, Outputs],
-    validation: Mapping[str, Any],
-) -> None:
-    """Raise if labels are of unknown names, where the names of the model are known."""
-    if not labels or (description is None and model is None):
-        return
-    names = set(validation)
-    for simulator, columns in outputs.items():
-        names |= {simulator, *columns.names}
-    if description is not None:
-        names |= {str(variable["name"]) for variable in description["variables"]}
-    evaluator = None if model is None else Evaluator.of(model)
-    refuse_labels(labels, sorted(names), evaluator=evaluator)
 
 
 # -- derived results -------------------------------------------------------------------------
@@ -318,15 +308,6 @@ def _estimates(tree: xr.DataTree) -> xr.DataTree:
     return tree.children["posterior" if "posterior" in tree else "optimum"]
 
 
-def _stored_description(results: dict[str, xr.DataTree]) -> dict[str, Any] | None:
-    """Return the first description of the model that a result has."""
-    for tree in results.values():
-        description = from_attributes(_estimates(tree).attrs)
-        if description is not None:
-            return description
-    return None
-
-
 def _observed(
     model: pm.Model | None, results: dict[str, xr.DataTree]
 ) -> tuple[dict[str, Floats], dict[str, Outputs]]:
@@ -335,42 +316,35 @@ def _observed(
         simulators = population_simulators(model)
         observed = {simulator.name: simulator.observed for simulator in simulators}
         return observed, {simulator.name: simulator.outputs for simulator in simulators}
-    for tree in results.values():
-        if "observed_data" in tree:
-            variables = tree["observed_data"].data_vars.items()
-            stored = {str(name): _stored_observed(str(name), x) for name, x in variables}
-            return (
-                {name: values for name, (values, _) in stored.items()},
-                {name: outputs for name, (_, outputs) in stored.items()},
-            )
-    return {}, {}
+    observed, outputs = {}, {}
+    tree = next((tree for tree in results.values() if "observed_data" in tree), None)
+    for key, values in {} if tree is None else tree["observed_data"].data_vars.items():
+        name = str(key)
+        units = values.attrs.get("units")
+        if values.ndim != 2:
+            observed[name] = np.ravel(values.values)
+            outputs[name] = SINGLE_OUTPUT
+            if isinstance(units, str) and units:
+                outputs[name] = Outputs(units=(units,))
+            continue
+        if units is not None and not isinstance(units, str):  # of each output
+            values = values.assign_coords(units=(values.dims[1], np.asarray(units)))
+        observed[name], outputs[name] = read_observed(name, values)
+    return observed, outputs
 
 
-def _stored_observed(name: str, values: xr.DataArray) -> tuple[Floats, Outputs]:
-    """Return the measured responses of a simulator, and their columns, from a result."""
-    units = values.attrs.get("units")
-    if values.ndim != 2:
-        outputs = Outputs(units=(units,)) if isinstance(units, str) and units else SINGLE_OUTPUT
-        return np.ravel(values.values), outputs
-    if units is not None and not isinstance(units, str):  # of each output
-        values = values.assign_coords(units=(values.dims[1], np.asarray(units)))
-    return read_observed(name, values)
-
-
-def _model_of(result: Optimum | xr.DataTree, model: pm.Model | None) -> pm.Model | None:
-    """Return the model, or None for a saved result by another metric or prior."""
-    if model is None or isinstance(result, Optimum):
-        return None
+def _diagnosis(result: Optimum | xr.DataTree, model: pm.Model | None) -> Diagnosis | None:
+    """Return the diagnosis of a result; None where it needs the model, which is not at hand."""
+    if isinstance(result, Optimum):
+        return diagnose(result)
     identity = identity_in(result)
-    if identity is not None and differences(identity, identity_of_model(model), Level.OPTIMUM):
+    if model is not None and identity is not None:
+        # The model is of no use to a saved result by another metric or prior
+        is_other = differences(identity, identity_of_model(model), Level.OPTIMUM)
+        model = None if is_other else model
+    if model is None and not {"optimum", "calibration"} & set(result.children):
         return None
-    return model
-
-
-def _can_be_diagnosed(result: Optimum | xr.DataTree, model: pm.Model | None) -> bool:
-    """Return whether a result has what its diagnosis needs, or the model is at hand."""
-    is_complete = isinstance(result, Optimum) or "optimum" in result or "calibration" in result
-    return is_complete or _model_of(result, model) is not None
+    return diagnose(result, model=model)
 
 
 # -- schema of results in files --------------------------------------------------------------
@@ -408,42 +382,58 @@ def kind_of_decision(table: Any) -> str | None:
 def complaints(tree: xr.DataTree) -> Iterator[str]:
     """Yield errors of a posterior, an optimum, a test of validity or a table: got, expected."""
     groups = {str(name): group.to_dataset() for name, group in tree.children.items()}
-    if "posterior" in groups:
-        yield from _of_posterior(groups)
-    elif "optimum" in groups:
-        yield from _of_optimum(groups)
+    if "posterior" in groups or "optimum" in groups:
+        yield from _of_estimates(groups)
     elif "u" in tree.data_vars:
         yield from _of_test(tree.to_dataset())
     else:
-        yield from _of_decision(tree.to_dataset())
-    for group in ("posterior", "optimum"):
-        if group in groups:
-            yield from _of_attributes(group, groups[group].attrs)
+        table = tree.to_dataset()
+        kind = kind_of_decision(table) or ""
+        present = {*table.variables, *table.attrs}
+        lacking = [name for name in _OF_DECISION[kind] if name not in present]
+        if lacking:
+            yield f"got no {lacking}, expected a table of prb.{CALLED[kind]}"
+        yield from _not_numbers("a decision", table.data_vars)
+    for group in {"posterior", "optimum"} & set(groups):
+        attrs = groups[group].attrs
+        for name in ("n_responses", "seconds"):
+            value = np.asarray(attrs.get(name, 0.0))
+            if value.size != 1 or value.dtype.kind not in "fiu" or np.isnan(value).any():
+                yield f"{group}: {name}: got {attrs[name]!r:.60}, expected a number"
+        try:
+            from_json(str(attrs.get("findings", "[]")))
+        except ValueError as error:
+            yield f"{group}: {error}"
     if "observed_data" in groups:
         yield from _not_numbers("observed_data", groups["observed_data"].data_vars)
 
 
-def _of_posterior(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
-    draws = groups["posterior"].data_vars
-    yield from _not_numbers("posterior", draws)
-    yield from _without_values("posterior", draws)
-    yield from _lacking(groups, "calibration", _OF_CALIBRATION)
-    stats = groups.get("sample_stats")
-    if stats is not None and "stage" in stats.dims:
-        yield from _lacking(groups, "sample_stats", ("beta", "accept_rate", "n_steps"))
-        yield from _not_numbers("sample_stats", stats.data_vars)
-
-
-def _of_optimum(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
-    point = groups["optimum"].data_vars
-    yield from _not_numbers("optimum", point)
-    yield from _without_values("optimum", point)
-    yield from _lacking(groups, "calibration", ("discrepancy", "metric"))
-    if "stderr" in groups:
+def _of_estimates(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
+    """Yield errors of a posterior, or else of an optimum."""
+    kind = "posterior" if "posterior" in groups else "optimum"
+    variables = groups[kind].data_vars
+    yield from _not_numbers(kind, variables)
+    for name, values in variables.items():
+        if not values.size:
+            yield f"{kind}: {name}: got no values (shape {values.shape}), expected some"
+        elif values.dtype.kind == "f" and not np.isfinite(values.values).any():
+            yield f"{kind}: {name}: got NaN or infinite values only, expected finite ones"
+    needed: dict[str, tuple[str, ...]] = {"calibration": ("discrepancy", "metric")}
+    if kind == "posterior":
+        needed = {"calibration": _OF_CALIBRATION}
+        if "sample_stats" in groups and "stage" in groups["sample_stats"].dims:
+            needed["sample_stats"] = ("beta", "accept_rate", "n_steps")
+    elif "stderr" in groups:
         errors = groups["stderr"]
-        for name, value in point.items():
+        for name, value in variables.items():
             if name not in errors or errors[name].shape != value.shape:
                 yield f"stderr: got no standard error of {name}, expected one of the same shape"
+    for group, names in needed.items():
+        lacking = [name for name in names if group in groups and name not in groups[group]]
+        if lacking:
+            yield f"{group}: got no {lacking}, expected them beside {list(groups[group])}"
+    if "sample_stats" in needed:
+        yield from _not_numbers("sample_stats", groups["sample_stats"].data_vars)
 
 
 def _of_test(test: xr.Dataset) -> Iterator[str]:
@@ -454,7 +444,6 @@ def _of_test(test: xr.Dataset) -> Iterator[str]:
     for name in _OF_TEST:
         if test[name].size != 1 or test[name].dtype.kind not in "fiub":
             yield f"{name}: got shape {test[name].shape}, expected one number"
-            return
     u = test["u"]
     yield from _not_numbers("a validity test", {"u": u})
     if u.ndim != 1 or not u.size or not bool(((u >= 0) & (u <= 1)).all()):
@@ -467,42 +456,7 @@ def _of_test(test: xr.Dataset) -> Iterator[str]:
             yield f"{name}: got NaN or an infinite number, expected a finite one"
 
 
-def _of_decision(table: xr.Dataset) -> Iterator[str]:
-    kind = kind_of_decision(table) or ""
-    present = {*table.variables, *table.attrs}
-    lacking = [name for name in _OF_DECISION[kind] if name not in present]
-    if lacking:
-        yield f"got no {lacking}, expected a table of prb.{CALLED[kind]}"
-        return
-    yield from _not_numbers("a decision", table.data_vars)
-
-
-def _of_attributes(group: str, attrs: Mapping[Any, Any]) -> Iterator[str]:
-    for name in ("n_responses", "seconds"):
-        value = np.asarray(attrs.get(name, 0.0))
-        if value.size != 1 or value.dtype.kind not in "fiu" or np.isnan(value).any():
-            yield f"{group}: {name}: got {attrs[name]!r:.60}, expected a number"
-    try:
-        from_json(str(attrs.get("findings", "[]")))
-    except ValueError as error:
-        yield f"{group}: {error}"
-
-
 def _not_numbers(group: str, variables: Mapping[Any, xr.DataArray]) -> Iterator[str]:
     for name, values in variables.items():
         if values.dtype.kind not in "fiu":
             yield f"{group}: {name}: got values of dtype {values.dtype}, expected numbers"
-
-
-def _without_values(group: str, variables: Mapping[Any, xr.DataArray]) -> Iterator[str]:
-    for name, values in variables.items():
-        if not values.size:
-            yield f"{group}: {name}: got no values (shape {values.shape}), expected some"
-        elif values.dtype.kind == "f" and not np.isfinite(values.values).any():
-            yield f"{group}: {name}: got NaN or infinite values only, expected finite ones"
-
-
-def _lacking(groups: Mapping[str, xr.Dataset], group: str, names: tuple[str, ...]) -> Iterator[str]:
-    lacking = [name for name in names if group in groups and name not in groups[group]]
-    if lacking:
-        yield f"{group}: got no {lacking}, expected them beside {list(groups[group])}"

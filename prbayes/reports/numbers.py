@@ -104,11 +104,6 @@ def span(values: Any, form: str) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def shown(seconds: float) -> str:
-    """Return seconds, to a tenth below ten."""
-    return f"{seconds:.0f}" if seconds >= 9.95 else f"{seconds:.1f}"
-
-
 def counted(n: int, noun: str) -> str:
     """Return a number with a noun."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
@@ -165,26 +160,49 @@ class Cells:
 
     def aligned(self) -> tuple[tuple[str, ...], ...]:
         """Return the rows with spaces after numbers that align decimal points."""
+        # A figure space is as wide as a digit, a punctuation space as a point (Unicode, 6.2).
+        digit, point = "\u2007", "\u2008"
         columns = []
         for column, numeric in zip(zip(*self.rows, strict=True), self.numeric, strict=True):
-            columns.append(_padded(column) if numeric else column)
+            decimals = [len(cell.partition(".")[2]) for cell in column]
+            if numeric and max(decimals) and not any("e" in cell for cell in column):
+                padded = []
+                for cell, n in zip(column, decimals, strict=True):
+                    spaces = ("" if "." in cell else point) + digit * (max(decimals) - n)
+                    padded.append(cell if cell == NOTHING else cell + spaces)
+                column = tuple(padded)
+            columns.append(column)
         return tuple(zip(*columns, strict=True))
 
 
 def cells(table: Any) -> Cells:
     """Return a table of pandas or xarray as text, or raise a `TypeError` if it is none."""
-    frame = _frame(table)
+    if isinstance(table, xr.DataArray):
+        table = table.to_dataset(name=table.name or "value")
+    if isinstance(table, xr.Dataset):
+        if table.dims:
+            table = table.to_dataframe()
+        else:  # pandas makes no table of numbers without a dimension
+            table = table.expand_dims("row").to_dataframe().reset_index(drop=True)
+    if not (hasattr(table, "reset_index") and hasattr(table, "columns")):
+        raise TypeError(
+            f"table: got {type(table).__name__}, "
+            "expected a pandas.DataFrame, xarray.Dataset or xarray.DataArray"
+        )
     # An unnamed index of integers only counts the rows.
-    is_named = any(name is not None for name in frame.index.names)
-    is_unnamed_text = not is_named and frame.index.dtype.kind not in "iu"
+    is_named = any(name is not None for name in table.index.names)
+    is_unnamed_text = not is_named and table.index.dtype.kind not in "iu"
     if is_named or is_unnamed_text:
-        frame = frame.reset_index()
-    header = tuple(map(str, frame.columns))
+        table = table.reset_index()
+    header = tuple(map(str, table.columns))
     if is_unnamed_text:
         header = ("", *header[1:])
-    rows = tuple(tuple(map(number, row)) for row in frame.itertuples(index=False, name=None))
-    columns = zip(*rows, strict=True) if rows else [()] * len(header)
-    return Cells(header, rows, tuple(map(_is_numeric, columns)))
+    rows = tuple(tuple(map(number, row)) for row in table.itertuples(index=False, name=None))
+    numeric = []
+    for column in zip(*rows, strict=True) if rows else [()] * len(header):
+        parts = [part for cell in column if cell != NOTHING for part in cell.split(" ± ")]
+        numeric.append(bool(parts) and all(_NUMBER.fullmatch(part) for part in parts))
+    return Cells(header, rows, tuple(numeric))
 
 
 def rows_table(rows: list[dict[str, Any]]) -> Any:
@@ -210,39 +228,3 @@ def correlation_table(names: Sequence[str], r: Any, digits: int) -> Any:
         texts[i] = "1"
         rows.append({"": name} | dict(zip(names, texts, strict=True)))
     return rows_table(rows)
-
-
-def _frame(table: Any) -> Any:
-    """Return a table of any kind as one of pandas."""
-    if isinstance(table, xr.DataArray):
-        table = table.to_dataset(name=table.name or "value")
-    if isinstance(table, xr.Dataset):
-        if table.dims:
-            return table.to_dataframe()
-        single = table.expand_dims("row")  # pandas makes no table of numbers without a dimension
-        return single.to_dataframe().reset_index(drop=True)
-    if hasattr(table, "reset_index") and hasattr(table, "columns"):
-        return table
-    raise TypeError(
-        f"table: got {type(table).__name__}, "
-        "expected a pandas.DataFrame, xarray.Dataset or xarray.DataArray"
-    )
-
-
-def _is_numeric(column: Sequence[str]) -> bool:
-    parts = [part for cell in column if cell != NOTHING for part in cell.split(" ± ")]
-    return bool(parts) and all(_NUMBER.fullmatch(part) for part in parts)
-
-
-def _padded(column: Sequence[str]) -> Sequence[str]:
-    """Return numbers with spaces in the place of decimals that only longer ones have."""
-    if any("e" in cell for cell in column) or not any("." in cell for cell in column):
-        return column
-    # A figure space is as wide as a digit, a punctuation space as a point (Unicode, chapter 6.2).
-    digit, point = "\u2007", "\u2008"
-    decimals = [len(cell.partition(".")[2]) for cell in column]
-    padded = []
-    for cell, n in zip(column, decimals, strict=True):
-        space = ("" if "." in cell else point) + digit * (max(decimals) - n)
-        padded.append(cell if cell == NOTHING else cell + space)
-    return padded

@@ -19,20 +19,8 @@ _BEGINNINGS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class _Content:
-    """The content of a section, as writers take it."""
-
-    title: str
-    text: tuple[str, ...]
-    table: Any
-    picture: bytes | None
-    alt: str
-    caption: str
-    level: int
-
-
-class Section(_Content):
+@dataclass(frozen=True, eq=False, init=False)
+class Section:
     """One section of a `Report`: paragraphs, a table and a picture, each where given.
 
     Parameters
@@ -73,6 +61,14 @@ class Section(_Content):
     ('Steel, as delivered.',)
     """
 
+    title: str
+    text: tuple[str, ...]
+    table: Any
+    picture: bytes | None
+    alt: str
+    caption: str
+    level: int
+
     def __init__(
         self,
         title: str,
@@ -105,29 +101,22 @@ class Section(_Content):
                     f"Section {title!r}: alt: got nothing, expected a sentence on the picture"
                 )
             picture = image(picture)
-        paragraphs = tuple(paragraph for paragraph in paragraphs if paragraph.strip())
-        super().__init__(title, paragraphs, table, picture, alt, caption, level)
+        vars(self).update(
+            title=title,
+            text=tuple(paragraph for paragraph in paragraphs if paragraph.strip()),
+            table=table,
+            picture=picture,
+            alt=alt,
+            caption=caption,
+            level=level,
+        )
 
     @property
     def kind(self) -> str:
         """The ending of a file with the picture."""
-        return kind_of(self._bytes)[0]
-
-    @property
-    def media_type(self) -> str:
-        """The type of the picture for a data URI."""
-        return kind_of(self._bytes)[1]
-
-    @property
-    def broad(self) -> bool:
-        """Whether the picture scrolls on a narrow screen, where it would be too small to read."""
-        return is_broad(self._bytes)
-
-    @property
-    def _bytes(self) -> bytes:
         if self.picture is None:
             raise ValueError(f"Section {self.title!r}: got no picture, expected one")
-        return self.picture
+        return kind_of(self.picture)[0]
 
 
 # -- pictures --------------------------------------------------------------------------------

@@ -23,7 +23,6 @@ from prbayes.model.parameters import (
 )
 from prbayes.optimize.optimum import compared_in
 from prbayes.plots.canvas import named
-from prbayes.plots.outputs import correlation
 from prbayes.reports.assessment import (
     answers,
     diagnostics,
@@ -100,7 +99,7 @@ def model(m: Material) -> list[Section]:
             "distribution": v["distribution"],
             "meaning": m.labels.get(v["name"], ""),
         }
-        for v in m.description["variables"]
+        for v in m.variables
     ]
     about = (
         "Hyperparameters describe how the inputs vary from specimen to specimen, "
@@ -109,7 +108,7 @@ def model(m: Material) -> list[Section]:
     sections = [Section("Model", about, rows_table(variables))]
     simulators = [
         {"simulator": s["name"]} | {key: s[key] for key in ("response", "inputs", "propagation")}
-        for s in m.description["simulators"]
+        for s in m.simulators
     ]
     if simulators:
         about = "A simulator computes the response of a specimen from its inputs."
@@ -124,83 +123,61 @@ def data(m: Material) -> list[Section]:
     """Return a summary of the measured responses, correlations of outputs, and the values."""
     if not m.observed:
         return []
-    rows = [row for name in m.observed for row in _output_rows(name, m)]
+    rows: list[dict[str, Any]] = []
     text = ["Measured responses, in the units of the response."]
-    for simulator in [] if m.description is None else m.description["simulators"]:
+    for simulator in m.simulators:
         if simulator["specimens"]:
             text.append(f"{simulator['name']}: {simulator['specimens']}.")
     correlations = []
+    # The measured values, by which a calibration can be repeated; at most half a page
+    about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
+    values = [about]
     for name, y in m.observed.items():
+        outputs = m.outputs.get(name, SINGLE_OUTPUT)
+        columns: list[tuple[str, int, Floats]] = []
         if y.ndim == 1:
-            continue
-        n = len(_shown_columns(y))
-        if n < y.shape[1]:
-            text.append(f"{name}: {n} of {y.shape[1]} outputs are shown.")
-        if y.shape[1] > 1:
-            correlations.append(_correlations(name, m))
+            columns = [("", 0, y)]
+        else:  # at most twelve outputs, half a page, from the first to the last
+            n = y.shape[1]
+            places = map(round, np.linspace(0, n - 1, min(n, 12)).tolist())
+            columns = [(outputs.names[j], j, y[:, j]) for j in places]
+            if len(columns) < n:
+                text.append(f"{name}: {len(columns)} of {n} outputs are shown.")
+            if n > 1:
+                correlations.append(_correlations(name, columns))
+        for output, j, column in columns:
+            meaning = m.labels.get(name, "")
+            if y.ndim > 1:
+                meaning = m.labels.get(f"{name}[{output}]", m.labels.get(output, ""))
+            units = outputs.units[j] if outputs.units else ""
+            row = {"simulator": name, "meaning": meaning, "output": output, "units": units}
+            rows.append(row | described(column))
+        if y.size > 300:
+            values.append(f"{name}: {y.size} values, which are too many to print.")
+        else:
+            names = [name] if y.ndim == 1 else [f"{name}[{output}]" for output in outputs.names]
+            for element, column in zip(names, np.atleast_2d(y.T), strict=True):
+                texts = alike(column.tolist(), sample_sd(column[np.isfinite(column)]), 4)
+                values.append(f"{element}: {', '.join(texts)}.")
     table = rows_table(with_zeros(rows))
-    return [Section("Data", tuple(text), table), *correlations, _values(m)]
+    return [
+        Section("Data", text, table),
+        *correlations,
+        Section("Measured values", values, level=3),
+    ]
 
 
-def _output_rows(name: str, m: Material) -> list[dict[str, Any]]:
-    """Return a row for each output of a simulator."""
-    y = m.observed[name]
-    outputs = m.outputs.get(name, SINGLE_OUTPUT)
-    if y.ndim == 1:
-        units = outputs.units[0] if outputs.units else ""
-        meaning = m.labels.get(name, "")
-        about = {"simulator": name, "meaning": meaning, "output": "", "units": units}
-        return [about | described(y)]
-    rows = []
-    for j in _shown_columns(y):
-        units = outputs.units[j] if outputs.units else ""
-        output = outputs.names[j]
-        meaning = m.labels.get(f"{name}[{output}]", m.labels.get(output, ""))
-        about = {"simulator": name, "meaning": meaning, "output": output, "units": units}
-        rows.append(about | described(y[:, j]))
-    return rows
-
-
-def _shown_columns(y: Floats) -> list[int]:
-    """Return at most twelve outputs, half a page, from the first to the last."""
-    m = y.shape[1]
-    return [round(place) for place in np.linspace(0, m - 1, min(m, 12)).tolist()]
-
-
-def _correlations(name: str, m: Material) -> Section:
+def _correlations(name: str, columns: list[tuple[str, int, Floats]]) -> Section:
     """Return the correlations of outputs, each of the specimens that have both."""
-    y = m.observed[name][:, _shown_columns(m.observed[name])]
-    r = np.full((y.shape[1], y.shape[1]), np.nan)
-    for i, j in np.ndindex(r.shape):
-        pairs = y[:, [i, j]]
-        pairs = pairs[np.isfinite(pairs).all(axis=1)]
-        if len(pairs) > 2:
-            r[i, j] = correlation(pairs, np.ones(len(pairs)))
-    names = [m.outputs[name].names[j] for j in _shown_columns(m.observed[name])]
+    pandas: Any = import_module("pandas")
+    y = np.column_stack([column for *_, column in columns])
+    r = pandas.DataFrame(np.where(np.isfinite(y), y, np.nan)).corr(min_periods=3).values
     about = (
         f"Correlations of the measured outputs of {name}, each of the specimens that have both; "
         "those that failed are in none."
     )
-    return Section(f"Correlations of {name}", about, correlation_table(names, r, 3), level=3)
-
-
-def _values(m: Material) -> Section:
-    """Return the measured values, by which a calibration can be repeated; at most half a page."""
-    text = []
-    for name, y in m.observed.items():
-        if y.size > 300:
-            text.append(f"{name}: {y.size} values, which are too many to print.")
-        elif y.ndim == 1:
-            text.append(f"{name}: {_listed(y)}.")
-        else:
-            columns = zip(m.outputs[name].names, y.T, strict=True)
-            text += [f"{name}[{output}]: {_listed(column)}." for output, column in columns]
-    about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
-    return Section("Measured values", (about, *text), level=3)
-
-
-def _listed(y: Floats) -> str:
-    return ", ".join(alike(y.tolist(), sample_sd(y[np.isfinite(y)]), 4))
+    table = correlation_table([output for output, *_ in columns], r, 3)
+    return Section(f"Correlations of {name}", about, table, level=3)
 
 
 # -- metric ----------------------------------------------------------------------------------
@@ -217,7 +194,17 @@ def metric(m: Material) -> list[Section]:
     if not rows and not metrics:
         return []
     if m.is_by_specimen:
-        return [_log_likelihood(rows)]
+        about = (
+            "The log-likelihood compares specimens: the density of each measured response in the "
+            "population, through the inputs that reproduce it. It is evaluated on an emulator of "
+            "the response, whose runs are counted here. The log-likelihood of a posterior is the "
+            "mean over its draws."
+        )
+        for row in rows:
+            row["log-likelihood"] = -row["discrepancy"]
+        keys = ("result", "simulator", "log-likelihood", "runs")
+        table = rows_table([{key: row[key] for key in keys} for row in rows])
+        return [Section("Log-likelihood", about, table)]
     about = (
         "The metric measures how far the distribution of the simulated responses is "
         "from that of the measured ones; smaller is better."
@@ -231,26 +218,6 @@ def metric(m: Material) -> list[Section]:
     compared = [line for table in m.calibrations.values() for line in compared_in(table)]
     text = (about, *lines, *dict.fromkeys(compared))
     return [Section("Metric and epsilon", text, rows_table(rows))]
-
-
-def _log_likelihood(rows: list[dict[str, Any]]) -> Section:
-    """Return the section of results of the log-likelihood by specimen."""
-    about = (
-        "The log-likelihood compares specimens: the density of each measured response in the "
-        "population, through the inputs that reproduce it. It is evaluated on an emulator of the "
-        "response, whose runs are counted here. The log-likelihood of a posterior is the mean over "
-        "its draws."
-    )
-    table = [
-        {
-            "result": row["result"],
-            "simulator": row["simulator"],
-            "log-likelihood": -row["discrepancy"],
-            "runs": row["runs"],
-        }
-        for row in rows
-    ]
-    return Section("Log-likelihood", about, rows_table(table))
 
 
 def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
@@ -277,26 +244,20 @@ def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
 
 def _metrics(m: Material) -> dict[str, str]:
     """Return the metric by simulator; by result as well, where results differ in it."""
-    by_result = {
-        label: {
-            str(name): str(metric)
-            for name, metric in zip(
-                calibration["simulator"].values, calibration["metric"].values, strict=True
-            )
-        }
-        for label, calibration in m.calibrations.items()
+    by_result = {}
+    for label, table in m.calibrations.items():
+        pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
+        by_result[label] = {str(name): str(metric) for name, metric in pairs}
+    if not by_result:
+        return {s["name"]: s["metric"] for s in m.simulators}
+    first, *rest = by_result.values()
+    if all(metrics == first for metrics in rest):
+        return first
+    return {
+        f"{label}, {name}": metric
+        for label, metrics in by_result.items()
+        for name, metric in metrics.items()
     }
-    if by_result:
-        first, *rest = by_result.values()
-        if all(metrics == first for metrics in rest):
-            return first
-        return {
-            f"{label}, {name}": metric
-            for label, by_simulator in by_result.items()
-            for name, metric in by_simulator.items()
-        }
-    simulators = [] if m.description is None else m.description["simulators"]
-    return {s["name"]: s["metric"] for s in simulators}
 
 
 # -- optima ----------------------------------------------------------------------------------
@@ -309,7 +270,17 @@ def optima(m: Material) -> list[Section]:
         names = readable_elements(
             optimum_elements(tree["optimum"].data_vars, tree["stderr"].data_vars)
         )
-        text = [_how_it_ended(tree["optimum"].attrs)]
+        attrs = tree["optimum"].attrs
+        ended = "converged" if attrs.get("converged") else "did not converge"
+        evaluations = counted(int(attrs.get("n_evaluations", 0)), "evaluation")
+        message = str(attrs.get("message", "")).rstrip(".")
+        ending = f"The optimiser {ended} after {evaluations} of the objective: {message}."
+        if attrs.get("prior"):
+            ending += (
+                " Minus the log prior was part of the objective: "
+                "the discrepancy alone is smallest elsewhere."
+            )
+        text = [ending]
         if label in m.live_optima:
             evaluator = m.live_optima[label].evaluator
             for rival in m.live_optima[label].rivals:
@@ -333,19 +304,6 @@ def optima(m: Material) -> list[Section]:
 
 def _titled(title: str, label: str, results: Mapping[str, Any]) -> str:
     return title if len(results) == 1 else f"{title}: {label}"
-
-
-def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
-    ended = "converged" if attrs.get("converged") else "did not converge"
-    evaluations = counted(int(attrs.get("n_evaluations", 0)), "evaluation")
-    message = str(attrs.get("message", "")).rstrip(".")
-    text = f"The optimiser {ended} after {evaluations} of the objective: {message}."
-    if attrs.get("prior"):
-        text += (
-            " Minus the log prior was part of the objective: "
-            "the discrepancy alone is smallest elsewhere."
-        )
-    return text
 
 
 def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
@@ -377,8 +335,19 @@ def posteriors(m: Material) -> list[Section]:
             f"{chains} of {posterior.sizes['draw']} draws{by}. "
             f"Intervals contain {INTERVAL:.0%} of the draws, with equal tails."
         ]
-        if not m.is_by_specimen:
-            text += _width(tree)
+        # The width of the draws of `sample_smc`
+        adjustment = str(posterior.attrs.get("adjustment", ""))
+        if m.is_by_specimen or not adjustment:
+            pass
+        elif adjustment == "estimate":
+            text.append(
+                "The posterior is that given the metric's own estimate: prior times density of the "
+                "estimate over repeated sets of specimens."
+            )
+        elif bool((tree["calibration"]["is_likelihood"] == 0).any()):
+            text.append(
+                "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."
+            )
         draws = stacked_draws(posterior)
         values = split_elements(draws)
         names = readable_elements(table_elements(draws))
@@ -392,21 +361,6 @@ def posteriors(m: Material) -> list[Section]:
             title = _titled("Correlations of the hyperparameters", label, m.posteriors)
             sections.append(Section(title, about, correlation_table(varying, r, 2), level=3))
     return sections
-
-
-def _width(tree: xr.DataTree) -> list[str]:
-    """Return a sentence on the width of the draws of `sample_smc`."""
-    attrs = tree["posterior"].attrs
-    if "adjustment" not in attrs:
-        return []
-    if str(attrs["adjustment"]) == "estimate":
-        return [
-            "The posterior is that given the metric's own estimate: prior times density of the "
-            "estimate over repeated sets of specimens."
-        ]
-    has_epsilon = bool((tree["calibration"].to_dataset()["is_likelihood"] == 0).any())
-    by_epsilon = "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."
-    return [by_epsilon] if has_epsilon else []
 
 
 def _posterior_rows(
@@ -456,7 +410,20 @@ def comparison(m: Material) -> list[Section]:
     for name in table["hyperparameter"].values.tolist():
         for label in labels:
             cell = table.sel(hyperparameter=name, result=label)
-            rows.append({"hyperparameter": name, "result": label} | _estimate(cell))
+            values = [float(cell[key]) for key in ("estimate", "sd", "lower", "upper")]
+            estimate, sd, lower, upper = alike(values, values[1])
+            shift = float(cell["shift"])
+            rows.append(
+                {
+                    "hyperparameter": name,
+                    "result": label,
+                    "estimate": estimate,
+                    "sd": sd,
+                    f"{INTERVAL:.0%} from": lower,
+                    "to": upper,
+                    "shift in sd": f"{shift + 0.0:.2f}" if math.isfinite(shift) else number(shift),
+                }
+            )
     about = (
         f"The shift is the distance from the estimate of {labels[0]}, "
         "in standard deviations of the result in the row."
@@ -474,20 +441,6 @@ def comparison(m: Material) -> list[Section]:
         )
         sections.append(Section("Scores under each metric", about, rows_table(scores), level=3))
     return sections
-
-
-def _estimate(cell: xr.Dataset) -> dict[str, str]:
-    """Return an estimate with its spread, as text."""
-    values = [float(cell[key]) for key in ("estimate", "sd", "lower", "upper")]
-    estimate, sd, lower, upper = alike(values, values[1])
-    shift = float(cell["shift"])
-    return {
-        "estimate": estimate,
-        "sd": sd,
-        f"{INTERVAL:.0%} from": lower,
-        "to": upper,
-        "shift in sd": f"{shift + 0.0:.2f}" if math.isfinite(shift) else number(shift),
-    }
 
 
 # -- decision --------------------------------------------------------------------------------
@@ -545,21 +498,16 @@ def _indices(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any
     value = plus_minus(float(table.attrs["value"]), float(table.attrs["sd"]))
     quantity = f"{table.attrs['quantity']} = {value}"
     response = str(table.attrs.get("of_inputs", "the response"))
-    return [
-        {
-            "of": response if str(kind) == "input" else quantity,
-            "factor": named(str(factor), labels),
-            "by itself": _index(table, "first", i),
-            "with all others known": _index(table, "total", i),
-        }
-        for i, (factor, kind) in enumerate(zip(table.factor.values, table.kind.values, strict=True))
-    ]
-
-
-def _index(table: xr.Dataset, key: str, i: int) -> str:
-    value = float(table[key][i])
-    error = float(table[f"{key}_error"][i])
-    return f"{value:.2f} ± {error:.2f}" if np.isfinite(value) else ""
+    rows = []
+    for i, (factor, kind) in enumerate(zip(table.factor.values, table.kind.values, strict=True)):
+        of = response if str(kind) == "input" else quantity
+        row = {"of": of, "factor": named(str(factor), labels)}
+        for key, title in (("first", "by itself"), ("total", "with all others known")):
+            index = float(table[key][i])
+            error = float(table[f"{key}_error"][i])
+            row[title] = f"{index:.2f} ± {error:.2f}" if np.isfinite(index) else ""
+        rows.append(row)
+    return rows
 
 
 def _plan(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:

@@ -51,13 +51,8 @@ class Budget:
         return granted
 
 
-_current: ContextVar[Budget] = ContextVar("budget")
-_UNLIMITED = Budget()
-
-
-def budget() -> Budget:
-    """Return the current budget, by default one without limits."""
-    return _current.get(_UNLIMITED)
+_current: ContextVar[Budget] = ContextVar("budget", default=Budget())  # noqa: B039 (no limits)
+budget = _current.get  # returns the current budget
 
 
 @contextmanager

@@ -160,7 +160,7 @@ def compute(
     if isinstance(function, bytes):
         function = _unpacked(function)
     clock = time.perf_counter()
-    known, n = outputs, len(points)
+    stated, n = outputs, len(points)
     values = np.full((n, *(() if outputs is None else outputs.event)), np.nan)
     raised = {}
     is_scalar = isinstance(function, scalar)
@@ -188,7 +188,7 @@ def compute(
         if not is_scalar:
             responses, outputs = checked(result, (rows.size,), arguments, outputs)
         values = assign_rows(values, rows, responses)
-    named = outputs if known is None else None
+    named = outputs if stated is None else None
     return Chunk(values, raised, time.perf_counter() - clock, named)
 
 
@@ -255,8 +255,8 @@ def checked(
         raise ResponseError(str(error.args[0])) from None
     except Exception as error:
         raise ResponseError(
-            f"the response returned {type(result).__name__} of which no array can be made "
-            f"({_reason(error)}), expected an array of real numbers"
+            f"the response returned {type(result).__name__} that is no array ({_reason(error)}), "
+            "expected an array of real numbers"
         ) from None
     if array.dtype.kind not in "fiub":
         got = f"{type(result).__name__} of dtype {array.dtype}"

@@ -115,20 +115,19 @@ def _checked_arguments(arguments: object) -> tuple[str, ...]:
             f"command: arguments: got {called(arguments)}, expected a list of the program and its "
             'arguments, such as ["solver", "input.txt"]'
         )
-    texts = []
     for argument in arguments:
         if not isinstance(argument, str | PathLike):
             raise TypeError(
                 f"command: arguments: got {called(argument)} among them, expected texts and paths"
             )
-        texts.append(os.fspath(argument))
-    path = shutil.which(texts[0])
+    program, *rest = map(os.fspath, arguments)
+    path = shutil.which(program)
     if path is None:
         raise FileNotFoundError(
-            f"command: got the program {texts[0]!r}, which is not there or cannot be run, expected "
+            f"command: got the program {program!r}, which is not there or cannot be run, expected "
             "one on the path, or its whole path"
         )
-    return (os.path.abspath(path), *texts[1:])  # it runs in another folder
+    return (os.path.abspath(path), *rest)  # it runs in another folder
 
 
 def _checked_names(inputs: object) -> tuple[str, ...]:
@@ -137,13 +136,12 @@ def _checked_names(inputs: object) -> tuple[str, ...]:
             f"command: inputs: got {called(inputs)}, expected a list of the simulator's inputs, "
             'such as ["modulus", "force"]'
         )
-    names = tuple(inputs)
-    for name in names:
-        if not isinstance(name, str) or not name.isidentifier() or names.count(name) > 1:
+    for name in inputs:
+        if not isinstance(name, str) or not name.isidentifier() or inputs.count(name) > 1:
             raise ValueError(
                 f"command: inputs: got {name!r}, expected names of letters and digits, each once"
             )
-    return names
+    return tuple(inputs)
 
 
 def _read_templates(write: object) -> dict[str, str]:

@@ -256,8 +256,8 @@ class Corrected:
         response = self.response(*arguments)
         if isinstance(response, Mapping):
             raise TypeError(
-                f"{self.__name__}: got a mapping, expected an array of outputs, each of which has "
-                "a condition"
+                f"{self.__name__}: got a mapping, expected an array with an output for each "
+                "condition"
             )
         response = np.asarray(response)
         coefficients = np.asarray(coefficients)

@@ -144,9 +144,9 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     Discrete distributions and those without one in PyMC are refused.
     """
     op = dist.owner.op
-    other = "use propagation=prb.Reweighted() or prb.Fresh()"
+    advice = "use propagation=prb.Reweighted() or prb.Fresh()"
     if dist.dtype.startswith(("int", "uint", "bool")):
-        raise TypeError(f"{name}: got {op}, which is discrete, expected a continuous one; {other}")
+        raise TypeError(f"{name}: got {op}, which is discrete, expected a continuous one; {advice}")
     if isinstance(op, MVNORMAL):
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
@@ -156,7 +156,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     except NotImplementedError:
         raise TypeError(
             f"{name}: got {op}, which has no inverse distribution function in PyMC, expected one "
-            f"that has; {other}"
+            f"that has; {advice}"
         ) from None
 
 
@@ -180,9 +180,9 @@ def refuse_without_density(name: str, inputs: Inputs) -> None:
     for dist in dists:
         if not isinstance(dist.owner.op, ELLIPTICAL) and _density(dist) is None:
             raise TypeError(
-                f"{name}: got {dist.owner.op}, of which PyMC has no density, expected one that it "
-                "has, since responses are stored and weighed by it; give a pm.CustomDist its "
-                "logp=, or use propagation=prb.Fresh()"
+                f"{name}: got {dist.owner.op}, for which PyMC has no density, expected one, since "
+                "stored responses are weighted by it; give a pm.CustomDist its logp=, or use "
+                "propagation=prb.Fresh()"
             )
 
 
@@ -247,7 +247,7 @@ class PriorSampler:
             draws = [self._function(k) for _ in range(k)]
         except NotImplementedError as error:
             raise TypeError(
-                f"priors: got {self._names}, of which one cannot be drawn ({error}), expected "
+                f"priors: got {self._names}, one of which cannot be drawn ({error}), expected "
                 "proper priors; replace pm.Flat and pm.HalfFlat by a wide pm.Normal or "
                 "pm.HalfNormal"
             ) from None
@@ -345,7 +345,7 @@ class PopulationSampler:
         except (NotImplementedError, RuntimeError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise TypeError(
-                f"inputs: got {self._names}, of which one cannot be drawn ({reason}), expected "
+                f"inputs: got {self._names}, one of which cannot be drawn ({reason}), expected "
                 "distributions from which specimens can be drawn; give a pm.CustomDist its random="
             ) from None
         n_aleatory = len(self._event_shapes)

@@ -182,14 +182,12 @@ def is_loss(failure: BaseException | None) -> bool:
 def has_slipped(failure: BaseException | None) -> bool:
     """Return whether Dask lost a result at the moment when its worker left.
 
-    Its executor reads the state of a task after the result. If the task is running again by then,
-    the executor takes the result for an exception.
+    Its executor takes the result for an exception if the task is running again by then.
     """
-    if not isinstance(failure, TypeError):
-        return False
-    frames = [frame for frame, _ in walk_tb(failure.__traceback__)]
+    frames = [frame for frame, _ in walk_tb(getattr(failure, "__traceback__", None))]
     file = frames[-1].f_code.co_filename if frames else ""
-    return Path(file).parts[-2:] == ("distributed", "cfexecutor.py")
+    is_dask = Path(file).parts[-2:] == ("distributed", "cfexecutor.py")
+    return isinstance(failure, TypeError) and is_dask
 
 
 def failure_text(failure: BaseException) -> str:
@@ -228,13 +226,8 @@ class Pool:
         # The standard library and loky store their arguments under the same names.
         parameters = signature(kind).parameters
         arguments: dict[str, Any] = {"max_workers": getattr(self.original, "_max_workers", None)}
-        for name, attribute in (
-            ("mp_context", "_mp_context"),
-            ("context", "_context"),
-            ("initializer", "_initializer"),
-            ("initargs", "_initargs"),
-        ):
-            value = getattr(self.original, attribute, None)
+        for name in ("mp_context", "context", "initializer", "initargs"):
+            value = getattr(self.original, f"_{name}", None)
             if name in parameters and value is not None:
                 arguments[name] = value
         _replacements[self.original] = kind(**arguments)

@@ -343,8 +343,8 @@ def _is_settable(variable: Any) -> bool:
 
 def _listed(names: Sequence[str]) -> str:
     """Return the first ten names as a text."""
-    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
-    return ", ".join(map(repr, names[:10])) + more if names else "none"
+    rest = f" and {len(names) - 10} more" if len(names) > 10 else ""
+    return ", ".join(map(repr, names[:10])) + rest if names else "none"
 
 
 # -- points of communication -----------------------------------------------------------------------
@@ -590,7 +590,7 @@ class _OpenUnit:
         except Exception as error:
             raise ValueError(
                 f"{unit.name}: got {unit.path}, which cannot be unzipped ({error!s:.200}), "
-                "expected a sound archive; copy it anew"
+                "expected a sound archive; copy it again"
             ) from None
         self.idle: list[Any] = []
         self.n_loaded = 0

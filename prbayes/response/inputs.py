@@ -74,11 +74,11 @@ class Inputs:
                 roots.update((v, None) for v in _ancestry([x], ends) if v in ends)
         return tuple(roots)
 
-    def ordered_as(self, other: Inputs) -> Inputs:
-        """Return the same arguments with the aleatory inputs in the order of equal ones."""
-        places = [other.aleatory.index(x) for x in self.aleatory]
+    def ordered_as(self, reference: Inputs) -> Inputs:
+        """Return the same arguments with the aleatory inputs in the order of a reference."""
+        places = [reference.aleatory.index(x) for x in self.aleatory]
         arguments = [places[a] if isinstance(a, int) else a for a in self.arguments]
-        return Inputs(arguments, other.aleatory, other.roots, self.nested)
+        return Inputs(arguments, reference.aleatory, reference.roots, self.nested)
 
     def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
         """Return the aleatory and epistemic inputs with the roots replaced by ``params``."""
@@ -398,9 +398,9 @@ def group(dim: str) -> TensorVariable:
         raise TypeError(f"{caller}: got no model on the context, expected `with pm.Model():`")
     labels = model.coords.get(dim)
     if labels is None:
-        known = [name for name, values in model.coords.items() if values is not None]
+        dims = [name for name, values in model.coords.items() if values is not None]
         raise ValueError(
-            f"{caller}: dim: got {dim!r}, expected a dimension with a coordinate, of {known}; "
+            f"{caller}: dim: got {dim!r}, expected a dimension with a coordinate, of {dims}; "
             f"write pm.Model(coords={{{dim!r}: ['Adler', 'Busch']}}), with the names of the groups"
         )
     names = [str(label) for label in labels]

@@ -102,7 +102,7 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
                 texts.append(column)
         if texts:
             raise TypeError(
-                f"{label}: got a DataFrame whose columns {texts} hold no numbers, expected a "
+                f"{label}: got a DataFrame whose columns {texts} are no numbers, expected a "
                 "column of measured responses for each output; leave others out, as in "
                 "df['life'], and where one names groups, such as suppliers, index hyperparameters "
                 f"by prb.response.group({str(texts[0])!r})"
@@ -122,24 +122,22 @@ def _labelled_columns(observed: Any, m: int) -> Outputs:
     """Return the outputs of an array, DataFrame or DataArray of m columns."""
     labels: tuple[Any, ...] = tuple(range(m))
     units: tuple[str, ...] = ()
+    dim = "output"
     if hasattr(observed, "dims") and hasattr(observed, "coords"):
         dim = str(observed.dims[1])
         if dim in observed.coords:
             labels = tuple(observed.coords[dim].values.tolist())
-        # One unit for all, or a coordinate of units.
-        unit = observed.attrs.get("units")
-        if "units" in observed.coords:
-            stated: NDArray[Any] = np.broadcast_to(observed.coords["units"].values, m)
-            units = tuple(map(str, stated.tolist()))
-        elif unit:
-            units = (str(unit),) * m
+        # A coordinate of units, or one unit for all.
+        unit: Any = observed.coords.get("units", observed.attrs.get("units"))
+        if unit is not None:
+            units = tuple(map(str, np.broadcast_to(np.asarray(unit), m).tolist()))
     elif hasattr(observed, "columns"):
         labels = tuple(np.asarray(observed.columns).tolist())
-        dim = str(getattr(observed.columns, "name", None) or "output")
+        dim = str(getattr(observed.columns, "name", None) or dim)
     else:
         return Outputs(labels)
     are_names = all(isinstance(label, str) for label in labels)
-    return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else (), units)
+    return Outputs(labels, dim, tuple([(x, None) for x in labels]) if are_names else (), units)
 
 
 def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:

@@ -8,6 +8,7 @@ write at once. A checksum of every run reveals damage.
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 import threading
 import uuid
@@ -40,7 +41,7 @@ class _Session:
     opened: tuple[int, ...]  # process, device and number of the file
     response: int  # number of the store's response in the file
     columns: int  # numbers that make the inputs of one run
-    known: dict[bytes, bytes] = field(default_factory=dict)  # values of all outputs by inputs
+    values: dict[bytes, bytes] = field(default_factory=dict)  # of all outputs by inputs
     failed: dict[bytes, str] = field(default_factory=dict)  # reasons by inputs
     n_read: int = 0  # runs of any response
 
@@ -140,7 +141,7 @@ class Store:
         return self.folder / "responses.sqlite"
 
     def __len__(self) -> int:
-        return len(self._read().known)
+        return len(self._read().values)
 
     def find(self, inputs: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Return stored responses of inputs (n, columns), and whether there is one, shape (n,).
@@ -148,7 +149,7 @@ class Store:
         Several outputs have shape (n, m).
         """
         session = self._read()
-        values = [session.known.get(key) for key in _keys(inputs)]
+        values = [session.values.get(key) for key in _keys(inputs)]
         is_known = np.array([value is not None for value in values], dtype=bool)
         missing = _NAN * self._n_outputs(session)
         return self._as_array(session, (v or missing for v in values)), is_known
@@ -166,8 +167,8 @@ class Store:
         NaN is a result, or a response that failed; see `failed`.
         """
         session = self._read()
-        inputs = _numbers(session.known).reshape(-1, session.columns)
-        return inputs, self._as_array(session, session.known.values())
+        inputs = _numbers(session.values).reshape(-1, session.columns)
+        return inputs, self._as_array(session, session.values.values())
 
     def add(self, inputs: Floats, values: Floats, reasons: Mapping[int, str] | None = None) -> None:
         """Append responses, safe on disk when this returns.
@@ -224,7 +225,7 @@ class Store:
             del self._local.session
 
     def _n_outputs(self, session: _Session) -> int:
-        first = next(iter(session.known.values()), _NAN)
+        first = next(iter(session.values.values()), _NAN)
         return self.outputs or len(first) // len(_NAN)
 
     def _as_array(self, session: _Session, values: Iterable[bytes]) -> Floats:
@@ -291,7 +292,7 @@ class Store:
         if name not in responses:
             raise _FileError(
                 f"which holds no responses of simulator {_name_text(*name)}",
-                f"one of [{', '.join(_name_text(*known) for known in responses)}]",
+                f"one of [{', '.join(_name_text(*response) for response in responses)}]",
                 "look at name, version and folder",
             )
         _, columns = responses[name]
@@ -330,7 +331,7 @@ class Store:
                 if response == session.response:
                     self._refuse_other_outputs(session, value)
                     # The last run of a point counts: a failed one may have been tried again.
-                    session.known[key] = value
+                    session.values[key] = value
                     session.failed.pop(key, None)
                     if state == "failed":
                         session.failed[key] = reason
@@ -340,7 +341,7 @@ class Store:
         """Raise if a stored run has another number of outputs."""
         n = len(value) // len(_NAN)
         expected = self._n_outputs(session)
-        if (session.known and n != expected) or self.outputs not in (None, n):
+        if (session.values and n != expected) or self.outputs not in (None, n):
             raise _FileError(
                 f"which holds runs with {n} outputs for simulator {self.name!r}",
                 f"{expected}",
@@ -507,33 +508,23 @@ def _damaged(reason: str) -> _FileError:
     )
 
 
-_FULL = (
-    "which cannot grow",
-    "space on the disk, and within its quota and the largest size of a file",
-    "all that was written before is kept: free some space and run again",
-)
-_LOCKED = (
-    f"which another process has locked for {_PATIENCE:.0f} s",
-    "to wait for milliseconds",
-    "end that process, if it hangs, and run again",
-)
-_CLOSED = (
-    "which cannot be opened",
-    "a file that may be read and written",
-    "nothing was changed: look at the rights of folder and file, or pass another folder",
-)
+# Names of errors of SQLite (https://www.sqlite.org/rescode.html), with got, expected, what to do.
 _EXPLANATIONS = {
-    sqlite3.SQLITE_FULL: _FULL,
-    sqlite3.SQLITE_IOERR_WRITE: _FULL,
-    sqlite3.SQLITE_IOERR_FSYNC: _FULL,
-    sqlite3.SQLITE_IOERR_TRUNCATE: _FULL,
-    sqlite3.SQLITE_IOERR_SHMSIZE: _FULL,
-    sqlite3.SQLITE_BUSY: _LOCKED,
-    sqlite3.SQLITE_LOCKED: _LOCKED,
-    sqlite3.SQLITE_CANTOPEN: _CLOSED,
-    sqlite3.SQLITE_READONLY: _CLOSED,
-    sqlite3.SQLITE_PERM: _CLOSED,
-    sqlite3.SQLITE_IOERR: _CLOSED,
+    "FULL|IOERR_(WRITE|FSYNC|TRUNCATE|SHMSIZE)": (
+        "which cannot grow",
+        "space on the disk, and within its quota and the largest size of a file",
+        "all that was written before is kept: free some space and run again",
+    ),
+    "BUSY|LOCKED": (
+        f"which another process has locked for {_PATIENCE:.0f} s",
+        "to wait for milliseconds",
+        "end that process, if it hangs, and run again",
+    ),
+    "CANTOPEN|READONLY|PERM|IOERR": (
+        "which cannot be opened",
+        "a file that may be read and written",
+        "nothing was changed: look at the rights of folder and file, or pass another folder",
+    ),
 }
 
 
@@ -541,10 +532,8 @@ def explanation(error: sqlite3.Error | _FileError) -> tuple[str, str, str]:
     """Return got, expected and what to do; an unknown error of SQLite is damage."""
     if isinstance(error, _FileError):
         return error.args
-    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
-    # The kind of an extended result code (https://www.sqlite.org/rescode.html).
-    known = _EXPLANATIONS.get(code) or _EXPLANATIONS.get(code & 0xFF)
-    if known is None:
-        return explanation(_damaged(f"{error!s:.200}"))  # it may quote what is damaged
-    got, expected, action = known
-    return f"{got} ({error})", expected, action
+    name = getattr(error, "sqlite_errorname", "")
+    for pattern, (got, expected, action) in _EXPLANATIONS.items():
+        if re.match(f"SQLITE_({pattern})", name):
+            return f"{got} ({error})", expected, action
+    return _damaged(f"{error!s:.200}").args  # it may quote what is damaged

@@ -108,7 +108,15 @@ def umbridge(
            [4., 7.]])
     """
     url = plain_text(url, "umbridge: url").rstrip("/")
-    _refuse_malformed(url)
+    try:
+        parts = urllib3.util.parse_url(url)
+    except LocationParseError:
+        parts = urllib3.util.Url()
+    if parts.scheme not in ("http", "https") or not parts.host or parts.port == 0:
+        raise ValueError(
+            f"umbridge: url: got {url!r}, expected the address of a server, such as "
+            "'http://localhost:4242'"
+        )
     limit = None if timeout is None else positive_number(timeout, "umbridge: timeout")
     patience = positive_number(patience, "umbridge: patience")
     request = {"name": plain_text(model, "umbridge: model"), "config": _plain_config(config)}
@@ -143,26 +151,12 @@ def umbridge(
     return scalar(remote)
 
 
-def _refuse_malformed(url: str) -> None:
-    try:
-        parts = urllib3.util.parse_url(url)
-    except LocationParseError:
-        parts = urllib3.util.Url()
-    if parts.scheme not in ("http", "https") or not parts.host or parts.port == 0:
-        raise ValueError(
-            f"umbridge: url: got {url!r}, expected the address of a server, such as "
-            "'http://localhost:4242'"
-        )
-
-
 def _plain_config(config: object) -> Any:
     """Return the settings of a model in the types of JSON."""
-    if config is None:
-        return {}
     reason = ""
-    if isinstance(config, Mapping):
+    if config is None or isinstance(config, Mapping):
         try:
-            return json.loads(json.dumps(dict(config)))
+            return json.loads(json.dumps(dict(config or {})))
         except (TypeError, ValueError) as error:
             reason = f" ({error})"
     raise TypeError(
@@ -174,13 +168,12 @@ def _plain_config(config: object) -> Any:
 def _sizes(answer: Mapping[str, Any], model: str, key: str) -> tuple[int, ...]:
     """Return the sizes of a model's vectors."""
     sizes = answer.get(key)
-    is_list = isinstance(sizes, list) and all(isinstance(n, int) and n >= 0 for n in sizes)
-    if not isinstance(sizes, list) or not is_list or sum(sizes) == 0:
-        raise ValueError(
-            f"umbridge: got {key} = {sizes!r:.100} of the model {model!r}, expected the sizes of "
-            "its vectors, such as [2]; look at the server"
-        )
-    return tuple(sizes)
+    if isinstance(sizes, list) and all(isinstance(n, int) and n >= 0 for n in sizes) and any(sizes):
+        return tuple(sizes)
+    raise ValueError(
+        f"umbridge: got {key} = {sizes!r:.100} of the model {model!r}, expected the sizes of its "
+        "vectors, such as [2]; look at the server"
+    )
 
 
 @dataclass(frozen=True)
@@ -215,7 +208,7 @@ class RemoteModel:
             rows = [np.asarray(vector, dtype=np.float64) for vector in output or ()]
         except (TypeError, ValueError):
             rows = []
-        if tuple(row.size for row in rows) != self.outputs or any(row.ndim != 1 for row in rows):
+        if [row.shape for row in rows] != [(size,) for size in self.outputs]:
             raise RuntimeError(
                 f"{self.model}: got {output!r:.300}, expected vectors of numbers, of sizes "
                 f"{list(self.outputs)}"
@@ -294,10 +287,7 @@ class RemoteModel:
 
 def _new_pool() -> urllib3.PoolManager:
     """Return connections that notice within two minutes that a machine is gone."""
-    options = [
-        *HTTPConnection.default_socket_options,
-        (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
-    ]
+    options = [*HTTPConnection.default_socket_options, (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)]
     for option, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
         if hasattr(socket, option):
             options.append((socket.IPPROTO_TCP, getattr(socket, option), value))
@@ -333,8 +323,7 @@ def _known(url: str, path: str, request: Any) -> dict[str, Any]:
 def _exchange(url: str, path: str, request: Any, seconds: float | None) -> tuple[int, str]:
     """Return status and text of the answer to a request.
 
-    `TimeoutError` means no complete answer in time, `ProtocolError` a connection that was lost
-    after the request, another `HTTPError` or `OSError` no connection.
+    `TimeoutError`: no answer in time. `ProtocolError`: lost after the request. Else no connection.
     """
     end = None if seconds is None else time.monotonic() + seconds
     try:

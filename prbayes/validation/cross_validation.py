@@ -139,7 +139,7 @@ def _require_refits(optimum: Optimum) -> Optimum:
     if is_specimen_optimum(optimum):
         specimen_refits(optimum, "cross_validate")
         return optimum
-    return require_refits(optimum, "cross_validate", "; the model cannot be calibrated anew")
+    return require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
 
 
 def _folds(
@@ -174,10 +174,7 @@ def _folds(
 
 
 def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
-    """Return discrepancies (folds, simulators) of populations at thetas, (folds, d).
-
-    ``data`` has weights of the observations, (folds, n_k) by simulator; NaN if all are zero.
-    """
+    """Return discrepancies (folds, simulators) for weights of the data; NaN without any weight."""
     columns = []
     for k, (node, by_fold) in enumerate(zip(evaluator.nodes, data, strict=True)):
         values, weights = evaluator.populations(thetas, k)
@@ -362,10 +359,8 @@ def _require_candidates(candidates: object) -> None:
     for label, candidate in candidates.items():
         if not isinstance(label, str):
             raise TypeError(f"rank: candidates: got label {label!r:.60}, expected a text")
-        is_table = isinstance(candidate, xr.Dataset) and {"score", "weight", "data"} <= set(
-            candidate
-        )
-        if not is_table and not isinstance(candidate, Optimum):
+        names = set(candidate) if isinstance(candidate, xr.Dataset) else set()
+        if not isinstance(candidate, Optimum) and not {"score", "weight", "data"} <= names:
             raise TypeError(
                 f"rank: candidates: {label}: got {called(candidate)}, expected an Optimum or "
                 "what prb.cross_validate returned"
@@ -374,29 +369,24 @@ def _require_candidates(candidates: object) -> None:
 
 def _require_same(table: xr.Dataset, reference: xr.Dataset, label: str, first: str) -> None:
     """Raise unless two cross-validations are of the same data, folds and seed."""
-    names, expected = (t["simulator"].values.tolist() for t in (table, reference))
-    if names != expected:
-        raise ValueError(
-            f"rank: got {label} with simulators {names} and {first} with "
-            f"{expected}, expected the same names in the same order"
-        )
-    is_same = table["data"].values == reference["data"].values
-    if not is_same.all():
-        differing = ", ".join(table["simulator"].values[~is_same].tolist())
-        raise ValueError(
-            f"rank: got {label} and {first} with different observed values, weights or "
-            f"labels of {differing}, or in another order, expected the same data; build the models "
-            "of one array"
-        )
-    for argument, a, b in (
+    for what, a, b in (
+        ("simulators", *(t["simulator"].values.tolist() for t in (table, reference))),
         ("folds", table.sizes["fold"], reference.sizes["fold"]),
         ("random_seed", table.attrs["random_seed"], reference.attrs["random_seed"]),
     ):
         if a != b:
             raise ValueError(
-                f"rank: got {label} with {argument} {a} and {first} with {b}, expected the "
-                "same; pass the optima, which are then cross-validated alike"
+                f"rank: got {label} with {what} {a} and {first} with {b}, expected the same; pass "
+                "the optima of the same simulators, which are then cross-validated alike"
             )
+    is_same = table["data"].values == reference["data"].values
+    if not is_same.all():
+        differing = ", ".join(table["simulator"].values[~is_same].tolist())
+        raise ValueError(
+            f"rank: got {label} and {first} with different observed values, weights or labels of "
+            f"{differing}, or in another order, expected the same data; build the models of one "
+            "array"
+        )
 
 
 def _comparison(tables: Mapping[str, xr.Dataset]) -> xr.Dataset:

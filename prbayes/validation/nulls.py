@@ -50,14 +50,15 @@ class Null(ABC):
     """A null distribution: `ExactModel`, `PosteriorNull` or `JointNull`."""
 
     own_specimens: ClassVar[bool] = False  # whether the calibration's own specimens may be tested
+    description: ClassVar[str] = ""
 
     @abstractmethod
     def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Return p-value, critical value and envelope."""
 
-    @abstractmethod
     def describe(self, case: Case) -> str:
         """Return the null hypothesis in a phrase."""
+        return self.description
 
 
 def judge_by_replicates(
@@ -215,6 +216,10 @@ class ExactModel(Null):
     0.1298
     """
 
+    description: ClassVar[str] = (
+        "the predicted population is exact (the uncertainty of its calibration is not counted)"
+    )
+
     def critical_value(self, n: int, alpha: float = 0.05) -> float:
         """Return the area that is exceeded with probability ``alpha`` by n uniform numbers."""
         n = positive_integer(n, "n")
@@ -262,12 +267,6 @@ class ExactModel(Null):
             critical_value=self.critical_value(case.size, alpha),
             lower=lower,
             upper=upper,
-        )
-
-    def describe(self, case: Case) -> str:
-        """Return the null hypothesis in a phrase."""
-        return (
-            "the predicted population is exact (the uncertainty of its calibration is not counted)"
         )
 
 
@@ -318,6 +317,10 @@ class JointNull(Null):
     """
 
     own_specimens: ClassVar[bool] = True
+    description: ClassVar[str] = (
+        "calibration and test data come from the calibrated model, which is recalibrated in each "
+        "replicate"
+    )
 
     optimum: Optimum = field(repr=False)
     _: KW_ONLY
@@ -345,13 +348,6 @@ class JointNull(Null):
     def judge(self, case: Case, statistic: float, alpha: float) -> Judgement:
         """Count the observed data among the replicates."""
         return judge_by_replicates([self._u_values(case)], case, statistic, alpha)
-
-    def describe(self, case: Case) -> str:
-        """Return the null hypothesis in a phrase."""
-        return (
-            "calibration and test data come from the calibrated model, which is recalibrated in "
-            "each replicate"
-        )
 
     def _u_values(self, case: Case) -> Floats:
         """Return u-values of the replicates, (r, n)."""
@@ -386,8 +382,7 @@ class JointNull(Null):
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
         for t in tested:
             responses, weights = populations[t.simulator]
-            t.require_population(responses[0], weights[0])
-
+            _require_population(t.condition, t.projected(responses[0]), weights[0])
         points = simulated_points(
             evaluator, populations, self.replicates, self.random_seed, more=n_new
         )
@@ -403,10 +398,9 @@ class JointNull(Null):
         u = []
         for t, number in zip(tested, numbers, strict=True):
             drawn = points[t.simulator][converged][:, number]
-            project = t.condition.projected
-            measured = project(t.values_or(populations[t.simulator][0][0])[drawn])
+            measured = t.projected(populations[t.simulator][0][0])[drawn]
             refitted, weights = evaluator.populations(thetas, t.simulator)
-            values = np.broadcast_to(project(t.values_or(refitted)), weights.shape)
+            values = np.broadcast_to(t.projected(refitted), weights.shape)
             rows = [
                 Predictive(row, weight).transform(y, rng_of_ties)
                 for row, weight, y in zip(values, weights, measured, strict=True)
@@ -468,38 +462,35 @@ class _Tested:
     simulator: int
     values: Floats | None  # (points,): responses at the simulator's points; None: the simulator's
 
-    def values_or(self, responses: Floats) -> Floats:
-        """Return the tested responses at points where the simulator has these."""
-        return responses if self.values is None else self.values
+    def projected(self, responses: Floats) -> Floats:
+        """Return the tested numbers at points where the simulator has these responses."""
+        values = responses if self.values is None else self.values
+        return np.asarray(self.condition.projected(values))
 
-    def require_population(self, responses: Floats, weights: Floats) -> None:
-        """Raise if the predicted population is not that at the optimum."""
-        condition = self.condition
-        predicted = condition.predicted[~np.isnan(condition.predicted)]
-        # Between these a distribution function moves by .05, half of the smallest difference.
-        at = np.quantile(predicted, np.linspace(0.05, 0.95, 19), method="nearest")
-        values = condition.projected(self.values_or(responses))
-        expected = Predictive(values, weights).transform(at, None)
-        got = Predictive(condition.predicted).transform(at, None)
-        largest = np.abs(expected - got).max()
-        # 500 random samples of a population differ from it by .06 at 5%, and those of `predict` by
-        # far less; a normal population a quarter of a standard deviation away differs by .1.
-        if largest > 0.1:
-            raise ValueError(
-                f"{condition.name}: predicted: got values whose distribution function differs by "
-                f"{largest:.2f} from that of the population at the optimum, expected "
-                "prb.predict(optimum, response, *inputs) of the same condition; for another "
-                "condition than a simulator's pass responses="
-            )
+
+def _require_population(condition: Condition, values: Floats, weights: Floats) -> None:
+    """Raise if the predicted population is not that at the optimum."""
+    predicted = condition.predicted[~np.isnan(condition.predicted)]
+    # Between these a distribution function moves by .05, half of the smallest difference.
+    at = np.quantile(predicted, np.linspace(0.05, 0.95, 19), method="nearest")
+    expected = Predictive(values, weights).transform(at, None)
+    got = Predictive(condition.predicted).transform(at, None)
+    largest = np.abs(expected - got).max()
+    # 500 random samples of a population differ from it by .06 at 5%, and those of `predict` by
+    # far less; a normal population a quarter of a standard deviation away differs by .1.
+    if largest > 0.1:
+        raise ValueError(
+            f"{condition.name}: predicted: got values whose distribution function differs by "
+            f"{largest:.2f} from that of the population at the optimum, expected "
+            "prb.predict(optimum, response, *inputs) of the same condition; for another condition "
+            "than a simulator's pass responses="
+        )
 
 
 def _specimen_numbers(
     nodes: Sequence[Node], tested: list[_Tested]
 ) -> tuple[list[NDArray[np.intp]], int]:
-    """Return the numbers of each condition's specimens, (n,), and how many are new.
-
-    Specimens of the calibration have their numbers there.
-    """
+    """Return the numbers of each condition's specimens in the calibration, and how many are new."""
     node_numbers, total = specimens(nodes)
     # The points of a group of simulators are drawn together.
     group_of = {k: i for i, members in enumerate(groups(nodes)) for k in members}

@@ -1,4 +1,4 @@
-"""Probabilities of exceedance, also rare ones, beside closed forms, with bounds where an input is an interval."""
+"""Probabilities of exceedance beside closed forms: common, rare, and with intervals."""
 
 import logging
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from scipy.special import ndtr, ndtri
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.decision.exceedance import RareEvent, _jackknife_error, rare_event
+from prbayes.decision.exceedance import _jackknife_error, rare_event
 from prbayes.decision.populations import InverseTransform
 from prbayes.response.inputs import read_inputs
 
@@ -23,13 +23,13 @@ THINNED = np.unique(np.linspace(0, 3999, 2000).round().astype(int))
 
 def exact(limit: float, prob: float = 0.89) -> tuple[float, Any]:
     """Return the probability of a new specimen, and the interval over the posterior."""
-    each = ndtr((MU[THINNED] - limit) / SIGMA[THINNED])
-    return float(each.mean()), np.quantile(each, [(1 - prob) / 2, (1 + prob) / 2])
+    by_draw = ndtr((MU[THINNED] - limit) / SIGMA[THINNED])
+    return float(by_draw.mean()), np.quantile(by_draw, [(1 - prob) / 2, (1 + prob) / 2])
 
 
-def ask(limit: float, response: Any = same, *more: Any, **given: Any) -> Any:
+def ask(limit: float, response: Any = same, *more: Any, **options: Any) -> Any:
     model, x = normal()
-    return prb.exceedance(posterior(), response, limit, x, *more, model=model, **given)
+    return prb.exceedance(posterior(), response, limit, x, *more, model=model, **options)
 
 
 def test_from_stored_responses() -> None:
@@ -43,33 +43,29 @@ def test_from_stored_responses() -> None:
     assert float(ask(4.0, doubled).probability) == pytest.approx(float(ask(2.0).probability))
 
 
-def test_from_points_where_it_matters() -> None:
+def test_from_points_near_the_limit() -> None:
     table = ask(2.8, points=2000)
     expected, interval = exact(2.8)
     assert expected < 2e-4
     assert abs(float(table.probability) - expected) < 4 * float(table.error)
     assert float(table.error) < 0.1 * expected
     np.testing.assert_allclose([table.lower, table.upper], interval, rtol=0.2)
-    assert table.attrs["responses"] == 2000
-    assert table.attrs["source"] == "importance points"
-
-
-def test_the_error_counts_that_draws_are_few() -> None:
-    few, many = (ask(2.8, points=2000, n_draws=draws) for draws in (50, 2000))
+    assert (table.attrs["responses"], table.attrs["source"]) == (2000, "importance points")
+    # The error includes that draws are few.
+    few = ask(2.8, points=2000, n_draws=50)
     scatter = float(few.by_draw.std(ddof=1)) / np.sqrt(50)
-    assert float(few.error) > scatter > 2 * float(many.error)
-    assert abs(float(few.probability) - exact(2.8)[0]) < 3 * float(few.error)
+    assert float(few.error) > scatter > 2 * float(table.error)
+    assert abs(float(few.probability) - expected) < 3 * float(few.error)
 
 
 def test_a_requirement_is_met_or_not_or_not_decided() -> None:
     table = ask(2.0)
     assert "verdict" not in table.attrs
     low, high = float(table.lower), float(table.upper)
-    for requirement, verdict in ((1.01 * high, "met"), (0.99 * low, "not met")):
-        assert ask(2.0, requirement=requirement).attrs["verdict"] == verdict
-    for requirement in (1.01 * low, 0.99 * high):
-        assert ask(2.0, requirement=requirement).attrs["verdict"] == "not decided"
-    assert ask(2.0, requirement=0.5).attrs["requirement"] == 0.5
+    undecided = [(value, "not decided") for value in (1.01 * low, 0.99 * high)]
+    for requirement, verdict in ((1.01 * high, "met"), (0.99 * low, "not met"), *undecided):
+        attributes = ask(2.0, requirement=requirement).attrs
+        assert (attributes["requirement"], attributes["verdict"]) == (requirement, verdict)
     with pytest.raises(ValueError, match="requirement"):
         ask(2.0, requirement=1.5)
 
@@ -82,17 +78,13 @@ def test_below_is_above_of_the_opposite() -> None:
 
 
 def test_the_error_of_equal_points_is_that_of_their_blocks_means() -> None:
-    values = np.arange(64.0)
-    blocks = np.arange(64) % 8
-    sample = SimpleNamespace(
-        values=values,
-        blocks=blocks,
-        mean_weights=lambda: np.full(64, 1 / 64),
-    )
+    values, blocks = np.arange(64.0), np.arange(64) % 8
+    weights = np.full(64, 1 / 64)
+    sample: Any = SimpleNamespace(values=values, blocks=blocks, mean_weights=lambda: weights)
     quantity = prb.decision.Exceedance(same, normal()[1], limit=42.0)
     means = [(values[blocks == b] > 42).mean() for b in range(8)]
     expected = np.std(means, ddof=1) / np.sqrt(8)
-    assert _jackknife_error(sample, quantity) == pytest.approx(expected)  # type: ignore[arg-type]
+    assert _jackknife_error(sample, quantity) == pytest.approx(expected)
 
 
 def shifted(x: Any, by: Any) -> Any:
@@ -102,11 +94,11 @@ def shifted(x: Any, by: Any) -> Any:
 def test_an_interval_gives_bounds_and_no_distribution() -> None:
     interval = prb.decision.Interval(-0.5, 0.5)
     table = ask(1.5, shifted, interval)
-    ends = [float(ask(1.5, shifted, by).probability) for by in (-0.5, 0.5)]
+    low, high = (ask(1.5, shifted, by) for by in (-0.5, 0.5))
+    ends = [float(low.probability), float(high.probability)]
     np.testing.assert_allclose(table.probability, ends)
     assert table.attrs["at"] == ["-0.5", "0.5"]
-    assert float(table.lower) == float(ask(1.5, shifted, -0.5).lower)
-    assert float(table.upper) == float(ask(1.5, shifted, 0.5).upper)
+    assert (float(table.lower), float(table.upper)) == (float(low.lower), float(high.upper))
     # An extreme inside is found at one of the places.
     inside = ask(1.5, lambda x, by: x - by**2, interval)
     assert inside.attrs["at"][1] == "0"
@@ -131,7 +123,7 @@ def test_a_population_without_stored_responses_takes_points() -> None:
         prb.exceedance(posterior(), shifted, 2.5, x, model["mu"], model=model, points=100)
 
 
-def test_what_is_hardly_known_is_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, logger="prbayes"):
         table = ask(9.0, lambda x: np.minimum(x, 5.0))
     assert float(table.probability) == 0
@@ -141,31 +133,32 @@ def test_what_is_hardly_known_is_said(caplog: pytest.LogCaptureFixture) -> None:
         ask(2.0, lambda x: np.where(x < 1, np.nan, x), points=200)
 
 
-def test_several_outputs() -> None:
-    def both(x: Any) -> Any:
-        return np.stack([x, -x], axis=-1)
+@pytest.mark.parametrize("points", [0, 300])
+def test_several_outputs(points: int) -> None:
+    first = ask(2.0, lambda x: np.stack([x, -x], axis=-1), output=0, points=points)
+    np.testing.assert_allclose(first.by_draw, ask(2.0, points=points).by_draw)
 
-    for points in (0, 300):
-        first = ask(2.0, both, output=0, points=points)
-        np.testing.assert_allclose(first.by_draw, ask(2.0, points=points).by_draw)
 
+# -- rare events -----------------------------------------------------------------------------------
 
 SEEDS = 12
 
 
-def found(
-    size: int, respond: Callable[[Floats], Any], limit: float, mu: Any = (0.0,), n: int = 1000
-) -> list[RareEvent]:
-    """Return probabilities of responses of independent normal inputs, by seed."""
+def rare_events(
+    size: int, respond: Callable[[Floats], Any], limit: float, mu: Any = (0.0,)
+) -> tuple[Floats, Floats, Floats]:
+    """Return probabilities of responses of independent normal inputs, errors and lost mass, by seed."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu") * np.ones(size), 1.0)
-    inputs = read_inputs("f", [x], model)
+    transform = InverseTransform("f", read_inputs("f", [x], model), [np.zeros(1)])
     roots = [np.asarray(mu, dtype=float)]
-    transform = InverseTransform("f", inputs, [np.zeros(1)])
-    return [
-        rare_event(transform, roots, respond, limit, n, np.random.default_rng(seed))
+    events = [
+        rare_event(transform, roots, respond, limit, 1000, np.random.default_rng(seed))
         for seed in range(SEEDS)
     ]
+    columns = [[event.by_draw, event.error, event.lost] for event in events]
+    by_draw, error, lost = (np.array(column) for column in zip(*columns, strict=True))
+    return by_draw, error, lost
 
 
 CASES: dict[str, tuple[int, Callable[[Floats], Any], float, float]] = {
@@ -179,28 +172,26 @@ CASES: dict[str, tuple[int, Callable[[Floats], Any], float, float]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_probabilities_and_their_stated_errors(case: str) -> None:
+def test_probabilities_and_their_errors(case: str) -> None:
     size, respond, limit, expected = CASES[case]
-    every = found(size, respond, limit)
-    values = np.array([one.by_draw[0] for one in every])
-    stated = np.array([one.error for one in every])
-    assert (stated < 0.25 * expected).all()
-    # In units of the stated error: a standard deviation of one, known to 1 / sqrt(2 SEEDS).
-    assert np.sqrt(np.mean(((values - expected) / stated) ** 2)) < 1 + 4 / np.sqrt(2 * SEEDS)
-    assert abs(values.mean() - expected) < 4 * np.sqrt(np.mean(stated**2) / SEEDS)
+    by_draw, errors, _ = rare_events(size, respond, limit)
+    values = by_draw[:, 0]
+    assert (errors < 0.25 * expected).all()
+    # In units of the error: a standard deviation of one, known to 1 / sqrt(2 SEEDS).
+    assert np.sqrt(np.mean(((values - expected) / errors) ** 2)) < 1 + 4 / np.sqrt(2 * SEEDS)
+    assert abs(values.mean() - expected) < 4 * np.sqrt(np.mean(errors**2) / SEEDS)
 
 
 def test_populations_share_their_points() -> None:
     mu = np.array([-0.5, 0.0, 0.5])
-    expected = ndtr(mu - 4.0)
-    every = np.array([one.by_draw for one in found(1, lambda z: z[:, 0], 4.0, mu)])
-    np.testing.assert_allclose(every.mean(axis=0), expected, rtol=0.1)
+    by_draw, _, _ = rare_events(1, lambda z: z[:, 0], 4.0, mu)
+    np.testing.assert_allclose(by_draw.mean(axis=0), ndtr(mu - 4.0), rtol=0.1)
 
 
-def test_what_has_no_response_is_counted_and_what_is_never_reached_has_an_error() -> None:
-    (lossy, *_) = found(1, lambda z: np.where(z[:, 0] < 0, np.nan, z[:, 0]), 3.0)
-    assert lossy.lost == pytest.approx(0.5, abs=0.2)
-    assert lossy.by_draw[0] == pytest.approx(ndtr(-3.0), rel=0.3)
-    (never, *_) = found(1, lambda z: np.clip(z[:, 0], -1, 1), 2.0)
-    assert never.by_draw[0] == 0
-    assert never.error > 0
+def test_lost_mass_is_counted_and_an_unreached_limit_has_an_error() -> None:
+    by_draw, _, lost = rare_events(1, lambda z: np.where(z[:, 0] < 0, np.nan, z[:, 0]), 3.0)
+    assert lost[0] == pytest.approx(0.5, abs=0.2)
+    assert by_draw[0, 0] == pytest.approx(ndtr(-3.0), rel=0.3)
+    by_draw, errors, _ = rare_events(1, lambda z: np.clip(z[:, 0], -1, 1), 2.0)
+    assert (by_draw == 0).all()
+    assert (errors > 0).all()

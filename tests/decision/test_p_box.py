@@ -1,4 +1,4 @@
-"""Bands of distribution functions beside those of the posterior's own populations."""
+"""Bands of distribution functions beside those of the posterior's populations."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ POSTERIOR = jeffreys(OBSERVED, DRAWS)
 MU, SIGMA = (POSTERIOR.posterior[name].values[0] for name in ("mu", "sigma"))
 
 
-def box(response: Any = same, *more: Any, **given: Any) -> xr.Dataset:
+def box(response: Any = same, *more: Any, **options: Any) -> xr.Dataset:
     model, x = normal()
-    return prb.decision.p_box(POSTERIOR, response, x, *more, model=model, **given)
+    return prb.decision.p_box(POSTERIOR, response, x, *more, model=model, **options)
 
 
 def functions(y: Any) -> Any:
@@ -27,32 +27,25 @@ def functions(y: Any) -> Any:
 
 
 @pytest.mark.parametrize("prob", [0.9, pytest.param(0.5, marks=pytest.mark.slow)])
-def test_bands_hold_what_they_say(prob: float) -> None:
+def test_bands_contain_their_share_of_distribution_functions(prob: float) -> None:
     found = box(prob=prob)
-    each = functions(found.y.values)
-    pointwise = found.sel(band="pointwise")
-    expected = np.quantile(each, [(1 - prob) / 2, (1 + prob) / 2], axis=0)
+    y = found.y.values
+    pointwise, entire = found.sel(band="pointwise"), found.sel(band="simultaneous")
+    expected = np.quantile(functions(y), [(1 - prob) / 2, (1 + prob) / 2], axis=0)
     np.testing.assert_allclose([pointwise.lower, pointwise.upper], expected, atol=0.01)
-    entire = found.sel(band="simultaneous")
+    np.testing.assert_allclose(found["mean"], functions(y).mean(axis=0), atol=0.01)
     model, x = normal()
     populations = Populations.of(POSTERIOR, model, DRAWS, "prb.decision.p_box")
-    own = _distribution_functions(populations.sample(same, (x,), None), found.y.values)
-    np.testing.assert_allclose(own, each, atol=0.012)
-    inside = (entire.lower.values <= own) & (own <= entire.upper.values)
+    of_sample = _distribution_functions(populations.sample(same, (x,), None), y)
+    np.testing.assert_allclose(of_sample, functions(y), atol=0.012)
+    inside = (entire.lower.values <= of_sample) & (of_sample <= entire.upper.values)
     # Draws are left out by the same number on both sides, at each of their places.
     assert prob <= inside.all(axis=1).mean() < prob + 0.03
-    np.testing.assert_allclose(found["mean"], each.mean(axis=0), atol=0.01)
-
-
-def test_bands_are_distribution_functions_and_nested() -> None:
-    found = box()
-    for key in ("lower", "upper"):
-        assert (np.diff(found[key].values, axis=1) >= 0).all()
-    wide, narrow = found.sel(band="simultaneous"), found.sel(band="pointwise")
-    assert (wide.lower <= narrow.lower).all()
-    assert (narrow.upper <= wide.upper).all()
-    assert float(found["mean"][0]) < 1e-3
-    assert float(found["mean"][-1]) > 1 - 1e-3
+    # The bands are distribution functions, and nested.
+    assert (np.diff([found.lower, found.upper], axis=-1) >= 0).all()
+    assert (entire.lower <= pointwise.lower).all()
+    assert (pointwise.upper <= entire.upper).all()
+    assert float(found["mean"][0]) < 1e-3 < 1 - 1e-3 < float(found["mean"][-1])
 
 
 def test_a_unit_moves_the_places_alone() -> None:
@@ -62,10 +55,7 @@ def test_a_unit_moves_the_places_alone() -> None:
 
 
 def test_an_interval_widens_to_both_ends() -> None:
-    def shifted(x: Any, by: float) -> Any:
-        return x + by
-
-    found = box(shifted, prb.decision.Interval(-0.5, 0.5))
+    found = box(lambda x, by: x + by, prb.decision.Interval(-0.5, 0.5))
     y = found.y.values
     low, high = functions(y - 0.5).mean(axis=0), functions(y + 0.5).mean(axis=0)
     np.testing.assert_allclose(found["mean"], low, atol=0.012)
@@ -74,16 +64,10 @@ def test_an_interval_widens_to_both_ends() -> None:
     assert (found.upper.sel(band="pointwise") >= high - 0.01).all()
 
 
-def test_a_value_counts_where_it_is() -> None:
-    found = box(np.round)
-    y = found.y.values
-    whole = np.isclose(y, 1.0)
-    assert whole.any()
-    expected = ndtr((1.5 - MU) / SIGMA).mean()
-    assert float(found["mean"].values[whole][0]) == pytest.approx(expected, abs=0.01)
-
-
-def test_specimens_that_failed_are_above_all_others() -> None:
-    found = box(lambda x: np.where(x > 1.0, np.inf, x))
-    last = float(found["mean"][-1])
-    assert last == pytest.approx(float(ndtr((1.0 - MU) / SIGMA).mean()), abs=0.02)
+def test_equal_and_failed_values() -> None:
+    rounded = box(np.round)
+    (whole,) = rounded["mean"].values[np.isclose(rounded.y, 1.0)][:1]
+    assert whole == pytest.approx(ndtr((1.5 - MU) / SIGMA).mean(), abs=0.01)
+    # Specimens that failed are above all others.
+    last = box(lambda x: np.where(x > 1.0, np.inf, x))["mean"].values[-1]
+    assert last == pytest.approx(ndtr((1.0 - MU) / SIGMA).mean(), abs=0.02)

@@ -17,18 +17,22 @@ X = pm.Normal.dist()
 
 
 @pytest.mark.parametrize(
-    ("quantity", "expected"),
+    ("quantity", "expected", "of_specimens"),
     [
-        (prb.decision.Mean(same, X), [3.125, 1.75]),
-        (prb.decision.StandardDeviation(same, X), [np.std(VALUES), 0.75]),
-        (prb.decision.Exceedance(same, X, limit=2.0), [0.5, 0.5]),
-        (prb.decision.Exceedance(same, X, limit=2.0, below=True), [0.25, 0.5]),
-        (prb.decision.Exceedance(same, X, limit=7.0), [0.0, 0.0]),
+        (prb.decision.Mean(same, X), [3.125, 1.75], VALUES),
+        (prb.decision.StandardDeviation(same, X), [np.std(VALUES), 0.75], VALUES),
+        (prb.decision.Exceedance(same, X, limit=2.0), [0.5, 0.5], [0, 0, 1, 1]),
+        (prb.decision.Exceedance(same, X, limit=2.0, below=True), [0.25, 0.5], [1, 0, 0, 0]),
+        (prb.decision.Exceedance(same, X, limit=7.0), [0.0, 0.0], [0, 0, 0, 0]),
+        (prb.decision.Quantile(same, X, probability=0.5), [2.25, 2.0], [0, 0, 1, 1]),
     ],
     ids=repr,
 )
-def test_numbers_of_a_population(quantity: prb.decision.Quantity, expected: Any) -> None:
+def test_numbers_of_a_population_and_of_specimens(
+    quantity: prb.decision.Quantity, expected: Any, of_specimens: Any
+) -> None:
     np.testing.assert_allclose(quantity.of(VALUES, WEIGHTS), expected, rtol=1e-12)
+    np.testing.assert_array_equal(quantity.of_specimen(VALUES, 2.25), of_specimens)
 
 
 def test_a_quantile_of_many_is_that_of_the_distribution() -> None:
@@ -40,30 +44,16 @@ def test_a_quantile_of_many_is_that_of_the_distribution() -> None:
 
 def test_a_large_mean_leaves_digits_for_the_spread() -> None:
     quantity = prb.decision.StandardDeviation(same, X)
-    np.testing.assert_allclose(
-        quantity.of(VALUES + 1e9, WEIGHTS), quantity.of(VALUES, WEIGHTS), rtol=1e-6
-    )
+    shifted = quantity.of(VALUES + 1e9, WEIGHTS)
+    np.testing.assert_allclose(shifted, quantity.of(VALUES, WEIGHTS), rtol=1e-6)
 
 
-def test_what_counts_of_a_specimen() -> None:
-    limit = prb.decision.Exceedance(same, X, limit=2.0, below=True)
-    np.testing.assert_array_equal(limit.of_specimen(VALUES, 0.0), [1, 0, 0, 0])
-    quantile = prb.decision.Quantile(same, X, probability=0.5)
-    np.testing.assert_array_equal(quantile.of_specimen(VALUES, 2.2), [0, 0, 1, 1])
-    np.testing.assert_array_equal(prb.decision.Mean(same, X).of_specimen(VALUES, 0), VALUES)
-
-
-TWO = [prb.decision.Interval(1, 2), "x", prb.decision.Interval(-1, 1)]
-
-
-def test_every_combination_with_the_ends() -> None:
-    found = interval_grid(TWO, 3)
+def test_intervals_have_every_combination_with_the_ends() -> None:
+    inputs = [prb.decision.Interval(1, 2), "x", prb.decision.Interval(-1, 1)]
+    found = interval_grid(inputs, 3)
     assert len(found) == 9
     assert {(1.0, "x", -1.0), (1.5, "x", 0.0), (2.0, "x", 1.0)} <= set(found)
     assert interval_grid(["x", 2.6], 3) == [("x", 2.6)]
-    assert interval_values(TWO, found[-1]) == "2, 1"
-
-
-def test_no_interval_is_refused() -> None:
+    assert interval_values(inputs, found[-1]) == "2, 1"
     with pytest.raises(ValueError, match=r"high: got 1 with low = 1, expected more"):
         prb.decision.Interval(1, 1)

@@ -1,18 +1,15 @@
-"""Numbers behind the pictures, against closed forms; regions hold what they say."""
+"""Densities, distributions, histograms and regions against closed forms."""
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from prbayes.plots import curves
-from prbayes.plots.curves import White, outlines
+from prbayes.plots.curves import outlines
 
 QUANTILES = stats.norm.ppf((np.arange(1000) + 0.5) / 1000)
 EQUAL = np.full(1000, 1e-3)
 GRID = np.linspace(-5, 9, 301)
-
-
-# -- densities -------------------------------------------------------------------------------------
 
 
 def test_a_weighted_density_is_that_of_the_target() -> None:
@@ -20,78 +17,53 @@ def test_a_weighted_density_is_that_of_the_target() -> None:
     x = 2 * QUANTILES
     w = stats.norm.pdf(x, 1, 1) / stats.norm.pdf(x, 0, 2)
     w /= w.sum()
-    found = curves.densities(x, w, GRID, 0.3)
-    np.testing.assert_allclose(found, stats.norm.pdf(GRID, 1, np.hypot(1, 0.3)), atol=2e-3)
-    assert np.trapezoid(found, GRID) == pytest.approx(1, abs=1e-3)
+    density = curves.densities(x, w, GRID, 0.3)
+    np.testing.assert_allclose(density, stats.norm.pdf(GRID, 1, np.hypot(1, 0.3)), atol=2e-3)
+    assert np.trapezoid(density, GRID) == pytest.approx(1, abs=1e-3)
+    rows = np.stack([QUANTILES, QUANTILES[::-1] + 0.7])
+    both = curves.densities(rows, np.stack([EQUAL, EQUAL]), GRID, 0.1)
+    expected = stats.norm.pdf(GRID, [[0], [0.7]], np.hypot(1, 0.1))
+    np.testing.assert_allclose(both, expected, atol=4e-3)
 
 
-def test_what_is_not_finite_is_missing_from_the_area() -> None:
+def test_the_area_is_the_share_of_finite_values() -> None:
     x = QUANTILES.copy()
     x[:100], x[-50:] = np.inf, np.nan
-    assert np.trapezoid(curves.densities(x, EQUAL, GRID, 0.2), GRID) == pytest.approx(
-        0.85, abs=2e-3
-    )
-    found = curves.distribution_functions(x[None], EQUAL[None], np.array([-9.0, 9.0]))
-    np.testing.assert_allclose(found, [[0, 0.85]], atol=1e-12)
+    area = np.trapezoid(curves.densities(x, EQUAL, GRID, 0.2), GRID)
+    assert area == pytest.approx(0.85, abs=2e-3)
 
 
-def test_rows_have_their_own_weights_and_values() -> None:
-    mixed = np.random.default_rng(1).permutation(QUANTILES)
-    shared = np.broadcast_to(mixed, (2, 1000))
-    tilted = np.exp(0.7 * mixed)
-    weights = np.stack([EQUAL, tilted / tilted.sum()])
-    expected = stats.norm.cdf(GRID - np.array([[0], [0.7]]))
-    np.testing.assert_allclose(
-        curves.distribution_functions(shared, weights, GRID), expected, atol=6e-3
-    )
-    own = np.stack([QUANTILES, QUANTILES[::-1] + 0.7])
-    np.testing.assert_allclose(
-        curves.distribution_functions(own, np.stack([EQUAL, EQUAL]), GRID), expected, atol=2e-3
-    )
-    both = curves.densities(own, np.stack([EQUAL, EQUAL]), GRID, 0.1)
-    np.testing.assert_allclose(
-        both, stats.norm.pdf(GRID, [[0], [0.7]], np.hypot(1, 0.1)), atol=4e-3
-    )
-
-
-def test_the_bandwidth_is_silvermans_of_the_effective_number() -> None:
-    weights = np.where(np.arange(1000) % 2, 2e-3, 0.0)
-    expected = 0.9 * 1000**-0.2, 0.9 * 500**-0.2
-    found = [curves.typical_bandwidth(QUANTILES, w[None]) for w in (EQUAL, weights)]
-    np.testing.assert_allclose(found, expected, rtol=0.02)
-    with_inf = np.append(QUANTILES, [np.inf, np.nan])
-    assert curves.typical_bandwidth(with_inf, np.full((3, 1002), 1 / 1002)) == pytest.approx(
-        expected[0], rel=0.02
-    )
+@pytest.mark.parametrize(("step", "n"), [(1, 1000), (2, 500)])
+def test_the_bandwidth_is_silvermans_of_the_effective_number(step: int, n: int) -> None:
+    """One bandwidth, the median, smooths all populations of a picture."""
+    weights = np.where(np.arange(1000) % step, 0.0, step * 1e-3)
+    rows = np.stack([QUANTILES, 3 * QUANTILES, 3 * QUANTILES])
+    rows = np.column_stack([rows, np.full((3, 2), [np.inf, np.nan])])
+    weights = np.append(weights, [0.0, 0.0])
+    density, *_ = curves.smooth_densities(rows, np.stack([weights] * 3), GRID)
+    h = 3 * 0.9 * n**-0.2
+    np.testing.assert_allclose(density, stats.norm.pdf(GRID, 0, np.hypot(1, h)), atol=6e-3)
 
 
 def test_a_density_does_not_dip_at_a_bound() -> None:
-    draws = np.abs(QUANTILES)
-    found = curves.bounded_density(draws, np.array([-0.1, 0.01, 0.5, 1.0]))
-    np.testing.assert_allclose(found, [0, *(2 * stats.norm.pdf([0.01, 0.5, 1.0]))], atol=0.03)
+    density = curves.bounded_density(np.abs(QUANTILES), np.array([-0.1, 0.01, 0.5, 1.0]))
+    expected = [0, *(2 * stats.norm.pdf([0.01, 0.5, 1.0]))]
+    np.testing.assert_allclose(density, expected, atol=0.03)
+    assert np.isnan(curves.bounded_density(np.ones(10), GRID)).all()
 
 
-def test_the_band_has_the_quantiles_of_the_level() -> None:
+def test_bands_and_ranges_are_quantiles() -> None:
     rows = np.arange(101.0)[:, None] * np.array([1.0, -2.0])
-    low, high = curves.pointwise_band(rows, 0.9)
-    np.testing.assert_allclose([low, high], [[5, -190], [95, -10]])
-
-
-def test_ranges_are_quantiles_of_most_samples() -> None:
+    np.testing.assert_allclose(curves.pointwise_band(rows, 0.9), [[5, -190], [95, -10]])
     rows = np.stack([QUANTILES + k for k in range(11)])
-    found = curves.central_range(rows, np.full(rows.shape, 1e-3), 0.05)
-    np.testing.assert_allclose(found, [1 - 1.645, 9 + 1.645], atol=0.02)
+    ends = curves.central_range(rows, np.full(rows.shape, 1e-3), 0.05)
+    np.testing.assert_allclose(ends, [1 - 1.645, 9 + 1.645], atol=0.02)
 
 
-# -- data ------------------------------------------------------------------------------------------
-
-
-def test_the_histogram_has_the_area_of_what_is_finite() -> None:
-    data = np.array([0.0, 0.1, 0.2, 0.9, 1.0, np.inf])
-    x, y = curves.histogram(data, np.full(6, 1 / 6))
+def test_the_histogram_has_the_area_of_finite_values() -> None:
+    x, y = curves.histogram(np.array([0.0, 0.1, 0.2, 0.9, 1.0, np.inf]), np.full(6, 1 / 6))
     assert np.trapezoid(y, x) == pytest.approx(5 / 6)
-    assert x.min() == 0
-    assert x.max() == 1
+    assert (x.min(), x.max()) == (0, 1)
     np.testing.assert_allclose(y[1::4] * np.diff(x)[1::4], [2 / 6, 1 / 6, 0, 0, 2 / 6], atol=1e-12)
     x, y = curves.histogram(np.array([3.0, 3.0]), np.full(2, 0.5))
     assert np.trapezoid(y, x) == pytest.approx(1)
@@ -104,52 +76,29 @@ def test_the_staircase_goes_up_by_the_weight_at_each_value() -> None:
     np.testing.assert_allclose(y, [0, 0, 0.2, 0.2, 0.7, 0.7])
 
 
-def test_a_density_of_equal_draws_is_unknown() -> None:
-    assert np.isnan(curves.bounded_density(np.ones(10), GRID)).all()
-
-
-def test_populations_of_one_picture_have_one_bandwidth() -> None:
-    rows = np.stack([QUANTILES, 3 * QUANTILES, 3 * QUANTILES])
-    weights = np.stack([EQUAL] * 3)
-    found = curves.smooth_densities(rows, weights, GRID)
-    h = curves.typical_bandwidth(3 * QUANTILES, EQUAL[None])
-    np.testing.assert_allclose(found[0], stats.norm.pdf(GRID, 0, np.hypot(1, h)), atol=4e-3)
-
-
-def test_steps_go_from_low_to_high_with_a_height_before_the_first() -> None:
-    x, y = curves.steps(np.array([1.0, 3.0]), np.array([5.0, 6.0, 7.0]), 0.0, 4.0)
-    np.testing.assert_array_equal(x, [0, 1, 1, 3, 3, 4])
-    np.testing.assert_array_equal(y, [5, 5, 6, 6, 7, 7])
-
-
 # -- regions ---------------------------------------------------------------------------------
 
 
-RNG = np.random.default_rng(1)
-NORMAL = RNG.standard_normal((4000, 2))
+NORMAL = np.random.default_rng(1).standard_normal((4000, 2))
+CLUSTERS = NORMAL / 10 + np.where(np.arange(4000) % 2, 3.0, -3.0)[:, None] * [1.0, 0.0]
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.9, -0.999])
 def test_regions_do_not_depend_on_units_and_correlation(correlation: float) -> None:
     root = np.linalg.cholesky([[1.0, correlation], [correlation, 1.0]])
     turned = NORMAL @ root.T * [1e3, 1e-3] + [5.0, 7.0]
-    for share, line in zip((0.5, 0.89), outlines(turned, np.ones(4000), (0.5, 0.89)), strict=True):
-        at = np.linalg.solve(root, ((line.T - [5.0, 7.0]) / [1e3, 1e-3]).T)
-        squares = np.nansum(at**2, axis=0)[np.isfinite(at[0])]
+    lines = outlines(turned, np.ones(4000), (0.5, 0.89))
+    for share, line in zip((0.5, 0.89), lines, strict=True):
+        places = np.linalg.solve(root, ((line.T - [5.0, 7.0]) / [1e3, 1e-3]).T)
+        squares = np.nansum(places**2, axis=0)[np.isfinite(places[0])]
         assert squares.mean() == pytest.approx(-2 * np.log(1 - share), rel=0.06)
 
 
-def test_weights_count_as_so_many_points() -> None:
-    centers = NORMAL / 10 + np.where(np.arange(4000) % 2, 3.0, -3.0)[:, None] * [1.0, 0.0]
-    weights = np.where(np.arange(4000) % 2, 0.9, 0.1)
-    (line,) = outlines(centers, weights, (0.5,))
-    assert np.nanmin(line[0]) > 2
-
-
-def test_two_clusters_have_two_lines() -> None:
-    centers = NORMAL / 10 + np.where(np.arange(4000) % 2, 3.0, -3.0)[:, None] * [1.0, 0.0]
-    (line,) = outlines(centers, np.ones(4000), (0.89,))
+def test_clusters_have_lines_of_their_own_and_count_by_weight() -> None:
+    (line,) = outlines(CLUSTERS, np.ones(4000), (0.89,))
     assert np.isnan(line[0]).sum() == 1
+    (line,) = outlines(CLUSTERS, np.where(np.arange(4000) % 2, 0.9, 0.1), (0.5,))
+    assert np.nanmin(line[0]) > 2
 
 
 def test_points_on_a_line_have_a_thin_region() -> None:
@@ -160,18 +109,9 @@ def test_points_on_a_line_have_a_thin_region() -> None:
     assert np.nanmax(np.abs(dot - 1)) < 0.01
 
 
-def test_coordinates_are_white() -> None:
-    weights = np.linspace(1, 2, 4000) / np.linspace(1, 2, 4000).sum()
-    points = NORMAL @ [[2.0, 1.0], [0.0, 0.5]]
-    white = White.of(points, weights)
-    inside = white.of_points(points)
-    np.testing.assert_allclose(inside.T @ (weights[:, None] * inside), np.eye(2), atol=0.05)
-    np.testing.assert_allclose(white.points(inside), points)
-
-
 def test_a_far_tail_does_not_widen_a_region() -> None:
     far = NORMAL.copy()
     far[:20] *= 1e6
-    for share, line in zip((0.5, 0.89), outlines(far, np.ones(4000), (0.5, 0.89)), strict=True):
-        squares = np.nansum(line**2, axis=0)[np.isfinite(line[0])]
-        assert squares.mean() == pytest.approx(-2 * np.log(1 - share), rel=0.1)
+    (line,) = outlines(far, np.ones(4000), (0.89,))
+    squares = np.nansum(line**2, axis=0)[np.isfinite(line[0])]
+    assert squares.mean() == pytest.approx(-2 * np.log(0.11), rel=0.1)

@@ -9,51 +9,44 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
-from scipy import stats
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots.landscape import (
     check_optimum,
     distinct_texts,
-    free_elements,
     landscape,
     objective,
     objective_label,
-    rooted,
 )
 
-QUANTILES = stats.norm.ppf((np.arange(30) + 0.5) / 30)
 
-
-def test_the_landscape_is_not_turned_over(optimum: prb.Optimum, read: SimpleNamespace) -> None:
-    pc = prb.plot_landscape(optimum, points=31)
+def test_the_landscape_is_not_turned_over(
+    optimum: prb.Optimum, read: SimpleNamespace, drawn: Callable[..., Any]
+) -> None:
+    pc = drawn("landscape")
     trace, point = optimum.search.trace["theta"], optimum.point
     np.testing.assert_allclose(read.xy(pc, "path", "landscape"), [trace[:, 0], np.exp(trace[:, 1])])
-    np.testing.assert_allclose(
-        read.xy(pc, "optimum", "landscape")[:, 0], [point["mu"], point["sigma"]]
-    )
+    mark = read.xy(pc, "optimum", "landscape")[:, 0]
+    np.testing.assert_allclose(mark, [point["mu"], point["sigma"]])
     axis = pc.viz["plot"]["landscape"].item()
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("mu", "sigma")
-    layers = read.artist(pc, "landscape", "landscape")
-    evaluator = optimum.evaluator
+    paths = read.artist(pc, "landscape", "landscape").get_paths()
     (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
-    places = np.array(
-        [
-            [x0 + u * (x1 - x0), y0 + v * (y1 - y0)]
-            for u in (0.1, 0.3, 0.5, 0.62)
-            for v in (0.2, 0.45, 0.9)
-        ]
-    )
+    u, v = np.meshgrid([0.1, 0.3, 0.5, 0.62], [0.2, 0.45, 0.9])
+    places = np.column_stack([x0 + u.ravel() * (x1 - x0), y0 + v.ravel() * (y1 - y0)])
     thetas = np.column_stack([places[:, 0], np.log(places[:, 1])])
-    heights = evaluator(thetas).discrepancies[:, 0]
-    layer = [
-        next((i for i, p in enumerate(layers.get_paths()) if p.contains_point(xy_)), 99)
-        for xy_ in places
-    ]
-    order = np.argsort(heights)
-    assert (np.diff(np.array(layer)[order]) >= 0).all()
-    assert len(set(layer)) > 3
+    order = np.argsort(optimum.evaluator(thetas).discrepancies[:, 0])
+    layers = [next((i for i, p in enumerate(paths) if p.contains_point(x)), 99) for x in places]
+    assert (np.diff(np.array(layers)[order]) >= 0).all()
+    assert len(set(layers)) > 3
+    # The colours are of roots: the height above the lowest is the square of the place on the bar
+    bar = pc.viz["figure"].item().axes[-1]
+    assert bar.get_ylabel() == "discrepancy (area metric)"
+    values = np.array([text.get_text() for text in bar.get_yticklabels()], dtype=float)
+    above = (values - values[0]) / (values[-1] - values[0])
+    np.testing.assert_allclose(above, bar.get_yticks() ** 2, atol=0.005)  # three digits
+    assert values[0] >= 0.995 * optimum.discrepancy
 
 
 def test_a_curve_over_one_hyperparameter(
@@ -69,21 +62,13 @@ def test_a_curve_over_one_hyperparameter(
 
 
 def test_other_optima_are_marked(read: SimpleNamespace) -> None:
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.3)
-        prb.Simulator(
-            "y", np.square, x, metric=prb.AreaMetric(), observed=(1 + 0.3 * QUANTILES) ** 2
-        )
-        found = prb.minimize()
-    pc = prb.plot_landscape(found)
-    assert (
-        abs(read.xy(pc, "rivals", "landscape")[0] + read.xy(pc, "optimum", "landscape")[0]).min()
-        < 0.05
-    )
-    np.testing.assert_allclose(
-        np.sort(np.abs(read.xy(pc, "asked", "landscape")[0]))[-1],
-        np.abs(found.search.trace["theta"]).max(),
-    )
+    optimum = prb.minimize(_one())
+    rivals = ({"theta": -optimum.theta, "point": {}, "discrepancy": 1.0, "comparable": True},)
+    pc = prb.plot_landscape(replace(optimum, rivals=rivals), points=21)
+    np.testing.assert_allclose(read.xy(pc, "rivals", "landscape")[0], -optimum.theta)
+    path = read.xy(pc, "asked", "landscape")[0]
+    largest = np.abs(optimum.search.trace["theta"]).max()
+    np.testing.assert_allclose(np.abs(path).max(), largest)
 
 
 def test_a_landscape_that_costs_responses_says_how_many(build: Callable[..., pm.Model]) -> None:
@@ -165,55 +150,35 @@ def test_the_landscape_is_blank_where_the_design_does_not_reach(optimum: prb.Opt
     assert np.isfinite(found.heights[ess > 40]).all()
 
 
-def test_an_axis_ends_within_the_support(optimum: prb.Optimum) -> None:
-    wide = replace(optimum, stderr={"mu": 0.1, "sigma": 0.5})
-    (s,) = landscape(wide, wide.evaluator, ["sigma"], 9).axes
-    assert 0 < s[0] < 0.1
-    assert s[-1] >= optimum.point["sigma"] + 2.0 - 1e-9
-
-
-def test_an_axis_of_unknown_standard_error_is_as_wide_as_the_prior(optimum: prb.Optimum) -> None:
-    unknown = replace(optimum, stderr={"mu": np.nan, "sigma": np.inf})
-    (m,) = landscape(unknown, unknown.evaluator, ["mu"], 9).axes
-    assert np.ptp(m) == pytest.approx(2 * 2 * 2.326, rel=0.15)  # between the 1% and 99% quantiles
-
-
-def test_roots_of_heights_are_even_around_a_parabola() -> None:
-    x = np.linspace(-2, 2, 41)
-    roots, low, high = rooted(3 + x**2)
-    assert low == pytest.approx(3)
-    np.testing.assert_allclose(roots, np.abs(x) / np.sqrt(high - low), atol=1e-12)
-    assert (roots <= 1).mean() == pytest.approx(0.9, abs=0.05)
-
-
-def test_the_objective_is_the_discrepancy_over_its_scale(optimum: prb.Optimum) -> None:
-    thetas = np.array([optimum.theta, optimum.theta + 0.3])
-    expected = optimum.evaluator(thetas).discrepancies[:, 0]
-    halved = replace(optimum, scales={"y": 2.0})
-    np.testing.assert_allclose(objective(halved, optimum.evaluator, thetas), expected / 2)
-
-
-def test_the_objective_is_called_by_its_metric(optimum: prb.Optimum) -> None:
-    assert objective_label(optimum) == "discrepancy (area metric)"
-    assert (
-        objective_label(replace(optimum, scales={"y": 1.0, "z": 1.0}))
-        == "sum of scaled discrepancies"
-    )
-
-
-def test_elements_are_in_the_users_own_units(optimum: prb.Optimum) -> None:
-    found = free_elements(optimum.evaluator, np.array([[1.0, np.log(0.5)], [2.0, 0.0]]))
-    assert list(found) == ["mu", "sigma"]
-    np.testing.assert_allclose(found["mu"], [1, 2])
-    np.testing.assert_allclose(found["sigma"], [0.5, 1])
-
-
 def test_what_has_no_trace_is_refused(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
-    check_optimum(optimum, "test")
-    with pytest.raises(TypeError, match="test: got DataTree, expected an Optimum"):
-        check_optimum(posterior, "test")
     with pytest.raises(ValueError, match="test: got an optimum without a trace"):
         check_optimum(replace(optimum, search=replace(optimum.search, trace={})), "test")
     for plot in (prb.plot_optimizer, prb.plot_landscape):
         with pytest.raises(TypeError, match=f"{plot.__name__}: got DataTree"):
             plot(posterior)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("error", "high"),
+    [
+        (0.5, (2.4, 3.0)),  # ends within the support
+        (np.inf, (2.0, 6.0)),  # unknown: as wide as the prior
+    ],
+)
+def test_axes_end_within_support_or_prior(
+    error: float, high: tuple[float, float], optimum: prb.Optimum
+) -> None:
+    changed = replace(optimum, stderr={"mu": 0.1, "sigma": error})
+    (s,) = landscape(changed, changed.evaluator, ["sigma"], 9).axes
+    assert 0 < s[0] < 0.1
+    assert high[0] < s[-1] < high[1]
+
+
+def test_the_objective_is_the_sum_of_discrepancies_over_scales(optimum: prb.Optimum) -> None:
+    thetas = np.array([optimum.theta, optimum.theta + 0.3])
+    expected = optimum.evaluator(thetas).discrepancies[:, 0]
+    halved = replace(optimum, scales={"y": 2.0})
+    np.testing.assert_allclose(objective(halved, optimum.evaluator, thetas), expected / 2)
+    assert objective_label(optimum) == "discrepancy (area metric)"
+    both = replace(optimum, scales={"y": 1.0, "z": 1.0})
+    assert objective_label(both) == "sum of scaled discrepancies"

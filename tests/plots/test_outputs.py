@@ -1,6 +1,5 @@
 """Pairs of outputs: measured specimens, and regions of the calibrated population."""
 
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,36 +14,28 @@ from prbayes.plots.outputs import _shown_outputs
 from prbayes.response.outputs import Outputs
 
 
-@pytest.mark.parametrize(("share", "visual"), [(0.5, "after_50"), (0.89, "after_89")])
 def test_regions_are_the_ellipses_of_a_normal_population(
-    pair: SimpleNamespace, read: SimpleNamespace, share: float, visual: str
-) -> None:
-    x, y = read.xy(pair.drawn(), visual, "second, first")
-    known = np.isfinite(x)
-    points = np.column_stack([x, y])[known] - pair.mean
-    squares = np.einsum("ij,jk,ik->i", points, np.linalg.inv(pair.covariance), points)
-    expected = -2 * np.log(1 - share)
-    assert squares.mean() == pytest.approx(expected, rel=0.06)
-    np.testing.assert_allclose(squares, expected, rtol=0.35)
-
-
-def test_points_are_the_specimens_that_have_both_outputs(
     pair: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    points = read.xy(pair.drawn(), "measured", "second, first")
-    both = np.isfinite(pair.observed).all(axis=1)
-    np.testing.assert_allclose(points.T, pair.observed[both])
-    assert both.sum() == len(both) - 3
+    for share, visual in ((0.5, "after_50"), (0.89, "after_89")):
+        x, y = read.xy(pair.drawn(), visual, "second, first")
+        points = np.column_stack([x, y])[np.isfinite(x)] - pair.mean
+        squares = np.einsum("ij,jk,ik->i", points, np.linalg.inv(pair.covariance), points)
+        expected = -2 * np.log(1 - share)
+        assert squares.mean() == pytest.approx(expected, rel=0.06)
+        np.testing.assert_allclose(squares, expected, rtol=0.35)
 
 
-def test_axes_have_the_names_and_units_and_the_title_both_correlations(
+def test_specimens_with_both_outputs_names_units_and_correlations(
     pair: SimpleNamespace, read: SimpleNamespace
 ) -> None:
     pc = pair.drawn()
+    points = read.xy(pc, "measured", "second, first")
+    is_complete = np.isfinite(pair.observed).all(axis=1)
+    np.testing.assert_allclose(points.T, pair.observed[is_complete])
     axis = pc.viz["plot"]["second, first"].item()
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("first (Hz)", "second (Hz)")
-    both = pair.observed[np.isfinite(pair.observed).all(axis=1)]
-    r = stats.spearmanr(both).statistic
+    r = stats.spearmanr(pair.observed[is_complete]).statistic
     # Of normal values 6 / pi arcsin(.8 / 2) = .786
     assert axis.get_title().startswith(f"rank correlation\nmeasured {r:.2f}, calibrated 0.7")
     assert read.texts(pc) == [
@@ -52,14 +43,10 @@ def test_axes_have_the_names_and_units_and_the_title_both_correlations(
         "calibrated: posterior predictive, 50% and 89%",
         "measured",
     ]
+    count = pair.calls()
     named = prb.plot_outputs(pair.posterior, model=pair.model, before=False, labels={"first": "F"})
     assert named.viz["plot"]["second, first"].item().get_xlabel() == "F"
     assert "before_50" not in named.viz
-
-
-def test_a_picture_of_stored_responses_computes_none(pair: SimpleNamespace) -> None:
-    count = pair.calls()
-    prb.plot_outputs(pair.posterior, model=pair.model)
     assert pair.calls() == count
 
 
@@ -147,10 +134,3 @@ def test_what_is_not_there_is_refused(
 ) -> None:
     with pytest.raises(error, match=match):
         prb.plot_outputs(several.posterior, model=several.model, **arguments)
-
-
-def test_a_model_of_single_outputs_is_told_of_another_picture(
-    posterior: xr.DataTree, build: Callable[..., pm.Model]
-) -> None:
-    with pytest.raises(ValueError, match=r"got simulators \['y'\] of one .* prb.plot_responses"):
-        prb.plot_outputs(posterior, model=build(prb.Resimulated(64)), n_draws=4)

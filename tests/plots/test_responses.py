@@ -32,9 +32,6 @@ def test_responses_are_the_closed_forms(
     assert (high - low).max() > 0.15
     truth = stats.norm.pdf(some, 1, 0.5)
     assert ((low - 0.02 <= truth) & (truth <= high + 0.02)).all()
-    narrow = prb.plot_responses(posterior, model=optimum.model, n_draws=300, prob=0.5)
-    inner = read.sides(narrow, "band", "y", some)
-    assert np.ptp(inner, axis=0).max() < 0.6 * (high - low).max()
     x, y = read.xy(pc, "before", "y")
     at_start = np.exp(optimum.evaluator.hyperparameters.initial[1])
     np.testing.assert_allclose(y, stats.norm.pdf(x, 0, at_start), atol=0.02)
@@ -42,58 +39,32 @@ def test_responses_are_the_closed_forms(
     np.testing.assert_allclose(np.trapezoid(*read.xy(pc, "measured", "y")[::-1]), 1)
 
 
-def test_the_legend_says_what_is_before_and_after(
-    posterior: xr.DataTree,
+def test_distribution_functions_of_an_optimum(
+    optimum: prb.Optimum,
     read: SimpleNamespace,
     pictures: dict[str, Callable[..., Any]],
     drawn: Callable[..., Any],
-) -> None:
-    assert read.texts(drawn("responses")) == [
-        "measured",
-        "before: prior's initial point",
-        "89% band of the posterior",
-        "calibrated: posterior predictive",
-    ]
-    pc = pictures["ecdf"](prob=0.5)
-    assert read.texts(pc)[2:] == ["50% band of the standard error", "calibrated: optimum"]
-    before, after = (read.artist(pc, name, "y") for name in ("before", "after"))
-    assert before.get_linestyle() != after.get_linestyle()
-    axis = pc.viz["plot"]["y"].item()
-    assert (axis.get_xlabel(), axis.get_ylabel(), axis.get_title()) == (
-        "y",
-        "share of specimens",
-        "30 measured values",
-    )
-
-
-def test_distribution_functions_of_an_optimum(
-    optimum: prb.Optimum, read: SimpleNamespace, pictures: dict[str, Callable[..., Any]]
 ) -> None:
     pc = pictures["ecdf"](before={"mu": 3.0, "sigma": 1.0})
     mu, sigma = optimum.point["mu"], optimum.point["sigma"]
     for name, mean, sd in (("after", mu, sigma), ("before", 3.0, 1.0)):
         x, y = read.xy(pc, name, "y")
         np.testing.assert_allclose(y, stats.norm.cdf(x, mean, sd), atol=0.01)
-    assert "before: as given" in read.texts(pc)
     x, y = read.xy(pc, "measured", "y")
     np.testing.assert_allclose(np.interp([0.99, 1.01], x, y), [0.5, 0.5], atol=0.04)
-    at = read.xy(pc, "after", "y")[0][60:200:20]
-    low, high = read.sides(pc, "band", "y", at)
-    error = (
-        1.5982
-        * np.hypot(0.5 / np.sqrt(30), (at - 1) * 0.5 / np.sqrt(60) / 0.5)
-        * stats.norm.pdf(at, 1, 0.5)
-    )
+    x = read.xy(pc, "after", "y")[0][60:200:20]
+    low, high = read.sides(pc, "band", "y", x)
+    deviation = np.hypot(0.5 / np.sqrt(30), (x - 1) / np.sqrt(60))
+    error = 1.5982 * deviation * stats.norm.pdf(x, 1, 0.5)
     np.testing.assert_allclose((high - low) / 2, error, atol=0.03)
-
-
-def test_without_a_sampling_distribution_there_is_no_band_and_before_can_be_left_out(
-    optimum: prb.Optimum,
-) -> None:
-    alone = replace(optimum, covariance=np.full((2, 2), np.nan))
-    pc = prb.plot_responses(alone, before=False)
-    assert not {"band", "before"} & set(pc.viz.children)
-    assert "band" not in prb.plot_population(alone).viz
+    band = "89% band of the {}"
+    ends = ["before: as given", band.format("standard error"), "calibrated: optimum"]
+    assert read.texts(pc) == ["measured", *ends]
+    ends = ["before: prior's initial point", band.format("posterior")]
+    assert read.texts(drawn("responses"))[1:3] == ends
+    axis = pc.viz["plot"]["y"].item()
+    assert axis.get_ylabel() == "share of specimens"
+    assert axis.get_title() == "30 measured values"
 
 
 def test_stored_responses_cost_nothing_and_others_as_little_as_said(
@@ -124,31 +95,24 @@ def test_stored_responses_cost_nothing_and_others_as_little_as_said(
         assert sum(seen) <= 300
 
 
-def test_what_the_stored_responses_do_not_reach(
-    caplog: pytest.LogCaptureFixture, optimum: prb.Optimum, posterior: xr.DataTree
-) -> None:
-    pc = prb.plot_responses(optimum, before={"mu": 50.0, "sigma": 0.1})
-    assert "before" not in pc.viz
-    assert "stored responses do not reach there" in caplog.text
-    far = posterior.copy(deep=True)
-    far["posterior"]["mu"] = far["posterior"]["mu"] + 50
-    with pytest.raises(
-        prb.propagation.DesignError, match="support 0 of 200 populations of the posterior"
-    ):
-        prb.plot_responses(far, model=optimum.model)
-
-
-def test_a_narrow_peak_before_does_not_flatten_the_data(
+def test_without_a_sampling_distribution_there_is_no_band(
     optimum: prb.Optimum, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_responses(optimum, before={"mu": 1.0, "sigma": 0.05})
+    unknown = replace(optimum, covariance=np.full((2, 2), np.nan))
+    pc = prb.plot_responses(unknown, before={"mu": 1.0, "sigma": 0.05})
+    assert "band" not in pc.viz
+    # A narrow peak before does not flatten the data
     low, high = pc.viz["plot"]["y"].item().get_ylim()
-    assert high < 3
-    assert low < 0
+    assert low < 0 < high < 3
     assert read.xy(pc, "before", "y")[1].max() > high
 
 
-def test_wrong_arguments_are_refused(optimum: prb.Optimum) -> None:
+def test_wrong_arguments_are_refused(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
+    far = posterior.copy(deep=True)
+    far["posterior"]["mu"] = far["posterior"]["mu"] + 50
+    unsupported = "support 0 of 200 populations of the posterior"
+    with pytest.raises(prb.propagation.DesignError, match=unsupported):
+        prb.plot_responses(far, model=optimum.model)
     with pytest.raises(TypeError, match="got int, expected an Optimum"):
         prb.plot_responses(3, model=optimum.model)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"prob: got 1\.5"):
@@ -224,15 +188,6 @@ def test_the_text_of_an_output(
     outputs: Outputs, alone: bool, labels: dict[str, str] | None, expected: str
 ) -> None:
     assert Output(node(outputs), 1, alone).text(labels) == expected
-
-
-def test_what_was_not_measured_is_left_out() -> None:
-    observed = np.array([[1.0, np.nan], [2.0, 5.0], [3.0, np.inf]])
-    weights = np.array([0.5, 0.3, 0.2])
-    y = SimpleNamespace(name="y", outputs=Outputs(("a", "b")), observed=observed, weights=weights)
-    values, weights = Output(y, 1, True).measured()
-    np.testing.assert_array_equal(values, [5.0, np.inf])
-    np.testing.assert_allclose(weights, [0.6, 0.4])
 
 
 @pytest.mark.long

@@ -14,8 +14,8 @@ from pytensor.graph.replace import vectorize_graph
 import prbayes as prb
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.ops import (
-    AdjointOp,
     BinnedOp,
+    CotangentOp,
     DensityOp,
     ResponseOp,
     symbolic_discrepancy,
@@ -91,9 +91,9 @@ def test_operations_are_equal_if_they_have_the_very_same_objects() -> None:
     assert DensityOp(cells) == DensityOp(cells)
     assert hash(DensityOp(cells)) == hash(DensityOp(cells))
     assert DensityOp(cells) != DensityOp(copy)
-    assert AdjointOp(cells, False) == AdjointOp(cells, False)
-    assert AdjointOp(cells, False) != AdjointOp(cells, True)
-    assert AdjointOp(cells, False) != DensityOp(cells)
+    assert CotangentOp(cells, False) == CotangentOp(cells, False)
+    assert CotangentOp(cells, False) != CotangentOp(cells, True)
+    assert CotangentOp(cells, False) != DensityOp(cells)
 
 
 def response_op(calls: list[tuple[int, ...]]) -> ResponseOp:
@@ -130,7 +130,7 @@ def test_a_batch_is_one_call_of_the_response() -> None:
 
 def test_backends_without_an_operation_say_what_to_do_and_not_what_it_contains() -> None:
     cells = target(prb.ProbabilityResidual()).cells  # type: ignore[attr-defined]
-    for op in [response_op([]), DensityOp(cells), AdjointOp(cells, False)]:
+    for op in [response_op([]), DensityOp(cells), CotangentOp(cells, False)]:
         assert str(op).startswith(f"{type(op).__name__}, which is computed by NumPy: PyTensor's JA")
         assert "use that, or nuts_sampler='nutpie' or 'pymc'" in str(op)
         assert len(str(op)) < 200

@@ -350,7 +350,7 @@ def test_refinement_of_two_correlated_inputs(caplog: pytest.LogCaptureFixture) -
     assert [r.count for r in responses] == [512, 512]
     short = shortcomings(evaluator, thetas)
     assert set(short) == {"sum", "difference"}
-    assert short["sum"].ess is not None
+    assert "weight effective sample size" in str(short["sum"])
     ess = evaluator.support(thetas)["sum"]["weight_ess"]
     assert np.median(ess) < 50  # a single batch from the prior predictive does not do
     with caplog.at_level(logging.INFO, logger="prbayes"):

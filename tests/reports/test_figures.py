@@ -20,12 +20,26 @@ import prbayes as prb
 from prbayes.reports import figures
 from prbayes.reports.material import gather
 
+Calls = dict[str, tuple[tuple[Any, ...], dict[str, Any]]]
 
-def drawn_by(monkeypatch: pytest.MonkeyPatch, functions: dict[str, Any]) -> None:
-    """Put other functions in the place of some pictures, by name."""
-    table = figures.ILLUSTRATIONS
-    new = tuple(replace(i, function=functions.get(i.function.__name__, i.function)) for i in table)
-    monkeypatch.setattr(figures, "ILLUSTRATIONS", new)
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    """Replace all pictures by a recorder of their arguments, by name."""
+    recorded: Calls = {}
+
+    class Picture:
+        def savefig(self, path: Path, **_: Any) -> None:
+            path.write_bytes(b"<svg/>")
+
+    for name, illustration in figures.ILLUSTRATIONS.items():
+
+        def draw(*arguments: Any, name: str = name, **keywords: Any) -> Picture:
+            recorded[name] = arguments, keywords
+            return Picture()
+
+        monkeypatch.setitem(figures.ILLUSTRATIONS, name, replace(illustration, function=draw))
+    return recorded
 
 
 def test_pictures_close_their_figures_and_leave_settings_alone(calibrated: Any) -> None:
@@ -47,83 +61,46 @@ def test_a_picture_that_fails_leaves_a_sentence(
         plt.figure()
         raise error("three hyperparameters")
 
-    drawn_by(monkeypatch, {"plot_validity": fails})
+    illustration = replace(figures.ILLUSTRATIONS["validity"], function=fails)
+    monkeypatch.setitem(figures.ILLUSTRATIONS, "validity", illustration)
     before = plt.get_fignums()
-    made = prb.Report("x", validity=calibrated.test)
-    assert made.sections[-1].text == ("This picture could not be made: three hyperparameters",)
-    assert made.sections[-1].picture is None
+    last = prb.Report("x", validity=calibrated.test).sections[-1]
+    assert last.text == ("This picture could not be made: three hyperparameters",)
+    assert last.picture is None
     assert plt.get_fignums() == before
 
 
-def test_a_mistake_in_a_request_is_no_sentence(
-    monkeypatch: pytest.MonkeyPatch, calibrated: Any
-) -> None:
-    """Only drawing may fail quietly; what a report asks for is its own affair."""
-
-    def wrong(_: Any) -> Any:
-        raise NotImplementedError
-
-    table = figures.ILLUSTRATIONS
-    new = tuple(replace(i, request=wrong) for i in table if i.after == "Validity")
-    monkeypatch.setattr(figures, "ILLUSTRATIONS", new)
-    with pytest.raises(NotImplementedError):
-        prb.Report("x", validity=calibrated.test)
-
-
-def test_each_illustration_gets_what_it_needs(
-    monkeypatch: pytest.MonkeyPatch, calibrated: Any
-) -> None:
+def test_each_illustration_gets_its_arguments(calls: Calls, calibrated: Any) -> None:
     """On results in memory and on files."""
     model, optimum, posterior, test = calibrated
-    called: dict[str, tuple[Any, ...]] = {}
-
-    class Picture:
-        def savefig(self, path: Path, **_: Any) -> None:
-            path.write_bytes(b"<svg/>")
-
-    def drawn(name: str) -> Any:
-        def made(*arguments: Any, **keywords: Any) -> Picture:
-            called[name] = (*arguments, *keywords.values())
-            return Picture()
-
-        return made
-
-    names = {i.function.__name__ for i in figures.ILLUSTRATIONS}
-    drawn_by(monkeypatch, {name: drawn(name) for name in names})
     full = prb.Report("x", model=model, optimum=optimum, posterior=posterior, validity=test)
-    assert set(called) == names - {
-        "plot_outputs",
-        "plot_sensitivity",
-        "plot_prediction",
-    }  # for several outputs; for a decision; for data of a test
-    assert called["plot_responses"] == called["plot_population"] == (posterior, model)
-    assert called["plot_posterior"] == (posterior, optimum, model)
-    assert called["plot_optimizer"] == (optimum, 2)
-    assert called["plot_landscape"] == (optimum, model)
-    assert called["plot_validity"] == (test,)
+    # The others are for several outputs, a decision, and data of a test
+    assert set(calls) == set(figures.ILLUSTRATIONS) - {"outputs", "sensitivity", "prediction"}
+    assert calls["responses"] == calls["population"] == ((posterior,), {"model": model})
+    assert calls["posterior"] == ((posterior,), {"optimum": optimum, "model": model})
+    assert calls["optimizer"] == ((optimum,), {"col_wrap": 2})
+    assert calls["landscape"] == ((optimum,), {"model": model})
+    assert calls["validity"] == ((test,), {})
     titles = [s.title for s in full.sections]
-    for illustration in figures.ILLUSTRATIONS:
-        if illustration.function.__name__ not in called:
-            continue
+    for name in calls:
+        illustration = figures.ILLUSTRATIONS[name]
         before = full.sections[: titles.index(illustration.title)]
-        chapters = [s.title for s in before if s.level == 2]
-        assert chapters[-1] == illustration.after
-    called.clear()
+        assert [s.title for s in before if s.level == 2][-1] == illustration.after
+    calls.clear()
     alone = prb.Report("x", posterior=posterior, optimum=optimum.to_datatree())
-    assert set(called) == {"plot_posterior", "plot_stages", "plot_comparison"}
+    assert set(calls) == {"posterior", "stages", "comparison"}
     assert "Graph" not in [s.title for s in alone.sections]
-    called.clear()
+    calls.clear()
     prb.Report("x", validity={"early": test, "late": test})
-    assert called == {"plot_validity": ({"early": test, "late": test},)}
+    assert calls == {"validity": (({"early": test, "late": test},), {})}
 
 
-def test_a_report_computes_no_response(monkeypatch: pytest.MonkeyPatch, section: Any) -> None:
-    drawn_by(monkeypatch, {"plot_responses": lambda *_, **__: pytest.fail("drawn")})
-    calls = 0
+def test_a_report_computes_no_response(calls: Calls, section: Any) -> None:
+    count = 0
 
     def response(x: Any) -> Any:
-        nonlocal calls
-        calls += np.size(x)
+        nonlocal count
+        count += np.size(x)
         return 2 * x
 
     with pm.Model() as model:
@@ -133,9 +110,10 @@ def test_a_report_computes_no_response(monkeypatch: pytest.MonkeyPatch, section:
             "y", response, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0], propagation=once
         )
     optimum = prb.minimize(model)
-    before, counted = calls, optimum.evaluator.n_responses
+    before = count, optimum.evaluator.n_responses
     made = prb.Report("x", model=model, optimum=optimum)
-    assert (calls, optimum.evaluator.n_responses) == (before, counted)
+    assert (count, optimum.evaluator.n_responses) == before
+    assert "responses" not in calls
     assert "Graph" not in [s.title for s in made.sections]
     text = section(made, "Measured and calibrated responses").text
     assert text == (
@@ -229,81 +207,39 @@ def test_the_graph_is_the_same_in_every_process(monkeypatch: pytest.MonkeyPatch)
     assert sources[0][0] == [["z", "b", "y", "a"], ["s"]]
 
 
-def test_pairs_of_outputs_are_drawn_where_responses_are_stored(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """And else one sentence says that they are not, for all pictures of responses."""
-    asked = []
+def pair_of(a: Any, b: Any) -> Any:
+    return np.stack([a, b], axis=-1)
 
-    class Picture:
-        def savefig(self, path: Path, **_: Any) -> None:
-            path.write_bytes(b"<svg/>")
 
-    def draw(*arguments: Any, **_: Any) -> Any:
-        asked.append(arguments)
-        return Picture()
-
-    drawn_by(monkeypatch, {"plot_outputs": draw, "plot_responses": draw})
+def test_pairs_of_outputs_are_drawn_where_responses_are_stored(calls: Calls) -> None:
+    """Otherwise one sentence reports that all pictures of responses are missing."""
     data = np.random.default_rng(1).normal(size=(10, 2))
     draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((2, 20)))})
     posterior = xr.DataTree.from_dict({"posterior": draws})
+    titles = ["Measured and calibrated responses", "Pairs of outputs"]
     for propagation, count in ((prb.Reweighted(256), 2), (prb.Resimulated(64), 0)):
         with pm.Model() as model:
             a = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+            given: Any = {"metric": prb.Joint(prb.AreaMetric()), "propagation": propagation}
             b = pm.Normal.dist(0.0, 1.0)
-            prb.Simulator(
-                "y",
-                lambda a, b: np.stack([a, b], axis=-1),
-                *(a, b),
-                metric=prb.Joint(prb.AreaMetric()),
-                observed=data,
-                propagation=propagation,
-            )
-        asked.clear()
-        material = gather(model, None, posterior, None, None)
-        made = figures.illustrate((prb.reports.Section("Data"),), material)
-        assert len(asked) == count
-        assert [section.title for section in made[1:]] == (
-            ["Measured and calibrated responses", "Pairs of outputs"][: max(count, 1)]
-        )
+            prb.Simulator("y", pair_of, a, b, observed=data, **given)
+        calls.clear()
+        made = figures.illustrate((prb.reports.Section("Data"),), gather(model, None, posterior))
+        assert len(calls) == count
+        assert [section.title for section in made[1:]] == titles[: max(count, 1)]
 
 
-def test_labels_reach_the_pictures_that_know_the_names(
-    monkeypatch: pytest.MonkeyPatch, calibrated: Any
-) -> None:
-    model, optimum, posterior, test = calibrated
-    given: dict[str, Any] = {}
-
-    class Picture:
-        def savefig(self, path: Path, **_: Any) -> None:
-            path.write_bytes(b"<svg/>")
-
-    def drawn(name: str) -> Any:
-        def made(*_: Any, labels: Any = None, **__: Any) -> Picture:
-            given[name] = labels
-            return Picture()
-
-        return made
-
-    names = {i.function.__name__ for i in figures.ILLUSTRATIONS}
-    drawn_by(monkeypatch, {name: drawn(name) for name in names})
+def test_labels_reach_the_pictures_with_their_names(calls: Calls, calibrated: Any) -> None:
+    model, optimum, posterior, _ = calibrated
     x = pm.Normal.dist(model["mu"], model["sigma"])
     later = prb.predict(posterior, np.positive, x, model=model, n_draws=20)
     warm = np.array([1.0, 2.0, 2.5])
-    test = prb.area_test(warm, later, null=prb.validation.PosteriorNull(199))
     labels = {"mu": "mean", "y": "stiffness (N/mm)", "hot": "at 200 °C"}
-    of_model = {"mu": "mean", "y": "stiffness (N/mm)"}
-    prb.Report(
-        "x",
-        model=model,
-        optimum=optimum,
-        posterior=posterior,
-        validity=test,
-        validation={"hot": (warm, later)},
-        labels=labels,
-    )
-    assert given["plot_responses"] == given["plot_landscape"] == of_model
-    assert given["plot_comparison"] == {"mu": "mean"}
-    assert given["plot_prediction"] == {"hot": "at 200 °C"}
+    results = {"model": model, "optimum": optimum, "posterior": posterior}
+    prb.Report("x", **results, validation={"hot": (warm, later)}, labels=labels)
+    given = {name: keywords.get("labels") for name, (_, keywords) in calls.items()}
+    assert given["responses"] == given["landscape"] == {"mu": "mean", "y": "stiffness (N/mm)"}
+    assert given["comparison"] == {"mu": "mean"}
+    assert given["prediction"] == {"hot": "at 200 °C"}
     with pytest.raises(KeyError, match="labels: got 'nu'"):
         prb.Report("x", model=model, optimum=optimum, labels={"nu": "typing error"})

@@ -24,9 +24,9 @@ def test_text_becomes_paragraphs() -> None:
 
 def test_a_picture_is_kept_as_bytes_of_its_kind(picture_bytes: bytes) -> None:
     made = prb.reports.Section("x", picture=picture_bytes, alt="A line.")
-    assert (made.kind, made.media_type) == ("svg", "image/svg+xml")
+    assert made.kind == "svg"
     pixels = prb.reports.Section("x", picture=b"\x89PNG\r\n\x1a\n", alt="A line.")
-    assert (pixels.kind, pixels.media_type) == ("png", "image/png")
+    assert pixels.kind == "png"
     with pytest.raises(ValueError, match="got no picture"):
         _ = prb.reports.Section("x").kind
 
@@ -57,17 +57,13 @@ def test_a_section_is_immutable_and_replaced_as_a_whole(picture_bytes: bytes) ->
         ({"picture": b"\x89PNG\r\n", "alt": " "}, "alt: got nothing"),
         ({"text": (3,)}, "expected a text"),
         ({"level": 1}, "expected 2, or 3"),
+        ({"title": " "}, "title: got"),
+        ({"title": None}, "title: got"),
     ],
 )
 def test_refusals(keywords: dict[str, Any], words: str) -> None:
     with pytest.raises((TypeError, ValueError), match=words):
-        prb.reports.Section("x", **keywords)
-
-
-@pytest.mark.parametrize("title", ["", " ", None])
-def test_a_section_has_a_title(title: Any) -> None:
-    with pytest.raises(TypeError, match="title: got"):
-        prb.reports.Section(title)
+        prb.reports.Section(**({"title": "x"} | keywords))
 
 
 class Drawing:
@@ -94,12 +90,8 @@ class Drawing:
 def test_kinds(beginning: bytes, kind: tuple[str, str]) -> None:
     assert kind_of(beginning) == kind
     assert image(beginning) == beginning
-
-
-@pytest.mark.parametrize("wrong", [b"", b"GIF89a", b"text".ljust(3000) + b"<svg/>"])
-def test_other_bytes_are_refused(wrong: bytes) -> None:
     with pytest.raises(ValueError, match="expected SVG, PNG or JPEG"):
-        image(wrong)
+        image(b"text".ljust(3000) + beginning)
 
 
 def test_a_large_drawing_is_kept_as_pixels() -> None:

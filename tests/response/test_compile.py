@@ -25,8 +25,6 @@ from prbayes.response.compile import (
     compile_batched,
     compiled,
     interpreted,
-    ninf_for_invalid,
-    with_leading_axis,
 )
 from prbayes.response.distributions import PriorSampler
 
@@ -113,20 +111,6 @@ def test_a_choice_that_is_the_same_throughout_has_the_shape_and_type_of_others(
     np.testing.assert_array_equal(function(choice, x, c, n)[0], expected[0])
 
 
-def test_a_graph_without_checks_stays_as_it_is() -> None:
-    x = pt.dscalar("x")
-    graph = 2 * x
-    assert ninf_for_invalid([graph]) == [graph]
-
-
-def test_a_leading_axis_keeps_name_type_and_shape() -> None:
-    symbols = [pt.dscalar("a"), pt.tensor("b", dtype="int64", shape=(3,))]
-    batched = with_leading_axis(symbols)
-    assert [b.name for b in batched] == ["a", "b"]
-    assert [b.dtype for b in batched] == ["float64", "int64"]
-    assert [b.type.shape for b in batched] == [(None,), (None, 3)]
-
-
 # -- once ------------------------------------------------------------------------------------------
 
 
@@ -170,16 +154,6 @@ def test_another_graph_is_compiled_for_itself(
     assert len(compilations) == 2
     given = ([2.0], [1.0]) if "vector" in change else (2.0, 1.0)
     np.testing.assert_array_equal(np.ravel(other(*given)), [found])
-
-
-def test_which_variable_goes_where_is_told_apart(compilations: list[Any]) -> None:
-    for pick in ((0, 1), (1, 0), (0, 0)):
-        x, y = pt.dscalar(), pt.dscalar()
-        a, b = pt.exp(x), pt.exp(y)
-        (found,) = compiled([x, y], [(a, b)[pick[0]] / (1 + (a, b)[pick[1]])])(0.0, 1.0)
-        numbers = np.exp([0.0, 1.0])
-        assert found == pytest.approx(numbers[pick[0]] / (1 + numbers[pick[1]]))
-    assert len(compilations) == 3
 
 
 def test_functions_of_one_graph_share_no_memory(compilations: list[Any]) -> None:
@@ -297,18 +271,6 @@ def test_no_compiler_is_called_for_a_prior_of_correlations(monkeypatch: pytest.M
         pm.LKJCholeskyCov("chol", n=3, eta=2, sd_dist=deviations)
     (packed,) = PriorSampler(model.free_RVs)(4, 0)
     assert packed.shape == (4, 6)
-    assert pytensor.config.cxx == before
-
-
-def test_threads_leave_the_compiler_as_they_found_it() -> None:
-    before = pytensor.config.cxx
-
-    def compile_one(k: int) -> float:
-        x = pt.dscalar("x")
-        return float(compiled([x], [x + k + 0.125])(1.0)[0])
-
-    with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(compile_one, range(8))) == [k + 1.125 for k in range(8)]
     assert pytensor.config.cxx == before
 
 

@@ -89,7 +89,7 @@ def test_a_function_of_one_specimen_stays_one() -> None:
 
 def test_a_mapping_is_refused() -> None:
     named = prb.response.Additive([0.0, 1.0]).of(lambda x: {"a": x}, 1.0)
-    with pytest.raises(TypeError, match="got a mapping, expected an array of outputs"):
+    with pytest.raises(TypeError, match="got a mapping, expected an array with an output"):
         named(1.0, 2.0)
 
 

@@ -211,7 +211,7 @@ def test_a_distribution_without_density_says_nothing_of_its_parameters() -> None
         lambda mu, sigma: [pm.CustomDist.dist(mu, dist=lambda mu, size: mu + pm.Gamma.dist(2, 1))]
     )
     refuse_without_density("y", sum_of_two)
-    with pytest.raises(TypeError, match=r"y: got CustomDist.* no density, .*prb.Fresh\(\)"):
+    with pytest.raises(TypeError, match=r"y: got CustomDist.*no density, .*prb.Fresh\(\)"):
         refuse_without_density("y", inputs)
 
 
@@ -270,7 +270,7 @@ def test_what_has_no_density_is_refused() -> None:
             pm.Truncated.dist(pm.SkewNormal.dist(mu=mu, sigma=sigma, alpha=1.0), lower=0.0)
         ]
     )
-    with pytest.raises(TypeError, match=r"y: got Trunc.* PyMC has no density.* expected one .*"):
+    with pytest.raises(TypeError, match=r"y: got Trunc.*PyMC has no density, expected one"):
         refuse_without_density("y", inputs)
 
 

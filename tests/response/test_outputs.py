@@ -40,9 +40,7 @@ def test_a_mask_is_a_missing_output():
 )
 def test_a_column_of_no_numbers_is_named(names):
     table = pd.DataFrame({"supplier": names, "life": [1.0, 2.0]})
-    with pytest.raises(
-        TypeError, match=r"y: .*columns \['supplier'\] hold no numbers.*group\('sup"
-    ):
+    with pytest.raises(TypeError, match=r"y: .*columns \['supplier'\] are no numbers.*group\('sup"):
         read_observed("y", table)
     # Numbers may be objects.
     values, outputs = read_observed("y", table[["life"]].astype(object))

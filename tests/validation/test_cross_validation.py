@@ -18,16 +18,48 @@ DATA = np.exp(np.random.default_rng(0).normal(0.0, 0.7, 60))
 METRIC = prb.AreaMetric()
 
 
-def lognormal_model(data: Any = DATA, family: Any = pm.LogNormal, **keywords: Any) -> pm.Model:
+QUIET: dict[str, Any] = {"progressbar": False}
+
+
+def normal(mean: Any, sd: Any) -> Any:
+    return pm.Normal.dist(mean, sd)
+
+
+def lognormal(mean: Any, sd: Any) -> Any:
+    variance = pm.math.log1p((sd / mean) ** 2)
+    return pm.LogNormal.dist(pm.math.log(mean) - variance / 2, pm.math.sqrt(variance))
+
+
+def minimized(
+    family: Any = lognormal,
+    data: Any = DATA,
+    response: Any = np.positive,
+    metric: Any = None,
+    propagation: Any = None,
+    **options: Any,
+) -> prb.Optimum:
     with pm.Model() as model:
-        x = family.dist(pm.Normal("mu", 0.5, 1), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", np.positive, x, metric=METRIC, observed=data, **keywords)
-    return model
+        x = family(pm.TruncatedNormal("mean", 1.2, 0.5, lower=0.1), pm.HalfNormal("sd", 1.0))
+        prb.Simulator(
+            "y", response, x, metric=metric or prb.KullbackLeibler(), observed=data,
+            propagation=propagation or prb.Reweighted(512), **QUIET,
+        )  # fmt: skip
+    return prb.minimize(model, refine=False, starts=0, **options, **QUIET)
 
 
 @cache
-def optimum(family: Any = pm.LogNormal) -> prb.Optimum:
-    return prb.minimize(lognormal_model(family=family))
+def optimum(family: Any = lognormal) -> prb.Optimum:
+    return minimized(family, metric=METRIC)
+
+
+@cache
+def skewed() -> dict[str, prb.Optimum]:
+    return {f.__name__: minimized(f) for f in (normal, lognormal)}
+
+
+@cache
+def validated(label: str, folds: int = 5) -> xr.Dataset:
+    return prb.cross_validate(skewed()[label], folds=folds, random_seed=0, **QUIET)
 
 
 @pytest.mark.long
@@ -40,50 +72,24 @@ def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
     assert found.converged.all()
     fold = np.random.default_rng([3, 3]).permutation(np.arange(60) % 4)
     for i in (0, 3):
-        other = prb.minimize(lognormal_model(DATA[fold != i]))
-        assert float(found.calibrated[i, 0]) == pytest.approx(other.discrepancy, rel=0.01)
-        z = np.random.default_rng(1).normal(size=400_000)
-        population = np.exp(other.point["mu"] + other.point["sigma"] * z)
-        assert float(found.discrepancy[i, 0]) == pytest.approx(
-            METRIC(population, DATA[fold == i]), rel=0.03
-        )
-
-
-@pytest.mark.long
-def test_the_wrong_family_predicts_worse() -> None:
-    right, wrong = (prb.cross_validate(optimum(f)) for f in (pm.LogNormal, pm.Normal))
-    assert float(wrong.discrepancy.mean()) > 1.1 * float(right.discrepancy.mean())
-    assert float(right.discrepancy.mean()) > float(right.calibrated.mean())
-
-
-@pytest.mark.long
-def test_specimens_are_dealt_out_whole() -> None:
-    with pm.Model() as model:
-        x = pm.LogNormal.dist(pm.Normal("mu", 0.5, 1), pm.HalfNormal("sigma", 1))
-        for name, f, size in (("first", np.positive, 60), ("second", np.sqrt, 50)):
-            prb.Simulator(
-                name, f, x, metric=METRIC, observed=f(DATA[:size]), specimens=np.arange(size)
-            )
-    found = prb.cross_validate(prb.minimize(model), folds=5)
-    assert found.n_held_out.sum("fold").values.tolist() == [60, 50]
-    fold = np.random.default_rng([0, 3]).permutation(np.arange(60) % 5)
-    np.testing.assert_array_equal(
-        found.n_held_out.sel(simulator="second"), np.bincount(fold[:50], minlength=5)
-    )
+        refit = minimized(data=DATA[fold != i], metric=METRIC)
+        assert float(found.calibrated[i, 0]) == pytest.approx(refit.discrepancy, rel=0.01)
+        (x,) = refit.evaluator.nodes[0].inputs.aleatory
+        population = prb.predict(refit, np.positive, x, n_samples=40_000, **QUIET).values.ravel()
+        expected = METRIC(population, DATA[fold == i])
+        assert float(found.discrepancy[i, 0]) == pytest.approx(expected, rel=0.03)
+    wrong = prb.cross_validate(optimum(normal), folds=4, random_seed=3)
+    assert float(wrong.discrepancy.mean()) > 1.1 * float(found.discrepancy.mean())
+    assert float(found.discrepancy.mean()) > float(found.calibrated.mean())
 
 
 def test_few_specimens_have_fewer_folds() -> None:
-    with pm.Model() as model:
-        x = pm.LogNormal.dist(pm.Normal("mu", 0.5, 1), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", np.positive, x, metric=METRIC, observed=DATA[:9])
-    few = prb.minimize(model)
+    few = minimized(data=DATA[:9], metric=METRIC)
     assert prb.cross_validate(few).sizes["fold"] == 4
-    assert prb.cross_validate(optimum()).sizes["fold"] == 5
-    table = prb.rank({"one": few, "other": few})
+    table = prb.rank({"a": few, "b": few})
     assert table.attrs["folds"] == 4
-    # Those that are there already say how many.
-    three = prb.cross_validate(few, folds=3)
-    table = prb.rank({"one": three, "other": few})
+    # Cross-validations among the candidates have a number of folds.
+    table = prb.rank({"a": prb.cross_validate(few, folds=3), "b": few})
     assert table.attrs["folds"] == 3
 
 
@@ -91,55 +97,14 @@ def test_refusals_of_cross_validation() -> None:
     with pytest.raises(TypeError, match="got dict, expected an Optimum"):
         prb.cross_validate({})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="folds: got 1"):
-        prb.cross_validate(optimum(), folds=1)
+        prb.cross_validate(skewed()["normal"], folds=1)
     with pytest.raises(ValueError, match="folds: got 40 for 60 specimens, expected at most 30"):
-        prb.cross_validate(optimum(), folds=40)
-    few = {"method": "Nelder-Mead", "starts": 0, "max_evaluations": 50}
-    fresh = prb.minimize(lognormal_model(propagation=prb.Fresh(60)), **few)
-    with pytest.raises(ValueError, match="cannot be calibrated anew"):
-        prb.cross_validate(fresh)
-
-
-compare = prb.rank
-NARROW = np.random.default_rng(2).normal(1.0, 0.1, 30)
-QUIET = {"progressbar": False}
-
-
-def normal(mean: Any, sd: Any) -> Any:
-    return pm.Normal.dist(mean, sd)
-
-
-def lognormal(mean: Any, sd: Any) -> Any:
-    variance = pm.math.log1p((sd / mean) ** 2)
-    return pm.LogNormal.dist(pm.math.log(mean) - variance / 2, pm.math.sqrt(variance))
-
-
-def build(family: Any, data: Any, response: Any = np.positive, **keywords: Any) -> pm.Model:
-    with pm.Model() as model:
-        mean = pm.TruncatedNormal("mean", 1.2, 0.5, lower=0.1)
-        x = family(mean, pm.HalfNormal("sd", 1.0))
-        given: dict[str, Any] = {"metric": prb.KullbackLeibler(), "observed": data} | keywords
-        prb.Simulator("y", response, x, propagation=prb.Reweighted(512), **given, **QUIET)
-    return model
-
-
-def minimized(family: Any, data: Any, response: Any = np.positive, **keywords: Any) -> prb.Optimum:
-    return prb.minimize(build(family, data, response, **keywords), refine=False, **QUIET)
-
-
-@cache
-def skewed() -> dict[str, prb.Optimum]:
-    return {f.__name__: minimized(f, DATA) for f in (normal, lognormal)}
-
-
-@cache
-def narrow() -> dict[str, prb.Optimum]:
-    return {f.__name__: minimized(f, NARROW) for f in (normal, lognormal)}
-
-
-@cache
-def validated(label: str, folds: int = 5, random_seed: int = 0) -> xr.Dataset:
-    return prb.cross_validate(skewed()[label], folds=folds, random_seed=random_seed, **QUIET)
+        prb.cross_validate(skewed()["normal"], folds=40)
+    simplex = {"method": "Nelder-Mead", "max_evaluations": 50}
+    fresh = minimized(metric=METRIC, propagation=prb.Fresh(60), **simplex)
+    for function, argument in ((prb.cross_validate, fresh), (prb.rank, {"a": fresh, "b": fresh})):
+        with pytest.raises(ValueError, match=r"cross_validate: .*cannot be recalibrated"):
+            function(argument)  # type: ignore[operator]
 
 
 def scored(scores: Any, weights: Any = None) -> xr.Dataset:
@@ -159,48 +124,40 @@ def scored(scores: Any, weights: Any = None) -> xr.Dataset:
 
 
 @pytest.mark.long
-def test_the_right_family_is_told_and_families_alike_are_not() -> None:
-    table = compare(skewed(), **QUIET)
+def test_the_right_family_is_identified_and_families_alike_are_not() -> None:
+    table = prb.rank(skewed(), **QUIET)
     assert table.candidate.values.tolist() == ["lognormal", "normal"]
     assert table.told_apart.values.tolist() == [False, True]
     by = f"{float(table.difference[1]):.1f} nats (standard error {float(table.stderr[1]):.1f})"
     assert table.attrs["verdict"] == f"lognormal predicts better than normal by {by}"
     assert table.to_dataframe().shape == (2, 6)
-    alike = compare(narrow(), **QUIET)
+    narrow = np.random.default_rng(2).normal(1.0, 0.1, 30)
+    alike = prb.rank({f.__name__: minimized(f, narrow) for f in (normal, lognormal)}, **QUIET)
     assert not alike.told_apart.any()
-    best, other = alike.candidate.values
-    assert alike.attrs["verdict"].startswith(
-        f"the data cannot tell {best} and {other} apart: {best} is ahead by "
-    )
+    best, second = alike.candidate.values
+    assert alike.attrs["verdict"].startswith(f"the data cannot tell {best} and {second} apart: ")
 
 
 @pytest.mark.long
 def test_optima_are_cross_validated_alike() -> None:
-    by_optima = compare(skewed(), folds=5, random_seed=0, **QUIET)
-    by_folds = compare({label: validated(label) for label in skewed()})
+    by_optima = prb.rank(skewed(), folds=5, random_seed=0, **QUIET)
+    by_folds = prb.rank({label: validated(label) for label in skewed()})
     xr.testing.assert_identical(by_optima, by_folds)
-    other = compare(skewed(), folds=5, random_seed=1, **QUIET)
+    other = prb.rank(skewed(), folds=5, random_seed=1, **QUIET)
     assert float(other.difference[1]) != float(by_folds.difference[1])
 
 
 @pytest.mark.long
 def test_the_numbers_are_those_of_arviz() -> None:
     found = {label: validated(label) for label in skewed()}
-    table = compare(found)
-    elpds = {}
-    for label, one in found.items():
-        score = one.score
-        elpds[label] = ELPDData(
-            elpd=float(score.sum()),
-            se=1.0,
-            p=2.0,
-            n_samples=1,
-            n_data_points=score.size,
-            scale="log",
-            warning=False,
-            good_k=0.7,
-            elpd_i=score,
+    table = prb.rank(found)
+    options = {"se": 1.0, "p": 2.0, "n_samples": 1, "scale": "log", "warning": False, "good_k": 0.7}
+    elpds = {
+        label: ELPDData(
+            elpd=float(table.score.sum()), n_data_points=60, elpd_i=table.score, **options
         )
+        for label, table in found.items()
+    }
     theirs = arviz_compare(elpds, method="pseudo-BMA", round_to="none")
     assert theirs.index.tolist() == table.candidate.values.tolist()
     # ArviZ divides by n, this by n - 1.
@@ -210,39 +167,32 @@ def test_the_numbers_are_those_of_arviz() -> None:
     np.testing.assert_allclose(table["stderr"], dse, rtol=1e-6)
 
 
-def test_a_score_is_that_of_a_population_that_has_not_seen_the_specimen() -> None:
-    found = validated("lognormal")
+def test_a_score_is_that_of_a_population_that_was_calibrated_without_the_specimen() -> None:
     fold = np.random.default_rng([0, 3]).permutation(np.arange(60) % 5)
     out = np.flatnonzero(fold == 2)
-    other = minimized(lognormal, DATA[fold != 2])
-    population = prb.predict(other, np.positive, _input(other), n_samples=20_000, **QUIET)
+    refit = minimized(data=DATA[fold != 2])
+    values, weights = refit.evaluator.populations(refit.theta[None], 0)
     target = scoring_target(DATA, np.full(60, 1 / 60))
-    values = population.values.ravel()
-    expected = log_scores(target, values, np.full(values.size, 1 / values.size), out)
-    np.testing.assert_allclose(found.score.values[out], expected, atol=0.1)
-
-
-def _input(optimum: prb.Optimum) -> Any:
-    return optimum.evaluator.nodes[0].bound.inputs.aleatory[0]
+    expected = log_scores(target, values[0], weights[0], out)
+    np.testing.assert_allclose(validated("lognormal").score.values[out], expected, atol=0.1)
 
 
 def test_the_error_of_equal_weights_is_the_usual_one_and_ties_are_no_preference() -> None:
     a, b = np.random.default_rng(3).normal(size=(2, 25))
-    table = compare({"a": scored(a), "b": scored(b)})
+    table = prb.rank({"a": scored(a), "b": scored(b)})
     expected = np.std(a - b, ddof=1) * 5
     assert table["stderr"].values.max() == pytest.approx(expected)
-    same = compare({"a": scored(a), "b": scored(a)})
+    same = prb.rank({"a": scored(a), "b": scored(a)})
     assert same.difference.values.tolist() == [0, 0]
     assert not same.told_apart.any()
 
 
-def test_specimens_that_count_more_are_as_many() -> None:
-    d = np.random.default_rng(5).normal(0.3, 1.0, 40)
+def test_the_difference_of_specimens_with_weights() -> None:
     weights = np.repeat([1.0, 3.0], 20)
     # A constant advantage for each observation has no error, however they are weighted.
-    constant = compare({"a": scored(0.2 * weights, weights), "b": scored(0 * d, weights)})
-    assert constant["stderr"].values.max() == pytest.approx(0, abs=1e-12)
-    assert constant.told_apart.values.tolist() == [False, True]
+    table = prb.rank({"a": scored(0.2 * weights, weights), "b": scored(np.zeros(40), weights)})
+    assert table["stderr"].values.max() == pytest.approx(0, abs=1e-12)
+    assert table.told_apart.values.tolist() == [False, True]
 
 
 def test_more_candidates_ask_for_more() -> None:
@@ -251,37 +201,37 @@ def test_more_candidates_ask_for_more() -> None:
     noise = (noise - noise.mean()) / noise.std(ddof=1)
     # Ahead by 2.2 standard errors.
     ahead = noise + 2.2 / np.sqrt(400)
-    two = compare({"a": scored(ahead), "b": scored(0 * noise)})
+    two = prb.rank({"a": scored(ahead), "b": scored(0 * noise)})
     assert two.told_apart.any()
-    three = compare({"a": scored(ahead), "b": scored(0 * noise), "c": scored(0 * noise)})
+    three = prb.rank({"a": scored(ahead), "b": scored(0 * noise), "c": scored(0 * noise)})
     assert not three.told_apart.any()
     assert three.attrs["verdict"].count("cannot tell") == 2
 
 
 @pytest.mark.long
 def test_two_responses_of_several_simulators_with_labels_and_weights() -> None:
-    def bent(x: Any) -> Any:
-        return 1.5 * x**2
+    weights = np.random.default_rng(1).uniform(0.5, 1.5, 60)
+    data = {"first": DATA, "second": 1.5 * DATA[:50] ** 2}
 
     def model_of(response: Any) -> prb.Optimum:
-        weights = np.random.default_rng(1).uniform(0.5, 1.5, 60)
         with pm.Model() as model:
             x = lognormal(pm.TruncatedNormal("mean", 1.2, 0.5, lower=0.1), pm.HalfNormal("sd", 1))
-            for name, f, size in (("first", np.positive, 60), ("second", response, 50)):
+            for name, function in {"first": np.positive, "second": response}.items():
+                n = len(data[name])
                 prb.Simulator(
-                    name,
-                    f,
-                    x,
-                    metric=prb.KullbackLeibler(),
-                    observed=(DATA if name == "first" else 1.5 * DATA**2)[:size],
-                    specimens=np.arange(size),
-                    weights=weights[:size],
-                    propagation=prb.Reweighted(512),
-                    **QUIET,
-                )
+                    name, function, x, metric=prb.KullbackLeibler(), observed=data[name],
+                    specimens=np.arange(n), weights=weights[:n],
+                    propagation=prb.Reweighted(512), **QUIET,
+                )  # fmt: skip
         return prb.minimize(model, refine=False, **QUIET)
 
-    table = compare({"bent": model_of(bent), "straight": model_of(lambda x: 2.0 * x)}, **QUIET)
+    optima = {"bent": model_of(lambda x: 1.5 * x**2), "straight": model_of(lambda x: 2.0 * x)}
+    # Specimens are assigned to folds whole.
+    folds = prb.cross_validate(optima["bent"], folds=5).n_held_out
+    fold = np.random.default_rng([0, 3]).permutation(np.arange(60) % 5)
+    expected = [np.bincount(fold[:n], minlength=5) for n in (60, 50)]
+    np.testing.assert_array_equal(folds.values.T, expected)
+    table = prb.rank(optima, **QUIET)
     assert table.candidate.values[0] == "bent"
     assert table.told_apart.values.tolist() == [False, True]
     assert table.attrs["n_specimens"] == 60
@@ -297,7 +247,7 @@ def test_several_outputs_with_some_not_measured_and_some_failed() -> None:
     assert np.isposinf(data).any()
     metric = prb.Joint(prb.KullbackLeibler())
     optima = {f.__name__: minimized(f, data, outputs, metric=metric) for f in (normal, lognormal)}
-    table = compare(optima, **QUIET)
+    table = prb.rank(optima, **QUIET)
     assert table.candidate.values[0] == "lognormal"
     assert np.isfinite(table["stderr"].values).all()
     assert table.attrs["n_specimens"] == 60
@@ -305,19 +255,12 @@ def test_several_outputs_with_some_not_measured_and_some_failed() -> None:
 
 @pytest.mark.long
 def test_any_metric_and_propagation_that_can_be_refitted() -> None:
-    resimulated = prb.Resimulated(2000)
-    with pm.Model() as model:
-        x = lognormal(pm.TruncatedNormal("mean", 1.2, 0.5, lower=0.1), pm.HalfNormal("sd", 1.0))
-        prb.Simulator(
-            "y", np.positive, x, metric=prb.KullbackLeibler(), observed=DATA,
-            propagation=resimulated, **QUIET,
-        )  # fmt: skip
     candidates = {
         "stored": skewed()["lognormal"],
-        "computed": prb.minimize(model, **QUIET),
-        "normal, PR": minimized(normal, DATA, metric=prb.ProbabilityResidual()),
+        "computed": minimized(propagation=prb.Resimulated(2000)),
+        "normal, PR": minimized(normal, metric=prb.ProbabilityResidual()),
     }
-    table = compare(candidates, **QUIET)
+    table = prb.rank(candidates, **QUIET)
     assert table.candidate.values[-1] == "normal, PR"
     assert not table.told_apart.values[1]
     assert float(table.difference[1]) < 1
@@ -325,51 +268,34 @@ def test_any_metric_and_propagation_that_can_be_refitted() -> None:
 
 def test_refusals_of_a_ranking() -> None:
     first = validated("normal")
-    with pytest.raises(TypeError, match=r"(?s)candidates: got list .*expected a mapping such as"):
-        compare([first, first])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"got \['a'\], expected at least two"):
-        compare({"a": first})
-    with pytest.raises(TypeError, match=r"(?s)candidates: b: got .*expected an Optimum or what"):
-        compare({"a": first, "b": first[["discrepancy"]]})
-    with pytest.raises(ValueError, match="got b with folds 4 and a with 5, expected the same"):
-        compare({"a": first, "b": first.isel(fold=slice(4))})
-    with pytest.raises(
-        ValueError, match="got b with random_seed 1 and a with 0, expected the same"
+    seeded = first.assign_attrs(random_seed="1")
+    reordered = first.assign(data=("simulator", ["another digest"]))
+    for candidates, error, words in (
+        ([first, first], TypeError, r"(?s)candidates: got list .*expected a mapping such as"),
+        ({"a": first}, ValueError, r"got \['a'\], expected at least two"),
+        ({1: first, 2: first}, TypeError, "got label 1, expected a text"),
+        ({"a": first, "b": first[["discrepancy"]]}, TypeError, "(?s)candidates: b: got .*Optimum"),
+        ({"a": first, "b": first.isel(fold=slice(4))}, ValueError, "b with folds 4 and a with 5"),
+        ({"a": first, "b": seeded}, ValueError, "b with random_seed 1 and a with 0"),
+        ({"a": first, "b": reordered}, ValueError, "different observed values, weights or labels"),
+        (
+            {"a": first, "b": first.assign_coords(simulator=["z"])},
+            ValueError,
+            r"b with simulators \['z'\] and a with \['y'\]",
+        ),
     ):
-        compare({"a": first, "b": first.assign_attrs(random_seed="1")})
-    other = prb.cross_validate(minimized(normal, DATA[::-1]), **QUIET)
-    with pytest.raises(
-        ValueError, match="b and a with different observed values, weights or labels of y, or in"
-    ):
-        compare({"a": first, "b": other})
-    renamed = first.assign_coords(simulator=["z"])
-    with pytest.raises(ValueError, match=r"b with simulators \['z'\] and a with \['y'\]"):
-        compare({"a": first, "b": renamed})
-    model = _with_propagation(prb.Fresh(60))
-    fresh = prb.minimize(model, method="Nelder-Mead", max_evaluations=50, **QUIET)
-    with pytest.raises(ValueError, match=r"cross_validate: .*cannot be calibrated anew"):
-        compare({"a": fresh, "b": fresh})
-
-
-def _with_propagation(propagation: Any) -> pm.Model:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        prb.Simulator(
-            "y", np.positive, x, metric=prb.AreaMetric(), observed=DATA,
-            propagation=propagation, **QUIET,
-        )  # fmt: skip
-    return model
+        with pytest.raises(error, match=words):
+            prb.rank(candidates)  # type: ignore[arg-type]
 
 
 def test_equal_observations_have_no_score() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=np.ones(12), **QUIET)
-    found = prb.cross_validate(prb.minimize(model, refine=False, **QUIET), **QUIET)
+    found = prb.cross_validate(minimized(normal, np.ones(12), metric=METRIC), **QUIET)
     assert found.score.isnull().all()
     assert found.discrepancy.notnull().all()
     with pytest.raises(ValueError, match="a without a score of 12 of 12 specimens"):
-        compare({"a": found, "b": found})
+        prb.rank({"a": found, "b": found})
+    with pytest.raises(ValueError, match="bandwidth: got 0"):
+        scoring_target(np.ones(9), np.full(9, 1 / 9))
 
 
 RNG = np.random.default_rng(4)
@@ -387,14 +313,13 @@ def test_a_score_is_the_log_density_of_a_normal_population() -> None:
     assert found.mean() == pytest.approx(norm.logpdf(READINGS, 3.0, 2.0).mean(), abs=0.02)
 
 
-def test_differences_do_not_depend_on_the_unit() -> None:
-    other = 1.3 * POPULATION
-    mine, theirs = (
-        log_scores(scoring_target(READINGS, EQUAL), p, ALIKE, EVERY) for p in (POPULATION, other)
-    )
-    scaled = scoring_target(1000 * READINGS, EQUAL)
-    a, b = (log_scores(scaled, 1000 * p, ALIKE, EVERY) for p in (POPULATION, other))
-    np.testing.assert_allclose(a - b, mine - theirs, atol=1e-9)
+def test_differences_of_scores_do_not_depend_on_the_unit() -> None:
+    differences = []
+    for unit in (1, 1000):
+        target = scoring_target(unit * READINGS, EQUAL)
+        a, b = (log_scores(target, unit * f * POPULATION, ALIKE, EVERY) for f in (1.0, 1.3))
+        differences.append(a - b)
+    np.testing.assert_allclose(*differences, atol=1e-9)
 
 
 @pytest.mark.parametrize("outputs", [1, 3])
@@ -416,24 +341,19 @@ def test_their_sum_is_what_the_log_likelihood_has_of_all(
     assert found.mean() == pytest.approx(expected, abs=0.01)
 
 
-def test_rows_are_scored_by_themselves() -> None:
-    scoring = scoring_target(READINGS, EQUAL)
-    every = log_scores(scoring, POPULATION, ALIKE, EVERY)
-    rows = np.array([7, 2, 30])
-    # Products of matrices of other shapes round differently.
-    found = log_scores(scoring, POPULATION, ALIKE, rows)
-    np.testing.assert_allclose(found, every[rows], rtol=1e-12)
-
-
-def test_a_specimen_keeps_its_score_in_any_order() -> None:
+def test_a_specimen_keeps_its_score_in_any_order_and_by_itself() -> None:
     observed = RNG.normal(size=(40, 2))
     observed[[1, 5, 6, 20, 33], 0] = np.nan
     simulated = RNG.normal(size=(20_000, 2))
-    found = log_scores(scoring_target(observed, EQUAL), simulated, ALIKE, EVERY)
+    target = scoring_target(observed, EQUAL)
+    found = log_scores(target, simulated, ALIKE, EVERY)
     order = RNG.permutation(40)
     again = log_scores(scoring_target(observed[order], EQUAL), simulated, ALIKE, EVERY)
     np.testing.assert_allclose(again, found[order], atol=1e-6)
     assert np.ptp(found) > 1
+    # Products of matrices of other shapes round differently.
+    rows = np.array([7, 2, 30])
+    np.testing.assert_allclose(log_scores(target, simulated, ALIKE, rows), found[rows], rtol=1e-12)
 
 
 def test_one_specimen_far_out_costs_a_bounded_amount() -> None:
@@ -453,8 +373,3 @@ def test_points_without_response_are_left_out_and_failures_are_not() -> None:
     lower = log_scores(scoring, failed, weights, EVERY) - complete
     # Half of the specimens fail, and half of the density is left, but for what is spread widely.
     np.testing.assert_allclose(lower, np.log(0.5), atol=0.15)
-
-
-def test_data_without_a_density_are_refused() -> None:
-    with pytest.raises(ValueError, match="bandwidth: got 0"):
-        scoring_target(np.ones(9), np.full(9, 1 / 9))

@@ -13,7 +13,7 @@ from scipy.special import ndtri
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.validation.conditions import Case, Condition, area, read_case
+from prbayes.validation.conditions import Case, area, read_case
 from prbayes.validation.nulls import judge_by_replicates, table
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -23,35 +23,33 @@ from benchmarks import area_null
 Posterior = Callable[..., Any]
 EXACT = prb.validation.ExactModel()
 PUBLISHED = {5: 0.2567, 10: 0.1828, 15: 0.1500, 20: 0.1297, 30: 0.1057, 50: 0.0824, 100: 0.0580}
-QUICK = prb.validation.PosteriorNull(999)
 GRID = ndtri((np.arange(1000) + 0.5) / 1000)  # a standard normal population
 
 
-def test_with_one_population_the_null_is_the_exact_one() -> None:
-    test = prb.area_test(GRID[::50], GRID, null=prb.validation.PosteriorNull(19_999))
+def critical(observed: Any, predicted: Any, null: Any = None, **keywords: Any) -> float:
+    """Return the critical value of a posterior's null with 9999 replicates."""
+    null = null or prb.validation.PosteriorNull()
+    return prb.area_test(observed, predicted, null=null, **keywords).critical_value
+
+
+def test_critical_values_of_an_exact_and_an_uncertain_population(posterior: Posterior) -> None:
     # The density of the area at its 95% point makes the standard error of a quantile about .001.
-    assert test.critical_value == pytest.approx(EXACT.critical_value(20), abs=0.004)
-    assert "the predicted population" in test.null
-
-
-def test_an_uncertain_population_is_rejected_less_easily(posterior: Posterior) -> None:
-    rng = np.random.default_rng(1)
-    predicted = posterior()
-    critical = prb.area_test(rng.normal(size=20), predicted, null=QUICK).critical_value
-    assert critical > 1.25 * EXACT.critical_value(20)
+    null = prb.validation.PosteriorNull(19_999)
+    assert critical(GRID[::50], GRID, null) == pytest.approx(EXACT.critical_value(20), abs=0.004)
+    y = np.random.default_rng(1).normal(size=20)
+    assert critical(y, posterior()) > 1.25 * EXACT.critical_value(20)
+    # Discrete responses: with random u-values of ties the size stays nominal.
+    ties = critical(np.zeros(5), np.round(GRID), randomize=True)
+    assert ties == pytest.approx(EXACT.critical_value(5), abs=0.01)
 
 
 def test_p_values_of_replicates_count_the_observed_data_in() -> None:
     u = np.linspace(0.01, 0.49, 19)[:, None]
-    case = Case(
-        (Condition("a", np.zeros(1), np.zeros((1, 1)), np.zeros(1), None, np.zeros(1, dtype=int)),),
-        1,
-        False,
-    )
+    case = read_case([0.0], np.zeros((1, 1)))
 
     def judged(statistic: float, alpha: float) -> tuple[float, float]:
-        found = judge_by_replicates([u], case, statistic, alpha)
-        return found.p_value, found.critical_value
+        judgement = judge_by_replicates([u], case, statistic, alpha)
+        return judgement.p_value, judgement.critical_value
 
     areas = area(u)  # falling
     assert judged(0.5, 0.05) == (1 / 20, areas[0])
@@ -73,49 +71,20 @@ def test_nan_is_left_out_of_populations(posterior: Posterior) -> None:
     assert with_holes.critical_value == pytest.approx(whole.critical_value, rel=0.08)
 
 
-def test_ties_in_populations_are_randomised_alike() -> None:
-    """Discrete responses: with a seed the size stays nominal, as if they were continuous."""
-    test = prb.area_test(
-        np.zeros(5), np.round(GRID), null=prb.validation.PosteriorNull(9999), randomize=True
-    )
-    assert test.critical_value == pytest.approx(EXACT.critical_value(5), abs=0.01)
-
-
-def test_repeated_measurements_are_not_counted_as_independent() -> None:
-    rng = np.random.default_rng(10)
-    y = rng.normal(size=20)
+def test_repeated_measurements_are_not_counted_as_independent(posterior: Posterior) -> None:
+    y = np.random.default_rng(10).normal(size=20)
+    data, populations = {"a": y, "b": 2 * y}, {"a": GRID, "b": 2 * GRID}
     labels = np.arange(20)
-    null = prb.validation.PosteriorNull(9999)
-
-    def test(specimens: Any) -> prb.validation.ValidityTest:
-        return prb.area_test(
-            {"a": y, "b": 2 * y}, {"a": GRID, "b": 2 * GRID}, null=null, specimens=specimens
-        )
-
-    together, apart = test({"a": labels, "b": labels}), test(None)
-    # The second response tells nothing new: 40 values, but the critical value of 20.
-    assert together.statistic == apart.statistic
-    assert together.critical_value == pytest.approx(EXACT.critical_value(20), abs=0.004)
-    assert apart.critical_value == pytest.approx(EXACT.critical_value(40), abs=0.004)
-
-
-def test_all_conditions_take_the_same_draw(posterior: Posterior) -> None:
-    """Two conditions of fresh specimens share the doubt about the population."""
-    y = np.random.default_rng(11).normal(size=20)
-    both = prb.area_test(
-        [y[:10], 5 * y[10:]],
-        [posterior(), 5 * posterior()],
-        null=prb.validation.PosteriorNull(9999),
-    )
-    one = prb.area_test(y, posterior(), null=prb.validation.PosteriorNull(9999))
-    assert both.critical_value == pytest.approx(one.critical_value, rel=0.05)
-
-
-def test_a_specimen_measured_twice_under_one_condition() -> None:
-    y = np.repeat(np.random.default_rng(12).normal(size=10), 2)
-    test = prb.area_test(
-        y, GRID, null=prb.validation.PosteriorNull(9999), specimens=np.repeat(list("abcdefghij"), 2)
-    )
+    together = critical(data, populations, specimens={"a": labels, "b": labels})
+    # The second response adds no information: 40 values, but the critical value of 20.
+    assert together == pytest.approx(EXACT.critical_value(20), abs=0.004)
+    assert critical(data, populations) == pytest.approx(EXACT.critical_value(40), abs=0.004)
+    # Two conditions of fresh specimens share the uncertain population.
+    both = critical([y[:10], 5 * y[10:]], [posterior(), 5 * posterior()])
+    assert both == pytest.approx(critical(y, posterior()), rel=0.05)
+    # A specimen that is measured twice under one condition.
+    twice = np.repeat(y[:10], 2)
+    test = prb.area_test(twice, GRID, specimens=np.repeat(list("abcdefghij"), 2))
     assert test.critical_value == pytest.approx(EXACT.critical_value(10), abs=0.005)
     assert test.specimens.tolist()[:3] == ["a", "a", "b"]
 
@@ -172,22 +141,14 @@ def test_refusals() -> None:
         prb.validation.PosteriorNull(random_seed=-1)
 
 
-@pytest.mark.parametrize(("n", "published"), PUBLISHED.items())
-def test_published_critical_values(n: int, published: float) -> None:
-    assert EXACT.critical_value(n) == pytest.approx(published, abs=4e-4)
-
-
-def test_the_limit_for_many_values() -> None:
+def test_published_critical_values_and_closed_forms() -> None:
+    for n, published in PUBLISHED.items():
+        assert EXACT.critical_value(n) == pytest.approx(published, abs=4e-4)
     scaled = [np.sqrt(n) * EXACT.critical_value(n) for n in (500, 1000, 10_000)]
     np.testing.assert_allclose(scaled, 0.5821, atol=2e-4)
-
-
-def test_one_value_has_a_closed_form() -> None:
-    # A = 1/4 + (u - 1/2)^2
-    for alpha in (0.5, 0.1, 0.05, 0.01):
-        assert EXACT.critical_value(1, alpha) == pytest.approx(
-            0.25 + ((1 - alpha) / 2) ** 2, abs=1e-4
-        )
+    for alpha in (0.5, 0.1, 0.05, 0.01):  # A = 1/4 + (u - 1/2)^2
+        expected = 0.25 + ((1 - alpha) / 2) ** 2
+        assert EXACT.critical_value(1, alpha) == pytest.approx(expected, abs=1e-4)
     assert EXACT.p_value(0.25 + 0.3**2, 1) == pytest.approx(0.4, abs=2e-3)
 
 
@@ -202,18 +163,22 @@ def test_the_table_against_simulation(n: int) -> None:
 
 @pytest.mark.long
 def test_the_table_is_what_its_script_makes() -> None:
-    sizes, rows = table().sizes, table().quantiles
+    sizes, _, rows = table()
     for n in (1, 9):
         np.testing.assert_allclose(area_null.quantiles(n), rows[sizes == n][0], atol=2e-6)
     np.testing.assert_allclose(area_null.areas(np.array([0.2, 0.5])), area(np.array([0.2, 0.5])))
 
 
 def test_the_table_is_monotone() -> None:
-    sizes, logs, rows = table().sizes, table().logs, table().quantiles
+    sizes, logs, rows = table()
     assert (np.diff(sizes) > 0).all()
     assert (np.diff(logs) > 0).all()
     assert (np.diff(rows, axis=1) >= 0).all()
     assert (sizes[0], sizes[-1]) == (1, 1000)
+    # Sizes between those of the table have quantiles between theirs.
+    for alpha in (0.5, 0.05, 1e-3):
+        falls = np.diff([np.sqrt(n) * EXACT.critical_value(n, alpha) for n in (22, 23, 24, 25)])
+        assert (falls > 0).all() or (falls < 0).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 8, 20, 77, 1000, 5000])
@@ -230,20 +195,10 @@ def test_the_far_tail_falls_like_that_of_a_brownian_bridge() -> None:
     x = np.array([1.6, 1.8])
     logs = np.log([EXACT.p_value(v / np.sqrt(1000), 1000) for v in x])
     assert (logs[1] - logs[0]) / (x[1] ** 2 - x[0] ** 2) == pytest.approx(-6, abs=0.6)
-
-
-def test_sizes_between_those_of_the_table_lie_between_them() -> None:
-    for alpha in (0.5, 0.05, 1e-3):
-        scaled = [np.sqrt(n) * EXACT.critical_value(n, alpha) for n in (22, 23, 24, 25)]
-        falls = np.diff(scaled)
-        assert (falls > 0).all() or (falls < 0).all()
-
-
-def test_the_slope_of_the_far_tail_does_not_hang_on_where_it_is_taken() -> None:
-    found = table()
-    logs = found.logs
+    # Its slope does not depend on the quantiles that it is taken from.
+    sizes, logs, rows = table()
     for n in (20, 100, 1000):
-        squares = found.at(n) ** 2
+        squares = rows[sizes == n][0] ** 2
         slopes = [(logs[-1] - logs[-1 - k]) / (squares[-1] - squares[-1 - k]) for k in range(1, 13)]
         np.testing.assert_allclose(slopes, slopes[6], rtol=0.055)
 
@@ -259,15 +214,27 @@ def double(x: Any) -> Any:
 DATA = np.random.default_rng(20).normal(10, 1, 20)
 
 
-@cache
-def calibrated(labelled: bool = False) -> tuple[prb.Optimum, Any]:
+def model_of(
+    data: Any = DATA, propagation: Any = None, labels: Any = None, metric: Any = None
+) -> Any:
+    """Return a model of a normal population, and its input."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3))
         prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=DATA, propagation=prb.Reweighted(512),
-            specimens=np.arange(20) if labelled else None,
+            "y", same, x, metric=metric or prb.AreaMetric(), observed=data, specimens=labels,
+            propagation=propagation or prb.Reweighted(512),
         )  # fmt: skip
+    return model, x
+
+
+@cache
+def calibrated(labelled: bool = False) -> tuple[prb.Optimum, Any]:
+    model, x = model_of(labels=np.arange(20) if labelled else None)
     return prb.minimize(model), x
+
+
+def joint(optimum: prb.Optimum, replicates: int = 199, **keywords: Any) -> Any:
+    return prb.validation.JointNull(optimum, replicates=replicates, **keywords)
 
 
 @pytest.mark.long
@@ -276,9 +243,7 @@ def test_own_data_take_the_joint_null() -> None:
     predicted = prb.predict(optimum, same, x, random_seed=1)
     with pytest.raises(ValueError, match="the very data of the calibration"):
         prb.area_test(DATA[::-1], predicted)
-    test = prb.area_test(
-        DATA[::-1], predicted, null=prb.validation.JointNull(optimum, replicates=999)
-    )
+    test = prb.area_test(DATA[::-1], predicted, null=joint(optimum, 999))
     # A fitted normal distribution follows its own data. 1500 normal samples of 20, fitted by
     # Nelder-Mead to the smallest area and tested by formulas of their own, have the 95% point
     # .0571; standard error of both .001.
@@ -290,13 +255,11 @@ def test_own_data_take_the_joint_null() -> None:
 @pytest.mark.long
 def test_own_specimens_under_another_condition_are_as_close_as_under_their_own() -> None:
     optimum, x = calibrated(labelled=True)
-    null = prb.validation.JointNull(optimum, responses=(double, x), replicates=199)
-    own = prb.area_test(
-        DATA, prb.predict(optimum, same, x), null=prb.validation.JointNull(optimum, replicates=199)
-    )
+    null = joint(optimum, responses=(double, x))
+    own = prb.area_test(DATA, prb.predict(optimum, same, x), null=joint(optimum))
     predicted = prb.predict(optimum, double, x)
     later = prb.area_test(2 * DATA, predicted, null=null, specimens=np.arange(20))
-    # 2 y tells the same as y; refits and replicates are the same.
+    # 2 y has the information of y; refits and replicates are the same.
     assert later.critical_value == pytest.approx(own.critical_value, rel=1e-6)
     fresh = prb.area_test(2 * DATA, predicted, null=null, specimens=np.arange(100, 120))
     assert fresh.critical_value > 1.15 * EXACT.critical_value(20)
@@ -304,81 +267,57 @@ def test_own_specimens_under_another_condition_are_as_close_as_under_their_own()
         prb.area_test(2 * DATA, predicted, specimens=np.arange(20))
 
 
-def test_the_joint_null_rejects_what_the_family_cannot_follow() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 3), pm.HalfNormal("sigma", 3))
-        data = np.concatenate([np.full(15, -1.0), np.full(15, 1.0)]) + np.random.default_rng(
-            2
-        ).normal(0, 0.05, 30)
-        prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=data, propagation=prb.Reweighted(512)
-        )
+def test_the_joint_null_rejects_data_that_the_family_cannot_follow() -> None:
+    noise = np.random.default_rng(2).normal(0, 0.05, 30)
+    model, x = model_of(10 + np.repeat([-1.0, 1.0], 15) + noise)
     optimum = prb.minimize(model)
-    test = prb.area_test(
-        data,
-        prb.predict(optimum, same, x, random_seed=1),
-        null=prb.validation.JointNull(optimum, replicates=199),
-    )
-    assert test.rejected
+    predicted = prb.predict(optimum, same, x, random_seed=1)
+    data = optimum.evaluator.nodes[0].observed
+    assert prb.area_test(data, predicted, null=joint(optimum)).rejected
 
 
 def test_a_resimulated_model_has_a_joint_null_too() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3))
-        prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=DATA, propagation=prb.Resimulated(256)
-        )
+    model, x = model_of(propagation=prb.Resimulated(256))
     optimum = prb.minimize(model)
     predicted = prb.predict(optimum, same, x, random_seed=1)
-    test = prb.area_test(DATA, predicted, null=prb.validation.JointNull(optimum, replicates=199))
+    test = prb.area_test(DATA, predicted, null=joint(optimum))
     assert test.critical_value == pytest.approx(0.0571, abs=0.012)  # to first order
+    null = joint(optimum, 19, responses=(double, x))
     with pytest.raises(ValueError, match=r"no simulator with prb\.Reweighted has"):
-        prb.area_test(
-            2 * DATA,
-            2 * predicted,
-            null=prb.validation.JointNull(optimum, responses=(double, x), replicates=19),
-            alpha=0.1,
-        )
+        prb.area_test(2 * DATA, 2 * predicted, null=null, alpha=0.1)
 
 
 def test_refusals_of_the_joint_null(posterior: Posterior) -> None:
     optimum, x = calibrated()
-    null = prb.validation.JointNull(optimum, replicates=19)
-    with pytest.raises(ValueError, match="got 400 draws, expected the one population"):
-        prb.area_test(DATA, posterior(), null=null, alpha=0.1)
-    with pytest.raises(ValueError, match="distribution function differs by"):
-        prb.area_test(DATA, prb.predict(optimum, double, x), null=null, alpha=0.1)
     two = prb.predict(optimum, same, x, random_seed=1)
-    with pytest.raises(
-        ValueError, match=r"condition 'late', expected the name of a simulator, \['y'\]"
+    named = {"late": two, "y": two}
+    for observed, predicted, words in (
+        (DATA, posterior(), "got 400 draws, expected the one population"),
+        (DATA, prb.predict(optimum, double, x), "distribution function differs by"),
+        (dict.fromkeys(named, DATA), named, r"condition 'late', expected the name .*, \['y'\]"),
     ):
-        prb.area_test({"late": DATA, "y": DATA}, {"late": two, "y": two}, null=null, alpha=0.1)
+        with pytest.raises(ValueError, match=words):
+            prb.area_test(observed, predicted, null=joint(optimum, 19), alpha=0.1)
     with pytest.raises(TypeError, match="got str, expected an Optimum"):
-        prb.validation.JointNull("optimum")  # type: ignore[arg-type]
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 10, 3), 1.0)
-        metric = prb.FunctionMetric(lambda s, o: np.abs(s.mean(-1) - o.mean()))
-        prb.Simulator("y", same, x, metric=metric, observed=DATA, propagation=prb.Resimulated(64))
-    with pytest.raises(
-        ValueError, match=r"a FunctionMetric, .*the model cannot be calibrated anew"
-    ):
-        prb.validation.JointNull(prb.minimize(model, method="Nelder-Mead"))
+        joint("optimum")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"responses: got .*, expected a tuple \(response"):
+        joint(optimum, responses=same)
+    metric = prb.FunctionMetric(lambda s, o: np.abs(s.mean(-1) - o.mean()))
+    model, _ = model_of(propagation=prb.Resimulated(64), metric=metric)
+    with pytest.raises(ValueError, match=r"a FunctionMetric, .*the model cannot be recalibrated"):
+        joint(prb.minimize(model, method="Nelder-Mead", starts=0, max_evaluations=100))
 
 
-def test_own_data_are_known_in_any_order_as_their_specimens() -> None:
-    optimum, x = calibrated()
-    null = prb.validation.JointNull(optimum, replicates=99)
+def test_the_calibrations_data_in_any_order_and_some_of_its_specimens() -> None:
+    optimum, x = calibrated(labelled=True)
     predicted = prb.predict(optimum, same, x, random_seed=1)
     tests = [
-        prb.area_test(data, predicted, null=null) for data in (DATA, DATA[::-1], np.sort(DATA))
+        prb.area_test(data, predicted, null=joint(optimum, 99))
+        for data in (DATA, DATA[::-1], np.sort(DATA))
     ]
     assert len({(t.p_value, t.critical_value) for t in tests}) == 1
-
-
-def test_fewer_of_the_own_specimens_are_followed_less_closely() -> None:
-    optimum, x = calibrated(labelled=True)
-    null = prb.validation.JointNull(optimum, replicates=199)
-    predicted = prb.predict(optimum, same, x, random_seed=1)
-    some = prb.area_test(DATA[:8], predicted, null=null, specimens=np.arange(8))
+    # Fewer of the calibration's specimens are followed less closely.
+    null = joint(optimum)
+    part = prb.area_test(DATA[:8], predicted, null=null, specimens=np.arange(8))
     fresh = prb.area_test(DATA[:8] + 0.01, predicted, null=null, specimens=np.arange(50, 58))
-    assert some.critical_value < fresh.critical_value
+    assert part.critical_value < fresh.critical_value
