@@ -55,18 +55,13 @@ CONSOLE = _console()  # one for all bars: an inner bar is drawn below an outer o
 
 
 def live() -> bool:
-    """Return whether a bar can move: in a terminal, or in a notebook with widgets.
-
-    Elsewhere, as in a log or an executed page, it would be a line of its last state.
-    """
+    """Return whether a bar can move: in a terminal, or in a notebook with widgets."""
     return CONSOLE.is_terminal or CONSOLE.is_jupyter
 
 
 def lines() -> Callable[[str], None]:
-    """Return a function that writes a text once a minute where no bar can move, as in a log.
-
-    In a notebook without widgets, such as an executed page, it writes nothing.
-    """
+    """Return a function that writes a text once a minute where no bar can move, as in a log."""
+    # An executed page is a notebook without widgets.
     silent = live() or _hidden.get() or _in_kernel()
     last = time.perf_counter()
 

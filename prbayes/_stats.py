@@ -50,11 +50,7 @@ def ranked(
 
 
 def cumulated(weights: Floats, order: NDArray[np.intp]) -> Floats:
-    """Return the sums of the first 0, 1, ... n weights in an order, (..., n), (n,) -> (..., n + 1).
-
-    With the order and the counts of `ranked`, ``cumulated(weights, order)[..., below]`` is the
-    distribution function.
-    """
+    """Return sums of the first 0, 1, ... n weights in an order, (..., n), (n,) -> (..., n + 1)."""
     total = np.cumsum(weights[..., order], axis=-1)
     zero = np.zeros((*total.shape[:-1], 1))
     return np.concatenate([zero, total], axis=-1)

@@ -63,10 +63,7 @@ def real_array(values: ArrayLike, name: str) -> Floats:
 def observed_sample(
     values: ArrayLike, name: str = "observed", *, minimum: int = 1, failures: bool = False
 ) -> Floats:
-    """Return measured responses, shape (N,), or raise if they are not finite or too few.
-
-    With ``failures``, specimens may have failed, +inf, besides the ``minimum``.
-    """
+    """Return measured responses, (N,), finite or a failure (+inf) if allowed, or raise."""
     if np.ma.is_masked(values):
         raise ValueError(f"{name}: got masked values, expected none; leave missing specimens out")
     array = real_array(values, name)
@@ -219,10 +216,7 @@ def number(
     closed: bool = True,
     whole: bool = False,
 ) -> float:
-    """Return a finite number between two ends, or raise; an int if ``whole``.
-
-    The ends themselves are allowed if ``closed``.
-    """
+    """Return a finite number between two ends, themselves if ``closed``, or raise."""
     if whole:
         expected = f"an integer >= {low:g}"
     elif high < math.inf:
@@ -253,11 +247,7 @@ type Seed = int | Sequence[int] | np.random.Generator | np.random.RandomState | 
 
 
 def seed_number(random_seed: object, name: str = "random_seed") -> int:
-    """Return an integer for anything that PyMC accepts as a seed, or raise.
-
-    A generator gives its next number, a sequence of integers one number, and None a new one at
-    every call.
-    """
+    """Return an integer for anything that PyMC accepts as a seed, or raise; a new one for None."""
     match random_seed:
         case None:
             return int(np.random.SeedSequence().generate_state(1)[0])

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import numpy as np
@@ -49,10 +50,17 @@ def results() -> dict[str, xr.DataTree | xr.Dataset]:
     return {"p.nc": posterior, "o.nc": optimum.to_datatree(), "v.nc": test.to_dataset()}
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("saved")
     for name, tree in results().items():
-        tree.to_netcdf(tmp_path / name, engine="h5netcdf")
+        tree.to_netcdf(path / name, engine="h5netcdf")
+    return path
+
+
+@pytest.fixture
+def folder(saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    copytree(saved, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -159,25 +167,21 @@ def test_a_damaged_decision_gets_one_line(folder: Path, capsys: pytest.CaptureFi
 def test_mistakes_get_one_line_and_exit_code_2(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    def write(name: str, tree: xr.DataTree | xr.Dataset) -> None:
+        tree.to_netcdf(folder / name, engine="h5netcdf")
+
     (folder / "text.nc").write_text("no netCDF")
-    (folder / "empty.nc").write_bytes(b"")
     (folder / "cut.nc").write_bytes((folder / "p.nc").read_bytes()[:5000])
-    xr.Dataset({"a": 1.0}).to_netcdf(folder / "other.nc", engine="h5netcdf")
-    xr.Dataset({"u": 1.0}).to_netcdf(folder / "u.nc", engine="h5netcdf")
-    xr.DataTree.from_dict({"posterior": xr.Dataset({"mu": 1.0})}).to_netcdf(
-        folder / "nodims.nc", engine="h5netcdf"
-    )
-    stranger = xr.Dataset(
-        {"nu": (("chain", "draw"), np.random.default_rng(1).normal(size=(2, 50)))}
-    )
-    xr.DataTree.from_dict({"posterior": stranger}).to_netcdf(
-        folder / "stranger.nc", engine="h5netcdf"
-    )
+    write("other.nc", xr.Dataset({"a": 1.0}))
+    write("u.nc", xr.Dataset({"u": 1.0}))
+    draws = np.random.default_rng(1).normal(size=(2, 50))
+    stranger = xr.Dataset({"nu": (("chain", "draw"), draws)})
+    for name, posterior in (("nodims.nc", xr.Dataset({"mu": 1.0})), ("stranger.nc", stranger)):
+        write(name, xr.DataTree.from_dict({"posterior": posterior}))
     cases = [
         (["missing.nc"], "missing.nc: there is no such file"),
         (["."], "there is no such file"),
         (["text.nc"], "no netCDF file that can be read"),
-        (["empty.nc"], "no netCDF file that can be read"),
         (["cut.nc"], "no netCDF file that can be read"),
         (["other.nc"], "expected results of prbayes"),
         (["u.nc"], "expected a validity test"),

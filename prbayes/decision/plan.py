@@ -361,7 +361,7 @@ def fisher_information(sample: ResponseSample) -> Floats:
 def _at_most(information: Floats, bound: Floats) -> Floats:
     """Return information that exceeds a bound in no direction, (d, d).
 
-    Along directions of which the response contains next to no information, both factors of a
+    The response contains next to no information along some directions. There both factors of a
     sandwich are rounding errors, and their quotient is arbitrary.
     """
     if not np.isfinite(bound).all():  # the support moves, and the likelihood is no bound

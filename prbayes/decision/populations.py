@@ -20,7 +20,7 @@ from prbayes.inference.asymptotics import oriented
 from prbayes.model.description import versions
 from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.fingerprint import as_attributes, identity_of_model
+from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
 from prbayes.propagation.base import DesignError
@@ -72,7 +72,7 @@ class Populations:
 
     def provenance(self) -> dict[str, Any]:
         """Return the attributes of a table: the problem's fingerprint, and versions."""
-        identity = identity_in(self.result) or identity_of_model(self.evaluator.model)
+        identity = identity_in(self.result) or identity_of(self.evaluator.model)
         return {**as_attributes(identity), **versions()}
 
     def thinned(self) -> Floats:
@@ -113,9 +113,9 @@ class Populations:
         simulator = serving(simulators, responses)
         if simulator is None:
             raise TypeError(
-                f"{self.caller}: {responses.name}: got inputs of which no simulator of the model "
-                "has stored responses, expected the .dist() objects of one with prb.Reweighted(), "
-                "and constants"
+                f"{self.caller}: {responses.name}: got inputs without stored responses in any "
+                "simulator of the model, expected the .dist() objects of one with "
+                "prb.Reweighted(), and constants"
             )
         k = simulators.index(simulator)
         if simulator.is_emulated:
@@ -290,7 +290,7 @@ def _sobol_thetas(optimum: Optimum, n: int, caller: str) -> Floats:
         is_known = np.isfinite(np.diag(covariance))
         unknown = [name for name, is_ok in zip(optimum.names, is_known, strict=True) if not is_ok]
         raise ValueError(
-            f"{caller}: got an optimum that says nothing of the uncertainty of {unknown}, expected "
+            f"{caller}: got an optimum without the uncertainty of {unknown}, expected "
             "a standard error of each; pass the posterior of prb.sample_smc"
         )
     z = ndtri(sobol(n, optimum.theta.size, seed=0))

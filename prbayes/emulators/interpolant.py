@@ -151,7 +151,7 @@ class Interpolant:
     def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield the rows of a block of points, squared distances to the runs (n, k), and a spare.
 
-        The two arrays are reused, so that they stay in the processor's cache.
+        The two arrays are reused and stay in the cache of the processor.
         """
         n = len(self.z)
         step = min(max(1, IN_CACHE // 2 // n), len(z))

@@ -99,7 +99,7 @@ def cross_validated(
 
 
 def points_needed(model: Any, dimensions: int) -> int:
-    """Return the number of design points of which nine tenths determine a surface."""
+    """Return the least number of design points such that nine tenths determine a surface."""
     # The least model of an unknown regressor is a constant.
     terms = model.terms(dimensions) if isinstance(model, Surface) else 1
     n = terms + 2
@@ -197,13 +197,13 @@ def predict_outputs(
     at: Floats,
     mask: NDArray[np.bool_] | None = None,
     coarse: Floats | None = None,
-    known: Mapping[int, Floats] = {},
+    given: Mapping[int, Floats] = {},
 ) -> Floats:
     """Return outputs at points, (k, d) -> (k, m), predicted by a model of each output.
 
     Where the nearest run failed, the outputs are those of that run. Predictions are at most one
     range of the runs' outputs beyond them. ``mask``, (n,), selects the runs of the fit; ``coarse``,
-    (k, m), is a coarse response at the points; ``known`` has predictions of some outputs, (k,).
+    (k, m), is a coarse response at the points; ``given`` has predictions of some outputs, (k,).
     """
     mask = np.ones(len(runs.x), dtype=bool) if mask is None else mask
     rows = runs.among(mask)
@@ -211,8 +211,8 @@ def predict_outputs(
     points = runs.scaled(at)
     outputs = []
     for k, model in enumerate(models):
-        if k in known:
-            outputs.append(known[k])
+        if k in given:
+            outputs.append(given[k])
             continue
         coarse_runs = None if runs.coarse is None else runs.coarse[rows, k]
         coarse_points = None if coarse is None else coarse[:, k]
@@ -245,8 +245,8 @@ def predict_without_blocks(
             if surfaces is not None:
                 by_output[k] = surfaces(points)
     for b, block in enumerate(runs.block_masks):
-        known = {k: values[:, b] for k, values in by_output.items()}
-        yield predict_outputs(models, runs, at, ~block, coarse, known)
+        given = {k: values[:, b] for k, values in by_output.items()}
+        yield predict_outputs(models, runs, at, ~block, coarse, given)
 
 
 def left_out_predictions(models: Sequence[Any], runs: Runs) -> Floats:

@@ -258,7 +258,7 @@ class MultifidelityModel:
 
 @dataclass(frozen=True, eq=False)
 class MultifidelitySurface:
-    """A response as rho times a coarse one and a surface; a class, so that it can be pickled."""
+    """A response as rho times a coarse one and a surface, which can be pickled."""
 
     rho: float
     scaling: tuple[float, float] | None  # center and unit of a coarse response that is an input

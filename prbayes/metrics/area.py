@@ -135,22 +135,20 @@ class RankedBasis(Basis):
 
     def features(self, weights: Any, xp: Any = np) -> Features:
         """Return the areas, (..., K)."""
-        if xp is np:  # one after another takes less memory
+        if xp is np or len(self.observed_weights) == 1:  # one after another takes less memory
             areas = []
-            for *ranks, lengths, observed_weights in zip(
-                *self.arrays, self.observed_weights, strict=True
-            ):
-                order, below, observed_order, observed_below = ranks
-                if weights.size > 1 << 16:  # where a compiled loop repays its loading
+            for k, observed_weights in enumerate(self.observed_weights):
+                order, below, observed_order, observed_below, lengths = [a[k] for a in self.arrays]
+                if xp is np and weights.size > 1 << 16:  # where a compiled loop repays its loading
                     rows = np.ascontiguousarray(weights).reshape(-1, weights.shape[-1])
                     simulated = np.empty((len(rows), len(below)))
                     sum_below(rows, order, below, simulated)
                     simulated = simulated.reshape(*weights.shape[:-1], -1)
                 else:
-                    simulated = summed_below(weights, order, below)
-                observed = summed_below(observed_weights, observed_order, observed_below)
-                areas.append((np.abs(simulated - observed) * lengths).sum(axis=-1))
-            return (np.stack(areas, axis=-1),)
+                    simulated = summed_below(weights, order, below, xp)
+                observed = summed_below(observed_weights, observed_order, observed_below, xp)
+                areas.append((xp.abs(simulated - observed) * lengths).sum(axis=-1))
+            return (xp.stack(areas, axis=-1),)
         order, below, observed_order, observed_below, lengths = self.arrays
         simulated = _rows_summed_below(xp.take(weights, order), below, xp)
         rows = np.arange(len(self.observed_weights))[:, None]

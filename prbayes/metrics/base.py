@@ -3,8 +3,8 @@
 `Metric` is configuration. ``metric.against(observed)`` prepares a `Discrepancy`, which compares the
 measured values with simulated responses in two steps:
 
-- *features*: a density on cells, or a difference of distribution functions. For stored responses
-  they are a linear map of the weights, a `Basis`;
+- *features*: a density on cells, or the area between two distribution functions. For stored
+  responses a `Basis` maps the weights to them;
 - the *outer* function of the features, written for any array namespace, so that the direct call,
   the optimiser's gradient and the compiled graph of a PyMC model run through the same lines.
 """
@@ -107,7 +107,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Basis(ABC):
-    """The linear map from weights of stored responses to the features of a discrepancy."""
+    """The map from weights of stored responses to the features of a discrepancy."""
 
     arrays: tuple[Any, ...]  # the numbers of the map; shared variables in a compiled graph
 
@@ -231,9 +231,9 @@ class Discrepancy(ABC):
     def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
         """Return the map from weights of stored responses, (n,) or (n, m), to features.
 
-        By default the responses themselves. A metric whose features are linear in the weights
-        returns a map that is computed once, equal to `features` up to rounding. ``most`` is the
-        largest size of a matrix where a smaller form exists.
+        By default the responses themselves. A metric whose features are a fast function of the
+        weights returns a map that is computed once, equal to `features` up to rounding. ``most`` is
+        the largest size of a matrix where a smaller form exists.
         """
         return StoredBasis((simulated,), self)
 

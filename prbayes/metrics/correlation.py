@@ -6,7 +6,6 @@ from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._validate import AT_ONCE, Floats, positive_number, sample_weights
 from prbayes.metrics.base import (
@@ -108,7 +107,18 @@ class MarginalCorrelation(LiftedMetric):
         # Rows that lack some of the outputs count in the correlations of the others.
         together = Projection(np.arange(m), caps, center, unit=unit)
         values, _ = together.observed_of(observed)
-        correlations = CorrelationDiscrepancy.between(self, values, weights)
+        has = ~np.isnan(values[weights > 0])
+        for i, k in zip(*np.tril_indices(m, -1), strict=True):
+            n_complete = int((has[:, i] & has[:, k]).sum())
+            if n_complete < 3:
+                raise ValueError(
+                    f"observed: got {n_complete} specimens that have both output {i} and "
+                    f"output {k} (counted from 0), expected at least 3; leave one of the outputs "
+                    "out"
+                )
+        correlations = CorrelationDiscrepancy(
+            self, values, weights, _observed_correlations(values, weights)
+        )
         parts.append(Part(correlations, correlation_weight, "correlations", together))
         shares = np.array([part.share for part in parts])
         return CompositeDiscrepancy(self, observed, weights, tuple(parts), shares)
@@ -120,19 +130,6 @@ class CorrelationDiscrepancy(Discrepancy):
 
     correlations: Floats  # (pairs,) or (..., pairs): the observed ones; NaN where there is none
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "correlations")
-
-    @classmethod
-    def between(cls, metric: Any, observed: Floats, weights: Floats) -> Self:
-        """Return the residuals from correlations of observed values, (N, m), NaN among them."""
-        has = ~np.isnan(observed[weights > 0])
-        for i, j in zip(*_pairs(observed.shape[1]), strict=True):
-            both = int((has[:, i] & has[:, j]).sum())
-            if both < 3:
-                raise ValueError(
-                    f"observed: got {both} specimens that have both output {i} and output {j} "
-                    "(counted from 0), expected at least 3; leave one of the outputs out"
-                )
-        return cls(metric, observed, weights, _observed_correlations(observed, weights))
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
         """Return the residuals from correlations of other values."""
@@ -170,11 +167,6 @@ class CorrelationDiscrepancy(Discrepancy):
         return (residual**2).sum(axis=-1)
 
 
-def _pairs(m: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the pairs of outputs, the later one first."""
-    return np.tril_indices(m, -1)
-
-
 def _powers(values: Floats) -> Floats:
     """Return 1, the values and their products, (n, m) -> (n, M); zero where one is NaN."""
     is_complete = ~np.isnan(values).any(axis=-1, keepdims=True)
@@ -189,7 +181,7 @@ def _correlations(moments: Any, m: int, xp: Any) -> Any:
     rows, columns = np.tril_indices(m)
     place = np.zeros((m, m), dtype=int)
     place[rows, columns] = np.arange(rows.size)
-    i, j = _pairs(m)
+    i, j = np.tril_indices(m, -1)
     unit = xp.maximum(moments[..., 0], 1e-300)[..., None]
     mean = moments[..., 1 : m + 1] / unit
     second = moments[..., m + 1 :] / unit
@@ -201,7 +193,7 @@ def _correlations(moments: Any, m: int, xp: Any) -> Any:
 
 def _observed_correlations(values: Floats, weights: Floats) -> Floats:
     """Return the correlation of each pair, of the rows that have both; NaN without variance."""
-    i, j = _pairs(values.shape[-1])
+    i, j = np.tril_indices(values.shape[-1], -1)
     correlations = np.full((*weights.shape[:-1], i.size), np.nan)
     for k, pair in enumerate(zip(i, j, strict=True)):
         moments = product(weights, _powers(values[:, pair]))

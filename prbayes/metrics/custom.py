@@ -96,8 +96,7 @@ class FunctionDiscrepancy(Discrepancy):
 
     def _value(self, simulated: Floats, observed_weights: Floats, weights: Floats) -> Floats:
         """Return the checked value of the function for one data set."""
-        observed = repeated(self.observed, observed_weights, self.size)
-        arguments = [simulated, observed]
+        arguments = [simulated, self._repeated(observed_weights)]
         if self.metric.weighted:
             arguments.append(np.broadcast_to(weights, simulated.shape))
         elif not np.allclose(weights, np.asarray(weights)[..., :1]):
@@ -115,24 +114,23 @@ class FunctionDiscrepancy(Discrepancy):
             )
         return value
 
+    def _repeated(self, weights: Floats) -> Floats:
+        """Return a sample in which observed values are repeated in proportion to weights, (n,).
+
+        It has the nominal size if the weights are multiples of its inverse; else the value of
+        smallest weight occurs once, as in a subset.
+        """
+        for counts in (weights * self.size, weights / weights[weights > 0].min()):
+            whole = np.round(counts)
+            # Weights that are not counts differ from integers by far more.
+            if np.abs(counts - whole).max() < 1e-6:
+                return np.repeat(self.observed, whole.astype(int))
+        raise ValueError(
+            "observed weights: got weights that are no counts, expected repeated values; a "
+            "FunctionMetric takes no weights of observed values; use "
+            "prb.bootstrap(optimum, parametric=True)"
+        )
+
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the value of the function."""
         return features[0]
-
-
-def repeated(values: Floats, weights: Floats, size: int) -> Floats:
-    """Return a sample in which each value, (n,), is repeated in proportion to its weight.
-
-    It has ``size`` values if the weights are multiples of its inverse; else the value of smallest
-    weight occurs once, as in a subset. Weights that are no counts raise a ValueError.
-    """
-    for counts in (weights * size, weights / weights[weights > 0].min()):
-        whole = np.round(counts)
-        # Weights that are not counts differ from integers by far more.
-        if np.abs(counts - whole).max() < 1e-6:
-            return np.repeat(values, whole.astype(int))
-    raise ValueError(
-        "observed weights: got weights that are no counts, expected repeated values; a "
-        "FunctionMetric takes no weights of observed values; use "
-        "prb.bootstrap(optimum, parametric=True)"
-    )

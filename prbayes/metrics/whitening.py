@@ -56,7 +56,7 @@ class Components:
         if self.left_out <= LEFT_OUT or self.rest_correlation < 0.5:  # white noise has .1
             return ""
         return (
-            f"{self.summary}, so that it is no noise: the metric does not see it; pass more "
+            f"{self.summary}: it is no noise, and the metric does not compare it; pass more "
             "components= to prb.Joint, or measure more specimens"
         )
 
@@ -169,7 +169,7 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tup
         which = outputs[dependent > 0.1 * dependent.max()]
         raise ValueError(
             f"observed: got outputs {_listed(which)} (counted from 0) that depend on each other "
-            "linearly, to 1e-5 of their spread, expected outputs of which none follows from the "
+            "linearly, to 1e-5 of their spread, expected outputs that do not follow from "
             "others; leave one of them out"
         )
     # Rotate to the axes of a second scatter, with signs by a third moment.

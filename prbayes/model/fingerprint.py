@@ -87,53 +87,51 @@ class Identity:
     log_other: tuple[float, ...] = ()  # log-likelihood of other terms at these points
 
 
-def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) -> Identity:
-    """Return the identity of an evaluator's problem, with numbers; computes no response."""
-    hyperparameters = evaluator.hyperparameters
-    # A power of two: Sobol points are balanced then.
-    thetas, order = fixed_points(hyperparameters, 4)
-    simulators = []
-    for k, node in enumerate(evaluator.nodes):
-        values = evaluator.discrepancies(thetas, k) if node.bound.stored else np.empty(0)
-        simulators.append(replace(_simulator_identity(node), discrepancies=_tuples(values)))
-    simulators += map(_simulator_identity, evaluator.measurements)
-    return _identity(
-        evaluator.model,
-        simulators,
-        shapes=hyperparameters.shapes,
-        prior_minimised=prior_minimised,
-        thetas=_tuples(thetas[:, order]),
-        log_prior=_tuples(hyperparameters.log_prior(thetas)),
-        log_other=_tuples(evaluator.log_other(thetas)),
-    )
+def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None = None) -> Identity:
+    """Return the identity of a problem; computes no response.
 
-
-def identity_of_model(model: pm.Model) -> Identity:
-    """Return the identity of a model without densities and discrepancies, which are compiled."""
-    simulators = [*map(_simulator_identity, nodes(model).values())]
-    simulators += map(_simulator_identity, measurements_of(model).values())
-    values = [model.rvs_to_values[rv] for rv in model.free_RVs]
-    shapes = {str(value.name): value.type.shape for value in values}
-    if any(None in shape for shape in shapes.values()):
-        with interpreted():
-            point = model.initial_point(random_seed=0)
-        shapes = {name: np.shape(point[name]) for name in shapes}
-    return _identity(model, simulators, shapes=shapes)
-
-
-def _identity(model: pm.Model, simulators: list[SimulatorIdentity], **fields: Any) -> Identity:
-    """Return the identity with distributions and other terms as texts."""
+    That of a model is without densities and discrepancies, which an evaluator compiles.
+    """
+    numbers: dict[str, Any] = {}
+    if isinstance(problem, Evaluator):
+        model, hyperparameters = problem.model, problem.hyperparameters
+        shapes = hyperparameters.shapes
+        parts: list[Node | Measurement] = [*problem.nodes, *problem.measurements]
+        simulators = list(map(_simulator_identity, parts))
+        # A power of two: Sobol points are balanced then.
+        thetas, order = fixed_points(hyperparameters, 4)
+        for k, node in enumerate(problem.nodes):
+            if node.bound.stored:
+                values = _tuples(problem.discrepancies(thetas, k))
+                simulators[k] = replace(simulators[k], discrepancies=values)
+        numbers = {
+            "thetas": _tuples(thetas[:, order]),
+            "log_prior": _tuples(hyperparameters.log_prior(thetas)),
+            "log_other": _tuples(problem.log_other(thetas)),
+        }
+    else:
+        model = problem
+        parts = [*nodes(model).values(), *measurements_of(model).values()]
+        simulators = list(map(_simulator_identity, parts))
+        values = [model.rvs_to_values[rv] for rv in model.free_RVs]
+        shapes = {str(value.name): value.type.shape for value in values}
+        if any(None in shape for shape in shapes.values()):
+            with interpreted():
+                point = model.initial_point(random_seed=0)
+            shapes = {name: np.shape(point[name]) for name in shapes}
     named = {*model.basic_RVs, *model.deterministics}
     simulated = {*nodes(model), *specimen_likelihoods(model)}
     observed = [rv for rv in model.observed_RVs if rv not in simulated]
     terms = [f"{rv.name} ~ {as_pymc_writes(rv, named)}" for rv in observed]
     terms += [str(potential.name) for potential in model.potentials]
     return Identity(
+        shapes=shapes,
         priors={str(rv.name): as_pymc_writes(rv, named) for rv in model.free_RVs},
         terms=tuple(sorted(terms)),
         # Clones may order variables in other ways.
         simulators=tuple(sorted(simulators, key=attrgetter("name"))),
-        **fields,
+        prior_minimised=prior_minimised,
+        **numbers,
     )
 
 
@@ -300,7 +298,7 @@ def require_together(
     with_identity = [i for i in identities.values() if i is not None]
     expected = with_identity[0] if with_identity else None
     if model is not None and (nodes(model) or specimen_likelihoods(model)):
-        expected = identity_of_model(model)
+        expected = identity_of(model)
     for label, identity in identities.items():
         require_same(identity, expected, f"{caller}: {label}", level)
     return expected
@@ -317,7 +315,20 @@ def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
     names_of = [[simulator.name for simulator in i.simulators] for i in (got, expected)]
     if names_of[0] != names_of[1]:
         return [_unlike("simulators", *names_of)]
-    priors = _prior_differences(got, expected)
+    priors = [
+        _unlike(f"prior of {name}", prior, expected.priors[name])
+        for name, prior in got.priors.items()
+        if prior != expected.priors.get(name)
+    ]
+    if got.terms != expected.terms:
+        terms = got.terms or "none", expected.terms or "none"
+        priors.append(_unlike("other likelihood terms", *terms))
+    if not priors and got.thetas and expected.thetas:
+        has_same_points = _close(got.thetas, expected.thetas)
+        if not (has_same_points and _close(got.log_prior, expected.log_prior)):
+            priors = ["the priors have other densities"]
+        elif not _close(got.log_other, expected.log_other):
+            priors = ["other likelihood terms, or potentials, have other values"]
     minimised = []
     if got.prior_minimised is not None and expected.prior_minimised is not None:
         goals = (
@@ -382,24 +393,6 @@ def _simulator_differences(
         Level.POSTERIOR: posterior,
         Level.RUN: run,
     }
-
-
-def _prior_differences(got: Identity, expected: Identity) -> list[str]:
-    result = [
-        _unlike(f"prior of {name}", prior, expected.priors[name])
-        for name, prior in got.priors.items()
-        if prior != expected.priors.get(name)
-    ]
-    if got.terms != expected.terms:
-        terms = got.terms or "none", expected.terms or "none"
-        result.append(_unlike("other likelihood terms", *terms))
-    if result or not got.thetas or not expected.thetas:
-        return result
-    if not (_close(got.thetas, expected.thetas) and _close(got.log_prior, expected.log_prior)):
-        return ["the priors have other densities"]
-    if not _close(got.log_other, expected.log_other):
-        return ["other likelihood terms, or potentials, have other values"]
-    return []
 
 
 def _unlike(what: str, got: object, expected: object) -> str:

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from threading import Lock
 from typing import Any
 
 # The number of threads is global: a second caller does not change it.
 _setting = Lock()
-
-
-@cache
-def _algebra() -> Any:
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController().select(user_api="blas")
+# The libraries of linear algebra, once they are loaded.
+_libraries: list[Any] = []
 
 
 @contextmanager
@@ -26,7 +20,11 @@ def one_thread() -> Iterator[None]:
         yield
         return
     try:
-        with _algebra().limit(limits=1):
+        if not _libraries:
+            from threadpoolctl import ThreadpoolController
+
+            _libraries.append(ThreadpoolController().select(user_api="blas"))
+        with _libraries[0].limit(limits=1):
             yield
     finally:
         _setting.release()

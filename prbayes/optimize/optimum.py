@@ -41,7 +41,6 @@ from prbayes.model.fingerprint import (
     as_attributes,
     from_attributes,
     identity_of,
-    identity_of_model,
     require_same,
 )
 from prbayes.model.locking import locked
@@ -457,7 +456,7 @@ def require_minimiser(optimum: Optimum, caller: str) -> Optimum:
 
 def require_of_model(result: Any, model: pm.Model, caller: str, level: Level) -> None:
     """Raise with all differences if a result is of another problem than a model's."""
-    require_same(identity_in(result), identity_of_model(model), caller, level)
+    require_same(identity_in(result), identity_of(model), caller, level)
 
 
 def identity_in(result: Any) -> Identity | None:

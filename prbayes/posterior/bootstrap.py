@@ -32,17 +32,14 @@ def bootstrap(
 ) -> xr.DataTree:
     """Minimise the discrepancy of each of many data sets that resemble the observed one.
 
-    By default the observed specimens get Dirichlet weights: the loss-likelihood bootstrap, whose
-    minimisers are draws from a posterior without prior and without epsilon. The parametric
-    bootstrap draws data sets from the model at the optimum; its minimisers are the sampling
-    distribution of the optimum. Observations of one specimen label are weighted, or drawn,
-    together.
+    By default the observed specimens get Dirichlet weights [1]_. The minimisers are draws from a
+    posterior without prior and without epsilon. The parametric bootstrap draws data sets from the
+    model at the optimum; its minimisers have the sampling distribution of the optimum. Observations
+    with one specimen label are weighted, or drawn, together.
 
     With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is
-    of first order. A metric of several outputs takes its coordinates from the data, and is prepared
-    for each data set, which takes some hundredths of a second. With the log-likelihood by specimen
-    the minimisers are maximum-likelihood estimates; simulated data sets are drawn from one pool of
-    simulated specimens, and nothing is run.
+    of first order. A metric of several outputs is prepared for each data set. With the
+    log-likelihood by specimen the minimisers are maximum-likelihood estimates, and nothing is run.
 
     Parameters
     ----------
@@ -128,7 +125,8 @@ def _specimen_estimates(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return maximum-likelihood estimates, (draws, d), and whether they converged."""
     refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
-    _require_identified(np.array(optimum.names)[np.isinf(np.diag(optimum.covariance))].tolist())
+    is_infinite = np.isinf(np.diag(optimum.covariance))
+    _require_identified(np.array(optimum.names)[is_infinite].tolist())
     if not parametric:
         return refits.reweighted(dirichlet_weights(refits.evaluator.emulated, draws, seed))
     thetas, converged, _ = zip(*refits.simulated(draws, seed), strict=True)

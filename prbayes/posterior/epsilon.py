@@ -35,24 +35,23 @@ _log = logging.getLogger("prbayes")
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     """Return an epsilon for each simulator with which the posterior has the width of the estimate.
 
-    - KLD and log-likelihood: 1/N, which puts them on the scale of a log-likelihood, N the effective
-      number of specimens.
+    - KLD and log-likelihood: 1/N, the scale of a log-likelihood. N is the effective number of
+      specimens.
     - Other smooth metrics (probability residual): trace(H^-1 J) / p over the p identified
-      directions, H the Hessian of the discrepancy at the optimum and J the sampling covariance of
-      its gradient: then the posterior's covariance epsilon H^-1 matches the estimator's
+      directions. H is the Hessian of the discrepancy at the optimum, J the sampling covariance of
+      its gradient. The posterior's covariance epsilon H^-1 then matches the estimator's
       H^-1 J H^-1 on average.
-    - Area metric: the epsilon with which 89% intervals of the posteriors of data sets simulated at
-      the optimum contain the optimum in 89% of cases, on average over the two directions that the
+    - Area metric: data sets are simulated at the optimum. With this epsilon, 89% intervals of their
+      posteriors contain the optimum in 89% of cases, on average over the two directions that the
       data identify best.
-    - Metrics with an undeclared minimum, such as a `FunctionMetric` (`Reweighted` only):
-      the mean, over data sets simulated at the optimum and refitted, of delta . grad d / p at the
-      minimiser plus delta, delta drawn from the sampling distribution. For any density proportional
-      to exp(-d / epsilon) that mean is epsilon, by integration by parts; for a quadratic d it is
-      trace(H Sigma) / p, which is the sandwich's.
+    - Metrics with an undeclared minimum, such as a `FunctionMetric` (`Reweighted` only): the mean
+      of delta . grad d / p at the minimiser plus delta, over refitted data sets, with delta from
+      the sampling distribution. For a density proportional to exp(-d / epsilon) it is epsilon, by
+      integration by parts.
 
-    Simulators that share specimens count them several times: their epsilons are then multiplied by
-    the ratio of the variance of their common minimiser, over data sets, to its variance with
-    different specimens (not with a metric whose minimum is undeclared).
+    Simulators that share specimens count them several times. Their epsilons are multiplied by the
+    ratio of the variance of their common minimiser to its variance with different specimens (not
+    with a metric whose minimum is undeclared).
 
     No response is computed under `Reweighted`.
 

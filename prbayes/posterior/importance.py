@@ -21,6 +21,8 @@ from prbayes._validate import Floats
 from prbayes.numerics.points import sobol
 
 LogDensity = Callable[[Floats], Floats]  # (S, d) -> (S,)
+# The prior as a proposal: draws by size and seed, (size, d), and its log-density.
+Prior = tuple[Callable[[int, int], Floats], LogDensity]
 
 
 @dataclass(frozen=True)
@@ -34,14 +36,6 @@ class ImportanceOptions:
     rounds: int = 6  # largest number of proposals; the r-th fitted one has r / 2 points a draw
     components: int = 4  # of a fitted mixture
     prior_share: float = 0.1  # of the points of a fitted proposal; half in the first
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """The prior as a proposal: ``draws(size, seed)``, (size, d), and its log-density."""
-
-    draws: Callable[[int, int], Floats]
-    log_density: LogDensity
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +161,7 @@ def importance_sample(
             for mixture, n in proposals
         ]
         if prior is not None and n_prior:
-            terms.append(prior.log_density(points) + np.log(n_prior / len(points)))
+            terms.append(prior[1](points) + np.log(n_prior / len(points)))
         log_ratio = log_p - logsumexp(terms, axis=0)
         sample = _resampled(points, log_p, log_ratio, size, seed, options)
         # Too few effective points have no moments.
@@ -182,8 +176,9 @@ def importance_sample(
         n_added = int(share * count)
         new = proposal.draws(count - n_added, seed + round_)
         if prior is not None:
-            new = np.concatenate([new, prior.draws(n_added, seed + round_)])
-        points, log_p = np.concatenate([points, new]), np.concatenate([log_p, log_density(new)])
+            new = np.concatenate([new, prior[0](n_added, seed + round_)])
+        points = np.concatenate([points, new])
+        log_p = np.concatenate([log_p, log_density(new)])
         proposals.append((proposal, count - n_added))
         n_prior += n_added
     return sample

@@ -62,9 +62,9 @@ class Particles(NamedTuple):
 class BatchedKernel(SMC_KERNEL):
     """SMC kernel that computes priors, responses and discrepancies of all particles in one call.
 
-    Independent proposals from a normal fitted to the particles, which forget the past at once,
-    alternate with random-walk proposals, which also move inside separate modes, until the particles
-    are uncorrelated with the previous ones, or their correlation stops falling. Also usable as
+    Independent proposals from a normal fitted to the particles alternate with random-walk
+    proposals, which also move inside separate modes. They stop when the particles are uncorrelated
+    with the previous ones, or their correlation stops falling. Also usable as
     ``pymc.sample_smc(kernel=prbayes.posterior.BatchedKernel)``.
 
     Parameters
@@ -172,7 +172,7 @@ class BatchedKernel(SMC_KERNEL):
     def resample(self) -> None:
         """Resample the particles in proportion to their weights."""
         self.resampling_indexes = systematic_resampling(self.weights, self.rng)
-        self._take(Particles(*(array[self.resampling_indexes] for array in self.particles)))
+        self._take(Particles(*[array[self.resampling_indexes] for array in self.particles]))
 
     def tempered(self, evaluator: Evaluator, max_stages: int | None = None) -> Iterator[None]:
         """Do the remaining stages, the last one with this evaluator, and yield after each."""
@@ -249,7 +249,7 @@ class BatchedKernel(SMC_KERNEL):
             gain = proposed.log_prior - current.log_prior + tempered + log_ratio
         log_uniform = np.log(self.rng.random(len(thetas)))
         is_accepted = log_uniform < np.nan_to_num(gain, nan=-np.inf)
-        merged = Particles(*(array.copy() for array in current))
+        merged = Particles(*[array.copy() for array in current])
         for array, new in zip(merged, proposed, strict=True):
             array[is_accepted] = new[is_accepted]
         self._take(merged)

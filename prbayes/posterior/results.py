@@ -117,11 +117,12 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     bounds = [node.bound for node in nodes]
     designs = [node.reweighted for node in nodes]
     at_best = [chains.missing.get(node.name, {}) for node in nodes]
+    errors = np.full(len(nodes), np.nan) if chains.errors is None else chains.errors
     by_simulator = {
         "lossy_draws": [
             share_of_lossy(lost[:, :, k], bound.max_lost) for k, bound in enumerate(bounds)
         ],
-        "discrepancy_error": np.nan if chains.errors is None else chains.errors,
+        "discrepancy_error": errors,
         "lost_mass_at_best": [missing.get("lost_mass", np.nan) for missing in at_best],
         "failed_mass_at_best": [missing.get("failed_mass", np.nan) for missing in at_best],
         "epsilon": evaluator.epsilon,
@@ -132,7 +133,7 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
         "propagation": [without_addresses(node.propagation) for node in nodes],
         "n_points": [bound.n_points for bound in bounds],
         "n_runs": [bound.n_runs for bound in bounds],
-        "is_likelihood": 0,
+        "is_likelihood": np.zeros(len(nodes), dtype=int),
     }
     coords = {
         "simulator": [node.name for node in nodes],
@@ -144,7 +145,7 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
         "discrepancy": (_BY_DRAW, chains.discrepancies),
         "theta": (["chain", "draw", "element"], chains.thetas),
         **{key: (_BY_DRAW, values) for key, values in by_draw.items()},
-        **_columns(by_simulator, len(nodes)),
+        **{key: ("simulator", values) for key, values in by_simulator.items()},
     }
     by_metric = xr.Dataset(variables, coords=coords)
     if not evaluator.likelihoods:
@@ -159,14 +160,6 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     )
 
 
-def _columns(values: Mapping[str, Any], size: int) -> dict[str, Any]:
-    """Return variables by simulator of lists of values, or of one for all simulators."""
-    return {
-        key: ("simulator", value if np.ndim(value) else np.full(size, value))
-        for key, value in values.items()
-    }
-
-
 def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) -> xr.Dataset:
     """Return the same variables of log-likelihoods by specimen, as minus discrepancies."""
     chains, draws, d = thetas.shape
@@ -177,16 +170,16 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) ->
     preparations = [prepared(likelihood_of(evaluator, m)) for m in measurements]
     n_runs = [len(preparation.emulation.z) for preparation in preparations]
     by_simulator = {
-        "epsilon": 1.0,
-        "max_lost": MAX_LOST,
+        "epsilon": np.ones(len(names)),
+        "max_lost": np.full(len(names), MAX_LOST),
         "metric": [without_addresses(m.metric) for m in measurements],
-        "compared": "",
+        "compared": [""] * len(names),
         "propagation": [f"emulator of {n} runs" for n in n_runs],
         "n_points": [preparation.points.log_a.size for preparation in preparations],
         "n_runs": n_runs,
-        "is_likelihood": 1,
+        "is_likelihood": np.ones(len(names), dtype=int),
     }
-    variables = _columns(by_simulator, len(names))
+    variables: dict[str, Any] = {key: ("simulator", x) for key, x in by_simulator.items()}
     variables["discrepancy"] = (_BY_DRAW, discrepancies.reshape(chains, draws, -1))
     for name, variable in by_metric.data_vars.items():
         if name not in variables and "simulator" in variable.dims:
@@ -246,7 +239,7 @@ def _log_likelihood(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     rows = chains.thetas.reshape(-1, d)
     other_terms = evaluator.log_other(rows).reshape(n_chains, n_draws)
     observed = observed_dataset(evaluator)
-    specimens = list(dict.fromkeys(str(observed[node.name].dims[0]) for node in evaluator.nodes))
+    specimens = list(dict.fromkeys([str(observed[node.name].dims[0]) for node in evaluator.nodes]))
     shape = (n_chains, n_draws, *[1] * len(specimens))
     dims = ["chain", "draw", *specimens]
     note = (
@@ -304,7 +297,7 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
     """Draw stored responses by weight, as many as were observed, at thetas (chains, draws, d)."""
     chains, draws, d = thetas.shape
     stored = [k for k, node in enumerate(evaluator.nodes) if node.bound.n_per_theta == 0]
-    size = chains * draws * sum(evaluator.nodes[k].target.observed.size for k in stored)
+    size = chains * draws * sum([evaluator.nodes[k].target.observed.size for k in stored])
     thinned = np.arange(draws)[:: max(1, math.ceil(size / AT_ONCE))]
     leading = (chains, len(thinned))
     rows = thetas[:, thinned].reshape(-1, d)

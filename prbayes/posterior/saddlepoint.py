@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +83,7 @@ class EstimateLikelihood:
     # and optima that are as good.
     starts: Floats
     # By set of simulators that share specimens.
-    groups: tuple[StoredScores | ResimulatedScores, ...]
+    groups: Sequence[StoredScores | ResimulatedScores]
     combinations: Floats  # (d, r): combinations of the scores that vary
     # (d,): unit of `laplace`: a standard deviation of the prior, or a hundred standard errors if
     # these are less. With a prior far wider than the population, its unit would miss all data.
@@ -95,7 +95,7 @@ class EstimateLikelihood:
         """Return the log-density of the score at the estimate, (S, d) -> (S,)."""
         if self.combinations.shape[1] == 0:
             return np.zeros(len(thetas))
-        rows = min(group.rows for group in self.groups)
+        rows = min([group.rows for group in self.groups])
         blocks = []
         for first in range(0, len(thetas), rows):
             block = thetas[first : first + rows]
@@ -173,9 +173,9 @@ def estimate_likelihood(
     # Whitening or bandwidths by few observed specimens would bias the estimate: if they happen to
     # scatter little, the bandwidth is small and the weight in the sum of simulators large.
     nodes = evaluator.nodes
-    has_several_outputs = any(node.target.event for node in nodes)
-    fewest = min(len(node.observed) for node in nodes)
-    if has_several_outputs or len(nodes) > 1 or fewest < options.few_specimens:
+    events = [node.target.event for node in nodes]
+    fewest = min([len(node.observed) for node in nodes])
+    if any(events) or len(nodes) > 1 or fewest < options.few_specimens:
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
     evaluator = coarser_evaluator(evaluator, point) or evaluator
@@ -187,12 +187,13 @@ def estimate_likelihood(
     pairs = [group.population(evaluator, point[None]) for group in score_groups]
     log_weights, scores = zip(*pairs, strict=True)
     untilted = cumulants(log_weights, scores, np.zeros((1, len(point))))
-    size = sum(score.size for score in scores)
+    size = sum([score.size for score in scores])
     combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
     # A hundred standard errors of each element, or the prior's spread if it is less.
     hyperparameters = evaluator.hyperparameters
-    if all(node.bound.stored for node in evaluator.nodes):
-        n_observed = sum(len(node.observed) for node in evaluator.nodes)
+    is_stored = [node.bound.stored for node in nodes]
+    if all(is_stored):
+        n_observed = sum([len(node.observed) for node in nodes])
         precision = _likelihood_spread(evaluator, point, options) * np.sqrt(n_observed)
         scale = 100 / np.maximum(precision, 100) * hyperparameters.prior_sd
     else:
@@ -202,7 +203,7 @@ def estimate_likelihood(
     return EstimateLikelihood(
         evaluator=evaluator,
         starts=np.vstack([point, optima[1:]]),
-        groups=tuple(replace(group, combinations=combinations) for group in score_groups),
+        groups=[replace(group, combinations=combinations) for group in score_groups],
         combinations=combinations,
         scale=scale,
         options=options.saddlepoint,
@@ -264,7 +265,8 @@ def _group_scores(
         functions.append((factor, score))
     mean = observed.mean(axis=0)
     identity = np.eye(len(point))
-    if not all(node.bound.stored for node in nodes):
+    is_stored = [node.bound.stored for node in nodes]
+    if not all(is_stored):
         tables = []
         for k, (factor, _), population in zip(members, functions, populations, strict=True):
             assert isinstance(population, ShiftedResponses)
@@ -275,10 +277,11 @@ def _group_scores(
     is_observable = np.ones(len(populations[0].responses), dtype=bool)
     for node, population in zip(nodes, populations, strict=True):
         is_observable &= observable(population.responses, node.target)
-    stored = -mean + sum(
+    parts = [
         factor * score(population.responses[is_observable])
         for (factor, score), population in zip(functions, populations, strict=True)
-    )
+    ]
+    stored = sum(parts) - mean
     rows = max(16, IN_CACHE // len(stored))
     return StoredScores(members[0], is_observable, stored, n, identity, rows)
 
@@ -308,7 +311,8 @@ def _derivatives(
 
 def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
     """Return the estimate, (d,), or a point towards the middle of the prior if it is at an edge."""
-    if not all(node.bound.stored for node in evaluator.nodes):
+    is_stored = [node.bound.stored for node in evaluator.nodes]
+    if not all(is_stored):
         return theta
     hyperparameters = evaluator.hyperparameters
     direction = np.median(hyperparameters.prior_points(256, 0), axis=0) - theta
@@ -372,8 +376,7 @@ class Scores:
         return np.concatenate([ones, scores, scores[first] * scores[second]])
 
 
-@dataclass(frozen=True, eq=False)
-class Cumulants:
+class Cumulants(NamedTuple):
     """The cumulant function at S tilts, (S,), with gradients, (S, r), and Hessians, (S, r, r)."""
 
     values: Floats
@@ -460,7 +463,7 @@ def log_density(
         return cumulants([logs[rows] for logs in supported], scores, tilts)
 
     shape = len(supported[0]), scores[0].values.shape[1]
-    size = sum(score.size for score in scores)
+    size = sum([score.size for score in scores])
     result[is_supported] = saddlepoint_density(function, shape, size, options)
     return result
 

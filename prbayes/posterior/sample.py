@@ -24,7 +24,6 @@ from prbayes.posterior import smc
 from prbayes.posterior.importance import (
     ImportanceOptions,
     Laplace,
-    Prior,
     importance_sample,
     laplace,
 )
@@ -56,15 +55,14 @@ def sample(
 ) -> xr.DataTree:
     """Draw from the posterior of any model, by the fastest sampler that is exact for it.
 
-    With the log-likelihood by specimen: importance sampling from Laplace approximations of the
-    modes, then from mixtures fitted to the weighted points. If Pareto k stays above .7, or the
-    effective sample size below half of the draws, NUTS from the optimum; with several modes, or a
-    likelihood that jumps at the optimum, sequential Monte Carlo from the prior.
+    The first sampler is importance sampling from Laplace approximations of the modes, then from
+    mixtures fitted to the weighted points [1]_. It is replaced if Pareto k is above .7, or the
+    effective sample size below half of the draws. NUTS then starts at the optimum. Sequential Monte
+    Carlo serves models with a metric, several modes, or a likelihood that jumps at the optimum.
 
-    With a metric, the posterior is prior times density of the metric's own estimate, by a
-    saddlepoint approximation [2]_: of its score, if the gradient is a mean over specimens (PR, the
-    Kullback-Leibler divergence), else of refits of synthetic data sets on stored responses. It is
-    sampled in the same way, without NUTS.
+    With a metric, the posterior is prior times density of the metric's own estimate. The density is
+    a saddlepoint approximation [2]_. It is that of the score if the gradient is a mean over
+    specimens (PR, the Kullback-Leibler divergence), else of refits of synthetic data sets.
 
     Parameters
     ----------
@@ -79,9 +77,8 @@ def sample(
     idata_kwargs, var_names
         As in `sample_smc`.
     max_seconds : float, optional
-        Seconds after which no further run is begun. If they are over, or ``max_runs`` is reached,
-        during sequential Monte Carlo, the finished chains are returned, if there are any; the
-        attribute ``stopped`` and a warning say so.
+        Seconds after which no further run begins. Sequential Monte Carlo then returns its finished
+        chains, with the attribute ``stopped`` and a warning.
     max_runs : int, optional
         Largest number of responses to compute, the first runs included.
     random_seed : int, sequence of int, numpy.random.Generator or None
@@ -90,10 +87,10 @@ def sample(
     Returns
     -------
     xarray.DataTree
-        The groups of `sample_smc`. The attribute ``sampler`` of ``posterior`` is the name of the
-        sampler. Importance sampling has the attributes ``pareto_k``, ``efficiency`` (effective
-        sample size as a share of the points) and ``log_marginal_likelihood``, and ``lp``, the log
-        posterior density in unconstrained space, in ``sample_stats`` (chain, draw).
+        The groups of `sample_smc`. The attribute ``sampler`` of ``posterior`` is the sampler's
+        name. Importance sampling adds ``pareto_k``, ``efficiency`` (effective sample size of a
+        point) and ``log_marginal_likelihood``. Its ``sample_stats`` have ``lp``, the log posterior
+        density in unconstrained space.
 
     Raises
     ------
@@ -214,7 +211,7 @@ def _importance_chains(
     """Return draws by importance sampling, None if they are not reliable."""
     shape = settings.chains, settings.draws
     hyperparameters = target.evaluator.hyperparameters
-    prior = Prior(hyperparameters.prior_thetas, hyperparameters.log_prior)
+    prior = hyperparameters.prior_thetas, hyperparameters.log_prior
     seed = seed_number(settings.random_seed)
     size = settings.chains * settings.draws
     options = ImportanceOptions()

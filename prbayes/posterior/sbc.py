@@ -47,11 +47,10 @@ def simulation_based_calibration(
 ) -> xr.DataTree:
     """Calibrate many data sets with known hyperparameters, and rank these among the draws.
 
-    Each time hyperparameters are drawn from the prior, and specimens from their populations, for
-    which the response is called; with the log-likelihood by specimen its emulator gives the
-    responses, nothing is run, and the emulator itself is not checked. Then `sample`, or
-    `sample_smc` with ``adjustment=None``, runs as on measurements. If posteriors have the right
-    width and place, the ranks are uniform. The check covers the whole prior, not one true value.
+    Hyperparameters are drawn from the prior, and specimens from their populations. The response is
+    called for them; with the log-likelihood by specimen its emulator is, which is not checked. Then
+    `sample`, or `sample_smc` with ``adjustment=None``, runs as on measurements. If posteriors have
+    the right width and place, the ranks are uniform. The check covers the whole prior.
 
     Parameters
     ----------
@@ -118,7 +117,7 @@ def simulation_based_calibration(
     obstacle = None if evaluator.nodes else simulation_obstacle(evaluator)
     if obstacle is not None:
         raise ValueError(
-            f"simulation_based_calibration: {obstacle}, so that data sets cannot be drawn; "
+            f"simulation_based_calibration: {obstacle}, and data sets cannot be drawn; "
             "calibrate data of your own simulations with prb.sample_smc"
         )
     if evaluator.nodes and evaluator.has_other_terms:

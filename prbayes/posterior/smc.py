@@ -139,8 +139,8 @@ def sample_smc(
         count.
     checkpoint : path-like, optional
         A file with the state after every stage: a run that was killed continues there when it is
-        called again, and returns the same draws. Give the propagations a ``store`` as well, so that
-        the search for the optimum computes no response again.
+        called again, and returns the same draws. A ``store`` of the propagations keeps the
+        responses of the search for the optimum.
     random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
 
@@ -322,8 +322,8 @@ def result_of(
     if chains.stopped:
         again = "" if settings.checkpoint is None else f" and checkpoint={settings.checkpoint}"
         text = (
-            f"{chains.stopped}, so that {len(chains.thetas)} of {settings.chains} chains are here, "
-            "and what would have cost responses is left out; call prb.sample_smc with a larger "
+            f"{chains.stopped}: {len(chains.thetas)} of {settings.chains} chains are finished, and "
+            "results that cost responses are left out; call prb.sample_smc with a larger "
             f"budget{again}."
         )
         page = "expensive.md#a-night-is-not-enough"
@@ -331,16 +331,15 @@ def result_of(
     thetas, lost, discrepancies = chains.thetas, chains.lost, chains.discrepancies
     rows = thetas.reshape(-1, evaluator.hyperparameters.size)
     if not is_pseudo:
-        lost = _lost_of_some(evaluator, thetas)
-        discrepancies = np.full(lost.shape, np.nan)
+        discrepancies = np.full((*thetas.shape[:2], len(evaluator.nodes)), np.nan)
+        lost = discrepancies
+        is_stored = [node.bound.stored for node in evaluator.nodes]
+        if not all(is_stored):
+            lost = _lost_of_some(evaluator, thetas)
     assert lost is not None
     findings += _lost_findings(evaluator, lost, chains.missing)
     with unlimited():
-        if is_pseudo and settings.with_groups:
-            kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
-            other_terms = evaluator.log_other(rows).reshape(thetas.shape[:2])
-            chains = replace(chains, log_likelihood=kernels.sum(axis=-1) + other_terms)
-        elif not is_pseudo and evaluator.nodes and not evaluator.responses_per_theta:
+        if not is_pseudo and evaluator.nodes and not evaluator.responses_per_theta:
             discrepancies = evaluator(rows).discrepancies.reshape(lost.shape)
         chains = replace(chains, discrepancies=discrepancies, lost=lost)
         groups = {}
@@ -398,8 +397,8 @@ def _lost_findings(
                 Finding(
                     "lost-mass",
                     f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
-                    f"{limit:.1%} of the population has no response (NaN), so that they rest on "
-                    "the specimens that have one; repair the response, return +inf for specimens "
+                    f"{limit:.1%} of the population has no response (NaN), and they rest on the "
+                    "specimens that have one; repair the response, return +inf for specimens "
                     "that fail, or narrow the priors.",
                     "expensive.md#when-a-run-fails",
                 )
@@ -441,9 +440,14 @@ def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum |
 
 
 def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
-    """Return chains with errors of the discrepancies and missing responses at the best draw."""
-    assert chains.discrepancies is not None
-    total = (chains.discrepancies / evaluator.epsilon).sum(axis=-1)
+    """Return chains with log-likelihoods, and errors and missing responses at the best draw."""
+    discrepancies = chains.discrepancies
+    assert discrepancies is not None
+    kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
+    rows = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
+    other_terms = evaluator.log_other(rows).reshape(kernels.shape[:2])
+    chains = replace(chains, log_likelihood=kernels.sum(axis=-1) + other_terms)
+    total = (discrepancies / evaluator.epsilon).sum(axis=-1)
     best = chains.thetas[np.unravel_index(total.argmin(), total.shape)]
     errors = []
     missing = {}
@@ -463,7 +467,7 @@ def _chains_on_designs(
     evaluator: Evaluator, settings: SamplingSettings, optimum: Optimum | None
 ) -> Chains:
     """Return chains that the designs support, after refinements, or raise."""
-    starts = _starts(evaluator, settings)
+    starts = None if settings.start is None else _starts(evaluator, settings)
     checkpoint = None
     entropy: int | None = settings.random_seed
     if settings.checkpoint is not None:
@@ -509,11 +513,9 @@ def _chains_on_designs(
     return replace(chains, log_likelihood=log_likelihood(rows).reshape(chains.thetas.shape[:2]))
 
 
-def _starts(evaluator: Evaluator, settings: SamplingSettings) -> list[Floats] | None:
-    """Return the particles that each chain begins with, None for draws of the prior."""
+def _starts(evaluator: Evaluator, settings: SamplingSettings) -> list[Floats]:
+    """Return the particles that each chain begins with."""
     start, chains = settings.start, settings.chains
-    if start is None:
-        return None
     by_chain = list(start) if isinstance(start, list | tuple) else [start] * chains
     if len(by_chain) != chains:
         raise ValueError(
@@ -587,9 +589,9 @@ def run_chains(
             stages.append(kernel.stages)
     if not finished:
         raise BudgetError(stopped)
-    thetas, discrepancies, lost = (
+    thetas, discrepancies, lost = [
         np.array([arrays[name] for arrays in finished]) for name in _SAVED
-    )
+    ]
     stats, evidence = _stage_statistics(stages)
     is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
     return Chains(
@@ -650,7 +652,7 @@ def _save(
 
 def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, float]]:
     """Return statistics by chain and stage, NaN after the last one, and the mean evidence."""
-    n_stages = max(len(stages["beta"]) for stages in chains)
+    n_stages = max([len(stages["beta"]) for stages in chains])
     variables = {}
     for name in chains[0]:
         table = np.full((len(chains), n_stages), np.nan)

@@ -117,7 +117,8 @@ def prior_conflicts(
     optimum: Optimum, evaluator: Evaluator, thetas: Floats, size: int = 4096
 ) -> tuple[Finding, ...]:
     """Report hyperparameters whose prior pulls the posterior thetas from the estimate."""
-    if optimum.search.prior or any(rival["comparable"] for rival in optimum.rivals):
+    comparable = [rival["comparable"] for rival in optimum.rivals]
+    if optimum.search.prior or any(comparable):
         return ()
     order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
     covariance = optimum.covariance[np.ix_(order, order)]
@@ -249,21 +250,18 @@ def extended_log_density(
 
     def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
         empirical = cumulants([log_weights[rows]], scores, tilts)
-        linear = np.einsum("skl,sl->sk", covariance[rows], tilts)
-        normal = (mean[rows] * tilts).sum(axis=1) + (linear * tilts).sum(axis=1) / 2
-        weight = share[rows]
-        normal_weight = 1 - weight
-        gradients = normal_weight[:, None] * (mean[rows] + linear)
-        hessians = normal_weight[:, None, None] * covariance[rows]
-        return Cumulants(
-            weight * empirical.values + normal_weight * normal,
-            weight[:, None] * empirical.gradients + gradients,
-            weight[:, None, None] * empirical.hessians + hessians,
-        )
+        center, within = mean[rows], covariance[rows]
+        linear = np.einsum("skl,sl->sk", within, tilts)
+        values = (center * tilts).sum(axis=1) + (linear * tilts).sum(axis=1) / 2
+        mixed = []
+        for of_sets, of_normal in zip(empirical, (values, center + linear, within), strict=True):
+            weight = share[rows].reshape(-1, *[1] * (of_sets.ndim - 1))
+            mixed.append(weight * of_sets + (1 - weight) * of_normal)
+        return Cumulants(*mixed)
 
-    mixed = saddlepoint_density(function, shifts.shape, 1, options.saddlepoint)
+    logs = saddlepoint_density(function, shifts.shape, 1, options.saddlepoint)
     normal = -(distance + np.linalg.slogdet(covariance)[1]) / 2
-    return np.where(np.isfinite(mixed), mixed, normal)
+    return np.where(np.isfinite(logs), logs, normal)
 
 
 def refit_likelihood(

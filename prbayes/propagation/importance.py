@@ -6,7 +6,7 @@ Between stored runs a sample may have points with emulated responses.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -263,16 +263,31 @@ class DesignEmulator:
     runs: Runs
     surfaces: tuple[Any, ...]  # by output
     left_out: Floats  # (n, m): predictions of runs that were left out
+    event: tuple[int, ...]  # shape of one response: () or (m,)
     weights: Floats  # (T, n): of the runs in the populations that matter
-    run_share: float  # mixing weight of the runs among the points of a population
+    run_share: float = 1.0  # mixing weight of the runs among the points of a population
     # Root mean square error of the worst output at runs that were left out, in units of its spread
     # in the populations that matter.
-    error: float
-    event: tuple[int, ...]  # shape of one response: () or (m,)
+    error: float = np.nan
 
     def for_populations(self, weights: Floats) -> DesignEmulator | None:
-        """Return the same surfaces for other populations; None where runs alone are as good."""
-        return _for_populations(self.runs, self.surfaces, self.left_out, weights, self.event)
+        """Return the same surfaces for populations; None where the runs alone are as good."""
+        runs, left_out = self.runs, self.left_out
+        share = mixing_weight(weights, runs.y, left_out, runs.blocks)
+        if share > SIZES.runs_alone:
+            return None
+        share = 0.0 if share < SIZES.runs_negligible else share
+        has_prediction = runs.good & np.isfinite(left_out).all(axis=1)
+        importance = weights.mean(axis=0)[has_prediction]
+        total = importance.sum()
+        worst = np.nan
+        if total > 0:
+            y = runs.y[has_prediction]
+            importance = importance / total
+            spread = np.sqrt(importance @ (y - importance @ y) ** 2)
+            error = np.sqrt(importance @ (left_out[has_prediction] - y) ** 2)
+            worst = float((error / np.where(spread > 0, spread, 1.0)).max())
+        return replace(self, weights=weights, run_share=share, error=worst)
 
     @property
     def n_following(self) -> int:
@@ -330,33 +345,8 @@ def fit_emulator(
         best, left_out = select_surfaces(surfaces, fitted)
     except np.linalg.LinAlgError:
         return None
-    return _for_populations(fitted, best, left_out, weights, runs.values.shape[1:])
-
-
-def _for_populations(
-    runs: Runs,
-    surfaces: tuple[Any, ...],
-    left_out: Floats,
-    weights: Floats,
-    event: tuple[int, ...],
-) -> DesignEmulator | None:
-    """Return an emulator with the share of the runs; None where they stay alone."""
-    share = mixing_weight(weights, runs.y, left_out, runs.blocks)
-    if share > SIZES.runs_alone:
-        return None
-    share = 0.0 if share < SIZES.runs_negligible else share
-    # The error of the worst output at runs that were left out, in its spreads.
-    has_prediction = runs.good & np.isfinite(left_out).all(axis=1)
-    importance = weights.mean(axis=0)[has_prediction]
-    total = importance.sum()
-    worst = np.nan
-    if total > 0:
-        y = runs.y[has_prediction]
-        importance = importance / total
-        spread = np.sqrt(importance @ (y - importance @ y) ** 2)
-        error = np.sqrt(importance @ (left_out[has_prediction] - y) ** 2)
-        worst = float((error / np.where(spread > 0, spread, 1.0)).max())
-    return DesignEmulator(runs, surfaces, left_out, weights, share, worst, event)
+    fit = DesignEmulator(fitted, best, left_out, runs.values.shape[1:], weights)
+    return fit.for_populations(weights)
 
 
 class CoarseResponse:

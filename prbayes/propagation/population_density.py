@@ -98,8 +98,7 @@ def _standardised(values: Floats) -> Floats:
 class ExponentialForm:
     """Log-densities at n fixed points as a matrix product."""
 
-    # (q + 1, n): sufficient statistics of all inputs, the last of which is the constant; zero
-    # outside of the support
+    # (q + 1, n): sufficient statistics of all inputs, then the constant; zero outside the support
     statistics: Floats
     is_inside: NDArray[np.bool_]  # (n,): points of the support
     # (q + 1, *event): points at which the log-density determines the natural parameters

@@ -19,7 +19,7 @@ from prbayes.model.fingerprint import (
     Identity,
     Level,
     differences,
-    identity_of_model,
+    identity_of,
     require_same,
     require_together,
 )
@@ -267,7 +267,7 @@ def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | 
     """Raise if no posterior is under the prior of the model, which the report prints."""
     if model is None or not population_simulators(model):
         return
-    expected = identity_of_model(model)
+    expected = identity_of(model)
     posteriors = {label: identity for label, identity in identities.items() if identity is not None}
     if posteriors and all(differences(i, expected, Level.PRIORS) for i in posteriors.values()):
         label, identity = next(iter(posteriors.items()))
@@ -340,7 +340,7 @@ def _diagnosis(result: Optimum | xr.DataTree, model: pm.Model | None) -> Diagnos
     identity = identity_in(result)
     if model is not None and identity is not None:
         # The model is of no use to a saved result by another metric or prior
-        is_other = differences(identity, identity_of_model(model), Level.OPTIMUM)
+        is_other = differences(identity, identity_of(model), Level.OPTIMUM)
         model = None if is_other else model
     if model is None and not {"optimum", "calibration"} & set(result.children):
         return None

@@ -241,11 +241,7 @@ def checked(
     arguments: Sequence[Any],
     outputs: Outputs | None = SINGLE_OUTPUT,
 ) -> tuple[Floats, Outputs | None]:
-    """Return a response's result as floats, shape (*batch, *event), or raise `ResponseError`.
-
-    If one output of a point is NaN, all of its outputs are. Outputs that are not known are those of
-    the result, if it is a mapping.
-    """
+    """Return a result as floats, (*batch, *event), and its outputs, or raise `ResponseError`."""
     try:
         if isinstance(result, Mapping):
             outputs = outputs or outputs_of_result(result, len(batch))
@@ -285,7 +281,7 @@ def checked(
             f"{count} per specimen; {remedy}"
         )
     values = array.astype(np.float64)
-    if expected:
+    if expected:  # a point with an output that is NaN has no response
         values[np.isnan(values).any(axis=-1)] = np.nan
     return values, outputs
 
@@ -384,9 +380,20 @@ def respond(
     """
     policy = settings.on_failure
     _verify_store(settings, points, tally)
-    keys = points.keys() if settings.store is not None else np.empty((len(points), 0))
-    values, missing, failed = _stored(settings, keys)
+    event = () if settings.outputs is None else settings.outputs.event
+    values, missing = np.full((len(points), *event), np.nan), np.arange(len(points))
+    failed: dict[int, str] = {}
     raised: dict[int, str] = {}
+    if settings.store is not None:
+        keys = points.keys()
+        values, is_stored = settings.store.find(keys)
+        if settings.outputs is not None:
+            values = values.reshape(len(keys), *event)
+        failed = settings.store.failed(keys)
+        if settings.retry_failed or not isinstance(policy.final, Replace):
+            is_stored[list(failed)] = False
+            failed = {}
+        missing = np.flatnonzero(~is_stored)
     for attempt in range(policy.tries):
         is_last = attempt == policy.tries - 1
         tolerant = isinstance(policy.final, Replace) or not is_last
@@ -414,10 +421,7 @@ def respond(
 
 
 def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
-    """Compute one stored response again, once for a store without a version.
-
-    The function, or its variables, may have changed since the response was stored.
-    """
+    """Compute a stored response again, once: the function or its variables may have changed."""
     store = settings.store
     if store is None or store.verified:
         return
@@ -456,30 +460,13 @@ def _numbers_text(values: Floats, digits: int = 10) -> str:
     return f"({text}, ...)" if values.size > 6 else f"({text})"
 
 
-def _stored(settings: CallSettings, keys: Floats) -> tuple[Floats, Rows, dict[int, str]]:
-    """Return the stored responses, the rows to compute, and the reasons of stored failures."""
-    if settings.store is None:
-        event = () if settings.outputs is None else settings.outputs.event
-        return np.full((len(keys), *event), np.nan), np.arange(len(keys)), {}
-    values, is_stored = settings.store.find(keys)
-    if settings.outputs is not None:
-        values = values.reshape(len(keys), *settings.outputs.event)
-    failed = settings.store.failed(keys)
-    if settings.retry_failed or not isinstance(settings.on_failure.final, Replace):
-        is_stored[list(failed)] = False
-        failed = {}
-    return values, np.flatnonzero(~is_stored), failed
-
-
 def _add_to_store(
     store: Store, keys: Floats, finished: Sequence[Finished], *, is_last: bool, tolerant: bool
 ) -> None:
-    """Store finished chunks in one transaction, since each waits for the disk.
-
-    After the last try NaN is a result, too, except in a chunk that a failure ended.
-    """
+    """Store finished chunks in one transaction, since each waits for the disk."""
     parts = []
     for rows, chunk in finished:
+        # After the last try NaN is a result, too, except in a chunk that a failure ended.
         is_complete = tolerant or not chunk.raised
         stored = np.flatnonzero(~is_missing(chunk.values) | (is_last and is_complete))
         if stored.size:

@@ -59,10 +59,7 @@ def _index_batches(fgraph: Any, node: Any) -> Any:
 
 
 class _Where(Op):
-    """Choose between arrays, at no cost where the first is chosen throughout.
-
-    Every density checks whether its values and parameters are in its support; most often all are.
-    """
+    """Choose between arrays, at no cost if all are the first: most values are in a support."""
 
     __props__ = ()
     view_map = {0: [1]}  # noqa: RUF012 - what PyTensor declares
@@ -123,10 +120,9 @@ def compiled(
     *,
     allow_input_downcast: bool | None = None,
 ) -> Any:
-    """Compile a graph, unless a graph of the same structure was compiled in this process.
+    """Compile a graph, or copy the function of a graph of the same structure.
 
-    Another evaluator of the same model gets a copy with its own storage, so two threads may call
-    both. Shared variables are those of the graph; the cached function has empty ones.
+    A copy has its own storage, for another thread, and the shared variables of its graph.
     """
     shared = [
         v
@@ -166,10 +162,9 @@ def compiled(
 def _structure(
     inputs: Sequence[TensorVariable], outputs: Sequence[TensorVariable], *options: Hashable
 ) -> tuple[Hashable, ...] | None:
-    """Return options, operations, constants and connections of a graph, without names.
+    """Return options, operations, constants and connections of a graph without names.
 
-    None for graphs that must not be kept: with random numbers, operations outside PyTensor, or
-    many constants.
+    None for graphs with random numbers, operations outside PyTensor or many constants.
     """
     number: dict[Variable, int] = {}
     structure: list[Hashable] = [*options]

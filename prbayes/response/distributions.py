@@ -33,10 +33,7 @@ def log_density(
     values: Sequence[Any],
     instead: Mapping[int, Callable[[TensorVariable, Any], TensorVariable]] | None = None,
 ) -> TensorVariable:
-    """Return log p(x), shape (n,), of values (n, *event), summed over the aleatory inputs.
-
-    ``instead`` has other log-densities for some inputs, by their positions.
-    """
+    """Return log p(x), (n,), of values (n, *event), by ``instead`` for some positions of inputs."""
     total: Any = 0.0
     triples = zip(aleatory, values, inputs.event_shapes, strict=True)
     for i, (dist, x, shape) in enumerate(triples):
@@ -66,10 +63,7 @@ def compiled_log_density(inputs: Inputs) -> Any:
 
 
 def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
-    """Return log p(x) by forward substitution, elementwise.
-
-    PyMC's own density solves once for each theta and point of a batch.
-    """
+    """Return log p(x) by elementwise substitution: PyMC solves for each theta and point."""
     *freedom, mean, covariance = dist.owner.op.dist_params(dist.owner)
     root = _cholesky(covariance, size)
     # Solve root z = x - mean.
@@ -95,11 +89,8 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
 
 
 def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
-    """Return the rows of a lower Cholesky factor, NaN if the matrix is not positive definite.
-
-    Elementwise if it is small: PyTensor's loops over the matrices of a batch.
-    """
-    if size > 4:
+    """Return the rows of a lower Cholesky factor, NaN if the matrix is not positive definite."""
+    if size > 4:  # below elementwise: PyTensor loops over the matrices of a batch
         root = pt.linalg.cholesky(matrix, on_error="nan")
         return [[root[..., i, j] for j in range(i + 1)] for i in range(size)]
     rows: list[list[Any]] = []
@@ -115,10 +106,8 @@ def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
 
 
 def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None:
-    """Raise if a covariance is not symmetric, at values of the roots, (k, *shape).
-
-    Density and draws read one half of the matrix only.
-    """
+    """Raise if a covariance is not symmetric, at values of the roots, (k, *shape)."""
+    # Density and draws read one half of the matrix only.
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     covariances = [
@@ -138,11 +127,7 @@ def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None
 
 
 def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
-    """Return the inverse distribution function of ``dist`` at u, shape (n, *event).
-
-    A multivariate normal takes its mean plus Cholesky factor times standard normal quantiles.
-    Discrete distributions and those without one in PyMC are refused.
-    """
+    """Return the inverse distribution function of ``dist`` at u, (n, *event), or raise."""
     op = dist.owner.op
     advice = "use propagation=prb.Reweighted() or prb.Fresh()"
     if dist.dtype.startswith(("int", "uint", "bool")):
@@ -332,8 +317,7 @@ class PopulationSampler:
     ) -> tuple[list[Floats], list[Floats]]:
         """Draw n specimens from each of k populations, at roots (k, *shape).
 
-        Aleatory inputs have shapes (k, n, *event); epistemic ones (k, 1, *event), or (*event) where
-        they depend on no root.
+        Aleatory inputs are (k, n, *event), epistemic ones (k, 1, *event), or (*event) without root.
         """
         _seed(self._function, rng)
         try:

@@ -85,11 +85,9 @@ class _AlarmError(TimeoutError):
 
 @contextmanager
 def time_limit(seconds: float | None) -> Iterator[None]:
-    """Raise `TimeoutError` in the block after some seconds, or end this process a while later.
-
-    A signal interrupts the main thread. Other threads, and code that never returns to Python, end
-    with their process.
-    """
+    """Raise `TimeoutError` in the block after some seconds, or end this process a while later."""
+    # A signal interrupts the main thread. Other threads, and code that never returns to Python,
+    # end with their process.
     if seconds is None:
         yield
         return
@@ -184,10 +182,11 @@ def has_slipped(failure: BaseException | None) -> bool:
 
     Its executor takes the result for an exception if the task is running again by then.
     """
-    frames = [frame for frame, _ in walk_tb(getattr(failure, "__traceback__", None))]
+    if not isinstance(failure, TypeError):
+        return False
+    frames = [frame for frame, _ in walk_tb(failure.__traceback__)]
     file = frames[-1].f_code.co_filename if frames else ""
-    is_dask = Path(file).parts[-2:] == ("distributed", "cfexecutor.py")
-    return isinstance(failure, TypeError) and is_dask
+    return Path(file).parts[-2:] == ("distributed", "cfexecutor.py")
 
 
 def failure_text(failure: BaseException) -> str:
@@ -226,10 +225,10 @@ class Pool:
         # The standard library and loky store their arguments under the same names.
         parameters = signature(kind).parameters
         arguments: dict[str, Any] = {"max_workers": getattr(self.original, "_max_workers", None)}
-        for name in ("mp_context", "context", "initializer", "initargs"):
-            value = getattr(self.original, f"_{name}", None)
-            if name in parameters and value is not None:
-                arguments[name] = value
+        for attribute in ("_mp_context", "_context", "_initializer", "_initargs"):
+            value = getattr(self.original, attribute, None)
+            if attribute[1:] in parameters and value is not None:
+                arguments[attribute[1:]] = value
         _replacements[self.original] = kind(**arguments)
 
     def refuse_dead(self) -> None:
@@ -257,10 +256,7 @@ class Pool:
         return future
 
     def done(self, futures: Iterable[Future[Any]]) -> set[Future[Any]]:
-        """Return the finished futures, at least one of them; log a long silence.
-
-        Ten minutes without any worker are an error.
-        """
+        """Return finished futures, at least one; ten minutes without any worker are an error."""
         waiting = list(futures)
         silent, absences = 0.0, 0
         while True:

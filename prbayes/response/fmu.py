@@ -300,10 +300,7 @@ class Variable:
 
 
 def _variable(description: Any, name: str, argument: str) -> Variable:
-    """Return a variable with one number, which inputs and parameters can set.
-
-    A parameter may be a text.
-    """
+    """Return a variable with one number, which inputs and parameters set; or one text."""
     unit = description.modelName
     described = {v.name: v for v in description.modelVariables}
     if name not in described:
@@ -556,11 +553,8 @@ def _log_text() -> str:
 
 @cache
 def _callbacks() -> Any:
-    """Return the functions that units of FMI 2 call, for as long as this process lives.
-
-    FMPy's proxy for messages with arguments is left out: it calls the logger of the first unit even
-    after that is gone. Messages keep their %s.
-    """
+    """Return the functions that units of FMI 2 call, for as long as this process lives."""
+    # Without FMPy's proxy, which calls the logger of a unit that is gone; messages keep their %s.
     from fmpy import calloc, fmi2, free
 
     callbacks = fmi2.fmi2CallbackFunctions()

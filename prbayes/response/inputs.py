@@ -114,10 +114,7 @@ class Inputs:
 
 
 def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
-    """Sort the inputs of a response into aleatory, epistemic and constant ones.
-
-    One has to be aleatory, and one to depend on a model variable.
-    """
+    """Sort the inputs of a response into aleatory, epistemic and constant ones, or raise."""
     model_variables: set[Variable] = set(model.basic_RVs)
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
@@ -126,7 +123,21 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     for i, x in enumerate(inputs):
         label = f"{name}: input {i + 1}"
         if not isinstance(x, Variable):
-            arguments.append(_constant(x, label))
+            try:
+                array = real_array(x, label)
+            except TypeError as error:
+                raise TypeError(
+                    f"{error}; an input is a `.dist()` (varies between specimens), a model "
+                    "variable (common to all) or a number"
+                ) from None
+            if not np.isfinite(array).all():
+                raise ValueError(
+                    f"{label}: got a constant that is not finite ({x!r:.60}), expected a number"
+                )
+            # Neither the user nor the response may change it between two responses.
+            array = array.copy()
+            array.setflags(write=False)
+            arguments.append(array if array.ndim else float(array))
             continue
         model_variables.update(filter(is_group, _ancestry([x], model_variables)))
         ancestry = _ancestry([x], model_variables)
@@ -212,26 +223,6 @@ def _refuse_foreign_variables(
             "variable of this model or a constant; create the variables it depends on inside the "
             "same `with pm.Model()`"
         )
-
-
-def _constant(x: object, label: str) -> Any:
-    try:
-        array = real_array(x, label)  # type: ignore[arg-type]
-    except TypeError as error:
-        raise TypeError(
-            f"{error}; an input is a `.dist()` (varies between specimens), a model variable "
-            "(common to all) or a number"
-        ) from None
-    if not np.isfinite(array).all():
-        raise ValueError(
-            f"{label}: got a constant that is not finite ({x!r:.60}), expected a number"
-        )
-    if array.ndim == 0:
-        return float(array)
-    # Neither the user nor the response may change it between two responses.
-    array = array.copy()
-    array.setflags(write=False)
-    return array
 
 
 # -- variables of a graph --------------------------------------------------------------------------

@@ -85,12 +85,7 @@ def outputs_of_keys(keys: Sequence[tuple[str, int | None]]) -> Outputs:
 
 
 def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
-    """Return observed responses, (N,) or (N, m), and their outputs.
-
-    One dimension is one output. With two, the first are specimens and the second outputs: a
-    DataFrame's columns and a DataArray's coordinate name them. A mapping has an array for each
-    output, or group of outputs.
-    """
+    """Return observed responses, (N,) or (N, m), and their outputs, with names where they have."""
     label = f"{name}: observed"
     if isinstance(observed, Mapping):
         return _from_mapping(label, observed)

@@ -39,10 +39,7 @@ def refuse_uncallable(name: str, function: object, argument: str = "response") -
 def refuse_misfit(
     name: str, function: Any, sizes: Sequence[int], outputs: Outputs | None = None
 ) -> None:
-    """Raise if a function takes other arguments than there are inputs, of these sizes.
-
-    A function of one specimen may have a method of this name, which compares the outputs, too.
-    """
+    """Raise if a function takes other arguments than inputs of these sizes, or other outputs."""
     inner: Any = function.function if isinstance(function, scalar) else function
     try:
         # Of a decorated function its own signature, not that of the function inside.
@@ -58,7 +55,7 @@ def refuse_misfit(
             f"({error}), expected an input for each argument; a multivariate input is one "
             "argument, an array with an axis for its elements"
         ) from None
-    if hasattr(inner, "refuse_misfit"):
+    if hasattr(inner, "refuse_misfit"):  # of a program, unit or server
         inner.refuse_misfit(name, sizes, outputs)
 
 
@@ -103,12 +100,7 @@ class Runs:
 
 
 class Responses:
-    """The user's response: a function of inputs, and how it is called.
-
-    A function of whole batches without other settings is called once for each batch. Every other
-    one goes through `respond`: on an executor, in chunks, with a store (a folder) and a failure
-    policy. ``outputs`` of None are those of the first run.
-    """
+    """The user's response: a function of inputs, called once for each batch or by `respond`."""
 
     def __init__(
         self,
@@ -122,7 +114,7 @@ class Responses:
         on_failure: OnFailure | None = None,
         retry_failed: bool = False,
         timeout: float | None = None,
-        outputs: Outputs | None = SINGLE_OUTPUT,
+        outputs: Outputs | None = SINGLE_OUTPUT,  # None takes those of the first run
     ) -> None:
         refuse_uncallable(name, function)
         refuse_misfit(name, function, inputs.sizes, outputs)
@@ -144,6 +136,7 @@ class Responses:
         self.outputs = outputs
         self.function = function
         self.inputs = inputs
+        # Without other settings a function of batches is called once for each of them.
         self.is_batched = (
             executor is None
             and store is None
@@ -349,9 +342,8 @@ def deduplicated_responses(
 ) -> Floats:
     """Return the responses at points (n, *event), (n,) or (n, m), each different point once.
 
-    ``known`` has points and responses. Discrete inputs have few values, and a censored input
-    repeats its bounds. If four points that are computed again differ, the response is random and is
-    computed at all points.
+    ``known`` has points and responses. A response that differs at four points that are computed
+    again is random, and is computed at all points.
     """
     n = len(points[0])
     known_points, known_values = ([x[:0] for x in points], np.empty(0)) if known is None else known

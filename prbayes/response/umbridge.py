@@ -321,10 +321,7 @@ def _known(url: str, path: str, request: Any) -> dict[str, Any]:
 
 
 def _exchange(url: str, path: str, request: Any, seconds: float | None) -> tuple[int, str]:
-    """Return status and text of the answer to a request.
-
-    `TimeoutError`: no answer in time. `ProtocolError`: lost after the request. Else no connection.
-    """
+    """Return status and text of an answer; `ProtocolError` if it is lost after the request."""
     end = None if seconds is None else time.monotonic() + seconds
     try:
         response = _pool.request(

@@ -78,16 +78,14 @@ def compare(
     Returns
     -------
     xarray.Dataset
-        With dimensions ``result`` and ``hyperparameter``: ``estimate`` (the optimum, or the
-        posterior mean), ``sd`` (the standard error, or the posterior standard deviation),
-        ``lower`` and ``upper`` (an 89% interval: normal, or equal-tailed), ``shift`` (of the
-        estimate from that of the first result, in this
-        result's sd); and by result: ``n_responses`` and ``seconds``, NaN if a result does not have
-        them, and the discrepancy of the estimate's population under each metric, by the metric's
-        class, with the simulator's name before it if there are several; NaN where stored responses
-        do not support it. Of a simulator with the log-likelihood by specimen, populations are
-        emulated, and ``LogLikelihood by specimen`` is minus its mean over the specimens. A notebook
-        shows it as a table.
+        By ``result`` and ``hyperparameter``: ``estimate`` (the optimum, or the posterior mean),
+        ``sd`` (the standard error, or the posterior standard deviation), ``lower`` and ``upper``
+        (an 89% interval: normal, or equal-tailed), and ``shift`` (of the estimate from that of the
+        first result, in sd). By ``result``: ``n_responses`` and ``seconds``, and the discrepancy of
+        the estimate's population by the metric's class, after the simulator's name if there are
+        several. Scores are NaN where stored responses do not support the population. With the
+        log-likelihood by specimen populations are emulated, and ``LogLikelihood by specimen`` is
+        minus its mean over the specimens. A notebook shows a table.
 
     Raises
     ------
@@ -128,15 +126,16 @@ def compare(
         raise ValueError(f"{error}; models of the same data are compared by prb.rank") from None
     optima = [result for result in results.values() if isinstance(result, Optimum)]
     # Draws without coordinates have those of the model.
-    naming = model or next((optimum.model for optimum in optima), None)
+    naming = optima[0].model if model is None and optima else model
     read = [_estimates(label, result, naming) for label, result in results.items()]
     columns, shown, costs = zip(*read, strict=True)
-    shared = [name for name in columns[0] if all(name in column for column in columns)]
+    in_all = set.intersection(*map(set, columns))
+    shared = [name for name in columns[0] if name in in_all]
     if model is not None:
         variables = {variable.name for variable in model.unobserved_RVs}
         shared = [name for name in shared if variable_of(name) in variables]
     in_table = set.intersection(*shown)
-    names = readable_elements(name for name in shared if name in in_table)
+    names = readable_elements([name for name in shared if name in in_table])
     if not names:
         raise ValueError(
             f"compare: got results {list(results)} that share no hyperparameter, "
@@ -191,7 +190,7 @@ class Comparison(xr.Dataset):  # type: ignore[no-untyped-call]
 
 def _estimates(
     label: str, result: Any, naming: pm.Model | None
-) -> tuple[dict[str, tuple[float, ...]], set[str], tuple[float, ...]]:
+) -> tuple[dict[str, tuple[float, ...]], set[str], list[float]]:
     """Return estimate, sd and interval of each element, elements that a table shows, and costs."""
     groups = result.children if isinstance(result, xr.DataTree) else {}
     estimates: dict[str, tuple[float, ...]] = {}
@@ -205,10 +204,8 @@ def _estimates(
     else:
         if isinstance(result, Optimum):
             attrs = {"n_responses": result.n_responses, "seconds": result.search.seconds}
-            point, stderr = (
-                labelled(result.evaluator, values, {}).data_vars
-                for values in (result.point, result.stderr)
-            )
+            point = labelled(result.evaluator, result.point, {}).data_vars
+            stderr = labelled(result.evaluator, result.stderr, {}).data_vars
         elif "optimum" in groups:
             attrs = result["optimum"].attrs
             point, stderr = result["optimum"].data_vars, result["stderr"].data_vars
@@ -223,7 +220,7 @@ def _estimates(
             sd = errors[element]
             estimates[element] = (value, sd, value - z * sd, value + z * sd)
         shown = optimum_elements(point, stderr)
-    return estimates, set(shown), tuple(float(attrs.get(key, np.nan)) for key in COSTS)
+    return estimates, set(shown), [float(attrs.get(key, np.nan)) for key in COSTS]
 
 
 def _scores(
@@ -238,9 +235,15 @@ def _scores(
     evaluator = Evaluator.of(model)
     if metrics is None and evaluator.responses_per_theta:
         return {}  # scores that were not requested compute no response
-    thetas = _thetas(evaluator, names, estimates)
-    if thetas is None:
-        return {}
+    values = []
+    for rv in evaluator.model.free_RVs:
+        shape = event_shape(rv)
+        elements = element_names(str(rv.name), shape, coordinates(evaluator.model, str(rv.name)))
+        if not set(elements) <= set(names):
+            return {}
+        columns = [names.index(element) for element in elements]
+        values.append(estimates[:, columns].reshape(-1, *shape))
+    thetas = evaluator.hyperparameters.thetas_of(values)
     with nullcontext() if is_covered else temporary_first_samples(evaluator, thetas):
         lacking = [shortcomings(evaluator, theta[None]) for theta in thetas]
         several = len(evaluator.simulators) > 1
@@ -256,9 +259,9 @@ def _scores(
             for metric in default if metrics is None else metrics:
                 target = metric.against(simulator.observed, simulator.weights)
                 if simulator.is_emulated:
-                    values, weights = evaluator.populations(thetas, k)
+                    responses, weights = evaluator.populations(thetas, k)
                     rows = range(len(thetas))
-                    totals = np.array([target.of(values[[i]], weights[[i]])[0] for i in rows])
+                    totals = np.array([target.of(responses[[i]], weights[[i]])[0] for i in rows])
                 else:
                     totals = simulator.bound.discrepancies(evaluator.roots(thetas, k), target)
                 inner = getattr(metric, "metric", None)
@@ -266,21 +269,8 @@ def _scores(
                 if isinstance(inner, Metric):
                     name = f"{name}({type(inner).__name__})"
                 scores[f"{prefix}{name}"] = np.where(is_supported, totals, np.nan)
-        for name, values in specimen_log_likelihoods(evaluator, thetas).items():
+        for name, logs in specimen_log_likelihoods(evaluator, thetas).items():
             prefix = f"{name} " if several else ""
-            if values.size:
-                scores[f"{prefix}LogLikelihood by specimen"] = -values.mean(axis=1)
+            if logs.size:
+                scores[f"{prefix}LogLikelihood by specimen"] = -logs.mean(axis=1)
         return scores
-
-
-def _thetas(evaluator: Evaluator, names: list[str], estimates: Floats) -> Floats | None:
-    """Return the estimates as thetas, shape (results, d); None if an element is missing."""
-    values = []
-    for rv in evaluator.model.free_RVs:
-        shape = event_shape(rv)
-        elements = element_names(str(rv.name), shape, coordinates(evaluator.model, str(rv.name)))
-        if not set(elements) <= set(names):
-            return None
-        columns = [names.index(element) for element in elements]
-        values.append(estimates[:, columns].reshape(-1, *shape))
-    return evaluator.hyperparameters.thetas_of(values)

@@ -113,18 +113,16 @@ class Diagnosis:
 def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) -> Diagnosis:
     """Report in sentences what is wrong with a result of any sampler or optimiser, and what to do.
 
-    It reports what is not identified; whether an optimiser converged; R-hat and effective sample
-    size of draws, by ArviZ; how many draws differ; how far the particles of `sample_smc` moved in
-    its last stage; whether the stored responses of `Reweighted` supported the answer; and, of
-    optima on stored responses, whether the data can come from the best population, by refits
-    (p < .01). If they cannot, notes name the outputs, and the correlations of two outputs, that
-    misfit. No response is computed. Notes also list what was not tested.
+    Findings are about identification, the convergence of an optimiser, and the support of the
+    answer by the stored responses of `Reweighted`. For draws they are about R-hat and effective
+    sample size (by ArviZ), equal draws, and moves of `sample_smc` in its last stage. Optima on
+    stored responses are refitted: can the data come from the best population (p < .01)? Notes name
+    the outputs, and the correlations of two outputs, that misfit, and tests that were not run. No
+    response is computed.
 
-    With the log-likelihood by specimen: a test of the family of the population of the inputs, with
-    its power at this number of specimens; of draws, whether chains are in different modes, the
-    conflict of prior and data, and specimens on which the posterior depends (Pareto k, where the
-    result has a log-likelihood by specimen). Both tests of draws need the optimum of the
-    likelihood, which is computed for them.
+    With the log-likelihood by specimen, the family of the population of the inputs is tested. For
+    draws it reports chains in different modes, conflicts of prior and data, and specimens on which
+    the posterior depends (Pareto k). The optimum that these need is computed.
 
     Parameters
     ----------
@@ -381,23 +379,23 @@ def _convergence(posterior: xr.Dataset) -> list[Finding]:
     findings = []
     limit = max(1.01, 1 + _NOISE / (chains * draws))
     rhats = _by_element("rhat", posterior) if chains > 1 else {}
-    listed = ", ".join(f"{rhat:.2f} for {name}" for name, rhat in rhats.items() if rhat > limit)
-    if listed:
+    large = [f"{rhat:.2f} for {name}" for name, rhat in rhats.items() if rhat > limit]
+    if large:
         text = (
-            f"R-hat is {listed}, expected at most {limit:.2f}: the chains disagree, look at "
-            "az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; if "
-            "the chains sit in separate modes, state a prior that excludes one."
+            f"R-hat is {', '.join(large)}, expected at most {limit:.2f}: the chains disagree, look "
+            "at az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; "
+            "if the chains sit in separate modes, state a prior that excludes one."
         )
         findings.append(Finding("chains-disagree", text, page))
     total = chains * draws
     # For R-hat and ESS themselves to be reliable; of few draws a quarter.
     needed = min(400, 0.25 * total)
     sizes = _by_element("ess", posterior)
-    listed = ", ".join(f"{size:.0f} for {name}" for name, size in sizes.items() if size < needed)
-    if listed:
+    small = [f"{size:.0f} for {name}" for name, size in sizes.items() if size < needed]
+    if small:
         text = (
-            f"The effective sample size is {listed} of {total} draws: too few for means and "
-            "intervals. Pass more draws."
+            f"The effective sample size is {', '.join(small)} of {total} draws: too few for means "
+            "and intervals. Pass more draws."
         )
         findings.append(Finding("few-independent-draws", text, page))
     return findings

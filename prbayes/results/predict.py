@@ -28,7 +28,7 @@ from prbayes.model.evaluator import TOLERABLE, shortcoming
 from prbayes.model.fingerprint import (
     Level,
     as_attributes,
-    identity_of_model,
+    identity_of,
     require_same_responses,
 )
 from prbayes.model.locking import locked
@@ -66,15 +66,13 @@ def predict(
 
     Also of another response, or under another condition.
 
-    Each draw of the posterior is a population of its own, of which ``n_samples`` specimens are
-    drawn; an optimum is one population. Where the model has a simulator with `Reweighted` and the
-    same ``.dist()`` objects, the specimens are its design points, resampled by their weights: its
-    own response then costs nothing, and any other one is computed once per design point, not once
-    per draw, specimen or call. Where it has a simulator with the log-likelihood by specimen,
-    specimens are new. Its own response is then that of its emulator, without a run; any other one
-    is computed at the points of the emulator's runs, and interpolated. Elsewhere specimens are new:
-    Sobol points through the inverse distribution functions, with another shift for each draw, or
-    random draws where there is no inverse.
+    Each draw of the posterior is a population, from which ``n_samples`` specimens are drawn; an
+    optimum is one population. If a simulator with `Reweighted` has the same ``.dist()`` objects,
+    the specimens are its design points, resampled by their weights. Its own response then costs
+    nothing, and another one is computed once for each design point. Otherwise specimens are new:
+    Sobol points through the inverse distribution functions, or random draws without an inverse. The
+    response of a simulator with the log-likelihood by specimen is that of its emulator. Another
+    response is computed at the points of the emulator's runs, and interpolated.
 
     Parameters
     ----------
@@ -199,7 +197,7 @@ def predict(
         "random_seed": str(seed),
         "findings": as_json(findings_of(response)),
         **_calibration_attributes(result, model),
-        **as_attributes(identity_in(result) or identity_of_model(model)),
+        **as_attributes(identity_in(result) or identity_of(model)),
         **versions(),
     }
     return _labelled(drawn.values, responses, coords, n_samples).rename(label).assign_attrs(attrs)

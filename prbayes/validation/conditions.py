@@ -369,8 +369,8 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
 class Predictive:
     """The pooled predictive distribution of all draws and samples.
 
-    ``values`` of any shape, of which NaN are left out and +inf is the largest, have equal weights
-    or ``weights`` of the same shape.
+    ``values``, of any shape, have equal weights, or ``weights`` of the same shape. NaN are left
+    out, and +inf is the largest.
     """
 
     def __init__(self, values: Floats, weights: Floats | None = None) -> None:

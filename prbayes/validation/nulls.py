@@ -100,9 +100,9 @@ def judge_by_replicates(
 
 @dataclass(frozen=True)
 class PosteriorNull(Null):
-    """The specimens come from one of the posterior's populations, nobody knows which.
+    """The specimens come from one unknown population of the posterior.
 
-    u-values are taken in the pool of all.
+    u-values are taken in the pool of all populations.
 
     Each replicate takes one draw of the posterior, the same under all conditions, and all its
     values from that population; a specimen that was measured several times is one sample.

@@ -117,7 +117,7 @@ def test_a_population_without_stored_responses_takes_points() -> None:
         )
     table = prb.exceedance(posterior(), same, 2.5, x, model=model, points=1000)
     assert float(table.probability) == pytest.approx(exact(2.5)[0], rel=0.3)
-    with pytest.raises(TypeError, match="has stored responses"):
+    with pytest.raises(TypeError, match="without stored responses"):
         prb.exceedance(posterior(), same, 2.5, x, model=model)
     with pytest.raises(TypeError, match="got a model variable as an input"):
         prb.exceedance(posterior(), shifted, 2.5, x, model["mu"], model=model, points=100)

@@ -27,7 +27,6 @@ from prbayes.model.fingerprint import (
     from_attributes,
     from_text,
     identity_of,
-    identity_of_model,
     require_same,
 )
 from prbayes.model.random_variable import nodes
@@ -144,7 +143,7 @@ class Named:
 def test_the_same_problem(copy_of: Callable[[], pm.Model], level: Level) -> None:
     model = copy_of()
     assert differences(identity_of(Evaluator.of(model)), identity(), level) == []
-    assert differences(identity_of_model(model), identity(), level) == []
+    assert differences(identity_of(model), identity(), level) == []
 
 
 def test_the_order_of_variables_makes_no_other_problem() -> None:
@@ -215,12 +214,12 @@ def test_an_identity_computes_no_response_and_compares_them(
     assert (node.bound.responses.count, node.bound.draws) == (count, draws)
     assert len(found.simulators[0].responses) == 8
     assert len(found.log_prior) == 4
-    changed = identity_of_model(Problem(slope=4.0, propagation=propagation).model())
+    changed = identity_of(Problem(slope=4.0, propagation=propagation).model())
     texts = differences(changed, found, Level.POPULATIONS)
     assert texts == ["the response of y has other values at the same points"]
     # A user's own propagation may store no points.
     monkeypatch.setattr(node.bound, "first_points", ())
-    assert not identity_of_model(evaluator.model).simulators[0].points
+    assert not identity_of(evaluator.model).simulators[0].points
 
 
 def test_text_and_back() -> None:

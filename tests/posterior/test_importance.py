@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, multivariate_t
 
 from prbayes._validate import Floats
-from prbayes.posterior.importance import ImportanceOptions, Prior, importance_sample, laplace
+from prbayes.posterior.importance import ImportanceOptions, importance_sample, laplace
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.0], [0.6, 0.5, -0.1], [0.0, -0.1, 0.3]])
@@ -127,7 +127,7 @@ def test_further_rounds_follow_a_bent_ridge_into_the_prior() -> None:
         return np.asarray(prior.rvs(size, random_state=seed))
 
     modes = laplace(ridge, np.full((1, 2), np.log(0.5)), np.full(2, 2.0))
-    sample = importance_sample(ridge, modes, 4000, seed=0, prior=Prior(draws, prior.logpdf))
+    sample = importance_sample(ridge, modes, 4000, seed=0, prior=(draws, prior.logpdf))
     assert sample.effective_size / sample.efficiency > 8000  # points
     assert sample.is_reliable
     x = np.linspace(-14, 1, 3001)

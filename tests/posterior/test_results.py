@@ -53,6 +53,7 @@ def sample(draws: int = 40, **keywords: Any) -> Any:
 
 @cache
 def idata() -> xr.DataTree:
+    optimum()  # whose search may refine the designs of the model
     return sample()
 
 

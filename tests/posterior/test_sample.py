@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -17,13 +16,14 @@ import prbayes as prb
 from prbayes.posterior.importance import ImportanceOptions
 
 X = np.random.default_rng(0).normal(10, 1, 20)
+DIVERGENCE = prb.KullbackLeibler()
 
 
 @cache
-def linear_model() -> pm.Model:
+def linear_model(**keywords: Any) -> pm.Model:
     with pm.Model() as model:
         inputs = pm.Normal.dist(pm.Normal("mu", 9, 3), pm.HalfNormal("sigma", 2))
-        prb.Simulator("y", lambda x: 2 * x + 1, inputs, observed=2 * X + 1)
+        prb.Simulator("y", lambda x: 2 * x + 1, inputs, observed=2 * X + 1, **keywords)
     return model
 
 
@@ -109,25 +109,13 @@ def test_unreliable_importance_sampling_is_replaced() -> None:
     result = prb.sample(500, chains=2, model=linear_model(), progressbar=False)
     assert result.posterior.attrs["sampler"] == "NUTS"
     require_exact(result, 0.3, (0.8, 1.2))
-    result = prb.sample(50, chains=1, model=metric_model(prb.KullbackLeibler()), progressbar=False)
+    result = prb.sample(50, chains=1, model=linear_model(metric=DIVERGENCE), progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC"
     assert result.posterior.attrs["adjustment"] == "estimate"
 
 
-def metric_model(
-    metric: prb.Metric, mu: Callable[[], Any] = lambda: pm.Normal("mu", 9, 3), *, parts: Any = (X,)
-) -> pm.Model:
-    with pm.Model() as model:
-        center, sigma = mu(), pm.HalfNormal("sigma", 2)
-        for k, part in enumerate(parts):
-            inputs = pm.Normal.dist(center, sigma)
-            observed = 2 * part + 1
-            prb.Simulator(f"y{k}", lambda x: 2 * x + 1, inputs, metric=metric, observed=observed)
-    return model
-
-
 def test_the_posterior_given_the_estimate_of_the_divergence_is_nearly_the_exact_one() -> None:
-    model = metric_model(prb.KullbackLeibler())
+    model = linear_model(metric=DIVERGENCE)
     result = prb.sample(1000, model=model, progressbar=False)
     assert result.posterior.attrs["sampler"] == "importance sampling"
     assert result.posterior.attrs["adjustment"] == "estimate"
@@ -135,34 +123,7 @@ def test_the_posterior_given_the_estimate_of_the_divergence_is_nearly_the_exact_
     # The log-likelihood is that of the draws' density, up to a constant, for power-scaling.
     log_prior = sum(result.log_prior[name] for name in ("mu", "sigma"))
     jacobian = np.log(result.posterior["sigma"])
-    parts = result.log_likelihood.to_dataset().squeeze("y0_dim_0", drop=True)
+    parts = result.log_likelihood.to_dataset().squeeze("y_dim_0", drop=True)
     total = log_prior + jacobian + sum(parts[name] for name in parts.data_vars)
     np.testing.assert_allclose(result.sample_stats["lp"], total, atol=1e-8)
     assert prb.diagnose(result, model=model).ok
-
-
-def test_the_end_of_a_prior_cuts_the_posterior_given_the_estimate() -> None:
-    """The estimate is near the end; its density does not depend on the prior."""
-    metric = prb.ProbabilityResidual()
-    free = prb.sample(2000, model=metric_model(metric), progressbar=False).posterior["mu"]
-    end = float(free.mean())
-    model = metric_model(metric, lambda: pm.Uniform("mu", 0.0, end))
-    cut = prb.sample(1000, model=model, progressbar=False).posterior
-    assert cut.attrs["sampler"] == "importance sampling"
-    # The normal prior of the first is flat over its posterior: .01 standard deviations.
-    expected = free.values[free.values < end]
-    assert abs(float(cut["mu"].mean()) - expected.mean()) < 0.15 * expected.std()
-    assert 0.9 < float(cut["mu"].std()) / expected.std() < 1.1
-
-
-@pytest.mark.long
-def test_a_prior_that_is_far_wider_than_the_population() -> None:
-    model = metric_model(prb.KullbackLeibler(), lambda: pm.Normal("mu", 0.0, 300.0))
-    require_exact(prb.sample(500, model=model, progressbar=False), 0.3, (0.8, 1.2))
-
-
-def test_two_simulators_share_hyperparameters() -> None:
-    model = metric_model(prb.KullbackLeibler(), parts=(X[:10], X[10:]))
-    result = prb.sample(1000, model=model, progressbar=False)
-    assert result.posterior.attrs["sampler"] == "importance sampling"
-    require_exact(result, 0.3, (0.85, 1.2))

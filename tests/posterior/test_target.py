@@ -27,6 +27,7 @@ from prbayes.posterior.target import (
     RefitLikelihoodOptions,
     estimate_target,
     extended_log_density,
+    prior_conflicts,
     refit_likelihood,
 )
 
@@ -114,13 +115,13 @@ def _vague(mu: Floats, sigma: Floats) -> Floats:
 
 
 def test_a_prior_away_from_the_estimate_is_reported() -> None:
+    thetas = np.array([[1.0, np.log(0.5)]])
+    assert prior_conflicts(fitted(KLD), fitted(KLD).evaluator, thetas) == ()
     model = normal_model(KLD, DATA, mu=lambda: pm.Normal("mu", 0.0, 0.2))
     tree = prb.sample(50, chains=1, model=model, **QUIET)
     findings = from_json(tree.posterior.attrs["findings"])
     (finding,) = [finding for finding in findings if finding.code == "prior-conflict"]
     assert "mu" in finding.text
-    agreeing = prb.sample(50, chains=1, model=fitted(KLD).model, optimum=fitted(KLD), **QUIET)
-    assert from_json(agreeing.posterior.attrs["findings"]) == ()
 
 
 # -- priors that end near the data, or are sharper than these --
@@ -143,7 +144,7 @@ def test_the_end_of_a_prior_within_a_standard_error(end: str) -> None:
     require_close(moments_of(tree), exact_moments(log_prior, NEAR))
 
 
-@pytest.mark.parametrize("spread", [0.25, 0.5, 0.85])
+@pytest.mark.parametrize("spread", [0.25, 0.85])
 def test_a_prior_that_is_sharper_than_the_data(spread: float) -> None:
     z = np.random.default_rng(6).normal(size=10)
     y = 1 + spread * (z - z.mean()) / z.std()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,14 +22,13 @@ def response(x: Any) -> Any:
     return np.where(x > 2.0, np.nan, np.where(x < 0.0, np.inf, x))
 
 
-def bound(propagation: Propagation, response: Any = np.positive, sigma: Any = None) -> Bound:
+@cache
+def bound(propagation: Propagation, response: Any = np.positive) -> Bound:
     with pm.Model() as model:
-        mu = pm.Normal("mu", 1.0, 0.5)
-        sigma = pm.HalfNormal("sigma", 1.0) if sigma is None else sigma()
+        x = pm.Normal.dist(pm.Normal("mu", 1.0, 0.5), pm.HalfNormal("sigma", 1.0))
         prb.Simulator(
-            "y", response, pm.Normal.dist(mu, sigma), metric=prb.AreaMetric(), observed=OBSERVED,
-            propagation=propagation,
-        )  # fmt: skip
+            "y", response, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=propagation
+        )
     (node,) = first_use(model).values()
     return node.bound
 
@@ -75,8 +75,11 @@ def test_the_error_of_random_draws_is_that_of_repetitions() -> None:
 
 
 def test_priors_that_are_never_valid_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"invalid parameters of the inputs at all .* of mu, sig"):
-        bound(prb.Reweighted(64), sigma=lambda: pm.Normal("sigma", -50.0, 0.1))
+    with pm.Model() as model:
+        x = pm.Normal.dist(0.0, pm.Normal("sigma", -50.0, 0.1))
+        prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=OBSERVED)
+    with pytest.raises(ValueError, match=r"invalid parameters of the inputs at all .* of sigma"):
+        first_use(model)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -136,15 +136,14 @@ def test_samples_grow_for_errors_of_points_and_runs_for_errors_of_emulators() ->
     assert bound.n_points == 2 * SIZES.first
 
 
-@pytest.mark.parametrize(("little", "runs"), [(0.25, 64), (0.0, 80)])
-def test_runs_are_added_where_emulators_predict_little(
-    little: float, runs: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("prbayes.optimize.design_refinement._POOR_EMULATOR", little)
+def test_runs_are_added_where_emulators_predict_little(monkeypatch: pytest.MonkeyPatch) -> None:
+    evaluator, bound = emulated()
     far = around(np.array([[2.5, 0.0, 2.5, 0.0]]), 0.01)
-    evaluator, bound = design_of(build())
-    assert refine_at(evaluator, far)
-    assert bound.n_runs == runs
+    for little, runs in ((0.25, 64), (0.0, 80)):
+        monkeypatch.setattr("prbayes.optimize.design_refinement._POOR_EMULATOR", little)
+        with designs_restored([bound]):
+            assert refine_at(evaluator, far)
+            assert bound.n_runs == runs
 
 
 def test_a_part_of_a_sample_for_a_while() -> None:
@@ -298,7 +297,7 @@ def test_left_out_emulators_differ_where_the_emulator_is_wrong() -> None:
     ]
     assert len(spread) == 8
     assert min(spread) > 1e-3
-    assert design_of(build(emulator=None))[1].design.without_each_block() == []
+    assert bound.design.runs_alone().without_each_block() == []
 
 
 def test_an_optimum_from_few_runs_is_that_of_many() -> None:

@@ -176,6 +176,3 @@ def test_inputs_that_pymc_draws_by_functions_of_its_own(make: Any, expected: Any
     assert values.shape == weights.shape == (1, 400)
     # A fixed seed: far from the one in a thousand that another distribution would give.
     assert stats.kstest(values[0], expected.cdf).pvalue > 0.01
-    assert np.isfinite(
-        prb.sample_smc(20, chains=2, model=model, adjustment=None).posterior["mu"]
-    ).all()

@@ -568,32 +568,6 @@ def test_a_design_that_can_never_do_is_refused() -> None:
         prb.refine(model, thetas=thetas)
 
 
-@pytest.mark.long
-def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    observed = np.random.default_rng(1).normal(10, 1, 50)
-
-    def error(metric: prb.Metric, propagation: prb.Reweighted | prb.Resimulated) -> float:
-        model = model_of(
-            lambda: pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3)),
-            metric=metric, propagation=propagation, observed=observed,
-        )  # fmt: skip
-        return float(prb.minimize(model).stderr["sigma"])
-
-    likelihood = prb.LogLikelihood(density=prb.GaussianKDE())
-    right = error(likelihood, prb.Reweighted(1024))
-    assert not caplog.records
-    few = error(likelihood, prb.Resimulated(1024))
-    assert "1024 resimulated responses sees too little of the tails" in caplog.text
-    assert "expected at least 15000" in caplog.text
-    assert few < 0.6 * right
-    caplog.clear()
-    assert 0.88 < error(likelihood, prb.Resimulated(16_384)) / right < 1.05
-    assert error(prb.KullbackLeibler(), prb.Resimulated(1024)) > 0.9 * right
-    assert not caplog.records
-
-
 @pytest.mark.exact
 def test_another_response_is_computed_at_the_new_points_only() -> None:
     model = line(64)

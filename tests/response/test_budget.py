@@ -219,7 +219,7 @@ def test_finished_chains_are_returned_and_the_rest_goes_on(name: str, tmp_path: 
     assert attrs["n_responses"] <= most
     assert attrs["stopped"] == f"max_runs = {most} was reached in chain 2 of 2"
     assert dict(part["posterior"].sizes) == {"chain": 1, "draw": 30}
-    assert any("1 of 2 chains are here" in line for line in prb.diagnose(part).messages)
+    assert any("1 of 2 chains are finished" in line for line in prb.diagnose(part).messages)
     whole = undisturbed(name)["posterior"]["mu"]
     assert np.array_equal(part["posterior"]["mu"].values, whole.values[:1])
     assert np.isnan(part["calibration"]["discrepancy_error"]).all()

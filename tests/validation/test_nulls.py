@@ -305,7 +305,7 @@ def test_refusals_of_the_joint_null(posterior: Posterior) -> None:
     metric = prb.FunctionMetric(lambda s, o: np.abs(s.mean(-1) - o.mean()))
     model, _ = model_of(propagation=prb.Resimulated(64), metric=metric)
     with pytest.raises(ValueError, match=r"a FunctionMetric, .*the model cannot be recalibrated"):
-        joint(prb.minimize(model, method="Nelder-Mead", starts=0, max_evaluations=100))
+        joint(prb.minimize(model, method="Nelder-Mead", starts=0, max_evaluations=20))
 
 
 def test_the_calibrations_data_in_any_order_and_some_of_its_specimens() -> None:
