@@ -73,7 +73,8 @@ def errors(metric: Any, rooted: bool, size: int, replicates: int) -> Any:
 
     import prbayes as prb
     from prbayes.model.evaluator import Evaluator
-    from prbayes.optimize.minimize import Minimisation, find_optimum
+    from prbayes.optimize.minimize import find_optimum
+    from prbayes.optimize.objective import Minimisation
 
     def data(replicate: int) -> Any:
         y = folded.data(size, replicate)

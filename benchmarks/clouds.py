@@ -30,7 +30,8 @@ SIZES = (8192, 32_768)
 
 def scatter(name: str, seeds: int) -> dict[str, Any]:
     """Return the scatter of optima over clouds, and what is claimed, by size."""
-    from prbayes.optimize.minimize import Minimisation, find_optimum
+    from prbayes.optimize.minimize import find_optimum
+    from prbayes.optimize.objective import Minimisation
 
     n = few_runs.FIRST * RESPONSES[name].d
     stored = prb.Reweighted(n, emulator="auto", random_seed=1)

@@ -92,7 +92,11 @@ KEYS = ("response", "metric", "truth", "cv", "n")
 def compared(optima: dict[str, prb.Optimum], data: Any, truth: str) -> tuple[float, float, bool]:
     """Return by how much the right family is ahead, the standard error, and whether it is told."""
     anew = {
-        family: replace(one, evaluator=one.evaluator.observing({"y": data}), identity=None)
+        family: replace(
+            one,
+            evaluator=one.evaluator.observing({"y": data}),
+            search=replace(one.search, identity=None),
+        )
         for family, one in optima.items()
     }
     table = prb.rank(anew, progressbar=False)

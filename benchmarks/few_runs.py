@@ -121,7 +121,7 @@ def fitted(name: str, observed: Any, propagation: Any, reference: Any) -> dict[s
         return {"refused": str(error)[:200]}
     stderr = np.sqrt(np.diag(reference.covariance))
     along = along_axes(reference)
-    others = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
+    others = [other["theta"] for other in optimum.local_optima if other["comparable"]]
     each = [(theta - reference.theta) / stderr for theta in (optimum.theta, *others)]
     away = min(each, key=lambda off: np.nansum(off**2))
     widths = np.sqrt(np.diag(optimum.covariance)) / stderr

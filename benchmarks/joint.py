@@ -281,7 +281,8 @@ class Cell:
 
     def calibrated(self, method: str, x: Any) -> dict[str, Any]:
         """Calibrate one data set; return estimate, posterior and what it cost."""
-        from prbayes.optimize.minimize import Minimisation, find_optimum
+        from prbayes.optimize.minimize import find_optimum
+        from prbayes.optimize.objective import Minimisation
         from prbayes.posterior.sample import draw_posterior
         from prbayes.posterior.smc import SamplingSettings
 

@@ -81,7 +81,7 @@ def basins(evaluator: Any, name: str, metric: str, *, guided: bool) -> tuple[Any
         if guided:
             start, trace = approach(search, theta, np.ones(1), 0, trace)
         run = settle(search, minimise(search, start, np.ones(1), trace))
-        at, spread = run.best[0], np.exp(run.best[1])
+        at, spread = run.theta[0], np.exp(run.theta[1])
         close = 0.5 < spread / sigma < 2
         mirror = MIRROR[name]
         if close and abs(at - mu) < sigma:

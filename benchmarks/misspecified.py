@@ -83,7 +83,7 @@ def fit(base: Evaluator, data: Any, metric: str) -> tuple[float, float, bool]:
     start = ev.hyperparameters.unconstrained({"mu": float(np.median(data)) + 0.3, "sigma": 1.5})
     theta, trace = approach(search, start, np.ones(1), 0, Trace())
     run = settle(search, minimise(search, theta, np.ones(1), trace))
-    return float(run.best[0]), float(np.exp(run.best[1])), run.result.converged
+    return float(run.theta[0]), float(np.exp(run.theta[1])), run.result.converged
 
 
 def families(base: Evaluator, seeds: int) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def fits(
         run = minimise(search, theta, np.ones(1), Trace())
         walked = len(run.trace.values)
         run = settle(search, run)
-        point = ev.constrained(run.best[None])
+        point = ev.constrained(run.theta[None])
         out[name] = [
             float(point["mu"][0]),
             float(point["sigma"][0]),

@@ -204,7 +204,8 @@ def build(problem: Problem, prior: str, metric: str, size: int) -> Any:
 
 def analyse(evaluator: Any, problem: Problem, seed: list[int]) -> dict[str, Any]:
     """Draw a truth and its data, calibrate them, and return the posterior's place and width."""
-    from prbayes.optimize.minimize import Minimisation, find_optimum
+    from prbayes.optimize.minimize import find_optimum
+    from prbayes.optimize.objective import Minimisation
     from prbayes.posterior.sample import draw_posterior
     from prbayes.posterior.smc import SamplingSettings
 

@@ -138,7 +138,7 @@ def test_results_have_the_names_of_groups(
     tmp_path: Path, model: pm.Model, optimum: prb.Optimum, draws: xr.DataTree
 ) -> None:
     elements = ["mu[Adler]", "mu[Busch]", "sigma"]
-    assert optimum.names == [*elements[:2], "sigma_log__"]
+    assert optimum.evaluator.hyperparameters.names == [*elements[:2], "sigma_log__"]
     assert list(optimum.discrepancies) == PARTS
     assert list(draws["observed_data"].data_vars) == PARTS
     table = prb.compare({"optimum": optimum, "ABC": draws}, model=model)

@@ -69,7 +69,7 @@ def answers(kind: str, factor: float) -> dict[str, Any]:
         "standard errors": optimum.covariance,
         "epsilon": epsilon / factor ** POWER.get(kind, 0),
         "responses": optimum.n_responses,
-        "rivals": len(optimum.rivals),
+        "local optima": len(optimum.local_optima),
         "posterior": [draws.mean(), draws.std()],
         "findings": len(optimum.findings),
         "converged": optimum.converged,

@@ -288,7 +288,11 @@ def _sobol_thetas(optimum: Optimum, n: int, caller: str) -> Floats:
     covariance = optimum.covariance
     if not np.isfinite(covariance).all():
         is_known = np.isfinite(np.diag(covariance))
-        unknown = [name for name, is_ok in zip(optimum.names, is_known, strict=True) if not is_ok]
+        unknown = [
+            name
+            for name, is_ok in zip(optimum.evaluator.hyperparameters.names, is_known, strict=True)
+            if not is_ok
+        ]
         raise ValueError(
             f"{caller}: got an optimum without the uncertainty of {unknown}, expected "
             "a standard error of each; pass the posterior of prb.sample_smc"

@@ -29,24 +29,8 @@ from prbayes.inference.resampling import (
 from prbayes.metrics.base import Discrepancy, Minimum, Part, is_additive
 from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.random_variable import Node
 from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
-
-@dataclass(frozen=True)
-class AsymptoticsOptions:
-    """Steps of differences in prior standard deviations, and limits."""
-
-    narrow_step: float = 1e-3  # for densities, which are twice differentiable
-    wide_step: float = 0.05  # for step functions: distribution functions, jumps, moving supports
-    # Largest distance between distribution functions that a step makes: .6 sd of a normal
-    # population, over which differences are right to a few per cent.
-    largest_move: float = 0.24
-    # Share of an element in unidentified directions above which it is not identified.
-    largest_loading: float = 0.02
-
-
-_OPTIONS = AsymptoticsOptions()
 # Avoids division by zero.
 _TINY = np.finfo(float).tiny
 
@@ -54,11 +38,6 @@ _TINY = np.finfo(float).tiny
 def number_parts(target: Discrepancy) -> list[Part]:
     """Return the parts that see one number of a specimen: of one output, the metric itself."""
     return [part for part in target.parts if not part.target.event]
-
-
-def one_dimensional(target: Discrepancy, values: Floats) -> list[Floats]:
-    """Return the projections of responses, (..., n) or (..., n, m) -> (..., n) each."""
-    return [part.of(values) for part in number_parts(target)]
 
 
 # -- populations around theta ------------------------------------------------------------------
@@ -81,155 +60,122 @@ class LinearArea:
 class Stencil:
     """Populations around theta, in the order of `numerics.derivatives.stencil`."""
 
-    share: float  # the nominal step, in prior standard deviations
-    step: Floats  # (d,): the step, shorter where the prior is wide beside the population
+    step: Floats  # (d,): shorter than the nominal one where the prior is wide
+    is_wide: bool  # the nominal step is that for step functions
     values: Floats  # (s, n), or (s, n, m) of several outputs
     weights: Floats  # (s, n)
     blocks: NDArray[np.intp]  # (n,): of the design's points, which may change afterwards
-    target: Discrepancy
+    has_equal_values: bool  # the responses are the same at all points, as stored ones are
 
-    @property
-    def n_cross(self) -> int:
-        """Number of points that are theta and its neighbours along each element."""
-        return 1 + 2 * self.step.size
 
-    @cached_property
-    def has_equal_values(self) -> bool:
-        """Whether the responses are the same at all points, as stored ones are."""
-        return np.array_equal(self.values[0], self.values[-1], equal_nan=True)
+def _stencil_around(
+    evaluator: Evaluator, k: int, theta: Floats, share: float, *, is_wide: bool
+) -> Stencil:
+    """Return populations around theta; steps are shortened until populations overlap.
 
-    @cached_property
-    def moves(self) -> Floats:
-        """Largest change of a distribution function over a step along each element, (d,)."""
-        d = self.step.size
-        moves = []
-        values = self.values[:1] if self.has_equal_values else self.values
-        for projection in one_dimensional(self.target, values):
-            center, weights = projection[0], self.weights[0]
-            is_usable = np.isfinite(center) & (weights > 0)
+    ``share`` is the nominal step in prior standard deviations.
+    """
+    node, d = evaluator.nodes[k], theta.size
+    across = slice(1 + 2 * d)  # theta and its neighbours along each element
+    step = share * evaluator.hyperparameters.prior_sd
+    # Largest distance between distribution functions that a step makes: .6 sd of a normal
+    # population, over which differences are right to a few per cent.
+    largest = 0.24
+    stencils = []
+    for _ in range(9):  # each up to ten times shorter: to 1e-11 of the prior's spread
+        values, weights = evaluator.populations(theta + stencil(d) * step, k)
+        is_equal = np.array_equal(values[0], values[-1], equal_nan=True)
+        around = Stencil(step, is_wide, values, weights, node.bound.blocks, is_equal)
+        stencils.append(around)
+        moves = np.zeros(d)  # of a distribution function over a step, by element
+        for part in number_parts(node.target):
+            projection = part.of(values[:1] if is_equal else values)
+            is_usable = np.isfinite(projection[0]) & (weights[0] > 0)
             if not is_usable.any():
-                moves.append(np.zeros(d))
                 continue
-            mass = weights[is_usable]
+            mass = weights[0][is_usable]
             mass = mass / mass.sum()
-            knots = quantile(center[is_usable], mass, np.linspace(0.05, 0.95, 19))
-            across = slice(self.n_cross)
-            simulated = projection[0] if len(projection) == 1 else projection[across]
-            below = distribution_function(simulated, self.weights[across], knots)
-            gaps = np.abs(below[1:] - below[0]).max(axis=-1)
-            moves.append(np.nan_to_num(gaps).reshape(2, d).max(axis=0))
-        return np.asarray(np.max(moves, axis=0))
-
-
-def _stencil_around(evaluator: Evaluator, k: int, theta: Floats, share: float) -> Stencil:
-    """Return populations around theta; steps are shortened until populations overlap."""
-    node = evaluator.nodes[k]
-
-    def within(step: Floats) -> Stencil:
-        values, weights = evaluator.populations(theta + stencil(step.size) * step, k)
-        return Stencil(share, step, values, weights, node.bound.blocks, node.target)
-
-    largest = _OPTIONS.largest_move
-    nominal = within(share * evaluator.hyperparameters.prior_sd)
-    if nominal.moves.max(initial=0.0) <= largest:
-        return nominal
-    around = nominal
-    for _ in range(8):  # each up to ten times: to 1e-11 of the prior's spread
-        # Populations that do not overlap give no estimate of the factor.
-        factor = np.where(around.moves > 0.9, 0.1, 0.5 * largest / around.moves.clip(1e-9))
-        is_too_far = around.moves > largest
-        around = within(np.where(is_too_far, factor, 1.0) * around.step)
-        if around.moves.max() <= largest:
+            knots = quantile(projection[0][is_usable], mass, np.linspace(0.05, 0.95, 19))
+            simulated = projection[0] if is_equal else projection[across]
+            below = distribution_function(simulated, weights[across], knots)
+            gaps = np.nan_to_num(np.abs(below[1:] - below[0]).max(axis=-1))
+            moves = np.maximum(moves, gaps.reshape(2, d).max(axis=0))
+        if moves.max(initial=0.0) <= largest:
             return around
+        # Populations that do not overlap give no estimate of the factor.
+        factor = np.where(moves > 0.9, 0.1, 0.5 * largest / moves.clip(1e-9))
+        step = np.where(moves > largest, factor, 1.0) * step
     # A population that is one number overlaps with no other.
-    return nominal
+    return stencils[0]
 
 
 # -- H and J ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
 class Information:
     """Information about theta in one simulator's data, if they are drawn from the model there."""
 
-    evaluator: Evaluator
-    k: int  # index of the simulator
-    theta: Floats  # (d,)
-    n_sets: int = SETS  # number of simulated data sets, each of the observed size
-    # Factor of the step where the discrepancy is a step function of theta, or jumps.
-    widened: float = 1.0
-
-    @property
-    def node(self) -> Node:
-        """The simulator."""
-        return self.evaluator.nodes[self.k]
-
-    @property
-    def prior_sd(self) -> Floats:
-        """The prior's standard deviations, shape (d,)."""
-        return self.evaluator.hyperparameters.prior_sd
-
-    @property
-    def jumps(self) -> bool:
-        """Whether points lose their response close to theta, where a smooth discrepancy jumps."""
-        is_smooth = is_differentiable(self.node.target) and not self.node.bound.stored
-        return is_smooth and self.stencil.share > _OPTIONS.narrow_step
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        k: int,
+        theta: Floats,
+        n_sets: int = SETS,
+        widened: float = 1.0,
+    ) -> None:
+        self.evaluator = evaluator
+        self.k = k  # index of the simulator
+        self.node = evaluator.nodes[k]
+        self.theta = theta  # (d,)
+        self.prior_sd = evaluator.hyperparameters.prior_sd  # (d,)
+        self.n_sets = n_sets  # number of simulated data sets, each of the observed size
+        # Factor of the step where the discrepancy is a step function of theta, or jumps.
+        self.widened = widened
 
     @cached_property
     def stencil(self) -> Stencil:
         """The populations around theta, as close as the discrepancy can be differenced."""
         target, bound = self.node.target, self.node.bound
-        wide = self.widened * _OPTIONS.wide_step
-        if bound.stored:
-            # A moving edge passes several points within a wide step.
-            share = wide if bound.support_moves else _OPTIONS.narrow_step
-            return _stencil_around(self.evaluator, self.k, self.theta, share)
-        if is_differentiable(target):
-            narrow = _stencil_around(self.evaluator, self.k, self.theta, _OPTIONS.narrow_step)
+        # A moving edge of a support passes several points within a wide step.
+        is_smooth = not bound.support_moves if bound.stored else is_differentiable(target)
+        if is_smooth:
+            narrow = _stencil_around(self.evaluator, self.k, self.theta, 1e-3, is_wide=False)
             # Of several outputs a failed one is at the end of its scale, and does not jump.
             is_known = ~np.isnan(narrow.values) if target.event else np.isfinite(narrow.values)
             # Unless a point gains or loses its response within the step.
-            if (is_known == is_known[0]).all():
+            if bound.stored or (is_known == is_known[0]).all():
                 return narrow
-        return _stencil_around(self.evaluator, self.k, self.theta, wide)
+        # For step functions: distribution functions, jumps, moving supports.
+        share = 0.05 * self.widened
+        return _stencil_around(self.evaluator, self.k, self.theta, share, is_wide=True)
 
     @cached_property
     def data_sets(self) -> DataSets:
         """Data sets drawn from the model at theta, for all simulators."""
         return simulated_sets(self.evaluator, self.theta, self.n_sets)
 
-    @property
-    def data_set(self) -> tuple[Floats, Floats]:
-        """Values and weights of this simulator's data sets, shapes (n,), (n_sets, n)."""
-        sets = self.data_sets
-        return sets.values[self.k], sets.weights[self.k]
-
     @cached_property
-    def _center(self) -> tuple[Floats, Floats]:
-        """The population at theta that can be observed, with weights that sum to one."""
-        values = self.stencil.values[0]
-        is_observable = observable(values, self.node.target)
-        mass = self.stencil.weights[0][is_observable]
-        return values[is_observable], mass / mass.sum()
-
-    @cached_property
-    def _features(self) -> Any:
-        """Features at the stencil; they do not depend on the observed side."""
+    def _sides(self) -> tuple[Any, Floats, Floats]:
+        """Features at the stencil, and the values and weights at theta that can be observed."""
         around, target = self.stencil, self.node.target
         has_densities = [isinstance(part.target, DensityDiscrepancy) for part in target.parts]
         if around.has_equal_values and len(has_densities) > 1 and all(has_densities):
             # Cells are filled once for all points, and not for each.
-            return target.basis(around.values[0]).features(around.weights)
-        return target.features(around.values, around.weights, np)
+            features = target.basis(around.values[0]).features(around.weights)
+        else:
+            features = target.features(around.values, around.weights, np)
+        is_observable = observable(around.values[0], target)
+        mass = around.weights[0][is_observable]
+        return features, around.values[0][is_observable], mass / mass.sum()
 
-    def _along_stencil(
+    def discrepancies(
         self, observed: Floats, weights: Floats, points: slice = slice(None)
     ) -> Floats:
         """Return discrepancies at points of the stencil, (s,) or (n_sets, s)."""
-        features = [feature[points] for feature in self._features]
+        features = [feature[points] for feature in self._sides[0]]
         target = self.node.target.with_observed(observed, weights)
         n_sets = len(weights) if weights.ndim > 1 else 1
-        at_once = max(1, AT_ONCE // sum(feature.size for feature in features))
+        at_once = max(1, AT_ONCE // sum(map(np.size, features)))
         if n_sets <= at_once:
             return np.atleast_1d(target.outer(*features, xp=np))
         starts = range(0, n_sets, at_once)
@@ -248,9 +194,9 @@ class Information:
             return self.theta.size / (2 * self.node.n_specimens)
         at_theta = self.evaluator.populations(self.theta[None], self.k)
         values, weights = thinned(*at_theta, self.node)
-        observed, data_sets = self.data_set
+        observed = self.data_sets.values[self.k]
         distances = []
-        for w in data_sets:
+        for w in self.data_sets.weights[self.k]:
             is_drawn = w > 0
             target = self.node.target.with_observed(observed[is_drawn], w[is_drawn])
             distances.append(target.of(values, weights))
@@ -258,71 +204,88 @@ class Information:
 
     def gradients(self, observed: Floats, weights: Floats) -> Floats:
         """Return gradients at theta, (n_sets, d), for data sets of values (n,)."""
-        across = self._along_stencil(observed, weights[:, None], slice(self.stencil.n_cross))
-        return slopes(across.T, self.stencil.step)
+        step = self.stencil.step
+        across = self.discrepancies(observed, weights[:, None], slice(1 + 2 * step.size))
+        return slopes(across.T, step)
 
     @cached_property
     def sampling_covariance(self) -> Floats:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
         target = self.node.target
         if not is_additive(target) or dependent([self.node]):
-            return np.atleast_2d(np.cov(self.gradients(*self.data_set), rowvar=False))
-        # A mean over observations: the covariance of single ones, by N.
-        single, mass = _importance_sample(target, *self._center)
+            sets = self.data_sets
+            gradients = self.gradients(sets.values[self.k], sets.weights[self.k])
+            return np.atleast_2d(np.cov(gradients, rowvar=False))
+        # A mean over observations: the covariance of single ones, by N. Single specimens are drawn
+        # at equal steps of probability. Of several outputs half of them are drawn in proportion to
+        # the fourth power of their distance from the middle, as most of the mean square of
+        # gradients is theirs.
+        _, values, weights = self._sides
+        order = np.argsort(values.reshape(len(values), -1)[:, 0])
+        n, mass = 1000, weights
+        if values.ndim > 1:
+            n = 2000
+            far = _squared_distances(target, values, weights) ** 2
+            mass = weights * (1 + far / max(float(weights @ far), _TINY))
+            mass = mass / mass.sum()
+        rows = order[reached(mass[order], (np.arange(n) + 0.5) / n)]
+        single = values[rows]
         # 64 at a time, as the work grows with their square.
-        batches = [single[i : i + 64] for i in range(0, len(single), 64)]
-        gradients = [self.gradients(batch, np.eye(len(batch))) for batch in batches]
-        covariance = np.cov(np.concatenate(gradients), rowvar=False, aweights=mass)
+        batches = [single[i : i + 64] for i in range(0, n, 64)]
+        singles = [self.gradients(batch, np.eye(len(batch))) for batch in batches]
+        aweights = weights[rows] / mass[rows]
+        covariance = np.cov(np.concatenate(singles), rowvar=False, aweights=aweights)
         return np.atleast_2d(covariance) / target.n_effective
 
     @cached_property
     def hessian(self) -> Floats:
         """H: the Hessian of the discrepancy against the population at theta, shape (d, d)."""
         step = self.stencil.step
-        differences = hessian_of(self._along_stencil(*self._center), step.size)
+        differences = hessian_of(self.discrepancies(*self._sides[1:]), step.size)
         return differences / np.outer(step, step)
 
-    def areas(
-        self, observed: Floats, weights: Floats, subset: NDArray[np.bool_] | None = None
-    ) -> list[LinearArea]:
+    def areas(self, sets: DataSets, subset: NDArray[np.bool_] | None = None) -> list[LinearArea]:
         """Return a linear model of each area that the metric is a sum of, for data sets.
 
         ``subset`` are the points of the population that count; all by default.
         """
+        around = self.stencil
+        observed, observed_weights = sets.values[self.k], sets.weights[self.k]
+        weights = around.weights
+        if subset is not None:
+            weights = weights * subset
+            total = weights.sum(axis=-1, keepdims=True)
+            # A population that does not reach these points has a distribution function of zeros.
+            weights = weights / np.where(total > 0, total, 1.0)
         areas = []
         for part in self.node.target.parts:
-            values, rows = part.observed_of(observed)
-            w = weights[:, rows]
-            if len(values) < len(observed):
+            part_observed, rows = part.observed_of(observed)
+            w = observed_weights[:, rows]
+            if len(part_observed) < len(observed):
                 w = w / w.sum(axis=1, keepdims=True)
-            areas.append(_linear_area(self.stencil, part, values, w, subset))
+            values = part.of(around.values)
+            # Values that occur, where distribution functions are exact; 400 of all.
+            occurring = np.concatenate([values[0], part_observed])
+            knots = np.unique(occurring[np.isfinite(occurring)])
+            knots = knots[np.unique(np.linspace(0, knots.size - 1, 400).astype(int))]
+            # Responses that are the same at all points of the stencil are sorted once.
+            if np.array_equal(values[0], values[-1], equal_nan=True):
+                values = values[0]
+            simulated = distribution_function(values, weights, knots, kind="quicksort")
+            measured = distribution_function(part_observed, w, knots, kind="quicksort")
+            gaps = simulated[0] - measured
+            derivatives = slopes(simulated[: 1 + 2 * around.step.size], around.step).T
+            # An interval between knots has the values at its left end.
+            lengths = part.share * np.diff(knots)
+            areas.append(LinearArea(gaps[:, :-1], derivatives[:, :-1], lengths))
         return areas
-
-
-def _importance_sample(
-    target: Discrepancy, values: Floats, weights: Floats
-) -> tuple[Floats, Floats]:
-    """Return specimens of a population and their weights, for the covariance of gradients.
-
-    Of one output 1000 at equal steps of probability. Of several outputs 2000: half of them in
-    proportion to the fourth power of their distance from the middle, as most of the mean square of
-    gradients is theirs.
-    """
-    order = np.argsort(values.reshape(len(values), -1)[:, 0])
-    n, mass = 1000, weights
-    if values.ndim > 1:
-        n = 2000
-        far = _squared_distances(target, values, weights) ** 2
-        mass = weights * (1 + far / max(float(weights @ far), _TINY))
-        mass = mass / mass.sum()
-    rows = order[reached(mass[order], (np.arange(n) + 0.5) / n)]
-    return values[rows], weights[rows] / mass[rows]
 
 
 def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> Floats:
     """Return mean squares of the standardised projections of each specimen, (n,)."""
     squares = [np.zeros(len(values))]
-    for projection in one_dimensional(target, values):
+    for part in number_parts(target):
+        projection = part.of(values)
         is_finite = np.isfinite(projection)
         finite = np.where(is_finite, projection, 0.0)
         mass = np.where(is_finite, weights, 0.0)
@@ -333,35 +296,6 @@ def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> 
     return np.asarray(np.mean(squares, axis=0))
 
 
-def _linear_area(
-    around: Stencil,
-    part: Part,
-    observed: Floats,
-    weights: Floats,
-    subset: NDArray[np.bool_] | None,
-) -> LinearArea:
-    """Return the linear model of the area of one part, for values (n,), weights (n_sets, n)."""
-    values, simulated_weights = part.of(around.values), around.weights
-    if subset is not None:
-        simulated_weights = simulated_weights * subset
-        total = simulated_weights.sum(axis=-1, keepdims=True)
-        # A population that does not reach these points has a distribution function of zeros.
-        simulated_weights = simulated_weights / np.where(total > 0, total, 1.0)
-    # Values that occur, where distribution functions are exact; 400 of all.
-    occurring = np.concatenate([values[0], observed])
-    knots = np.unique(occurring[np.isfinite(occurring)])
-    knots = knots[np.unique(np.linspace(0, knots.size - 1, 400).astype(int))]
-    # Responses that are the same at all points of the stencil are sorted once.
-    if np.array_equal(values[0], values[-1], equal_nan=True):
-        values = values[0]
-    simulated = distribution_function(values, simulated_weights, knots, kind="quicksort")
-    measured = distribution_function(observed, weights, knots, kind="quicksort")
-    gaps = simulated[0] - measured
-    derivatives = slopes(simulated[: around.n_cross], around.step).T
-    # An interval between knots has the values at its left end.
-    return LinearArea(gaps[:, :-1], derivatives[:, :-1], part.share * np.diff(knots))
-
-
 def identified_by_area(information: Information, weakest: float = 1.0) -> Floats:
     """Return the directions that an area metric identifies, the strongest last, shape (d, r).
 
@@ -370,7 +304,8 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
     of the points do not agree on the change, which is then the points' own error.
     """
     spread = information.prior_sd[:, None]
-    areas = information.areas(*information.data_set)
+    sets, blocks = information.data_sets, information.stencil.blocks
+    areas = information.areas(sets)
     gram: Any = 0
     for area in areas:
         scaled = np.asarray(area.slopes * spread)
@@ -382,28 +317,20 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
         changes = np.abs(vectors.T @ np.asarray(area.slopes * spread))
         change = change + (changes * area.lengths).sum(axis=-1)
     is_identified = weakest * change > 0.5 * information.noise_floor
-    if information.stencil.blocks.size >= 256:
-        is_identified &= _halves_agree(information, vectors)
+    if blocks.size >= 256:
+        even_areas = information.areas(sets, blocks % 2 == 0)
+        odd_areas = information.areas(sets, blocks % 2 == 1)
+        product = even_square = odd_square = np.zeros(vectors.shape[1])
+        for even, odd in zip(even_areas, odd_areas, strict=True):
+            even_change = vectors.T @ np.asarray(even.slopes * spread)
+            odd_change = vectors.T @ np.asarray(odd.slopes * spread)
+            lengths = even.lengths  # both halves have the same knots
+            product = product + (even_change * odd_change * lengths).sum(axis=-1)
+            even_square = even_square + (even_change**2 * lengths).sum(axis=-1)
+            odd_square = odd_square + (odd_change**2 * lengths).sum(axis=-1)
+        # Correlation of the changes. Half or twice of .35 changes no answer.
+        is_identified &= product > 0.35 * np.sqrt(even_square * odd_square)
     return np.asarray(vectors[:, is_identified])
-
-
-def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_]:
-    """Return along which directions both halves of the points change alike, shape (d,)."""
-    spread = information.prior_sd[:, None]
-    blocks = information.stencil.blocks
-    even_areas = information.areas(*information.data_set, blocks % 2 == 0)
-    odd_areas = information.areas(*information.data_set, blocks % 2 == 1)
-    product = even_square = odd_square = np.zeros(vectors.shape[1])
-    for even, odd in zip(even_areas, odd_areas, strict=True):
-        even_change = vectors.T @ np.asarray(even.slopes * spread)
-        odd_change = vectors.T @ np.asarray(odd.slopes * spread)
-        # Both halves have the same knots.
-        lengths = even.lengths
-        product = product + (even_change * odd_change * lengths).sum(axis=-1)
-        even_square = even_square + (even_change**2 * lengths).sum(axis=-1)
-        odd_square = odd_square + (odd_change**2 * lengths).sum(axis=-1)
-    # Correlation of the changes. Half or twice of .35 changes no answer.
-    return np.asarray(product > 0.35 * np.sqrt(even_square * odd_square))
 
 
 # -- the sampling distribution --------------------------------------------------------------------
@@ -419,49 +346,44 @@ def first_order_shifts(
     basis, (d, r), has directions in units of the prior's spread; the shifts are (n_sets, r).
     """
     directions = basis * information[0].prior_sd[:, None]
-    r = basis.shape[1]
-    force = np.zeros((len(sets.weights[0]), r))  # minus the gradients
+    n_sets, r = len(sets.weights[0]), basis.shape[1]
+    force = np.zeros((n_sets, r))  # minus the gradients
     curvature = np.zeros((r, r))
     areas = []
     for item, scale in zip(information, scales, strict=True):
-        observed, weights = sets.values[item.k], sets.weights[item.k]
         if item.node.metric.minimum is Minimum.QUADRATIC:
-            force -= item.gradients(observed, weights) @ directions / scale
+            gradients = item.gradients(sets.values[item.k], sets.weights[item.k])
+            force -= gradients @ directions / scale
             curvature += directions.T @ item.hessian @ directions / scale
         else:
-            for area in item.areas(observed, weights):
+            for area in item.areas(sets):
                 areas.append(
                     LinearArea(area.gaps, directions.T @ area.slopes, area.lengths / scale)
                 )
     shifts = np.zeros_like(force)
     # Without an area one solution is exact.
     for _ in range(30 if areas else 1):
-        shifts = _reweighted_solution(force, curvature, areas, shifts)
-    return shifts
-
-
-def _reweighted_solution(
-    force: Floats, curvature: Floats, areas: list[LinearArea], shifts: Floats
-) -> Floats:
-    """Return the minimisers with each |gap| as a parabola through its value at ``shifts``."""
-    n_sets, r = shifts.shape
-    matrix = np.broadcast_to(curvature, (n_sets, r, r)).copy()
-    vector = force.copy()
-    for area in areas:
-        gaps = area.gaps + shifts @ area.slopes
-        # Below a gap of 1e-4 an absolute value counts as a parabola.
-        weight = area.lengths / np.sqrt(gaps**2 + 1e-8)
-        matrix += np.einsum("bm,im,jm->bij", weight, area.slopes, area.slopes, optimize=True)
-        vector -= np.einsum("bm,im->bi", weight * area.gaps, area.slopes, optimize=True)
-    # A ridge relative to each direction's own size: priors may differ in width by far.
-    ridge = 1e-10 * np.diagonal(matrix, axis1=1, axis2=2)[:, :, None]
-    solution = np.linalg.solve(matrix + ridge * np.eye(r), vector[..., None])
-    return np.asarray(solution[..., 0])
+        matrix = np.broadcast_to(curvature, (n_sets, r, r)).copy()
+        vector = force.copy()
+        for area in areas:
+            # Each |gap| is a parabola through its value at the present shifts. Below a gap of 1e-4
+            # an absolute value counts as a parabola.
+            gaps = area.gaps + shifts @ area.slopes
+            weight = area.lengths / np.sqrt(gaps**2 + 1e-8)
+            matrix += np.einsum("bm,im,jm->bij", weight, area.slopes, area.slopes, optimize=True)
+            vector -= np.einsum("bm,im->bi", weight * area.gaps, area.slopes, optimize=True)
+        # A ridge relative to each direction's own size: priors may differ in width by far.
+        ridge = 1e-10 * np.diagonal(matrix, axis1=1, axis2=2)[:, :, None]
+        shifts = np.linalg.solve(matrix + ridge * np.eye(r), vector[..., None])[..., 0]
+    return np.asarray(shifts)
 
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Covariance of the minimiser at one theta, in units of the prior's spread."""
+    """Covariance of the minimiser at one theta, in units of the prior's spread.
+
+    Elements and functions with a share above .02 in unidentified directions are not identified.
+    """
 
     prior_sd: Floats  # (d,): the prior's spread
     identified: Floats  # (d, r): orthonormal directions that the data identify
@@ -473,7 +395,7 @@ class Local:
         """The covariance in theta, (d, d), infinite for elements with a share not identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
         covariance = self.identified @ self.covariance @ self.identified.T * unit
-        is_hidden = (self.unidentified**2).sum(axis=1) > _OPTIONS.largest_loading
+        is_hidden = (self.unidentified**2).sum(axis=1) > 0.02
         covariance[is_hidden] = np.inf
         covariance[:, is_hidden] = np.inf
         return np.asarray(covariance)
@@ -488,7 +410,7 @@ class Local:
         along = unit @ self.identified
         across = unit @ self.unidentified
         variance = np.einsum("...i,ij,...j->...", along, self.covariance, along)
-        is_hidden = (across**2).sum(axis=-1) > _OPTIONS.largest_loading * (unit**2).sum(axis=-1)
+        is_hidden = (across**2).sum(axis=-1) > 0.02 * (unit**2).sum(axis=-1)
         return np.asarray(np.where(is_hidden, np.inf, np.maximum(variance, 0)))
 
 
@@ -498,23 +420,24 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
     Directions along which its standard error is above ``weakest``, in units of the prior's spread,
     are not identified.
     """
-    if all(item.node.metric.minimum is Minimum.QUADRATIC for item in information):
-        return _sandwich(information, scales, weakest)
-    return _area_covariance(information, scales, weakest)
-
-
-def _sandwich(information: list[Information], scales: Floats, weakest: float) -> Local:
-    """Return H^-1 J H^-1 along the directions that the data identify."""
+    if any(item.node.metric.minimum is not Minimum.QUADRATIC for item in information):
+        return _area_covariance(information, scales, weakest)
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
-    pairs = list(zip(information, scales, strict=True))
-    hessian = unit * sum(item.hessian / scale for item, scale in pairs)
-    if dependent(information[0].evaluator.nodes):
+    is_dependent = dependent(information[0].evaluator.nodes)
+    hessian, noise, gradients = (np.zeros(()) for _ in range(3))
+    for item, scale in zip(information, scales, strict=True):
+        hessian = hessian + item.hessian / scale
+        if is_dependent:
+            sets = information[0].data_sets
+            observed, weights = sets.values[item.k], sets.weights[item.k]
+            gradients = gradients + item.gradients(observed, weights) / scale
+        else:
+            noise = noise + item.sampling_covariance / scale**2
+    if is_dependent:
         # Gradients of simulators that share specimens depend on each other.
-        gradients: Any = sum(item.gradients(*item.data_set) / scale for item, scale in pairs)
-        noise = unit * np.atleast_2d(np.cov(gradients, rowvar=False))
-    else:
-        noise = unit * sum(item.sampling_covariance / scale**2 for item, scale in pairs)
+        noise = np.atleast_2d(np.cov(gradients, rowvar=False))
+    hessian, noise = unit * hessian, unit * noise
     values, vectors, is_identified = identified_by_curvature(hessian, noise, weakest)
     identified = vectors[:, is_identified]
     inverse = identified / values[is_identified]
@@ -566,15 +489,6 @@ def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]
         # Directions of the complement have a strength of one, up to rounding.
         space = axes[:, strength > 1e-6]
     return labels
-
-
-def without(unidentified: Floats, elements: NDArray[np.bool_]) -> Floats:
-    """Return unidentified directions, (d, q), without those of some elements, (d,)."""
-    if not elements.any():
-        return unidentified
-    axes, strength, _ = np.linalg.svd(unidentified * ~elements[:, None], full_matrices=False)
-    # One, or zero up to rounding for elements on which nothing depends.
-    return np.asarray(axes[:, strength > 0.5])
 
 
 def oriented(axes: Floats) -> Floats:

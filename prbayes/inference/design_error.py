@@ -35,12 +35,17 @@ class DesignErrors:
 
 def design_error(sampling: SamplingDistribution) -> DesignErrors:
     """Return the distance to the optimum of another design along the worst axis."""
-    if not is_stored(sampling.evaluator):
-        return DesignErrors(np.nan, np.nan)
-    # Two designs differ by the root of two of one's error.
-    points = np.sqrt(2) * _error_of_points(sampling).max(initial=0.0)
-    emulators = np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0)
-    return DesignErrors(float(points), float(emulators))
+    points = emulators = np.nan
+    if is_stored(sampling.evaluator):
+        nodes, designs = sampling.evaluator.nodes, sampling.evaluator.reweighted
+        on_line = {name for name, bound in designs.items() if bound.design.on_line}
+        # Two designs differ by the root of two of one's error. Points on a line, which cut it into
+        # parts of equal mass, count as exact.
+        if [node for node in nodes if node.bound.blocks.any() and node.name not in on_line]:
+            points = float(np.sqrt(2) * _error_of_points(sampling).max(initial=0.0))
+        if [bound for bound in designs.values() if bound.design.is_emulated]:
+            emulators = float(np.sqrt(2) * _error_of_emulators(sampling).max(initial=0.0))
+    return DesignErrors(points, emulators)
 
 
 def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
@@ -71,60 +76,47 @@ def _error_of_emulators(sampling: SamplingDistribution) -> Floats:
 
 
 def _error_of_points(sampling: SamplingDistribution) -> Floats:
-    """Return the error of the optimum by the design's points, (r,); NaN if not known.
+    """Return the error of the optimum by the design's points, (r,).
 
-    The spread of the minima of blocks of the design, each a coarser design of the same kind, as if
-    they were independent, bounds the error of the whole. Points of large emulated samples fill
-    space better together. Points on a line, which cut it into parts of equal mass, are far better
-    than their parts: they count as exact.
+    The spread of the minima of blocks of the design, as if they were independent, bounds it.
     """
-    evaluator = sampling.evaluator
-    blocks = [
-        np.zeros_like(node.bound.blocks)
-        if node.reweighted is not None and node.reweighted.design.on_line
-        else node.bound.blocks
-        for node in evaluator.nodes
-    ]
-    if not any(block.any() for block in blocks):
-        return np.full(sampling.stderr.size, np.nan)
+    evaluator, scales = sampling.evaluator, sampling.scales
+    bounds = evaluator.reweighted
     observed = observed_set(evaluator)
-    bounds = [node.reweighted for node in evaluator.nodes]
-    if all(bound is not None and bound.design.is_emulated for bound in bounds):
+    if all(
+        node.name in bounds and bounds[node.name].design.is_emulated for node in evaluator.nodes
+    ):
+        minima = []
+        descent = None
+        for b in range(N_BLOCKS):
+            parts = {
+                k: bound.copied(bound.design.rows(bound.blocks == b)) for k, bound in bounds.items()
+            }
+            nodes = tuple(replace(node, bound=parts[node.name]) for node in evaluator.nodes)
+            part = replace(evaluator, nodes=nodes, has_graph=False)
+            objective = BatchObjective.of(part, scales, observed)
+            descent = descent or descent_of(sampling, objective, is_rough=True)
+            minima.append(_minimum(sampling, objective, descent))
+        x = np.array(minima)
+        is_usable = np.isfinite(x).all(axis=1)
         # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
         # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
         rate = 0.5 + 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)
-        return np.asarray(_spread_of_parts(sampling, observed) / N_BLOCKS**rate)
-    # The observed responses against each block.
-    first = np.zeros(N_BLOCKS, dtype=int)
-    sets = DataSets(observed.values, [w[first] for w in observed.weights])
-    objective = BatchObjective.of(evaluator, sampling.scales, sets, blocks=blocks)
-    x, converged = minimise_sets(sampling, objective, descent_of(sampling, objective))
-    if converged.sum() < N_BLOCKS / 2:
+    else:
+        # The observed responses against each block.
+        on_line = {name for name, bound in bounds.items() if bound.design.on_line}
+        blocks = [
+            0 * node.bound.blocks if node.name in on_line else node.bound.blocks
+            for node in evaluator.nodes
+        ]
+        first = np.zeros(N_BLOCKS, dtype=int)
+        sets = DataSets(observed.values, [w[first] for w in observed.weights])
+        objective = BatchObjective.of(evaluator, scales, sets, blocks=blocks)
+        x, is_usable = minimise_sets(sampling, objective, descent_of(sampling, objective))
+        rate = 0.5
+    if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
-    return np.asarray(x[converged].std(axis=0, ddof=1) / N_BLOCKS**0.5)
-
-
-def _spread_of_parts(sampling: SamplingDistribution, observed: DataSets) -> Floats:
-    """Return the spread of the minima of an eighth of the points each, (r,)."""
-    evaluator = sampling.evaluator
-    bounds = evaluator.reweighted
-    minima = []
-    descent = None
-    for b in range(N_BLOCKS):
-        parts = {
-            k: bound.copied(bound.design.rows(bound.blocks == b)) for k, bound in bounds.items()
-        }
-        nodes = tuple(replace(node, bound=parts[node.name]) for node in evaluator.nodes)
-        part = replace(evaluator, nodes=nodes, has_graph=False)
-        objective = BatchObjective.of(part, sampling.scales, observed)
-        descent = descent or descent_of(sampling, objective, is_rough=True)
-        (minimum,), (is_converged,) = minimise_sets(sampling, objective, descent)
-        if is_converged and np.isfinite(minimum).all():
-            minima.append(minimum)
-    finite = np.array(minima)
-    if len(finite) < N_BLOCKS / 2:
-        return np.full(sampling.stderr.size, np.inf)
-    return np.asarray(finite.std(axis=0, ddof=1))
+    return np.asarray(x[is_usable].std(axis=0, ddof=1) / N_BLOCKS**rate)
 
 
 def _minimum(sampling: SamplingDistribution, objective: BatchObjective, descent: Descent) -> Floats:

@@ -20,7 +20,6 @@ from prbayes.inference.asymptotics import number_parts
 from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
 from prbayes.metrics.multivariate import failure_caps
-from prbayes.model.random_variable import Node
 
 # p-value below which the data do not come from the family, by convention.
 UNLIKELY = 0.01
@@ -58,8 +57,10 @@ class FittedSets:
         """The p-value of the distance of the data from their fit; NaN if too few converged."""
         if self.converged.mean() < MIN_CONVERGED:
             return np.nan
-        observed = self._distances(self.center[None], observed_set(self.sampling.evaluator))
-        return worst_p_value(observed[0], self._distances(self.x, self.sets)[self.converged])
+        evaluator = self.sampling.evaluator
+        pairs = ((self.center[None], observed_set(evaluator)), (self.x, self.sets))
+        observed, drawn = (self._distances(x, sets) for x, sets in pairs)
+        return worst_p_value(observed[0], drawn[self.converged])
 
     def _distances(self, x: Floats, sets: DataSets) -> Floats:
         """Return distances of data sets from their fits, by simulator and part, (n_sets, 2 K)."""
@@ -71,8 +72,18 @@ class FittedSets:
             for part in number_parts(node.target):
                 values, rows = part.observed_of(sets.values[k])
                 order = np.argsort(values, kind="stable")
-                expected = _middles(part.of(simulated), weights, values[order])
-                columns.append(log_distances(expected, sets.weights[k][:, rows][:, order]))
+                samples = np.broadcast_to(part.of(simulated), weights.shape)
+                expected = []
+                for sample, w in zip(samples, weights, strict=True):
+                    # Through the middles of steps; only finite values can be observed.
+                    is_finite = np.isfinite(sample)
+                    sorted_ = np.argsort(sample[is_finite], kind="stable")
+                    mass = w[is_finite][sorted_]
+                    mass = mass / mass.sum()
+                    middles = np.cumsum(mass) - mass / 2
+                    expected.append(np.interp(values[order], sample[is_finite][sorted_], middles))
+                observed = sets.weights[k][:, rows][:, order]
+                columns.append(log_distances(np.array(expected), observed))
         return np.concatenate(columns, axis=1)
 
 
@@ -105,43 +116,25 @@ def log_distances(expected: Floats, weights: Floats) -> Floats:
     return np.asarray(np.log(np.maximum(distances, 1e-300)))
 
 
-def _middles(values: Floats, weights: Floats, points: Floats) -> Floats:
-    """Return distribution functions through the middles of their steps, at (m,) -> (P, m)."""
-    rows = []
-    for sample, w in zip(np.broadcast_to(values, weights.shape), weights, strict=True):
-        # Only finite values can be observed.
-        is_finite = np.isfinite(sample)
-        order = np.argsort(sample[is_finite], kind="stable")
-        mass = w[is_finite][order]
-        mass = mass / mass.sum()
-        rows.append(np.interp(points, sample[is_finite][order], np.cumsum(mass) - mass / 2))
-    return np.array(rows)
-
-
 def population_misfit(p_value: float, *, with_prior: bool) -> list[Finding]:
     """Report data that cannot come from the population at an optimum."""
     if not p_value < UNLIKELY:
         return []
     if with_prior:
-        return [
-            Finding(
-                "prior-misfit",
-                "The data are farther from the population at this optimum than "
-                f"{1 - p_value:.1%} of data sets drawn there: the prior, which is part of its "
-                "objective, and the data contradict each other, or the inputs have another family; "
-                "look at prb.minimize without the prior.",
-            )
-        ]
-    return [
-        Finding(
-            "population-misfit",
-            f"The data are farther from the best population than {1 - p_value:.1%} or more of "
-            "data sets that the model draws there are from theirs: the inputs probably have "
-            "another family, or the response an error; look at prb.plot_responses, at outliers, "
-            "and at other families, by prb.rank.",
-            "choosing_metric.md#a-wrong-family",
+        text = (
+            f"The data are farther from the population at this optimum than {1 - p_value:.1%} of "
+            "data sets drawn there: the prior, which is part of its objective, and the data "
+            "contradict each other, or the inputs have another family; look at prb.minimize "
+            "without the prior."
         )
-    ]
+        return [Finding("prior-misfit", text)]
+    text = (
+        f"The data are farther from the best population than {1 - p_value:.1%} or more of data "
+        "sets that the model draws there are from theirs: the inputs probably have another family, "
+        "or the response an error; look at prb.plot_responses, at outliers, and at other families, "
+        "by prb.rank."
+    )
+    return [Finding("population-misfit", text, "choosing_metric.md#a-wrong-family")]
 
 
 # -- by output -------------------------------------------------------------------------------------
@@ -153,43 +146,39 @@ def output_misfits(fitted: FittedSets) -> list[Finding]:
     Outputs by the distances of Cramer-von Mises and Anderson-Darling, pairs by the residual of
     their correlation.
     """
-    nodes = enumerate(fitted.sampling.evaluator.nodes)
-    return [_output_misfit(fitted, k, node) for k, node in nodes if len(node.outputs.labels) > 1]
-
-
-def _output_misfit(fitted: FittedSets, k: int, node: Node) -> Finding:
-    """Report the outputs and pairs of one simulator that misfit."""
-    observed = observed_set(fitted.sampling.evaluator)
-    data = _Outputs.of(fitted, observed, fitted.center[None], k)
-    drawn = _Outputs.of(fitted, fitted.sets, fitted.x, k)
-    names = node.outputs.names
-    outputs, pairs = [], []
-    for j in data.columns:
-        p = worst_p_value(data.distances(j)[0], drawn.distances(j)[fitted.converged])
-        if p < UNLIKELY:
-            outputs.append(f"{names[j]} (p = {p:.2g})")
-    for i, j in combinations(data.columns, 2):
-        measured, calibrated = data.correlations(i, j)
-        drawn_measured, drawn_calibrated = drawn.correlations(i, j)
-        residuals = (drawn_measured - drawn_calibrated)[fitted.converged, None]
-        p = worst_p_value(measured - calibrated, residuals, two_sided=True)
-        if p < UNLIKELY:
-            pairs.append(
-                f"{names[i]} with {names[j]} (measured {measured[0]:.2f}, calibrated "
-                f"{calibrated[0]:.2f}, p = {p:.2g})"
+    findings = []
+    evaluator, is_fitted = fitted.sampling.evaluator, fitted.converged
+    for k, node in enumerate(evaluator.nodes):
+        if len(node.outputs.labels) < 2:
+            continue
+        data = _Outputs.of(fitted, observed_set(evaluator), fitted.center[None], k)
+        drawn = _Outputs.of(fitted, fitted.sets, fitted.x, k)
+        names = node.outputs.names
+        outputs, pairs = [], []
+        for j in data.columns:
+            p = worst_p_value(data.distances(j)[0], drawn.distances(j)[is_fitted])
+            if p < UNLIKELY:
+                outputs.append(f"{names[j]} (p = {p:.2g})")
+        for i, j in combinations(data.columns, 2):
+            measured, calibrated = data.correlations(i, j)
+            drawn_measured, drawn_calibrated = drawn.correlations(i, j)
+            residuals = (drawn_measured - drawn_calibrated)[is_fitted, None]
+            p = worst_p_value(measured - calibrated, residuals, two_sided=True)
+            if p < UNLIKELY:
+                pairs.append(
+                    f"{names[i]} with {names[j]} (measured {measured[0]:.2f}, calibrated "
+                    f"{calibrated[0]:.2f}, p = {p:.2g})"
+                )
+        parts = [f"outputs {', '.join(outputs)}"] if outputs else []
+        parts += [f"correlations {', '.join(pairs)}"] if pairs else []
+        text = f"what disagrees with the best population are {' and '.join(parts)}."
+        if not parts:
+            text = (
+                "no output by itself, and no correlation of two, disagrees with the best "
+                "population; what does is a combination of outputs."
             )
-    if not outputs and not pairs:
-        return Finding(
-            "outputs-misfit",
-            f"{node.name}: no output by itself, and no correlation of two, disagrees with the best "
-            "population; what does is a combination of outputs.",
-        )
-    parts = [f"outputs {', '.join(outputs)}"] if outputs else []
-    parts += [f"correlations {', '.join(pairs)}"] if pairs else []
-    return Finding(
-        "outputs-misfit",
-        f"{node.name}: what disagrees with the best population are {' and '.join(parts)}.",
-    )
+        findings.append(Finding("outputs-misfit", f"{node.name}: {text}"))
+    return findings
 
 
 @dataclass(frozen=True, eq=False)

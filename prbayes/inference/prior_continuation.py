@@ -26,18 +26,11 @@ class Continuation:
     An element in the interval (a, b) has the value v = a + (b - a) / (1 + exp(-theta)). Its
     coordinate is v if populations exist beyond both ends, log(v - a) if only beyond b, -log(b - v)
     if only beyond a, and theta if beyond none.
-
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (d,)
-        Ends a and b; NaN of elements without them.
-    below, above : ndarray of bool, shape (d,)
-        Whether populations exist there.
     """
 
-    lower: Floats
-    upper: Floats
-    below: NDArray[np.bool_]
+    lower: Floats  # (d,): ends a; NaN of elements without them
+    upper: Floats  # (d,): ends b
+    below: NDArray[np.bool_]  # (d,): whether populations exist there
     above: NDArray[np.bool_]
 
     @property
@@ -71,11 +64,9 @@ class Continuation:
 
     def _shares(self, coordinates: Floats, margin: float) -> Floats:
         """Return values as shares of the interval, a margin away from ends that are passed."""
-        width = self.upper - self.lower
-        shares = (self.values(coordinates) - self.lower) / width
+        shares = (self.values(coordinates) - self.lower) / (self.upper - self.lower)
         least = np.where(self.below, margin, 1e-300)
-        most = np.where(self.above, 1 - margin, 1 - 1e-16)
-        return np.clip(shares, least, most)
+        return np.clip(shares, least, np.where(self.above, 1 - margin, 1 - 1e-16))
 
     def _thetas(self, shares: Floats, coordinates: Floats) -> Floats:
         return np.asarray(np.where(self.is_continued, logit(shares), coordinates))
@@ -163,40 +154,28 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
             points = trial.coordinates(np.nan_to_num(thetas, posinf=30, neginf=-30))
             middle, half = (upper[i] + lower[i]) / 2, (upper[i] - lower[i]) / 2
             points[:, i] = middle + sign * 1.05 * half
-            side[i] = _is_possible(ContinuedEvaluator.continuing(evaluator, trial), points)
+            continued = ContinuedEvaluator.continuing(evaluator, trial)
+            # Populations are possible where they have weights.
+            weights = [continued.populations(points, k)[1] for k in range(len(evaluator.nodes))]
+            side[i] = all(np.isfinite(w).all() and bool((w.sum(axis=1) > 0).all()) for w in weights)
     return Continuation(lower, upper, below, above)
-
-
-def _is_possible(evaluator: Evaluator, points: Floats) -> bool:
-    """Return whether populations at some points have weights."""
-    for k in range(len(evaluator.nodes)):
-        _, weights = evaluator.populations(points, k)
-        if not (np.isfinite(weights).all() and (weights.sum(axis=1) > 0).all()):
-            return False
-    return True
 
 
 def _ends(evaluator: Evaluator) -> tuple[Floats, Floats]:
     """Return the ends of the values of elements, (d,) each; NaN where there are none."""
-    d = evaluator.hyperparameters.size
-    nothing = np.full(d, np.nan)
-    base = evaluator.hyperparameters.prior_thetas(2, 0)
+    hyperparameters = evaluator.hyperparameters
+    d = hyperparameters.size
+    base = hyperparameters.prior_thetas(2, 0)
     far = np.full((2, d), 1e6)
     rows = np.vstack([base, -far, far])
     with np.errstate(over="ignore", invalid="ignore"):
-        values = _free_values(evaluator, rows)
-    if values.shape != rows.shape:  # elements without values of their own, as of a simplex
-        return nothing, nothing.copy()
-    lower, upper = values[2], values[4]
-    with np.errstate(invalid="ignore"):
+        variables = hyperparameters.constrained(rows)
+        names = [str(rv.name) for rv in evaluator.model.free_RVs]
+        values = np.column_stack([variables[name].reshape(len(rows), -1) for name in names])
+        if values.shape != rows.shape:  # elements without values of their own, as of a simplex
+            return np.full(d, np.nan), np.full(d, np.nan)
+        lower, upper = values[2], values[4]
         expected = lower + (upper - lower) * expit(base)
         is_logistic = np.isclose(values[:2], expected, rtol=1e-9).all(axis=0)
-    is_logistic &= np.isfinite(upper - lower)
+        is_logistic &= np.isfinite(upper - lower)
     return np.where(is_logistic, lower, np.nan), np.where(is_logistic, upper, np.nan)
-
-
-def _free_values(evaluator: Evaluator, thetas: Floats) -> Floats:
-    """Return the values of the free variables, side by side."""
-    values = evaluator.hyperparameters.constrained(thetas)
-    names = [str(rv.name) for rv in evaluator.model.free_RVs]
-    return np.column_stack([values[name].reshape(len(thetas), -1) for name in names])

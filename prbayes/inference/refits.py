@@ -6,8 +6,8 @@ sentence.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -25,6 +25,7 @@ from prbayes.inference.asymptotics import (
 )
 from prbayes.inference.resampling import SETS, DataSets, observed_set, one_set, simulated_sets
 from prbayes.metrics.base import Basis, Discrepancy, Minimum
+from prbayes.metrics.density import is_differentiable
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.batched_minimisers import Descent, descend_by_simplex
 from prbayes.numerics.derivatives import second_differences
@@ -100,10 +101,17 @@ def jumping_simulators(sampling: SamplingDistribution) -> list[int]:
     It does if twice the step of the differences gives other errors: second differences over a jump
     are the smaller the wider the step, those of a smooth function are not.
     """
-    jumping = [item.k for item in sampling.information if item.jumps]
+    jumping = [
+        item.k
+        for item in sampling.information
+        if is_differentiable(item.node.target)
+        and not item.node.bound.stored
+        and item.stencil.is_wide  # as points lose their response close to theta
+    ]
     if not jumping:
         return []
-    wider = [replace(item, widened=2.0) for item in sampling.information]
+    evaluator, theta = sampling.evaluator, sampling.theta
+    wider = [Information(evaluator, item.k, theta, widened=2.0) for item in sampling.information]
     variances, wide_variances = (
         np.diag(local_sampling(information, sampling.scales).in_theta)
         for information in (sampling.information, wider)
@@ -218,8 +226,12 @@ def descent_of(
         # A first guess of the curvature: 50 data sets suffice.
         return np.asarray(objective(sampling.thetas(z @ root.T), slice(50)).mean(axis=0))
 
+    # Positive definite: as a first guess, no direction is flatter than a twentieth of the steepest.
+    curvatures, vectors = np.linalg.eigh(second_differences(mean_objective, r))
+    lowest = 0.05 * max(np.nanmax(curvatures), 1e-300)
+    positive = np.maximum(np.nan_to_num(curvatures), lowest)
     across = np.linalg.inv(root)
-    curvature = across.T @ _mean_hessian(mean_objective, r) @ across
+    curvature = across.T @ ((vectors * positive) @ vectors.T) @ across
     # What an error of one standard error costs in any direction: the harmonic mean, as with
     # correlated estimates the mean curvature is that of a direction with hardly any error.
     cost = r / np.trace(np.linalg.inv(curvature))
@@ -251,35 +263,7 @@ def minimise_sets(
     return minima.x, minima.converged
 
 
-def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:
-    """Return the Hessian at zero by differences of one unit, made positive definite."""
-    curvatures, vectors = np.linalg.eigh(second_differences(value, r))
-    # As a first guess, no direction is flatter than a twentieth of the steepest.
-    lowest = 0.05 * max(np.nanmax(curvatures), 1e-300)
-    positive = np.maximum(np.nan_to_num(curvatures), lowest)
-    return np.asarray((vectors * positive) @ vectors.T)
-
-
 # -- refits of metrics that declare nothing of their minimum ---------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Along:
-    """An objective in coordinates x along axes, in steps, around theta."""
-
-    objective: BatchObjective
-    theta: Floats  # (d,)
-    prior_sd: Floats  # (d,)
-    axes: Floats  # (d, d): as columns, in units of the prior's spread
-    steps: Floats  # (d,): length of one unit of x along each axis
-
-    def shifts(self, x: Floats) -> Floats:
-        """Return coordinates (..., d) in units of the prior's spread."""
-        return np.asarray((x * self.steps) @ self.axes.T)
-
-    def __call__(self, x: Floats, rows: Any) -> Floats:
-        """Return the values of data sets ``rows``, shapes (A, s, d), (A,) -> (A, s)."""
-        return self.objective(self.theta + self.shifts(x) * self.prior_sd, rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +285,19 @@ class SimplexRefits:
         ``weakest**2``. For a quadratic discrepancy both say the same; along a flat one a minimiser
         stays close to its start, and only the second says so.
         """
-        curvatures, vectors = np.linalg.eigh(self.hessian())
+        # Second differences of the mean discrepancy at theta. Steps are the minimisers' standard
+        # errors, over which kinks at different places average out, and half a prior standard
+        # deviation where these are large.
+        axes, sd = principal_axes(self.shifts)
+        steps = np.minimum(np.where(sd > 0.1, 0.5, sd), 0.5)
+
+        def mean(x: Floats) -> Floats:
+            thetas = self.theta + (x * steps) @ axes.T * self.prior_sd
+            return np.asarray(self.objective(thetas, slice(None)).mean(axis=0))
+
+        back = axes / steps  # to derivatives in units of the prior's spread
+        hessian = back @ np.nan_to_num(second_differences(mean, steps.size)) @ back.T
+        curvatures, vectors = np.linalg.eigh(hessian)
         # The largest curvature first.
         curvatures, vectors = curvatures[::-1], vectors[:, ::-1]
         number = np.arange(1, curvatures.size + 1)
@@ -314,24 +310,6 @@ class SimplexRefits:
         identified = rising @ axes[:, is_narrow]
         unidentified = np.concatenate([level, rising @ axes[:, ~is_narrow]], axis=1)
         return Local(self.prior_sd, identified, unidentified, np.diag(sd[is_narrow] ** 2))
-
-    def hessian(self) -> Floats:
-        """Return second differences of the discrepancy at theta, averaged over data sets, (d, d).
-
-        In units of the prior's spread. Steps are the minimisers' standard errors, over which kinks
-        at different places average out, and half a prior standard deviation where these are large.
-        """
-        axes, sd = principal_axes(self.shifts)
-        steps = np.minimum(np.where(sd > 0.1, 0.5, sd), 0.5)
-        along = _Along(self.objective, self.theta, self.prior_sd, axes, steps)
-
-        def mean(x: Floats) -> Floats:
-            return np.asarray(along(x, slice(None)).mean(axis=0))
-
-        differences = np.nan_to_num(second_differences(mean, steps.size))
-        # From differences along the axes to derivatives in units of the prior's spread.
-        back = axes / steps
-        return np.asarray(back @ differences @ back.T)
 
 
 def simplex_refits(
@@ -367,18 +345,23 @@ def _cached_refits(
     sets = simulated_sets(evaluator, center, SETS, seed=0)
     objective = BatchObjective.of(evaluator, np.array(scales), sets, simulators=simulators)
     d = center.size
+
+    def value(x: Floats, rows: Any) -> Floats:
+        return objective(center + x * prior_sd, rows)
+
+    def value_along(x: Floats, rows: Any) -> Floats:
+        return value((x * sd) @ axes.T, rows)
+
     start = np.zeros((SETS, d))
-    along_prior = _Along(objective, center, prior_sd, np.eye(d), np.ones(d))
-    at_theta = along_prior(start[:, None], np.arange(SETS))[:, 0]
+    at_theta = value(start[:, None], np.arange(SETS))[:, 0]
     # In spreads of the prior: an ordinary step.
-    shifts, _, _ = descend_by_simplex(along_prior, start, sizes=[0.5])
+    shifts, _, _ = descend_by_simplex(value, start, sizes=[0.5])
     # The second simplices start along the principal axes of the first minimisers.
     axes, sd = principal_axes(shifts)
-    along = _Along(objective, center, prior_sd, axes, sd)
-    x, at_minimum, _ = descend_by_simplex(along, shifts @ axes / sd, sizes=[1.0])
+    x, at_minimum, _ = descend_by_simplex(value_along, shifts @ axes / sd, sizes=[1.0])
     is_finite = np.isfinite(at_theta)
     gain = float((at_theta[is_finite] - at_minimum[is_finite]).mean())
-    return SimplexRefits(objective, center, prior_sd, along.shifts(x), gain)
+    return SimplexRefits(objective, center, prior_sd, (x * sd) @ axes.T, gain)
 
 
 # Ends and middle of the central 89 %, whose width is 3.2 standard deviations of a normal.
@@ -472,38 +455,30 @@ class BatchObjective:
         With thetas of shape (1, s, d) all data sets are compared with the same populations. NaN,
         as where a design has no point, becomes infinite.
         """
-        portions = self.portions(len(thetas), thetas.shape[1])
-        if len(portions) < 2:
+        # In portions of a million weights.
+        most = max(len(values) for values in self.values) * thetas.shape[1]
+        at_once = max(1, (1 << 20) // most)
+        if len(thetas) <= at_once:
             return self._values(thetas, rows)
         numbers = np.arange(self.n_sets)[rows]
+        portions = [slice(i, i + at_once) for i in range(0, len(thetas), at_once)]
         return np.concatenate([self._values(thetas[p], numbers[p]) for p in portions])
 
-    def portions(self, number: int, populations: int = 1) -> list[slice]:
-        """Divide data sets, each with several populations, into portions of a million weights."""
-        most = max(len(values) for values in self.values)
-        at_once = max(1, (1 << 20) // (most * populations))
-        return [slice(first, first + at_once) for first in range(0, number, at_once)]
-
     def _values(self, thetas: Floats, rows: Any) -> Floats:
-        """Return the values for some data sets."""
+        """Return the values for some data sets, on the whole design or on blocks."""
+        stacked = thetas.reshape(-1, thetas.shape[-1])
         total: Any = 0.0
         for i, k in enumerate(self.simulators):
-            features = self.bases[i].rows(rows).features(self.weights(thetas, rows, i))
+            _, weights = self.evaluator.populations(stacked, k)
+            weights = weights.reshape(*thetas.shape[:-1], -1)
+            if self.blocks and self.blocks[i].any():
+                block_of_set = np.arange(self.n_sets)[rows, None, None]
+                weights = weights * (self.blocks[i] == block_of_set)
+                with np.errstate(invalid="ignore"):
+                    weights = weights / weights.sum(axis=-1, keepdims=True)
+            features = self.bases[i].rows(rows).features(weights)
             total = total + self.targets[i].rows(rows).outer(*features, xp=np) / self.scales[k]
         return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
-
-    def weights(self, thetas: Floats, rows: Any, i: int) -> Floats:
-        """Return weights of the stored responses, (A, s, n), on the whole design or on blocks."""
-        stacked = thetas.reshape(-1, thetas.shape[-1])
-        _, weights = self.evaluator.populations(stacked, self.simulators[i])
-        weights = weights.reshape(*thetas.shape[:-1], -1)
-        if not self.blocks or not self.blocks[i].any():
-            return weights
-        block_of_set = np.arange(self.n_sets)[rows, None, None]
-        weights = weights * (self.blocks[i] == block_of_set)
-        total = weights.sum(axis=-1, keepdims=True)
-        with np.errstate(invalid="ignore"):
-            return np.asarray(weights / total)
 
 
 def simulator_obstacle(evaluator: Evaluator, k: int) -> str | None:
@@ -543,4 +518,4 @@ def refit_obstacle(evaluator: Evaluator) -> str | None:
 
 def needs_refits(evaluator: Evaluator) -> bool:
     """Return whether a metric declares nothing of its minimum, so that refits measure it."""
-    return any(node.metric.minimum is Minimum.UNKNOWN for node in evaluator.nodes)
+    return Minimum.UNKNOWN in [node.metric.minimum for node in evaluator.nodes]

@@ -64,7 +64,7 @@ def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[NDArray[np.int
 def dependent(nodes: Sequence[Node]) -> bool:
     """Return whether a specimen has several observations."""
     numbers, total = specimens(nodes)
-    return total < sum(n.size for n in numbers)
+    return total < np.concatenate(numbers).size
 
 
 def groups(nodes: Sequence[Node]) -> list[list[int]]:
@@ -80,7 +80,7 @@ def groups(nodes: Sequence[Node]) -> list[list[int]]:
             else:
                 members, shared = members + group, shared | group_labels
         joined = [*separate, (sorted(members), shared)]
-    return sorted(members for members, _ in joined)
+    return sorted([members for members, _ in joined])
 
 
 def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
@@ -114,14 +114,19 @@ def aligned(nodes: Sequence[Node]) -> bool:
     )
 
 
-def _require_aligned(nodes: Sequence[Node]) -> None:
-    if not aligned(nodes):
-        names = ", ".join(n.name for n in nodes)
-        raise ValueError(
-            f"specimens: got the same labels in {names} with different inputs or designs, "
-            "expected the same .dist() objects, n and seed in all; then the model says how "
-            "responses of one specimen depend on each other"
-        )
+def _aligned_groups(nodes: Sequence[Node]) -> list[list[int]]:
+    """Return groups that share specimens, or raise if the model does not define how they depend."""
+    result = groups(nodes)
+    for group in result:
+        members = [nodes[k] for k in group]
+        if not aligned(members):
+            names = ", ".join([node.name for node in members])
+            raise ValueError(
+                f"specimens: got the same labels in {names} with different inputs or designs, "
+                "expected the same .dist() objects, n and seed in all; then the model says how "
+                "responses of one specimen depend on each other"
+            )
+    return result
 
 
 # -- parametric bootstrap --------------------------------------------------------------------------
@@ -130,15 +135,8 @@ def _require_aligned(nodes: Sequence[Node]) -> None:
 def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
     """Draw data sets of the observed sizes from the populations at theta (parametric bootstrap).
 
-    Specimens without a response (NaN) cannot be observed, and failed ones (+inf) only if the metric
-    counts them. Of populations of more than 2^15 points that many, the first of a Sobol sequence,
-    are used. Repeated observations of one specimen within a simulator are equal, as in the model.
-
-    Raises
-    ------
-    ValueError
-        If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or
-        whose designs differ, so that the model does not define the dependence of their responses.
+    Repeated observations of one specimen within a simulator are equal, as in the model. Raises
+    ValueError if simulators share specimens, but not their ``.dist()`` objects and designs.
     """
     populations = [
         thinned(*evaluator.populations(theta[None], k), node)
@@ -161,9 +159,9 @@ def points_along(
     size = (len(thetas), specimens(nodes)[1])
     populations = stored_populations(evaluator, thetas)
     points: dict[int, NDArray[np.intp]] = {}
-    for group in groups(nodes):
-        _require_aligned([nodes[k] for k in group])
-        is_observable = _observable_together(nodes, populations, group)
+    for group in _aligned_groups(nodes):
+        columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
+        is_observable = np.asarray(np.all(columns, axis=0))
         uniform = rng.random(size)
         drawn = np.empty(size, dtype=np.intp)
         at_once = max(1, AT_ONCE // is_observable.size)
@@ -191,10 +189,10 @@ def simulated_points(
     rng = np.random.default_rng([seed, 1])
     size = (n_sets, specimens(nodes)[1] + more)
     points: dict[int, NDArray[np.intp]] = {}
-    for group in groups(nodes):
-        _require_aligned([nodes[k] for k in group])
+    for group in _aligned_groups(nodes):
+        columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
+        is_observable = np.asarray(np.all(columns, axis=0))
         # Simulators that share specimens have the same points, with the same weights.
-        is_observable = _observable_together(nodes, populations, group)
         mass = np.where(is_observable, populations[group[0]][1][0], 0.0)
         probability = mass / mass.sum()
         points |= dict.fromkeys(group, rng.choice(probability.size, size=size, p=probability))
@@ -223,18 +221,13 @@ def sets_at(
                 pairs, places = np.unique(cells + size * row.ravel(), return_inverse=True)
                 cells = places.reshape(cells.shape)
                 occurring = np.where(patterns[pairs // size], occurring[pairs % size], np.nan)
+        # The observations' weights, added up by value; all data sets in one row.
+        n_sets, size = len(cells), len(occurring)
+        stacked = cells + (size * np.arange(n_sets))[:, None]
+        summed = np.bincount(stacked.ravel(), np.tile(node.target.weights, n_sets), n_sets * size)
         values.append(occurring)
-        weights.append(_summed_weights(cells, node.target.weights, len(occurring)))
+        weights.append(np.asarray(summed.reshape(n_sets, size)))
     return DataSets(values, weights)
-
-
-def _summed_weights(cells: NDArray[np.intp], weights: Floats, size: int) -> Floats:
-    """Add up the observations' weights at the cells drawn, (n_sets, n) -> (n_sets, size)."""
-    n_sets = len(cells)
-    # All data sets in one row, one after the other.
-    stacked = cells + (size * np.arange(n_sets))[:, None]
-    count = np.bincount(stacked.ravel(), np.tile(weights, n_sets), n_sets * size)
-    return np.asarray(count.reshape(n_sets, size))
 
 
 def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
@@ -244,14 +237,6 @@ def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
     """
     is_known = ~np.isnan(responses) if target.metric.counts_failures else np.isfinite(responses)
     return is_known if is_known.ndim == 1 else is_known.all(axis=1)
-
-
-def _observable_together(
-    nodes: Sequence[Node], populations: list[_Population], group: list[int]
-) -> NDArray[np.bool_]:
-    """Return which points can be observed by all simulators of a group, (n,)."""
-    columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
-    return np.asarray(np.all(columns, axis=0))
 
 
 def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
@@ -269,11 +254,10 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
     """
     nodes = evaluator.nodes
     numbers, total = specimens(nodes)
-    node_groups = groups(nodes)
+    node_groups = _aligned_groups(nodes)
     data = {}
     for group, generator in zip(node_groups, rng.spawn(len(node_groups)), strict=True):
         members = [nodes[k] for k in group]
-        _require_aligned(members)
         columns = []
         for k, node in zip(group, members, strict=True):
             sampler = PopulationSampler(node.bound.inputs)

@@ -6,8 +6,8 @@ tolerance then means the same for every model, metric and method.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -16,15 +16,14 @@ from pytensor.gradient import NullTypeGradError
 
 from prbayes._progress import progress
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local
-from prbayes.inference.refits import SamplingDistribution
+from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import overlap
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.parameters import THETAS
 from prbayes.numerics.derivatives import cross, differences
-from prbayes.optimize.objective import Function, Method, Objective, Ridge, SpentError, StalledError
+from prbayes.optimize.objective import Method, Objective, Ridge, SpentError, StalledError
 from prbayes.response.budget import BudgetError
 
 # Relative gain that no longer counts: far below the noise of any data, which is 1 / N.
@@ -76,69 +75,39 @@ class Trace:
         return Trace(
             thetas=self.thetas + tuple(objective.thetas),
             values=self.values + tuple(objective.values),
-            counts=self.counts + tuple(self.count + c for c in objective.counts),
+            counts=(*self.counts, *[self.count + c for c in objective.counts]),
             count=self.count + objective.count,
         )
-
-    def arrays(self, size: int) -> dict[str, Floats]:
-        """Return the trace of ``size`` parameters as arrays."""
-        return {
-            "theta": np.array(self.thetas).reshape(-1, size),
-            "discrepancy": np.array(self.values),
-            "evaluations": np.array(self.counts, dtype=np.int64),
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """The end of a minimisation."""
-
-    best: Floats  # (d,)
-    result: Result
-    details: str  # sentences with the numbers behind the result
-    trace: Trace  # with the points of earlier runs
-    center: Floats  # (d,): the start
-    scales: Floats  # (k,): by which discrepancies are divided
-    lowest: float  # the objective at ``best``
-    size: float  # its typical size
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """A minimum on the designs as they are, and the sampling distribution around it."""
 
-    run: Run  # the last one, with the trace of all
+    theta: Floats  # (d,)
+    result: Result
+    details: str  # sentences with the numbers behind the result
+    trace: Trace  # with the points of earlier minimisations
+    center: Floats  # (d,): the start
+    scales: Floats  # (k,): by which discrepancies are divided
+    lowest: float  # the objective at theta
+    size: float  # its typical size
+    ridge: Ridge | None = None  # on directions that designs do not identify
     sampling: SamplingDistribution | None = None  # None where it is not known
     design_error: float = np.nan  # in standard errors; NaN where it is not known
-    cloud: Floats | None = None  # (m, d): thetas of a pilot, around which designs grow
-    ridge: Ridge | None = None  # on directions that designs do not identify
-
-    @property
-    def theta(self) -> Floats:
-        """The minimum, (d,)."""
-        return self.run.best
-
-    @property
-    def scales(self) -> Floats:
-        """The divisors of the discrepancies, (k,)."""
-        return self.run.scales
-
-    @property
-    def local(self) -> Local | None:
-        """The sampling distribution to first order."""
-        return None if self.sampling is None else self.sampling.local
+    pilot: Floats | None = None  # (m, d): thetas around which designs grow
 
     @property
     def covariance(self) -> Floats:
         """The sampling covariance, (d, d); NaN where it is not known."""
-        if self.local is None:
+        if self.sampling is None:
             return np.full((self.theta.size, self.theta.size), np.nan)
-        return self.local.in_theta
+        return self.sampling.local.in_theta
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """An objective and a minimiser."""
+    """An objective and a minimiser; raise TypeError if the minimiser needs missing gradients."""
 
     evaluator: Evaluator
     prior_sd: Floats  # (d,): unit of the parameters
@@ -147,48 +116,61 @@ class Search:
     tolerance: float  # of the standardised problem
     max_evaluations: int  # in all
     ridge: Ridge | None = None  # added to the objective
+    uses_gradient: bool = field(init=False)  # whether the method receives gradients
+    has_kinks: bool = field(init=False)  # gradients jump: line searches end in ever smaller steps
 
-    @property
-    def uses_gradient(self) -> bool:
-        """Whether the method receives gradients."""
-        return self.method.gradient and not any(n.bound.random for n in self.evaluator.nodes)
-
-    @property
-    def has_kinks(self) -> bool:
-        """Whether gradients jump, so that line searches end in ever smaller steps."""
-        return any(n.metric.minimum is Minimum.ABSOLUTE for n in self.evaluator.nodes)
-
-    def refuse_random(self) -> None:
-        """Raise if a method of scipy needs gradients of random draws."""
-        random = [n.name for n in self.evaluator.nodes if n.bound.random]
+    def __post_init__(self) -> None:
+        nodes = self.evaluator.nodes
+        random = [node.name for node in nodes if node.bound.random]
         if random and self.method.gradient and isinstance(self.method.method, str):
             raise TypeError(
                 f"{random[0]}: prb.Fresh draws new responses at every evaluation, so the method "
-                f"{self.method.name} has no gradient to follow; pass epsilon= to prb.sample_smc, "
+                f"{self.method.method} has no gradient to follow; pass epsilon= to prb.sample_smc, "
                 "which then needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
                 "propagation=prb.Reweighted() or prb.Resimulated()"
             )
+        has_kinks = Minimum.ABSOLUTE in [node.metric.minimum for node in nodes]
+        object.__setattr__(self, "uses_gradient", self.method.gradient and not random)
+        object.__setattr__(self, "has_kinks", has_kinks)
 
     def size(self, theta: Floats, scales: Floats) -> float:
         """Return a typical size of the objective; for a user's metric its value at theta."""
         nodes = self.evaluator.nodes
-        if not any(n.metric.minimum is Minimum.UNKNOWN for n in nodes):
+        if Minimum.UNKNOWN not in [node.metric.minimum for node in nodes]:
             sizes = [n.target.scale / scale for n, scale in zip(nodes, scales, strict=True)]
             return float(sum(sizes))
         (total,) = self.evaluator.total(theta[None], scales)
         value = float(np.abs(total))
         return value if 0 < value < np.inf else 1.0
 
-    def best_of(self, thetas: Floats, scales: Floats) -> Floats:
-        """Return the theta with the smallest objective, evaluated in one batch."""
-        return np.asarray(thetas[np.argmin(self.evaluator.total(thetas, scales))])
-
     def objective(
-        self, center: Floats, scales: Floats, size: float, *, gradient: bool, spent: int
+        self, center: Floats, scales: Floats, size: float, spent: int, *, gradient: bool
     ) -> Objective:
-        """Return the standardised objective around a center."""
+        """Return the standardised objective around a center; its gradient is exact if possible."""
+        exact = None
+        if gradient:
+            # The response, or an inverse distribution function, may have no gradient.
+            with suppress(NotImplementedError, NullTypeGradError):
+                exact = self.evaluator.objective(prior=self.prior, gradient=True)
+
+        def values(thetas: Floats) -> Floats:
+            if not self.prior:
+                return self.evaluator.total(thetas, scales)  # needs no compilation
+            single = self.evaluator.objective(prior=True, gradient=False)
+            return np.array([float(single(theta, scales)[0]) for theta in thetas])
+
+        def function(theta: Floats) -> tuple[float, Floats | None, int]:
+            if not gradient:
+                return values(theta[None])[0], None, 1
+            if exact is not None:
+                value, slope = exact(theta, scales)
+                # PyMC's gradient of a truncated normal is NaN at points that are cut off.
+                if np.isfinite(slope).all() or not np.isfinite(value):
+                    return value, slope, 1
+            return differences(values, _STEP * self.prior_sd)(theta)
+
         return Objective(
-            self._function(scales, gradient=gradient),
+            function,
             center,
             self.prior_sd,
             size,
@@ -197,47 +179,18 @@ class Search:
             ridge=self.ridge,
         )
 
-    def _function(self, scales: Floats, *, gradient: bool) -> Function:
-        """Return the objective of theta; its gradient is exact where it can be."""
-        values = self._values(scales)
-        if not gradient:
-            return lambda theta: (values(theta[None])[0], None, 1)
-        by_differences = differences(values, _STEP * self.prior_sd)
-        try:
-            exact = self.evaluator.objective(prior=self.prior, gradient=True)
-        except (NotImplementedError, NullTypeGradError):
-            # The response, or an inverse distribution function, has no gradient.
-            return by_differences
-
-        def function(theta: Floats) -> tuple[float, Floats | None, int]:
-            value, slope = exact(theta, scales)
-            if np.isfinite(value) and not np.isfinite(slope).all():
-                # PyMC's gradient of a truncated normal is NaN at points that are cut off.
-                return by_differences(theta)
-            return value, slope, 1
-
-        return function
-
-    def _values(self, scales: Floats) -> Callable[[Floats], Floats]:
-        """Return thetas (P, d) -> values (P,)."""
-        if not self.prior:
-            # Needs no compilation.
-            return lambda thetas: self.evaluator.total(thetas, scales)
-        single = self.evaluator.objective(prior=self.prior, gradient=False)
-        return lambda thetas: np.array([float(single(t, scales)[0]) for t in thetas])
-
 
 def minimise(
     search: Search, theta: Floats, scales: Floats, trace: Trace, *, patient: bool = False
-) -> Run:
+) -> Fit:
     """Minimise from theta with the remaining evaluations.
 
     At kinks a line search is stopped soon, unless it is to be ``patient``.
     """
     size = search.size(theta, scales)
     gradient = search.uses_gradient
-    objective = search.objective(theta, scales, size, gradient=gradient, spent=trace.count)
-    if search.method.name.lower() in {"bfgs", "cg", "l-bfgs-b"}:
+    objective = search.objective(theta, scales, size, trace.count, gradient=gradient)
+    if str(search.method.method).lower() in {"bfgs", "cg", "l-bfgs-b"}:
         # Successful line searches take fewer evaluations without progress.
         objective.patience = 15
         if search.has_kinks and not patient:
@@ -251,8 +204,8 @@ def minimise(
         method=search.method.method,
         options=search.method.settings(search.tolerance, theta.size),
     )
-    return Run(
-        best=objective.best,
+    return Fit(
+        theta=objective.best,
         result=result,
         details=details,
         trace=trace.extended(objective),
@@ -260,6 +213,7 @@ def minimise(
         scales=scales,
         lowest=objective.lowest,
         size=size,
+        ridge=search.ridge,
     )
 
 
@@ -288,33 +242,29 @@ def _run_scipy(
 # -- stalled line searches -------------------------------------------------------------------------
 
 
-def settle(search: Search, run: Run) -> Run:
+def settle(search: Search, fit: Fit) -> Fit:
     """Decide whether a line search that gave up, at a kink or rounding, has converged.
 
     It has if gradients around its end promise next to nothing, or else if a simplex gains nothing,
-    after a more patient line search if the first was stopped soon. Where the discrepancy jumps, as
-    points lose their response, the simplex is wide enough to step over the jump.
+    after a more patient line search if the first was stopped soon.
     """
-
-    def is_done(run: Run) -> bool:
-        return run.result.converged or run.trace.count >= search.max_evaluations
-
-    if is_done(run) or not search.uses_gradient:
-        return run
-    is_jumping = _loses_responses(search, run.best)
+    most = search.max_evaluations
+    if fit.result.converged or fit.trace.count >= most or not search.uses_gradient:
+        return fit
+    is_jumping = _loses_responses(search, fit.theta)
     if not is_jumping:
-        run = _follow_gradients(search, run)
-        if is_done(run):
-            return run
-        if search.has_kinks:
-            run = minimise(search, run.best, run.scales, run.trace, patient=True)
-            if is_done(run):
-                return run
-    objective = search.objective(
-        run.center, run.scales, run.size, gradient=False, spent=run.trace.count
-    )
-    start = (run.best - run.center) / search.prior_sd
-    edge = 0.5 if is_jumping else 0.01  # of the simplex, in spreads of the prior
+        fit = _follow_gradients(search, fit)
+        if search.has_kinks and not fit.result.converged and fit.trace.count < most:
+            longer = minimise(search, fit.theta, fit.scales, fit.trace, patient=True)
+            fit = replace(
+                longer, sampling=fit.sampling, design_error=fit.design_error, pilot=fit.pilot
+            )
+        if fit.result.converged or fit.trace.count >= most:
+            return fit
+    objective = search.objective(fit.center, fit.scales, fit.size, fit.trace.count, gradient=False)
+    start = (fit.theta - fit.center) / search.prior_sd
+    # In spreads of the prior; wide enough to step over a jump.
+    edge = 0.5 if is_jumping else 0.01
     options = {
         "initial_simplex": np.vstack([start, start + edge * np.eye(start.size)]),
         "maxfev": _SIMPLEX_EVALUATIONS * start.size,
@@ -322,15 +272,16 @@ def settle(search: Search, run: Run) -> Run:
         "fatol": 1e-7,
     }
     result, message = _run_scipy(search, objective, start, method="Nelder-Mead", options=options)
-    gain = _relative_gain(run.lowest, objective)
+    gain = _relative_gain(fit.lowest, objective)
     if result.converged or gain < _NEGLIGIBLE_GAIN:
         result = Result.SETTLED_BY_SIMPLEX
+    is_as_good = np.isfinite(objective.lowest) and objective.lowest <= fit.lowest
     return replace(
-        run,
-        best=objective.best if objective.lowest <= run.lowest else run.best,
+        fit,
+        theta=objective.best if is_as_good else fit.theta,
         result=result,
-        details=f"{run.details} A simplex from there gained {max(gain, 0):.1e}: {message}",
-        trace=run.trace.extended(objective),
+        details=f"{fit.details} A simplex from there gained {max(gain, 0):.1e}: {message}",
+        trace=fit.trace.extended(objective),
     )
 
 
@@ -339,33 +290,34 @@ def _loses_responses(search: Search, theta: Floats) -> bool:
     nodes = search.evaluator.nodes
     if not all(n.metric.minimum is Minimum.QUADRATIC for n in nodes):
         return False
-    values, _ = _populations(search.evaluator, cross(theta, _STEP * search.prior_sd))
-    is_lost = [
-        np.isnan(v) if n.target.event else ~np.isfinite(v)
-        for n, v in zip(nodes, values, strict=True)
-    ]
-    return any((rows != rows[0]).any() for rows in is_lost)
+    nearby = cross(theta, _STEP * search.prior_sd)
+    for k, node in enumerate(nodes):
+        values, _ = search.evaluator.populations(nearby, k)
+        is_lost = np.isnan(values) if node.target.event else ~np.isfinite(values)
+        if (is_lost != is_lost[0]).any():
+            return True
+    return False
 
 
-def _follow_gradients(search: Search, run: Run) -> Run:
+def _follow_gradients(search: Search, fit: Fit) -> Fit:
     """Take Newton steps from gradients a distance apart, which count kinks as curvature.
 
     Converged if such a step neither promises nor brings a gain, and the objective is higher a
     quarter of the prior's spread downhill: kinks make small minima on a slope.
     """
-    spent = run.trace.count
-    objective = search.objective(run.center, run.scales, run.size, gradient=True, spent=spent)
+    spent = fit.trace.count
+    objective = search.objective(fit.center, fit.scales, fit.size, spent, gradient=True)
     # Gradients by differences may take as many evaluations as a simplex.
-    limit = _SIMPLEX_EVALUATIONS * run.best.size
+    limit = _SIMPLEX_EVALUATIONS * fit.theta.size
     objective.max_evaluations = min(objective.max_evaluations, limit)
-    best, lowest, result, details = run.best, run.lowest, run.result, ""
+    best, lowest, result, details = fit.theta, fit.lowest, fit.result, ""
     apart = 0.0025  # in spreads of the prior: wider than kinks of a thousand points
     try:
         for _ in range(5):
-            start = (best - run.center) / search.prior_sd
+            start = (best - fit.center) / search.prior_sd
             step, promised, downhill = _newton_step(objective, start, apart)
             objective(start + step)
-            promise = promised * run.size / max(abs(lowest), 1e-300)
+            promise = promised * fit.size / max(abs(lowest), 1e-300)
             if max(promise, _relative_gain(lowest, objective)) < _NEGLIGIBLE_GAIN:
                 for direction in downhill:
                     objective(start + step + 0.25 * direction)
@@ -387,12 +339,12 @@ def _follow_gradients(search: Search, run: Run) -> Run:
     except BudgetError:
         result = Result.STOPPED
     return replace(
-        run,
-        best=objective.best if objective.lowest < lowest else best,
+        fit,
+        theta=objective.best if objective.lowest < lowest else best,
         lowest=min(objective.lowest, lowest),
         result=result,
-        details=f"{run.details} {details}".strip(),
-        trace=run.trace.extended(objective),
+        details=f"{fit.details} {details}".strip(),
+        trace=fit.trace.extended(objective),
     )
 
 
@@ -443,16 +395,15 @@ def approach(
     response. Returns theta itself where there is overlap.
     """
     evaluator = search.evaluator
-    if any(n.bound.random for n in evaluator.nodes):
+    if [node for node in evaluator.nodes if node.bound.random]:
         return theta, trace
     # A weight effective sample size below two: the design does not reach the population at all.
-    support = evaluator.support(theta[None]).values()
-    is_unsupported = any(s["weight_ess"][0] < 2.0 for s in support)
-    if not is_unsupported:
-        (overlap_at_start,) = smallest_overlap(evaluator, *_populations(evaluator, theta[None]))
-        if overlap_at_start > least:
+    ess = [s["weight_ess"][0] for s in evaluator.support(theta[None]).values()]
+    if not [n for n in ess if n < 2.0]:
+        _, overlaps = overlapping_populations(evaluator, theta[None])
+        if overlaps.min() > least:
             return theta, trace
-    guide = _AreaGuide(evaluator, scales)
+    guide = AreaGuide(evaluator, scales)
     if not evaluator.responses_per_theta:
         candidates = np.vstack([theta, evaluator.hyperparameters.prior_points(THETAS, seed)])
         theta = candidates[np.argmin(guide(candidates))]
@@ -466,7 +417,8 @@ def approach(
     )
 
     def stop_with_overlap(t: Floats) -> None:
-        if guide.overlap_at(theta + t * search.prior_sd) > OVERLAP_ENOUGH:
+        overlap_there, _ = guide.records[(theta + t * search.prior_sd).tobytes()]
+        if overlap_there > OVERLAP_ENOUGH:
             raise StopIteration
 
     _run_scipy(
@@ -478,14 +430,13 @@ def approach(
         options={"gtol": 1e-2},  # coarse: the area metric is left before it converges
         callback=stop_with_overlap,
     )
-    end = objective.best
     # The trace has values of the model's own objective.
-    objective.values = [guide.objective_at(t) for t in objective.thetas]
-    return end, trace.extended(objective)
+    objective.values = [guide.records[t.tobytes()][1] for t in objective.thetas]
+    return objective.best, trace.extended(objective)
 
 
-class _AreaGuide:
-    """The area between populations and data; records the overlap and the objective of thetas."""
+class AreaGuide:
+    """The summed area between populations and data, in units of typical areas."""
 
     def __init__(self, evaluator: Evaluator, scales: Floats) -> None:
         self.evaluator = evaluator
@@ -494,35 +445,26 @@ class _AreaGuide:
             n.metric.like(AreaMetric()).against(n.target.observed, n.target.weights)
             for n in evaluator.nodes
         ]
-        self._records: dict[bytes, tuple[float, ...]] = {}
+        # By theta: the smallest overlap, and the model's own objective.
+        self.records: dict[bytes, tuple[float, float]] = {}
 
     def __call__(self, thetas: Floats) -> Floats:
-        """Return the sum of the areas, in units of their typical sizes; thetas (P, d) -> (P,)."""
-        values, weights = _populations(self.evaluator, thetas)
-        populations = list(zip(values, weights, strict=True))
+        """Return the sum of the areas; thetas (P, d) -> (P,)."""
+        populations, overlaps = overlapping_populations(self.evaluator, thetas)
         areas = [
             area.of(*population) / area.scale
             for area, population in zip(self.areas, populations, strict=True)
         ]
         in_support = self.evaluator.hyperparameters.in_support(thetas)
         total = np.where(in_support, np.sum(areas, axis=0), np.inf)
-        overlaps = smallest_overlap(self.evaluator, values, weights)
         objective = np.zeros(len(thetas))
         for node, scale, population in zip(
             self.evaluator.nodes, self.scales, populations, strict=True
         ):
             objective = objective + node.target.of(*population) / scale
-        for theta, *numbers in zip(thetas, overlaps, objective, strict=True):
-            self._records[theta.tobytes()] = tuple(numbers)
+        for theta, *numbers in zip(thetas, overlaps.min(axis=0), objective, strict=True):
+            self.records[theta.tobytes()] = (numbers[0], numbers[1])
         return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
-
-    def overlap_at(self, theta: Floats) -> float:
-        """Return the overlap at a theta that was evaluated."""
-        return self._records[theta.tobytes()][0]
-
-    def objective_at(self, theta: Floats) -> float:
-        """Return the model's own objective at a theta that was evaluated."""
-        return self._records[theta.tobytes()][1]
 
 
 def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
@@ -530,22 +472,21 @@ def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
 
     Without overlap density metrics are the same everywhere, up to rounding.
     """
-    if not all(apart_from_data(search.evaluator, theta) for theta in thetas):
-        return search.best_of(thetas, scales)
-    return np.asarray(thetas[np.argmin(areas(search.evaluator, scales, thetas))])
+    evaluator = search.evaluator
+    if all(apart_from_data(evaluator, theta) for theta in thetas):
+        values = AreaGuide(evaluator, scales)(thetas)
+    else:
+        values = evaluator.total(thetas, scales)
+    return np.asarray(thetas[np.argmin(values)])
 
 
-def areas(evaluator: Evaluator, scales: Floats, thetas: Floats) -> Floats:
-    """Return the summed areas between populations at thetas, (P, d), and the data, (P,)."""
-    return _AreaGuide(evaluator, scales)(thetas)
-
-
-def smallest_overlap(evaluator: Evaluator, values: list[Floats], weights: list[Floats]) -> Floats:
-    """Return the smallest overlap over simulators with densities, (P,); one where there is none."""
-    overlaps = [
-        overlap(n.target, v, w) for n, v, w in zip(evaluator.nodes, values, weights, strict=True)
-    ]
-    return np.min([np.ones(len(values[0])), *overlaps], axis=0)
+def overlapping_populations(
+    evaluator: Evaluator, thetas: Floats
+) -> tuple[list[tuple[Floats, Floats]], Floats]:
+    """Return responses and weights by simulator, and their overlaps with the data, (K, P)."""
+    populations = [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]
+    pairs = zip(evaluator.nodes, populations, strict=True)
+    return populations, np.array([overlap(node.target, *population) for node, population in pairs])
 
 
 def apart_from_data(evaluator: Evaluator, theta: Floats, least: float = OVERLAP) -> bool:
@@ -554,13 +495,7 @@ def apart_from_data(evaluator: Evaluator, theta: Floats, least: float = OVERLAP)
     Their densities then overlap by less than ``least``. False if this would compute responses, or
     a metric compares no densities.
     """
-    if not all(node.bound.stored for node in evaluator.nodes):
+    if not is_stored(evaluator):
         return False
-    populations = zip(evaluator.nodes, *_populations(evaluator, theta[None]), strict=True)
-    return all(overlap(node.target, v, w)[0] < least for node, v, w in populations)
-
-
-def _populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[Floats], list[Floats]]:
-    """Return responses and weights, (P, n) each, by simulator."""
-    pairs = [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]
-    return [values for values, _ in pairs], [weights for _, weights in pairs]
+    _, overlaps = overlapping_populations(evaluator, theta[None])
+    return bool((overlaps < least).all())

@@ -11,7 +11,7 @@ import numpy as np
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Information, Local, oriented
+from prbayes.inference.asymptotics import Information, oriented
 from prbayes.inference.checks.identification import unidentified_findings
 from prbayes.inference.design_error import DesignErrors, design_error
 from prbayes.inference.refits import SamplingDistribution, sampling_obstacle
@@ -20,17 +20,17 @@ from prbayes.model.evaluator import Evaluator, Shortcoming, n_design_runs, short
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.convergence import (
     OVERLAP_ENOUGH,
+    AreaGuide,
     Fit,
     Search,
     apart_from_data,
     approach,
-    areas,
     best_or_nearest,
 )
 from prbayes.optimize.objective import Ridge
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.importance import SIZES
-from prbayes.propagation.reweighted import ReweightedBound, designs_restored
+from prbayes.propagation.reweighted import designs_restored
 
 _log = logging.getLogger("prbayes")
 # Batches after which a design is refused; half or twice changes no answer.
@@ -51,7 +51,7 @@ class Restart:
     """Where to minimise again on designs that have grown."""
 
     theta: Floats  # (d,)
-    cloud: Floats | None
+    pilot: Floats | None
     ridge: Ridge | None
     alternative: Floats | None = None  # (d,): an earlier minimum, which may be better
 
@@ -67,22 +67,23 @@ def refine_designs(
     evaluator = search.evaluator
     if not evaluator.reweighted:
         return fit, None
-    nearby = _neighbourhood(evaluator, fit, seed)
+    nearby = neighbourhood(evaluator, fit, seed)
     short = shortcomings(evaluator, nearby) or shortcomings(evaluator, fit.theta[None])
     if short and round_ == MAX_ROUNDS:
         # A minimiser follows what is not identified until no design supports it.
-        findings = [] if fit.local is None else unidentified_findings(evaluator, fit.local)
+        findings = []
+        if fit.sampling is not None:
+            findings = unidentified_findings(evaluator, fit.sampling.local)
         refuse(short, evaluator, findings)
     if short:
         return fit, _cover(search, fit, nearby, seed)
     is_apart = apart_from_data(evaluator, fit.theta)
     if round_ < MAX_ROUNDS and apart_from_data(evaluator, fit.theta, OVERLAP_ENOUGH):
         # The design supports this point, but the fit is poor: continue along the area metric.
-        trace = fit.run.trace
-        theta, _ = approach(search, fit.theta, fit.scales, seed, trace, OVERLAP_ENOUGH)
+        theta, _ = approach(search, fit.theta, fit.scales, seed, fit.trace, OVERLAP_ENOUGH)
         if refine_at(evaluator, theta[None]):
             alternative = None if is_apart else fit.theta
-            return fit, Restart(theta, fit.cloud, fit.ridge, alternative)
+            return fit, Restart(theta, fit.pilot, fit.ridge, alternative)
     if is_apart or fit.sampling is None:
         return fit, None
     errors = design_error(fit.sampling)
@@ -96,41 +97,54 @@ def refine_designs(
     if not grow(evaluator, nearby, errors):
         return fit, None
     advance(n_design_runs(evaluator) - previous, note)
-    return fit, Restart(_best_nearby(search, fit, nearby), fit.cloud, fit.ridge)
+    # The fit may be an artefact of the smaller design.
+    theta = best_or_nearest(search, np.vstack([fit.theta, nearby]), fit.scales)
+    return fit, Restart(theta, fit.pilot, fit.ridge)
 
 
-def _neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
-    """Return thetas around a fit that designs have to support, (m, d)."""
+def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
+    """Return thetas around a fit that designs have to support, (m, d).
+
+    Those of the pilot; or normal thetas with the covariance of the fit, no wider than the prior,
+    where emulated samples follow the fit anywhere or a ridge is on unidentified directions.
+    """
     hyperparameters = evaluator.hyperparameters
-    nearby = fit.cloud
+    prior_sd = hyperparameters.prior_sd
+    local = None if fit.sampling is None else fit.sampling.local
     is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
-    if nearby is None or (is_emulated and fit.local is not None):
-        # Emulated samples follow the fit anywhere; runs are added around the pilot's thetas.
-        nearby = spread_around(fit.theta, fit.covariance, hyperparameters.prior_sd, seed=seed)
-    if fit.ridge is not None and fit.local is not None:
-        nearby = spread_along(fit.theta, fit.local, seed=seed)
-    return np.asarray(nearby[hyperparameters.in_support(nearby)])
+    if fit.ridge is not None and local is not None:
+        variances, vectors = np.linalg.eigh(local.covariance)
+        axes = local.identified @ vectors
+    elif fit.pilot is None or (is_emulated and local is not None):
+        # As wide as the prior along elements whose variance is not known.
+        covariance = fit.covariance
+        is_finite = np.isfinite(covariance)
+        relative = np.where(is_finite, covariance / np.outer(prior_sd, prior_sd), 0.0)
+        np.fill_diagonal(relative, np.where(np.diag(is_finite), np.diag(relative), 1.0))
+        variances, axes = np.linalg.eigh(relative)
+    else:
+        return np.asarray(fit.pilot[hyperparameters.in_support(fit.pilot)])
+    sd = np.sqrt(np.clip(variances, 0, 1))
+    z = np.random.default_rng(seed).standard_normal((THETAS, sd.size))
+    thetas = fit.theta + ((z * sd) @ oriented(axes).T) * prior_sd
+    return np.asarray(thetas[hyperparameters.in_support(thetas)])
 
 
 def _cover(search: Search, fit: Fit, nearby: Floats, seed: int) -> Restart:
     """Add points to designs that do not support a fit: a pilot first, then where it led."""
-    evaluator, cloud = search.evaluator, fit.cloud
-    if cloud is None:
-        cloud = nearby = pilot(evaluator, fit.scales, seed=seed)
-    elif (ridge := _ridge(search, fit, cloud, seed)) is not None:
+    evaluator, thetas = search.evaluator, fit.pilot
+    if thetas is None:
+        thetas = nearby = pilot(evaluator, fit.scales, seed=seed)
+    elif (ridge := _ridge(search, fit, thetas, seed)) is not None:
         refine_at(evaluator, ridge.center[None] if fit.ridge is None else nearby)
-        return Restart(ridge.center, cloud, ridge)
+        return Restart(ridge.center, thetas, ridge)
     elif not refine_at(evaluator, nearby):
         refine_at(evaluator, fit.theta[None])
-    return Restart(_best_nearby(search, fit, nearby), cloud, fit.ridge)
+    theta = best_or_nearest(search, np.vstack([fit.theta, nearby]), fit.scales)
+    return Restart(theta, thetas, fit.ridge)
 
 
-def _best_nearby(search: Search, fit: Fit, nearby: Floats) -> Floats:
-    """Return the best theta on the grown designs: the fit may be an artefact of the smaller one."""
-    return best_or_nearest(search, np.vstack([fit.theta, nearby]), fit.scales)
-
-
-def _ridge(search: Search, fit: Fit, cloud: Floats, seed: int) -> Ridge | None:
+def _ridge(search: Search, fit: Fit, pilot_thetas: Floats, seed: int) -> Ridge | None:
     """Return a penalty on directions that are not identified, or None if there are none.
 
     Along them a minimiser follows the error of the design, which grows with the distance. The
@@ -147,8 +161,9 @@ def _ridge(search: Search, fit: Fit, cloud: Floats, seed: int) -> Ridge | None:
     center = fit.theta
     if fit.ridge is None or shortcomings(evaluator, center[None]):
         # Of thetas that fit as well as the best, the one closest to the prior's median.
-        values = evaluator.total(cloud, fit.scales)
-        candidates = cloud[values <= values.min() + noise(cloud[np.argmin(values)])]
+        values = evaluator.total(pilot_thetas, fit.scales)
+        is_as_good = values <= values.min() + noise(pilot_thetas[np.argmin(values)])
+        candidates = pilot_thetas[is_as_good]
         median = np.median(hyperparameters.prior_thetas(THETAS, seed), axis=0)
         distances = (((candidates - median) / hyperparameters.prior_sd) ** 2).sum(axis=1)
         center = np.asarray(candidates[np.argmin(distances)])
@@ -176,6 +191,8 @@ def refine_at(
     too many points have no response.
     """
     short = shortcomings(evaluator, thetas)
+    if not short:
+        return short
     for name, shortcoming in short.items():
         if shortcoming.is_lost:
             raise DesignError(
@@ -184,10 +201,10 @@ def refine_at(
             )
     names = set(short)
     nearby = thetas if beside is None else np.concatenate([thetas, beside])
-    is_drawn = _redraw_samples(evaluator, nearby, names)
+    is_drawn = draw_samples(evaluator, nearby, names)
     while is_drawn and names:
         names &= set(shortcomings(evaluator, thetas))
-        is_drawn = _enlarge_samples(evaluator, nearby, names, same_surfaces=True)
+        is_drawn = draw_samples(evaluator, nearby, names, larger=True, same_surfaces=True)
     # Runs, where samples do not suffice or the emulator is poor.
     for name in short:
         emulator = evaluator.reweighted[name].design.emulator
@@ -209,39 +226,32 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     names = set(evaluator.reweighted)
+    factor = _growth_factor(evaluator, errors)
     # At most twice as many runs at a time: the estimate of the error is itself uncertain.
-    if _needs_runs(evaluator, errors) and _add_runs(
-        evaluator, thetas, names, min(2.0, _growth_factor(errors.whole))
-    ):
+    if factor > 1 and _add_runs(evaluator, thetas, names, min(2.0, factor)):
         return True
-    emulated = {name for name in names if evaluator.reweighted[name].design.is_emulated}
-    if not emulated or not errors.points > _SHARE * AGREE:
+    if not errors.points > _SHARE * AGREE:
         return False
-    return _enlarge_samples(evaluator, thetas, emulated)
+    return draw_samples(evaluator, thetas, names, larger=True)
 
 
 def runs_left(evaluator: Evaluator, errors: DesignErrors) -> int:
     """Return how many more runs are expected until the designs' error is small enough."""
-    if not _needs_runs(evaluator, errors):
-        return 0
-    more = _growth_factor(errors.whole) - 1
+    more = _growth_factor(evaluator, errors) - 1
     bounds = evaluator.reweighted.values()
     return round(sum(min(more * b.n_runs, max(0, b.config.most - b.n_runs)) for b in bounds))
 
 
-def _needs_runs(evaluator: Evaluator, errors: DesignErrors) -> bool:
-    """Return whether more runs reduce the designs' error."""
-    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
-    return not is_emulated or errors.emulators > _SHARE * AGREE
-
-
-def _growth_factor(error: float) -> float:
-    """Return the factor by which designs have to grow for an error to become small enough.
+def _growth_factor(evaluator: Evaluator, errors: DesignErrors) -> float:
+    """Return the factor by which the number of runs has to grow; one if runs do not help.
 
     The error of a design of several inputs falls with about the power .65 of its size
     (benchmarks/dimensions.py).
     """
-    return float((error / AGREE) ** (1 / 0.65))
+    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
+    if is_emulated and not errors.emulators > _SHARE * AGREE:
+        return 1.0
+    return float((errors.whole / AGREE) ** (1 / 0.65))
 
 
 def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:
@@ -295,14 +305,24 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         is_apart = apart_from_data(evaluator, thetas[order[0]])
         if is_apart:
             # Discrepancies are equal, up to rounding.
-            order = np.argsort(areas(evaluator, scales, thetas))[:THETAS]
+            order = np.argsort(AreaGuide(evaluator, scales)(thetas))[:THETAS]
         best = thetas[order]
-        # Extend the designs to them.
-        names = _undersampled(evaluator, best)
-        _redraw_samples(evaluator, best, names, same_surfaces=True)
-        _add_runs(
-            evaluator, best, {name for name in names if _has_room(evaluator.reweighted[name])}
-        )
+        # Extend the designs that support fewer than half of these populations. Emulated samples
+        # need no runs for that.
+        bounds = evaluator.reweighted
+        names = {
+            name
+            for name, support in evaluator.support(best).items()
+            if np.median(support["weight_ess"]) < bounds[name].required_ess
+        }
+        draw_samples(evaluator, best, names, same_surfaces=True)
+        has_room = {
+            name
+            for name in names
+            if not bounds[name].design.is_emulated
+            and len(bounds[name].design.batch_sizes) <= MAX_ROUNDS
+        }
+        _add_runs(evaluator, best, has_room)
         # Stop where sampling explains the remaining differences.
         spread = values[order[-1]] - values[order[0]]
         noise = sum(noise_floors(evaluator, best[0], FEW_SETS) / scales)
@@ -318,57 +338,34 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
     return best
 
 
-def _has_room(bound: ReweightedBound) -> bool:
-    """Return whether a pilot adds runs to a design: emulated samples need none."""
-    return not bound.design.is_emulated and len(bound.design.batch_sizes) <= MAX_ROUNDS
-
-
-def _undersampled(evaluator: Evaluator, thetas: Floats) -> set[str]:
-    """Return the designs that support fewer than half of the populations at thetas."""
-    return {
-        name
-        for name, support in evaluator.support(thetas).items()
-        if np.median(support["weight_ess"]) < evaluator.reweighted[name].required_ess
-    }
-
-
 # -- emulated samples ------------------------------------------------------------------------------
 
 
-def _emulated_designs(evaluator: Evaluator, names: set[str]) -> list[tuple[int, ReweightedBound]]:
-    """Return designs with emulated samples, by position of their simulators.
+def draw_samples(
+    evaluator: Evaluator,
+    thetas: Floats,
+    names: set[str],
+    *,
+    larger: bool = False,
+    same_surfaces: bool = False,
+) -> bool:
+    """Redraw emulated samples for the populations at thetas; return whether there are any.
 
-    Those named, and those of simulators that share their specimens.
+    Those of the designs named, and of simulators that share their specimens. ``larger`` samples are
+    not drawn beyond the largest size, and then do not count.
     """
     names = siblings(evaluator.nodes, names)
-    return [
-        (k, node.reweighted)
-        for k, node in enumerate(evaluator.nodes)
-        if node.reweighted is not None and node.reweighted.design.is_emulated and node.name in names
-    ]
-
-
-def _redraw_samples(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool = False
-) -> bool:
-    """Redraw emulated samples for the populations at thetas; return whether there are any."""
-    bounds = _emulated_designs(evaluator, names)
-    for k, bound in bounds:
-        bound.reach(_components(evaluator, thetas, k), same_surfaces=same_surfaces)
-    return bool(bounds)
-
-
-def _enlarge_samples(
-    evaluator: Evaluator, thetas: Floats, names: set[str], *, same_surfaces: bool = False
-) -> bool:
-    """Draw larger samples for the populations at thetas; return whether any could be."""
-    is_larger = False
-    for k, bound in _emulated_designs(evaluator, names):
-        if bound.design.emulated_size < SIZES.largest:
-            components = _components(evaluator, thetas, k)
-            bound.reach(components, same_surfaces=same_surfaces, growth=2)
-            is_larger = True
-    return is_larger
+    is_drawn = False
+    for k, node in enumerate(evaluator.nodes):
+        bound = node.reweighted
+        if bound is None or not bound.design.is_emulated or node.name not in names:
+            continue
+        components = _components(evaluator, thetas, k)
+        if not larger or bound.design.emulated_size < SIZES.largest:
+            growth = 2 if larger else 1
+            bound.reach(components, same_surfaces=same_surfaces, growth=growth)
+            is_drawn = True
+    return is_drawn
 
 
 @contextmanager
@@ -384,10 +381,8 @@ def temporary_samples(
     Those of all designs, or of the simulators with the given names and their siblings.
     """
     names = set(evaluator.reweighted) if names is None else names
-    designs = _emulated_designs(evaluator, names)
-    with designs_restored([bound for _, bound in designs]):
-        for k, bound in designs:
-            bound.reach(_components(evaluator, thetas, k), same_surfaces=same_surfaces)
+    with designs_restored(list(evaluator.reweighted.values())):
+        draw_samples(evaluator, thetas, names, same_surfaces=same_surfaces)
         yield
 
 
@@ -400,13 +395,34 @@ def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[No
         yield
 
 
-# -- noise, refusals, neighbourhoods ---------------------------------------------------------------
+# -- noise, findings and refusals ---------------------------------------------------------------
 
 
 def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
     """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
     nodes = range(len(evaluator.nodes))
     return np.array([Information(evaluator, k, theta, n_sets=n_sets).noise_floor for k in nodes])
+
+
+def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
+    """Report a large error of the optimum by the design, in standard errors."""
+    # An estimate from eight blocks is itself uncertain by a quarter.
+    if not error > 1.5 * AGREE:
+        return []
+    designs = [bound.design for bound in evaluator.reweighted.values()]
+    runs = max(len(design.runs) for design in designs)
+    advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
+    if min(len(design.emulated or ()) for design in designs) >= SIZES.largest:
+        advice = (
+            f"between its {runs} runs are {SIZES.largest} emulated points, the most there are: "
+            "more runs help as far as the emulator is off, which the message says, and the rest "
+            "counts as another error of the optimum"
+        )
+    text = (
+        f"The optimum of another design would differ by about {error:.2f} standard errors, "
+        f"expected at most {AGREE}; {advice}."
+    )
+    return [Finding("design-error", text, "choose.md#how-many-responses")]
 
 
 def refuse(
@@ -438,30 +454,3 @@ def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
                 "the specimens that have one; repair the response, return +inf for specimens that "
                 "fail, or pass a larger max_lost to the propagation"
             )
-
-
-def spread_around(center: Floats, covariance: Floats, prior_sd: Floats, *, seed: int = 0) -> Floats:
-    """Return normal thetas around an optimum with its covariance, (256, d).
-
-    They are no wider than the prior, and as wide along elements whose variance is not known.
-    """
-    relative = np.where(np.isfinite(covariance), covariance / np.outer(prior_sd, prior_sd), 0.0)
-    is_known = np.isfinite(np.diag(covariance))
-    np.fill_diagonal(relative, np.where(is_known, np.diag(relative), 1.0))
-    values, vectors = np.linalg.eigh(relative)
-    return np.asarray(center + _normal_steps(values, vectors, seed) * prior_sd)
-
-
-def spread_along(center: Floats, local: Local, *, seed: int = 0) -> Floats:
-    """Return thetas around an optimum along the directions that the data identify, (256, d)."""
-    values, vectors = np.linalg.eigh(local.covariance)
-    return np.asarray(
-        center + _normal_steps(values, local.identified @ vectors, seed) * local.prior_sd
-    )
-
-
-def _normal_steps(variances: Floats, axes: Floats, seed: int) -> Floats:
-    """Return normal vectors with at most unit variances along axes, (256, d)."""
-    sd = np.sqrt(np.clip(variances, 0, 1))
-    z = np.random.default_rng(seed).standard_normal((THETAS, sd.size))
-    return np.asarray((z * sd) @ oriented(axes).T)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
+from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator, shortcomings
+from prbayes.model.parameters import readable_variables, split_elements, table_elements
 from prbayes.numerics.batched_minimisers import descend
+from prbayes.optimize.convergence import Fit
 from prbayes.optimize.design_refinement import (
     FEW_SETS,
     noise_floors,
@@ -34,7 +37,7 @@ _POINTS_PER_START = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Rival:
+class LocalOptimum:
     """A local optimum other than the best."""
 
     theta: Floats  # (d,)
@@ -42,14 +45,31 @@ class Rival:
     comparable: bool  # whether it is as good as the best up to sampling noise
     better: bool  # whether it is better than the reference
 
-    def record(self, evaluator: Evaluator) -> dict[str, Any]:
-        """Return the rival as `Optimum` has it."""
+    def as_dict(self, evaluator: Evaluator) -> dict[str, Any]:
+        """Return the optimum as a record of `Optimum`."""
         return {
             "point": point_at(evaluator, self.theta),
             "discrepancy": self.value,
             "theta": self.theta,
             "comparable": self.comparable,
         }
+
+    def finding(self, evaluator: Evaluator) -> Finding:
+        """Report that the data could as well come from here."""
+        hyperparameters = evaluator.hyperparameters
+        # Beside a second point, so that constants can be recognised.
+        points = hyperparameters.constrained(np.stack([self.theta, hyperparameters.initial]))
+        names = readable_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
+        values = labelled(evaluator, {name: points[name] for name in names}, {"point": 2}).data_vars
+        elements = split_elements(values)
+        place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in table_elements(values))
+        return Finding(
+            "second-mode",
+            f"The data could as well come from {place}: another optimum, or mirror "
+            "solution, whose discrepancy differs by no more than sampling noise; state a prior "
+            "that excludes one, or report both.",
+            "optimum_or_abc.md#two-answers",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +79,7 @@ class Reference:
     evaluator: Evaluator
     theta: Floats  # (d,)
     scales: Floats  # (k,)
-    local: Local  # rivals are reported at theta along the directions that are not identified
+    local: Local  # optima are reported at theta along the directions that are not identified
     noise: float  # difference of the objective that sampling explains
     ridge: Ridge | None = None
 
@@ -71,18 +91,13 @@ class Reference:
             values = values + self.ridge(stacked, self.local.prior_sd)
         return values.reshape(thetas.shape[:-1])
 
-    def shifts(self, thetas: Floats) -> Floats:
-        """Return thetas relative to the reference in units of the prior's spread."""
-        return np.asarray((thetas - self.theta) / self.local.prior_sd)
-
-    def thetas(self, shifts: Floats) -> Floats:
-        """Return the thetas of shifts, (..., d)."""
-        return np.asarray(self.theta + shifts * self.local.prior_sd)
-
     def descend(self, shifts: Floats, curvature: Floats) -> tuple[Floats, Floats]:
-        """Return the minima below shifts, (n, d), all at once, and their values."""
+        """Return the minima below shifts from theta, (n, d), all at once, and their values.
+
+        Shifts and curvature, (d, d), are in units of the prior's spread.
+        """
         ends, values, *_ = descend(
-            lambda shifts, rows: self(self.thetas(shifts)),
+            lambda shifts, rows: self(self.theta + shifts * self.local.prior_sd),
             shifts,
             curvature,
             step=1e-3,
@@ -101,98 +116,105 @@ class Reference:
         if not variances.max() > 0:
             return thetas, self(thetas)
         variances = np.maximum(variances, 1e-12 * variances.max())
-        ends, values = self.descend(self.shifts(thetas), (axes / variances) @ axes.T)
-        return self.thetas(ends), values
+        shifts = (thetas - self.theta) / local.prior_sd
+        ends, values = self.descend(shifts, (axes / variances) @ axes.T)
+        return np.asarray(self.theta + ends * local.prior_sd), values
+
+    def separated(self, ends: Floats, values: Floats, lowest: float) -> list[LocalOptimum]:
+        """Return the optima that a barrier separates from the reference and from better ones."""
+        optima = [(self.theta, lowest)]
+        for i in np.argsort(values):
+            value = float(values[i])
+            if not np.isfinite(value):
+                continue
+            for theta, better in optima:
+                if not has_barrier(self, ends[i], value, theta, better):
+                    break
+            else:
+                optima.append((ends[i], value))
+        return [
+            LocalOptimum(
+                theta,
+                value,
+                comparable=value - lowest < _COMPARABLE * self.noise,
+                better=value < lowest - 0.1 * self.noise,
+            )
+            for theta, value in optima[1:]
+        ]
 
 
-def find_rivals(
-    evaluator: Evaluator,
-    theta: Floats,
-    scales: Floats,
-    local: Local,
-    ridge: Ridge | None,
-    *,
-    starts: int,
-    seed: int,
-    refine: bool,
-) -> list[Rival]:
-    """Return other optima, sorted by value; refine designs where one in question needs it."""
-    floors = noise_floors(evaluator, theta, FEW_SETS)
-    noise = _NOISE_SHARE * float((floors / scales).sum())
-    reference = Reference(evaluator, theta, scales, local, noise, ridge)
-
-    def search() -> list[Rival]:
-        return rivals_from_prior(reference, starts=starts, seed=seed)
-
+def find_local_optima(
+    evaluator: Evaluator, fit: Fit, starts: int, seed: int, *, refine: bool
+) -> list[LocalOptimum]:
+    """Return other optima than a fit, sorted by value; refine designs where they fall short."""
+    if fit.sampling is None:
+        return []
+    floors = noise_floors(evaluator, fit.theta, FEW_SETS)
+    noise = _NOISE_SHARE * float((floors / fit.scales).sum())
+    reference = Reference(evaluator, fit.theta, fit.scales, fit.sampling.local, noise, fit.ridge)
     if refine and any(bound.design.is_emulated for bound in evaluator.reweighted.values()):
-        rivals = verified_rivals(reference, search())
+        optima = verified_optima(reference, optima_from_prior(reference, starts, seed))
     else:
-        rivals = _supported_rivals(evaluator, search, refine=refine)
-    return _excluded_by_one_simulator(evaluator, theta, rivals, _NOISE_SHARE * floors)
+        for remaining in (2, 1, 0):  # most need one search
+            candidates = optima_from_prior(reference, starts, seed)
+            optima = [optimum for optimum in candidates if _is_supported(evaluator, optimum)]
+            undersampled = [
+                optimum
+                for optimum in candidates
+                if (optimum.better or optimum.comparable) and optimum not in optima
+            ]
+            if not undersampled or not refine or not remaining:
+                break
+            refine_at(evaluator, undersampled[0].theta[None])
+    if len(floors) < 2 or not optima:
+        return optima
+    # Not comparable where one simulator alone excludes an optimum: the noise of several simulators
+    # together grows with their number, and would hide it.
+    thetas = np.array([fit.theta, *(optimum.theta for optimum in optima)])
+    discrepancies = evaluator(thetas).discrepancies
+    increase = discrepancies[1:] - discrepancies[0]
+    is_excluded = (increase > _COMPARABLE * (_NOISE_SHARE * floors)).any(axis=1)
+    return [
+        replace(optimum, comparable=optimum.comparable and not excluded)
+        for optimum, excluded in zip(optima, is_excluded, strict=True)
+    ]
 
 
-def rivals_from_prior(reference: Reference, *, starts: int, seed: int) -> list[Rival]:
+def optima_from_prior(reference: Reference, starts: int, seed: int) -> list[LocalOptimum]:
     """Descend from points of the prior; return the optima that barriers separate, by value."""
     points = reference.evaluator.hyperparameters.prior_points(_POINTS_PER_START * starts, seed)
     values = reference(points)
     # The better half of the points, thinned.
     ranked = np.argsort(values, kind="stable")
     thinned = ranked[: len(ranked) // 2 : max(_POINTS_PER_START // 2, 1)]
-    first = reference.shifts(points[thinned[:starts]])
     # Typical size of the objective among the prior's points.
     half = float(np.ptp(np.quantile(values[np.isfinite(values)], [0.0, 0.5])))
     size = max(half, reference.noise)
     if not size > 0:
         return []
-    ends, values = reference.descend(first, size * np.eye(reference.theta.size))
-    lowest = float(reference(reference.theta[None])[0])
+    theta, prior_sd = reference.theta, reference.local.prior_sd
+    first = (points[thinned[:starts]] - theta) / prior_sd
+    ends, values = reference.descend(first, size * np.eye(theta.size))
+    lowest = float(reference(theta[None])[0])
     # To the reference along unidentified directions, if that is as good.
     unidentified = reference.local.unidentified
     aligned = ends - ends @ unidentified @ unidentified.T
-    aligned_values = reference(reference.thetas(aligned))
+    aligned_values = reference(theta + aligned * prior_sd)
     is_as_good = aligned_values < values + _NEGLIGIBLE * reference.noise
     ends = np.where(is_as_good[:, None], aligned, ends)
     values = np.minimum(aligned_values, values)
-    rivals = _separated(reference, reference.thetas(ends), values, lowest)
-    if not rivals:
+    optima = reference.separated(theta + ends * prior_sd, values, lowest)
+    if not optima:
         return []
-    thetas = np.stack([rival.theta for rival in rivals])
-    values = np.array([rival.value for rival in rivals])
+    thetas = np.stack([optimum.theta for optimum in optima])
+    values = np.array([optimum.value for optimum in optima])
     # A descent in a bent valley may end before it has learned how flat the valley is.
     for _ in range(8):
         previous = values
         thetas, values = reference.polish(thetas)
         if not (previous - values > _NEGLIGIBLE * reference.noise).any():
             break
-    return _separated(reference, thetas, values, lowest)
-
-
-def polished_rivals(reference: Reference, thetas: Floats) -> list[Rival]:
-    """Return the optima near thetas, (n, d), on designs as they are now."""
-    lowest = float(reference(reference.theta[None])[0])
-    ends, values = reference.polish(thetas)
-    return _separated(reference, ends, values, lowest)
-
-
-def _separated(reference: Reference, ends: Floats, values: Floats, lowest: float) -> list[Rival]:
-    """Return the optima that a barrier separates from the reference and from better ones."""
-    optima = [(reference.theta, lowest)]
-    for i in np.argsort(values):
-        value = float(values[i])
-        if np.isfinite(value) and all(
-            has_barrier(reference, ends[i], value, *optimum) for optimum in optima
-        ):
-            optima.append((ends[i], value))
-    noise = reference.noise
-    return [
-        Rival(
-            theta,
-            value,
-            comparable=value - lowest < _COMPARABLE * noise,
-            better=value < lowest - 0.1 * noise,
-        )
-        for theta, value in optima[1:]
-    ]
+    return reference.separated(thetas, values, lowest)
 
 
 def has_barrier(reference: Reference, a: Floats, value_a: float, b: Floats, value_b: float) -> bool:
@@ -221,43 +243,24 @@ def are_connected(reference: Reference, a: Floats, b: Floats, halvings: int) -> 
     )
 
 
-# -- designs ---------------------------------------------------------------------------------------
+def _is_supported(evaluator: Evaluator, optimum: LocalOptimum) -> bool:
+    return not shortcomings(evaluator, optimum.theta[None])
 
 
-def _is_supported(evaluator: Evaluator, rival: Rival) -> bool:
-    return not shortcomings(evaluator, rival.theta[None])
-
-
-def _supported_rivals(
-    evaluator: Evaluator, search: Callable[[], list[Rival]], *, refine: bool
-) -> list[Rival]:
-    """Return optima that designs support, with more runs where one in question has too few."""
-    for remaining in (2, 1, 0):  # most need one search
-        rivals = search()
-        supported = [rival for rival in rivals if _is_supported(evaluator, rival)]
-        undersampled = [
-            rival
-            for rival in rivals
-            if (rival.better or rival.comparable) and rival not in supported
-        ]
-        if not undersampled or not refine or not remaining:
-            break
-        refine_at(evaluator, undersampled[0].theta[None])
-    return supported
-
-
-def verified_rivals(reference: Reference, rivals: list[Rival]) -> list[Rival]:
+def verified_optima(reference: Reference, optima: list[LocalOptimum]) -> list[LocalOptimum]:
     """Return optima that persist when emulated samples are extended to them."""
     evaluator = reference.evaluator
-    supported = [rival for rival in rivals if _is_supported(evaluator, rival)]
-    unsupported = [rival.theta for rival in rivals if rival not in supported]
+    supported = [optimum for optimum in optima if _is_supported(evaluator, optimum)]
+    unsupported = [optimum.theta for optimum in optima if optimum not in supported]
     ends = [mirror_optimum(reference, theta) for theta in unsupported[:4]]
     mirrors = [end for end in ends if end is not None]
     if not mirrors:
         return supported
     refine_at(evaluator, np.stack(mirrors), beside=reference.theta[None])
-    thetas = np.stack([rival.theta for rival in supported] + mirrors)
-    return [r for r in polished_rivals(reference, thetas) if _is_supported(evaluator, r)]
+    thetas = np.stack([optimum.theta for optimum in supported] + mirrors)
+    lowest = float(reference(reference.theta[None])[0])
+    polished = reference.separated(*reference.polish(thetas), lowest)
+    return [optimum for optimum in polished if _is_supported(evaluator, optimum)]
 
 
 def mirror_optimum(reference: Reference, theta: Floats) -> Floats | None:
@@ -279,23 +282,3 @@ def mirror_optimum(reference: Reference, theta: Floats) -> Floats | None:
         if is_covered:
             return None if are_connected(reference, reference.theta, theta, 5) else theta
     return None
-
-
-def _excluded_by_one_simulator(
-    evaluator: Evaluator, best: Floats, rivals: list[Rival], noises: Floats
-) -> list[Rival]:
-    """Return rivals, not comparable where one simulator alone tells them from the best.
-
-    The noise of several simulators together grows with their number, and would hide it. ``noises``
-    are differences of each discrepancy that sampling explains, (k,).
-    """
-    if len(noises) < 2 or not rivals:
-        return rivals
-    thetas = np.array([best, *(rival.theta for rival in rivals)])
-    discrepancies = evaluator(thetas).discrepancies
-    increase = discrepancies[1:] - discrepancies[0]
-    is_excluded = (increase > _COMPARABLE * noises).any(axis=1)
-    return [
-        replace(rival, comparable=rival.comparable and not excluded)
-        for rival, excluded in zip(rivals, is_excluded, strict=True)
-    ]

@@ -94,7 +94,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
     findings = [finding for preparation in preparations for finding in preparation.findings]
     findings += report(*_findings(evaluator, objective, modes, weights))
-    rivals = tuple(
+    local_optima = tuple(
         {
             "point": point_at(evaluator, mode.theta),
             "discrepancy": mode.value,
@@ -112,13 +112,11 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         stderr=stderr,
         theta=best.theta,
         covariance=best.covariance,
-        names=hyperparameters.names,
         evaluator=evaluator,
         discrepancy=best.value,
         discrepancies={name: -float(v.sum()) for name, v in log_likelihoods.items()},
         scales=dict.fromkeys(log_likelihoods, 1.0),
         n_responses=evaluator.n_responses - n_previous,
-        identity=identity_of(evaluator, prior_minimised=settings.prior),
         search=SearchRecord(
             result=Result.CONVERGED if is_converged else Result.FAILED,
             prior=settings.prior,
@@ -128,8 +126,9 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
             n_computed=n_computed(evaluator),
             seconds=time.perf_counter() - clock,
             trace=objective.trace(best.steps),
+            identity=identity_of(evaluator, prior_minimised=settings.prior),
         ),
-        rivals=rivals,
+        local_optima=local_optima,
         findings=tuple(findings),
     )
 

@@ -43,23 +43,15 @@ from prbayes.inference.refits import SamplingDistribution, jumping_simulators
 from prbayes.inference.resampling import SETS
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.cost import explained, kept
-from prbayes.model.description import labelled
 from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
 from prbayes.model.locking import locked
-from prbayes.model.parameters import (
-    THETAS,
-    Hyperparameters,
-    readable_variables,
-    split_elements,
-    table_elements,
-)
+from prbayes.model.parameters import THETAS, Hyperparameters
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import specimen_likelihoods
-from prbayes.optimize.convergence import Fit, Search, Trace, approach, minimise, settle
+from prbayes.optimize.convergence import Fit, Result, Search, Trace, approach, minimise, settle
 from prbayes.optimize.design_refinement import (
-    AGREE,
     MAX_ROUNDS,
-    Restart,
+    design_error_findings,
     noise_floors,
     refine_at,
     refine_designs,
@@ -67,11 +59,10 @@ from prbayes.optimize.design_refinement import (
     refuse_lost,
     sampling_distribution,
 )
-from prbayes.optimize.local_optima import Rival, find_rivals
+from prbayes.optimize.local_optima import LocalOptimum, find_local_optima
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
-from prbayes.optimize.objective import Method, Ridge, initial_scales
+from prbayes.optimize.objective import Method, Minimisation, Ridge, initial_scales
 from prbayes.optimize.optimum import Optimum, SearchRecord, n_computed, optimum_of
-from prbayes.propagation.importance import SIZES
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -139,12 +130,17 @@ def refine(
             "propagation=prb.Reweighted(n)"
         )
     if thetas is not None:
-        thetas = _require_thetas(Hyperparameters.of(model), thetas)
-    with (
-        shown(progressbar),
-        explained(model, "prb.refine"),
-        limited(max_seconds, max_runs),
-    ):
+        thetas = real_array(thetas, "thetas")
+        hyperparameters = Hyperparameters.of(model)
+        size = hyperparameters.size
+        if thetas.ndim != 2 or thetas.shape[1] != size or not len(thetas):
+            raise ValueError(
+                f"thetas: got shape {thetas.shape}, expected (P, {size}) with P >= 1: a row for "
+                f"each population, a column for each of {hyperparameters.names}"
+            )
+        if not np.isfinite(thetas).all():
+            raise ValueError("thetas: got NaN or infinite values, expected finite ones")
+    with shown(progressbar), explained(model, "prb.refine"), limited(max_seconds, max_runs):
         evaluator = Evaluator.of(model)
         if thetas is None:
             require_finished(find_optimum(evaluator, Minimisation()))
@@ -154,20 +150,6 @@ def refine(
                     break
             refuse(shortcomings(evaluator, thetas), evaluator)
     return {name: bound.n_runs for name, bound in evaluator.reweighted.items()}
-
-
-def _require_thetas(hyperparameters: Hyperparameters, values: Any) -> Floats:
-    """Return thetas, shape (P, d), or raise if they do not fit the model."""
-    thetas = real_array(values, "thetas")
-    size = hyperparameters.size
-    if thetas.ndim != 2 or thetas.shape[1] != size or not len(thetas):
-        raise ValueError(
-            f"thetas: got shape {thetas.shape}, expected (P, {size}) with P >= 1: a row for each "
-            f"population, a column for each of {hyperparameters.names}"
-        )
-    if not np.isfinite(thetas).all():
-        raise ValueError("thetas: got NaN or infinite values, expected finite ones")
-    return thetas
 
 
 @locked
@@ -275,7 +257,7 @@ def minimize(
         positive_integer(starts, "starts", minimum=0)
     settings = Minimisation(
         start=start,
-        method=Method.of(method, options),
+        method=Method("BFGS" if method is None else method, {} if options is None else options),
         prior=flag(prior, "prior"),
         tolerance=positive_number(tolerance, "tolerance"),
         max_evaluations=positive_integer(max_evaluations, "max_evaluations"),
@@ -283,26 +265,8 @@ def minimize(
         starts=starts,
         random_seed=seed_number(random_seed),
     )
-    with (
-        shown(progressbar),
-        explained(model, "prb.minimize"),
-        limited(max_seconds, max_runs),
-    ):
+    with shown(progressbar), explained(model, "prb.minimize"), limited(max_seconds, max_runs):
         return find_optimum(Evaluator.of(model), settings)
-
-
-@dataclass(frozen=True)
-class Minimisation:
-    """Settings of `minimize`."""
-
-    start: dict[str, Any] | None = None
-    method: Method = field(default_factory=Method)
-    prior: bool = False
-    tolerance: float = 1e-6
-    max_evaluations: int = 5000
-    refine: bool = True
-    starts: int | None = None
-    random_seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,19 +277,8 @@ class _Problem:
     settings: Minimisation
     advance: Callable[[int, str], None]  # of the progress bar: number of runs, and a note
     n_previous: int  # responses computed before, without those of designs
-    n_screened: int  # points of the prior that were compared
-    n_approach: int  # evaluations of the area metric that led to the start
+    record: SearchRecord  # of the start
     fits: list[Fit] = field(default_factory=list)  # of each step; a spent budget reports the last
-
-    @property
-    def evaluator(self) -> Evaluator:
-        """The model's evaluator."""
-        return self.search.evaluator
-
-    def keep(self, fit: Fit) -> Fit:
-        """Record a fit."""
-        self.fits.append(fit)
-        return fit
 
 
 def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
@@ -335,34 +288,46 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
     for node in evaluator.nodes:
         node.bound.stream, node.bound.draws = settings.random_seed, 0
     clock = time.perf_counter()
+    hyperparameters = evaluator.hyperparameters
     search = Search(
         evaluator,
-        evaluator.hyperparameters.prior_sd,
+        hyperparameters.prior_sd,
         settings.method,
         settings.prior,
         settings.tolerance,
         settings.max_evaluations,
     )
-    search.refuse_random()
     n_previous = evaluator.n_responses - n_design_runs(evaluator)
+    n_screened, details = 0, ""
     with progress("runs") as advance:
+        # Start from the user's point, the best of the prior, or the model's initial point.
         scales = initial_scales(evaluator, prior=settings.prior)
-        theta, n_screened = _start(search, settings, scales)
+        theta = hyperparameters.initial
+        if settings.start is not None:
+            theta = hyperparameters.unconstrained(settings.start)
+        elif not evaluator.responses_per_theta:
+            points = hyperparameters.prior_points(THETAS, settings.random_seed)
+            candidates = np.concatenate([theta[None], points])
+            theta = np.asarray(candidates[np.argmin(evaluator.total(candidates, scales))])
+            n_screened = len(candidates)
         theta, trace = approach(search, theta, scales, settings.random_seed, Trace())
-        problem = _Problem(search, settings, advance, n_previous, n_screened, trace.count)
+        if trace.count:
+            details = (
+                "At the start hardly any simulated response was near the data: the area metric "
+                f"led from there, in {trace.count} evaluations."
+            )
+        record = SearchRecord(Result.STOPPED, details, settings.prior, n_screened=n_screened)
+        problem = _Problem(search, settings, advance, n_previous, record)
         try:
-            fit, rivals = _optimise(problem, theta, scales, trace)
-            optimum = _report(problem, fit, rivals)
+            fit, optima = _optimise(problem, theta, scales, trace)
+            optimum = _report(problem, fit, optima)
         except BudgetError as spent:
             if not problem.fits:
                 raise
             with unlimited():
                 optimum = _report(problem, problem.fits[-1], [], stopped=str(spent))
-    record = replace(
-        optimum.search,
-        seconds=time.perf_counter() - clock,
-        n_computed=n_computed(evaluator),
-    )
+    seconds = time.perf_counter() - clock
+    record = replace(optimum.search, seconds=seconds, n_computed=n_computed(evaluator))
     return replace(optimum, search=record)
 
 
@@ -373,38 +338,44 @@ def require_finished(optimum: Optimum) -> Optimum:
     return optimum
 
 
+# -- minimisation ----------------------------------------------------------------------------------
+
+
 def _optimise(
     problem: _Problem, theta: Floats, scales: Floats, trace: Trace
-) -> tuple[Fit, list[Rival]]:
+) -> tuple[Fit, list[LocalOptimum]]:
     """Minimise on designs that grow until they support the minimum, then compare local optima."""
+    search, settings = problem.search, problem.settings
+    evaluator, seed = search.evaluator, settings.random_seed
     fit = _fit(problem, theta, scales, trace)
-    if problem.settings.refine:
-        for round_ in count():
-            fit, restart = refine_designs(
-                *(problem.search, fit, round_, problem.settings.random_seed, problem.advance)
-            )
-            if restart is None:
-                break
-            fit = _refit(problem, fit, restart)
-    problem.keep(fit)
-    fit = problem.keep(_with_less_ridge(problem, fit))
-    fit, rivals = _compare_rivals(problem, fit)
-    return problem.keep(_settle(problem, problem.keep(fit))), rivals
-
-
-def _start(search: Search, settings: Minimisation, scales: Floats) -> tuple[Floats, int]:
-    """Return a starting point, and the number of points of the prior that were compared."""
-    hyperparameters = search.evaluator.hyperparameters
-    if settings.start is not None:
-        return hyperparameters.unconstrained(settings.start), 0
-    if search.evaluator.responses_per_theta:
-        return hyperparameters.initial, 0
-    points = hyperparameters.prior_points(THETAS, settings.random_seed)
-    candidates = np.concatenate([hyperparameters.initial[None], points])
-    return search.best_of(candidates, scales), len(candidates)
-
-
-# -- minimisation ----------------------------------------------------------------------------------
+    for round_ in count() if settings.refine else ():
+        fit, restart = refine_designs(search, fit, round_, seed, problem.advance)
+        if restart is None:
+            break
+        pilot, ridge = restart.pilot, restart.ridge
+        theta, trace = approach(search, restart.theta, fit.scales, seed, fit.trace)
+        fit = _fit(problem, theta, fit.scales, trace, pilot, ridge)
+        if restart.alternative is not None:
+            # An earlier minimum may be better on the grown designs.
+            thetas = np.array([restart.alternative, fit.theta])
+            earlier, later = evaluator.total(thetas, fit.scales)
+            if earlier < later:
+                fit = _fit(problem, restart.alternative, fit.scales, fit.trace, pilot, ridge)
+    problem.fits.append(fit)
+    if fit.ridge is not None and fit.sampling is not None:
+        # Without the ridge along directions that grown designs have come to identify.
+        directions = fit.sampling.local.unidentified
+        if directions.shape[1] < fit.ridge.directions.shape[1]:
+            rest = replace(fit.ridge, directions=directions) if directions.size else None
+            refit = _fit(problem, fit.theta, fit.scales, fit.trace, fit.pilot, rest)
+            if refit.sampling is not None and not shortcomings(evaluator, refit.theta[None]):
+                fit = refit
+            problem.fits.append(fit)
+    fit, optima = _compare_optima(problem, fit)
+    problem.fits.append(fit)
+    fit = _settle(problem, fit)
+    problem.fits.append(fit)
+    return fit, optima
 
 
 def _fit(
@@ -412,105 +383,78 @@ def _fit(
     theta: Floats,
     scales: Floats,
     trace: Trace,
-    cloud: Floats | None = None,
+    pilot: Floats | None = None,
     ridge: Ridge | None = None,
 ) -> Fit:
     """Minimise from theta; with several simulators again, with the noise at that pilot optimum."""
-    evaluator = problem.evaluator
     search = replace(problem.search, ridge=ridge)
-    fit = problem.keep(Fit(minimise(search, theta, scales, trace), cloud=cloud, ridge=ridge))
+    evaluator = search.evaluator
+    fit = replace(minimise(search, theta, scales, trace), pilot=pilot)
+    problem.fits.append(fit)
     is_unset = np.isnan(evaluator.epsilon)
     if len(evaluator.nodes) > 1 and is_unset.any():
         noise = noise_floors(evaluator, fit.theta, SETS)
         scales = np.where(is_unset, noise, evaluator.epsilon)
-        fit = problem.keep(replace(fit, run=minimise(search, fit.theta, scales, fit.run.trace)))
+        fit = replace(minimise(search, fit.theta, scales, fit.trace), pilot=pilot)
+        problem.fits.append(fit)
     return replace(fit, sampling=sampling_distribution(evaluator, fit.theta, fit.scales))
 
 
-def _refit(problem: _Problem, fit: Fit, restart: Restart) -> Fit:
-    """Minimise again from a restart, and from its alternative if that is better."""
-    seed, alternative = problem.settings.random_seed, restart.alternative
-    theta, trace = approach(problem.search, restart.theta, fit.scales, seed, fit.run.trace)
-    fit = _fit(problem, theta, fit.scales, trace, restart.cloud, restart.ridge)
-    if alternative is not None:
-        thetas = np.array([alternative, fit.theta])
-        earlier, later = problem.evaluator.total(thetas, fit.scales)
-        if earlier < later:
-            trace = fit.run.trace
-            fit = _fit(problem, alternative, fit.scales, trace, restart.cloud, restart.ridge)
-    return fit
-
-
-def _with_less_ridge(problem: _Problem, fit: Fit) -> Fit:
-    """Minimise without the ridge along directions that grown designs have come to identify."""
-    ridge, local = fit.ridge, fit.local
-    if ridge is None or local is None or local.unidentified.shape[1] >= ridge.directions.shape[1]:
-        return fit
-    rest = replace(ridge, directions=local.unidentified) if local.unidentified.size else None
-    refit = _fit(problem, fit.theta, fit.scales, fit.run.trace, fit.cloud, rest)
-    is_lost = refit.local is None or shortcomings(problem.evaluator, refit.theta[None])
-    return fit if is_lost else refit
-
-
-def _compare_rivals(problem: _Problem, fit: Fit) -> tuple[Fit, list[Rival]]:
+def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum]]:
     """Search for other optima; move to a better one."""
-    evaluator, settings = problem.evaluator, problem.settings
+    evaluator, settings = problem.search.evaluator, problem.settings
     n_starts = settings.starts
     if n_starts is None:
         n_starts = 0 if evaluator.responses_per_theta else 32
-    rivals: list[Rival] = []
+    optima: list[LocalOptimum] = []
     for is_first in (True, False):
-        if not n_starts or fit.local is None:
+        if not n_starts or fit.sampling is None:
             return fit, []
-        rivals = find_rivals(
-            *(evaluator, fit.theta, fit.scales, fit.local, fit.ridge),
-            starts=n_starts,
-            seed=settings.random_seed,
-            refine=settings.refine,
+        optima = find_local_optima(
+            evaluator, fit, n_starts, settings.random_seed, refine=settings.refine
         )
-        if not (is_first and rivals and rivals[0].better):
+        if not (is_first and optima and optima[0].better):
             break
         search = replace(problem.search, ridge=fit.ridge)
-        run = minimise(search, rivals[0].theta, fit.scales, fit.run.trace)
-        if settings.refine and refine_at(evaluator, run.best[None]):
-            run = minimise(search, run.best, fit.scales, run.trace)
-        sampling = sampling_distribution(evaluator, run.best, fit.scales)
-        fit = replace(fit, run=run, sampling=sampling)
-    return fit, rivals
+        moved = minimise(search, optima[0].theta, fit.scales, fit.trace)
+        if settings.refine and refine_at(evaluator, moved.theta[None]):
+            moved = minimise(search, moved.theta, fit.scales, moved.trace)
+        sampling = sampling_distribution(evaluator, moved.theta, fit.scales)
+        fit = replace(moved, sampling=sampling, design_error=fit.design_error, pilot=fit.pilot)
+    return fit, optima
 
 
 def _settle(problem: _Problem, fit: Fit) -> Fit:
     """Settle a line search that gave up, and complete the fit at its end."""
-    evaluator = problem.evaluator
     search = replace(problem.search, ridge=fit.ridge)
-    run = settle(search, fit.run)
-    if problem.settings.refine and refine_at(evaluator, run.best[None], beside=fit.theta[None]):
+    evaluator = search.evaluator
+    end = settle(search, fit)
+    if problem.settings.refine and refine_at(evaluator, end.theta[None], beside=fit.theta[None]):
         # A simplex may move to where few points have a lower value by accident.
-        run = settle(search, fit.run)
-        if shortcomings(evaluator, run.best[None]):
-            run = fit.run
-    shift = np.abs(run.best - fit.theta)
-    fit = replace(fit, run=run)
-    if fit.sampling is None:
-        return fit
+        end = settle(search, fit)
+        if shortcomings(evaluator, end.theta[None]):
+            end = fit
+    shift = np.abs(end.theta - fit.theta)
     # Standard errors change less than the theta of a settled line search.
-    if (shift > 0.01 * evaluator.hyperparameters.prior_sd).any():
-        sampling = sampling_distribution(evaluator, fit.theta, fit.scales)
-        fit = replace(fit, sampling=sampling)
-    if fit.sampling is None or not (np.isnan(fit.design_error) or shift.any()):
-        return fit
-    return replace(fit, design_error=design_error(fit.sampling).whole)
+    if end.sampling is not None and (shift > 0.01 * search.prior_sd).any():
+        end = replace(end, sampling=sampling_distribution(evaluator, end.theta, end.scales))
+    if end.sampling is None or not (np.isnan(end.design_error) or shift.any()):
+        return end
+    return replace(end, design_error=design_error(end.sampling).whole)
 
 
 # -- report ----------------------------------------------------------------------------------------
 
 
-def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = "") -> Optimum:
+def _report(
+    problem: _Problem, fit: Fit, optima: list[LocalOptimum], *, stopped: str = ""
+) -> Optimum:
     """Return the optimum of the last fit, and log its findings.
 
     No response is computed if a budget has ``stopped`` the minimisation.
     """
-    evaluator, search = problem.evaluator, problem.search
+    search = problem.search
+    evaluator = search.evaluator
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()
     if fit.sampling is not None and not stopped:
@@ -524,83 +468,72 @@ def _report(problem: _Problem, fit: Fit, rivals: list[Rival], *, stopped: str = 
         )
         at_jump = tuple(evaluator.nodes[k].name for k in jumping_simulators(fit.sampling))
         if at_edge or at_jump:
-            fit, rivals = replace(fit, sampling=None), []
-    record = SearchRecord(
-        result=fit.run.result,
-        prior=search.prior,
-        details=f"{fit.run.details} {_details(problem, fit, at_edge, stopped)}".strip(),
-        n_evaluations=fit.run.trace.count,
-        n_screened=problem.n_screened,
-        trace=fit.run.trace.arrays(fit.theta.size),
+            fit, optima = replace(fit, sampling=None), []
+    details = [fit.details, problem.record.details]
+    if stopped:
+        details.append(f"{stopped} before the minimisation was finished.")
+    else:
+        details += _details(search, fit, at_edge)
+    record = replace(
+        problem.record,
+        details=" ".join(filter(None, details)),
         stopped=stopped,
         at_edge=at_edge,
         at_jump=at_jump,
     )
     optimum = optimum_of(search, fit, record, problem.n_previous)
     if stopped:
-        finding = Finding(
-            "budget-spent",
+        text = (
             f"{stopped} before the minimisation was finished, so that this is no answer yet; "
             f"{kept(evaluator.model)}; call prb.minimize with a larger budget, on a model that is "
-            "built again, to go on.",
-            "expensive.md#a-night-is-not-enough",
+            "built again, to go on."
         )
+        finding = Finding("budget-spent", text, "expensive.md#a-night-is-not-enough")
         return replace(optimum, findings=report(finding))
-    refuse_lost(
-        evaluator, {name: numbers["lost_mass"] for name, numbers in optimum.support.items()}
-    )
+    support = optimum.search.support
+    refuse_lost(evaluator, {name: numbers["lost_mass"] for name, numbers in support.items()})
+    local = None if fit.sampling is None else fit.sampling.local
     findings = report(
         *breakdown_findings(at_edge, at_jump),
         *heavy_tails(evaluator, fit.theta),
         *data_between_runs(evaluator, fit.theta),
-        *smoothing_bias(evaluator, fit.theta, fit.scales, fit.local),
-        *optimum_findings(evaluator, fit.sampling, rivals, fit.design_error),
+        *smoothing_bias(evaluator, fit.theta, fit.scales, local),
+        *optimum_findings(evaluator, fit.sampling, optima, fit.design_error),
     )
-    records = tuple(rival.record(evaluator) for rival in rivals)
-    return replace(optimum, design_error=fit.design_error, rivals=records, findings=findings)
+    local_optima = tuple(mode.as_dict(evaluator) for mode in optima)
+    return replace(
+        optimum, design_error=fit.design_error, local_optima=local_optima, findings=findings
+    )
 
 
-def _details(problem: _Problem, fit: Fit, at_edge: tuple[str, ...], stopped: str) -> str:
-    """Return sentences about start, edges, designs and directions that are not identified."""
-    evaluator = problem.evaluator
-    sentences = []
-    if problem.n_approach:
-        sentences.append(
-            "At the start hardly any simulated response was near the data: the area metric led "
-            f"from there, in {problem.n_approach} evaluations."
-        )
-    if stopped:
-        return " ".join([*sentences, f"{stopped} before the minimisation was finished."])
-    if at_edge:
-        sentences.append(f"{', '.join(at_edge)} ran to the edge of the support.")
-    designs = [
-        bound.design.summary(name)
-        for name, bound in evaluator.reweighted.items()
-        if bound.design.is_emulated
-    ]
-    sentences += designs
-    if designs and np.isfinite(fit.design_error):
-        sentences.append(
-            f"Another design's optimum would differ by {fit.design_error:.2g} standard errors."
-        )
+def _details(search: Search, fit: Fit, at_edge: tuple[str, ...]) -> list[str]:
+    """Return sentences about edges, designs and directions that are not identified."""
+    evaluator = search.evaluator
+    sentences = [f"{', '.join(at_edge)} ran to the edge of the support."] if at_edge else []
+    designs = {name: bound.design for name, bound in evaluator.reweighted.items()}
+    emulated = [design.summary(name) for name, design in designs.items() if design.is_emulated]
+    if emulated and np.isfinite(fit.design_error):
+        error = f"{fit.design_error:.2g} standard errors"
+        emulated.append(f"Another design's optimum would differ by {error}.")
+    sentences += emulated
     if fit.ridge is not None:
         sentences.append(
             "Directions that the data do not identify were regularised; their values are arbitrary."
         )
     names = np.array(evaluator.hyperparameters.readable_names)
     indirect = names[only_through_prior(evaluator)]
-    if indirect.size and not problem.search.prior:
+    if indirect.size and not search.prior:
         sentences.append(
             f"The data inform {', '.join(indirect)} only through other hyperparameters and the "
             "prior, which is not minimised: their values are arbitrary; use prb.sample_smc."
         )
-    return " ".join(sentences)
+    return sentences
 
 
 def optimum_findings(
     evaluator: Evaluator,
     sampling: SamplingDistribution | None,
-    rivals: Sequence[Rival],
+    optima: Sequence[LocalOptimum],
     design_error: float,
 ) -> tuple[Finding, ...]:
     """Report what the metric leaves out, the design's error, other optima, and identification."""
@@ -608,10 +541,8 @@ def optimum_findings(
     findings = [
         Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
     ]
-    # An estimate from eight blocks is itself uncertain by a quarter.
-    if design_error > 1.5 * AGREE:
-        findings.append(_design_finding(evaluator, design_error))
-    findings += [_second_mode(evaluator, rival) for rival in rivals if rival.comparable]
+    findings += design_error_findings(evaluator, design_error)
+    findings += [mode.finding(evaluator) for mode in optima if mode.comparable]
     if sampling is not None:
         ends = prior_ends(sampling)
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
@@ -620,41 +551,3 @@ def optimum_findings(
         findings += unidentified_findings(evaluator, sampling.local, names)
         findings += confounding_findings(evaluator, sampling.local)
     return tuple(findings)
-
-
-def _design_finding(evaluator: Evaluator, error: float) -> Finding:
-    """Report a large error of the optimum by the design."""
-    designs = [bound.design for bound in evaluator.reweighted.values()]
-    runs = max(len(design.runs) for design in designs)
-    if min(len(design.emulated or ()) for design in designs) < SIZES.largest:
-        advice = f"pass a larger n or max_points to prb.Reweighted (now {runs} runs)"
-    else:
-        advice = (
-            f"between its {runs} runs are {SIZES.largest} emulated points, the most there are: "
-            "more runs help as far as the emulator is off, which the message says, and the rest "
-            "counts as another error of the optimum"
-        )
-    return Finding(
-        "design-error",
-        f"The optimum of another design would differ by about {error:.2f} standard errors, "
-        f"expected at most {AGREE}; {advice}.",
-        "choose.md#how-many-responses",
-    )
-
-
-def _second_mode(evaluator: Evaluator, rival: Rival) -> Finding:
-    """Report another optimum."""
-    hyperparameters = evaluator.hyperparameters
-    # Beside a second point, so that constants can be recognised.
-    points = hyperparameters.constrained(np.stack([rival.theta, hyperparameters.initial]))
-    names = readable_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
-    values = labelled(evaluator, {name: points[name] for name in names}, {"point": 2}).data_vars
-    elements = split_elements(values)
-    place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in table_elements(values))
-    return Finding(
-        "second-mode",
-        f"The data could as well come from {place}: another optimum, or mirror "
-        "solution, whose discrepancy differs by no more than sampling noise; state a prior that "
-        "excludes one, or report both.",
-        "optimum_or_abc.md#two-answers",
-    )

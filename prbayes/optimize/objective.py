@@ -62,9 +62,13 @@ class Objective:
     thetas: list[Floats] = field(default_factory=list, init=False)
     values: list[float] = field(default_factory=list, init=False)
     counts: list[int] = field(default_factory=list, init=False)  # evaluations up to each point
+    best: Floats = field(init=False)  # theta of the lowest value, or the center
     lowest: float = field(default=np.inf, init=False)  # smallest finite value
     _since_progress: int = field(default=0, init=False)
     _value_at_progress: float = field(default=np.inf, init=False)
+
+    def __post_init__(self) -> None:
+        self.best = self.center
 
     def __call__(self, t: Floats) -> Any:
         """Return the value, and the gradient where there is one.
@@ -79,23 +83,15 @@ class Objective:
             value = value + float(self.ridge(theta, self.prior_sd))
             if gradient is not None:
                 gradient = gradient + self.ridge.gradient(theta, self.prior_sd)
+        value = float(value)
         self.count += cost
         self.thetas.append(theta)
-        self.values.append(float(value))
+        self.values.append(value)
         self.counts.append(self.count)
-        if np.isfinite(value):
-            self.lowest = min(self.lowest, float(value))
-        value = float(value) / self.size
-        self._check_progress(value, cost)
-        if not self.gradient:
-            return value if np.isfinite(value) else 1e300
-        slope = np.asarray(gradient) * self.prior_sd / self.size
-        if not np.isfinite(value) or not np.isfinite(slope).all():
-            # Leads back to the start without breaking a line search.
-            return 1e10 + float(t @ t), 2 * t
-        return value, slope
-
-    def _check_progress(self, value: float, cost: int) -> None:
+        if np.isfinite(value) and value < self.lowest:
+            self.lowest, self.best = value, theta
+        self.report(cost, f"discrepancy {self.lowest:.4g}")
+        value = value / self.size
         # A relative gain below 1e-10 is rounding of a sum over thousands of points.
         least = max(1e-10, self.least_gain * abs(self._value_at_progress))
         is_first = not np.isfinite(self._value_at_progress)
@@ -103,17 +99,15 @@ class Objective:
             self._since_progress, self._value_at_progress = 0, value
         else:
             self._since_progress += 1
-        self.report(cost, f"discrepancy {self.lowest:.4g}")
         if self._since_progress > self.patience:
             raise StalledError
-
-    @property
-    def best(self) -> Floats:
-        """The point with the smallest value, or the center."""
-        if not self.values:
-            return self.center
-        values = np.nan_to_num(self.values, nan=np.inf, posinf=np.inf)
-        return self.thetas[int(np.argmin(values))]
+        if not self.gradient:
+            return value if np.isfinite(value) else 1e300
+        slope = np.asarray(gradient) * self.prior_sd / self.size
+        if not np.isfinite(value) or not np.isfinite(slope).all():
+            # Leads back to the start without breaking a line search.
+            return 1e10 + float(t @ t), 2 * t
+        return value, slope
 
 
 def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
@@ -125,9 +119,13 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
     terms = ""
     if prior:
         terms = "minus the log prior (prior=True)"
-    elif _has_varying_terms(evaluator):
-        terms = "other likelihood terms or potentials"
-    elif len(evaluator.nodes) == 1:
+    elif evaluator.has_other_terms:
+        # Terms that only exclude hyperparameters do not count.
+        values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))
+        finite = values[np.isfinite(values)]
+        if finite.size and np.ptp(finite) > 0:
+            terms = "other likelihood terms or potentials"
+    if not terms and len(evaluator.nodes) == 1:
         return np.ones(1)
     unset = [node.name for node in evaluator.nodes if np.isnan(node.epsilon_value)]
     if terms and unset:
@@ -142,16 +140,6 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
     return np.where(np.isnan(evaluator.epsilon), sizes, evaluator.epsilon)
 
 
-def _has_varying_terms(evaluator: Evaluator) -> bool:
-    """Return whether other terms do more than exclude hyperparameters."""
-    if not evaluator.has_other_terms:
-        return False
-    # A power of two, as Sobol points are then balanced.
-    values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))
-    finite = values[np.isfinite(values)]
-    return finite.size > 0 and bool(np.ptp(finite) > 0)
-
-
 # Scipy's minimisers that need no Hessian.
 _GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
 _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
@@ -159,40 +147,18 @@ _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-
 
 @dataclass(frozen=True)
 class Method:
-    """A minimiser of `scipy.optimize.minimize` with its options.
+    """A minimiser of `scipy.optimize.minimize`, by name or as a function, with its options.
 
-    Parameters
-    ----------
-    method : str or callable
-        Scipy's name of a method that needs no Hessian, or a function that
-        `scipy.optimize.minimize` accepts: ``method(fun, x0, args, jac=..., callback=...,
-        **options) -> OptimizeResult``.
-    options : mapping
-        For scipy's ``options=``, in units of the standardised problem; they replace those of
-        `settings`.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If there is no such method or option.
-
-    References
-    ----------
-    .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization,
-           doi:10.1007/978-0-387-40065-5.
-
-    Examples
-    --------
-    >>> Method("L-BFGS-B", {"maxcor": 5})
-    Method(method='L-BFGS-B', options={'maxcor': 5})
+    Raises ValueError or TypeError if there is no such method or option.
     """
 
     method: str | Callable[..., Any] = "BFGS"
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)  # replace those of `settings`
+    gradient: bool = field(init=False)  # whether the method uses gradients
 
     def __post_init__(self) -> None:
-        names = (*_WITH_GRADIENT, *_GRADIENT_FREE)
         if isinstance(self.method, str):
+            names = (*_WITH_GRADIENT, *_GRADIENT_FREE)
             if self.method.lower() not in {name.lower() for name in names}:
                 raise ValueError(
                     f"method: got {self.method!r}, expected one of {', '.join(names)}, or a "
@@ -209,6 +175,8 @@ class Method:
             )
         if isinstance(self.method, str) and self.options:
             self._refuse_unknown_options(self.method)
+        is_free = str(self.method).lower() in {name.lower() for name in _GRADIENT_FREE}
+        object.__setattr__(self, "gradient", not is_free)
 
     def _refuse_unknown_options(self, method: str) -> None:
         """Raise for options that scipy's method does not have, of which it only warns."""
@@ -233,59 +201,53 @@ class Method:
                     f"scipy says: {warning.message}"
                 )
 
-    @classmethod
-    def of(
-        cls, method: str | Callable[..., Any] | None, options: Mapping[str, Any] | None
-    ) -> Method:
-        """Return the method of the arguments of `minimize`."""
-        return cls("BFGS" if method is None else method, {} if options is None else options)
-
-    @property
-    def name(self) -> str:
-        """The name in messages."""
-        if isinstance(self.method, str):
-            return self.method
-        return str(getattr(self.method, "__name__", repr(self.method)))
-
-    @property
-    def gradient(self) -> bool:
-        """Whether the method uses gradients."""
-        gradient_free = {name.lower() for name in _GRADIENT_FREE}
-        return not isinstance(self.method, str) or self.method.lower() not in gradient_free
-
     def settings(self, tolerance: float, size: int) -> dict[str, Any]:
         """Return scipy's options for a standardised problem of ``size`` parameters.
 
         The objective limits evaluations, so iterations are unlimited.
         """
+        if not isinstance(self.method, str):
+            return dict(self.options)
         most = 10**9  # never reached
         # First step of methods without gradient, in spreads of the prior: larger than most standard
         # errors, and within the prior.
         step = 0.2
-        simplex = np.vstack([np.zeros(size), step * np.eye(size)])
         defaults: dict[str, dict[str, Any]] = {
-            "bfgs": {"gtol": tolerance, "maxiter": most},
-            "cg": {"gtol": tolerance, "maxiter": most},
-            "l-bfgs-b": {"gtol": tolerance, "ftol": tolerance**2, "maxfun": most, "maxiter": most},
-            "newton-cg": {"xtol": tolerance, "maxiter": most},
-            "slsqp": {"ftol": tolerance**2, "maxiter": most},
+            "bfgs": {"gtol": tolerance},
+            "cg": {"gtol": tolerance},
+            "l-bfgs-b": {"gtol": tolerance, "ftol": tolerance**2, "maxfun": most},
+            "newton-cg": {"xtol": tolerance},
+            "slsqp": {"ftol": tolerance**2},
             "tnc": {"gtol": tolerance, "ftol": tolerance**2, "xtol": 0.0, "maxfun": most},
-            "trust-constr": {"gtol": tolerance, "xtol": tolerance**2, "maxiter": most},
+            "trust-constr": {"gtol": tolerance, "xtol": tolerance**2},
             "nelder-mead": {
                 "xatol": tolerance,
                 "fatol": tolerance / 100,
-                "initial_simplex": simplex,
+                "initial_simplex": np.vstack([np.zeros(size), step * np.eye(size)]),
                 "maxfev": most,
-                "maxiter": most,
             },
-            "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most, "maxiter": most},
-            "cobyla": {"tol": tolerance, "rhobeg": step, "maxiter": most},
+            "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most},
+            "cobyla": {"tol": tolerance, "rhobeg": step},
             "cobyqa": {
                 "final_tr_radius": tolerance,
                 "initial_tr_radius": step,
                 "maxfev": most,
-                "maxiter": most,
             },
         }
-        name = self.method.lower() if isinstance(self.method, str) else ""
-        return {**defaults.get(name, {}), **self.options}
+        name = self.method.lower()
+        iterations = {} if name == "tnc" else {"maxiter": most}
+        return {**defaults[name], **iterations, **self.options}
+
+
+@dataclass(frozen=True)
+class Minimisation:
+    """Settings of `minimize`."""
+
+    start: dict[str, Any] | None = None
+    method: Method = field(default_factory=Method)
+    prior: bool = False
+    tolerance: float = 1e-6
+    max_evaluations: int = 5000
+    refine: bool = True
+    starts: int | None = None
+    random_seed: int = 0

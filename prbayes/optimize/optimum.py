@@ -87,6 +87,12 @@ class SearchRecord:
     at_jump : tuple of str
         Simulators whose discrepancy jumps at the optimum, as points lose their response there;
         standard errors are not known.
+    support : dict
+        By simulator: ``lost_mass``, the share of the population at the optimum without response
+        (NaN), and ``failed_mass``, the share of failed specimens (+inf) in the rest; with
+        `Reweighted` also ``weight_ess`` and ``mean_weight``.
+    identity : Identity or None
+        Fingerprint of the problem.
     """
 
     result: Result
@@ -100,6 +106,74 @@ class SearchRecord:
     stopped: str = ""
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()
+    support: dict[str, dict[str, float]] = field(default_factory=dict)
+    identity: Identity | None = None
+
+
+# -- display ---------------------------------------------------------------------------------------
+
+
+def _heading(optimum: Optimum) -> str:
+    """Return the discrepancy and its cost in words."""
+    kind = "Optimum with the prior" if optimum.search.prior else "Optimum"
+    label = "discrepancy" if optimum.evaluator.nodes else "minus log-likelihood"
+    state = "converged" if optimum.converged else "NOT converged"
+    return (
+        f"{kind}: {label} {optimum.discrepancy:.4g} after {optimum.search.n_evaluations} "
+        f"evaluations, {optimum.n_responses} responses, {state}"
+    )
+
+
+def _rows(optimum: Optimum) -> list[list[str]]:
+    """Return name, estimate and standard error in words.
+
+    Elements with labels, and those of matrices, have rows of their own, up to twenty of a variable.
+    """
+
+    def short(value: Any) -> str:
+        return np.array2string(
+            np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format}
+        )
+
+    point = labelled(optimum.evaluator, optimum.point, {}).data_vars
+    stderr = labelled(optimum.evaluator, optimum.stderr, {}).data_vars
+    names = [str(name) for name in point]
+    rows = []
+    for name in readable_variables(names, names):
+        value, error = point[name], stderr[name]
+        has_rows = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
+        if not has_rows or value.size > 20:
+            rows.append([name, short(value), short(error)])
+            continue
+        values, errors = single_elements({name: value}), single_elements({name: error})
+        for element in optimum_elements({name: value}, {name: error}):
+            rows.append([element, short(values[element]), short(errors[element])])
+    return rows
+
+
+def _sentences(optimum: Optimum) -> list[str]:
+    """Return the shares of specimens that fail or have no response, and the findings."""
+    sentences = []
+    for name, support in optimum.search.support.items():
+        for key, verb in (("failed_mass", "fail"), ("lost_mass", NO_RESPONSE)):
+            share = support.get(key, 0.0)
+            if share >= SMALLEST_SHARE:
+                sentences.append(f"{name}: {share:.1%} of specimens {verb}")
+    return [*sentences, *map(str, optimum.findings)]
+
+
+def _text(optimum: Optimum) -> str:
+    """Return the estimates, their cost, and the findings."""
+    rows = [f"{name} = {value} ± {error}" for name, value, error in _rows(optimum)]
+    return "\n  ".join([_heading(optimum), *rows, *_sentences(optimum)])
+
+
+def _html(optimum: Optimum) -> str:
+    """Return the same for a notebook, as a table."""
+    header = ["", "estimate", "standard error"]
+    return view(
+        _heading(optimum), header=header, rows=_rows(optimum), sentences=_sentences(optimum)
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,31 +192,24 @@ class Optimum:
         The optimum in unconstrained space.
     covariance : ndarray, shape (d, d)
         Sampling covariance in unconstrained space.
-    names : list of str
-        Names of the elements of theta.
     evaluator : Evaluator
+        The model, and its simulators at any hyperparameters.
     discrepancy : float
         The minimised sum of d_k / s_k; with one simulator, its discrepancy.
     discrepancies : dict
         Discrepancy by simulator.
     scales : dict
         The s_k by simulator.
-    support : dict
-        By simulator: ``lost_mass``, the share of the population at the optimum without response
-        (NaN), and ``failed_mass``, the share of failed specimens (+inf) in the rest; with
-        `Reweighted` also ``weight_ess`` and ``mean_weight``.
     n_responses : int
         Scalar responses that this optimum took, including the design's and those found in a store.
     design_error : float
         Distance to the optimum of an independent design of the same size, in standard errors along
         the worst direction; NaN where it is not known (`Resimulated`) or negligible (one input).
-    rivals : tuple of dict
+    local_optima : tuple of dict
         Other optima, such as mirror solutions: ``point``, ``discrepancy`` (the sum of d_k / s_k),
         ``theta``, and ``comparable``, whether the data could as well come from there.
     findings : tuple of Finding
         What is not identified, and what else to know of the answer; also logged.
-    identity : Identity or None
-        Fingerprint of the problem.
     search : SearchRecord
         How the minimisation went, and what it cost.
     """
@@ -151,28 +218,18 @@ class Optimum:
     stderr: dict[str, Any]
     theta: Floats
     covariance: Floats
-    names: list[str]
     evaluator: Evaluator
     discrepancy: float
     discrepancies: dict[str, float]
     scales: dict[str, float]
     n_responses: int
-    identity: Identity | None
     search: SearchRecord
-    support: dict[str, dict[str, float]] = field(default_factory=dict)
     design_error: float = np.nan
-    rivals: tuple[dict[str, Any], ...] = ()
+    local_optima: tuple[dict[str, Any], ...] = ()
     findings: tuple[Finding, ...] = ()
 
-    def __repr__(self) -> str:
-        """Show the estimates, their cost, and the findings."""
-        rows = [f"{name} = {value} ± {error}" for name, value, error in _rows(self)]
-        return "\n  ".join([_heading(self), *rows, *_sentences(self)])
-
-    def _repr_html_(self) -> str:
-        """Show the same in a notebook, as a table."""
-        header = ["", "estimate", "standard error"]
-        return view(_heading(self), header=header, rows=_rows(self), sentences=_sentences(self))
+    __repr__ = _text
+    _repr_html_ = _html
 
     @property
     def converged(self) -> bool:
@@ -239,10 +296,32 @@ class Optimum:
         Groups ``optimum``, ``stderr``, ``trace``, ``calibration`` and ``observed_data``, and
         ``failures`` if there are any.
         """
+        search = self.search
+        attributes = {
+            "discrepancy": self.discrepancy,
+            "converged": int(self.converged),
+            "prior": int(search.prior),
+            "message": self.message,
+            "stopped": search.stopped,
+            "n_evaluations": search.n_evaluations,
+            "n_screened": search.n_screened,
+            "n_responses": self.n_responses,
+            "seconds": search.seconds,
+            "findings": as_json(self.findings),
+            **versions(),
+            **as_attribute(self.model),
+            **as_attributes(search.identity),
+        }
+        trace = {
+            "theta": (["evaluation", "element"], search.trace["theta"]),
+            "discrepancy": ("evaluation", search.trace["discrepancy"]),
+            "evaluations": ("evaluation", search.trace["evaluations"]),
+        }
+        elements = {"element": self.evaluator.hyperparameters.names}
         groups = {
-            "optimum": labelled(self.evaluator, self.point, {}).assign_attrs(_attributes(self)),
+            "optimum": labelled(self.evaluator, self.point, {}).assign_attrs(attributes),
             "stderr": labelled(self.evaluator, self.stderr, {}),
-            "trace": _trace_dataset(self),
+            "trace": xr.Dataset(trace, coords=elements),
             "calibration": _calibration_dataset(self),
             "observed_data": observed_dataset(self.evaluator),
         }
@@ -252,75 +331,42 @@ class Optimum:
         return xr.DataTree.from_dict(groups)
 
 
-def _heading(optimum: Optimum) -> str:
-    """Return the discrepancy and its cost in words."""
-    kind = "Optimum with the prior" if optimum.search.prior else "Optimum"
-    label = "discrepancy" if optimum.evaluator.nodes else "minus log-likelihood"
-    state = "converged" if optimum.converged else "NOT converged"
-    return (
-        f"{kind}: {label} {optimum.discrepancy:.4g} after {optimum.search.n_evaluations} "
-        f"evaluations, {optimum.n_responses} responses, {state}"
-    )
-
-
-def _rows(optimum: Optimum) -> list[list[str]]:
-    """Return name, estimate and standard error in words.
-
-    Elements with labels, and those of matrices, have rows of their own, up to twenty of a variable.
-    """
-
-    def short(value: Any) -> str:
-        return np.array2string(
-            np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format}
-        )
-
-    point = labelled(optimum.evaluator, optimum.point, {}).data_vars
-    stderr = labelled(optimum.evaluator, optimum.stderr, {}).data_vars
-    names = [str(name) for name in point]
-    rows = []
-    for name in readable_variables(names, names):
-        value, error = point[name], stderr[name]
-        has_rows = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
-        if not has_rows or value.size > 20:
-            rows.append([name, short(value), short(error)])
-            continue
-        values, errors = single_elements({name: value}), single_elements({name: error})
-        for element in optimum_elements({name: value}, {name: error}):
-            rows.append([element, short(values[element]), short(errors[element])])
-    return rows
-
-
-def _sentences(optimum: Optimum) -> list[str]:
-    """Return the shares of specimens that fail or have no response, and the findings."""
-    sentences = []
-    for name, support in optimum.support.items():
-        for key, verb in (("failed_mass", "fail"), ("lost_mass", NO_RESPONSE)):
-            share = support.get(key, 0.0)
-            if share >= SMALLEST_SHARE:
-                sentences.append(f"{name}: {share:.1%} of specimens {verb}")
-    return [*sentences, *map(str, optimum.findings)]
-
-
 # -- from the end of a minimisation ----------------------------------------------------------------
 
 
 def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) -> Optimum:
-    """Return the optimum of a fit, without findings, rivals and design error.
+    """Return the optimum of a fit, without findings, local optima and design error.
 
     ``n_previous`` responses were computed for something else. None is computed if a budget has
     stopped the search.
     """
     evaluator, theta, scales = search.evaluator, fit.theta, fit.scales
+    hyperparameters = evaluator.hyperparameters
+    covariance = fit.covariance
     functions = None if fit.sampling is None else sampling_of_functions(fit.sampling)
-    point, stderr = point_and_stderr(evaluator, theta, fit.covariance, functions)
+    point, stderr = point_and_stderr(evaluator, theta, covariance, functions)
+    # How the search ended, unless its end is no minimum. A variance of rounding errors is as
+    # suspect as an infinite one; the discrepancy decides.
     is_affordable = not (record.stopped and evaluator.responses_per_theta)
-    record = replace(record, result=_final_result(search, fit, record, is_affordable=is_affordable))
+    variance = np.diag(covariance) / hyperparameters.prior_sd**2
+    is_suspect = bool((np.isinf(variance) | (variance < 1e-16)).all())
+    is_flat = is_suspect and no_information(evaluator, theta)
+    result = fit.result
+    if record.stopped:
+        result = Result.STOPPED
+    elif record.at_edge:
+        result = Result.AT_EDGE
+    elif is_flat:
+        result = Result.NO_INFORMATION
+    elif is_affordable and not search.prior and apart_from_data(evaluator, theta):
+        # Such a minimum is one of the mass beyond the grid, and no fit.
+        result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
     elif len(scales) > 1 or search.prior or evaluator.has_other_terms:
         values = np.full(len(scales), np.nan)
     else:
-        values = fit.run.lowest * scales
+        values = fit.lowest * scales
     n_responses = evaluator.n_responses - n_previous  # without those of the support
     support = {
         name: {key: float(value[0]) for key, value in numbers.items()}
@@ -330,52 +376,43 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         if node.reweighted is None and is_affordable:
             support[node.name] = missing_mass(evaluator, theta, k)
     names = [node.name for node in evaluator.nodes]
+    identity = identity_of(evaluator, prior_minimised=search.prior)
     return Optimum(
         point=point,
         stderr=stderr,
         theta=theta,
-        covariance=fit.covariance,
-        names=evaluator.hyperparameters.names,
+        covariance=covariance,
         evaluator=evaluator,
         discrepancy=float((values / scales).sum()),
         discrepancies=dict(zip(names, map(float, values), strict=True)),
         scales=dict(zip(names, map(float, scales), strict=True)),
         n_responses=n_responses,
-        identity=identity_of(evaluator, prior_minimised=search.prior),
-        search=record,
-        support=support,
+        search=replace(
+            record,
+            result=result,
+            n_evaluations=fit.trace.count,
+            trace={
+                "theta": np.array(fit.trace.thetas).reshape(-1, theta.size),
+                "discrepancy": np.array(fit.trace.values),
+                "evaluations": np.array(fit.trace.counts, dtype=np.int64),
+            },
+            support=support,
+            identity=identity,
+        ),
     )
-
-
-def _final_result(search: Search, fit: Fit, record: SearchRecord, *, is_affordable: bool) -> Result:
-    """Return how a minimisation ended: the result of its last run, unless it is no minimum."""
-    evaluator = search.evaluator
-    # A variance of rounding errors is suspect as well; the discrepancy decides.
-    variance = np.diag(fit.covariance) / evaluator.hyperparameters.prior_sd**2
-    is_suspect = bool((np.isinf(variance) | (variance < 1e-16)).all())
-    is_flat = is_suspect and no_information(evaluator, fit.theta)
-    if record.stopped:
-        return Result.STOPPED
-    if record.at_edge:
-        return Result.AT_EDGE
-    if is_flat:
-        return Result.NO_INFORMATION
-    if is_affordable and not search.prior and apart_from_data(evaluator, fit.theta):
-        # Such a minimum is one of the mass beyond the grid, and no fit.
-        return Result.NO_OVERLAP
-    return fit.run.result
 
 
 def n_computed(evaluator: Evaluator) -> int:
     """Return the number of responses computed for a model, without those found in a store."""
-    by_metric = sum(node.bound.responses.computed for node in evaluator.nodes)
-    return by_metric + sum(m.responses.computed for m in evaluator.measurements)
+    responses = [node.bound.responses for node in evaluator.nodes]
+    responses += [measurement.responses for measurement in evaluator.measurements]
+    return sum([r.computed for r in responses])
 
 
 def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:
     """Return variables and deterministics at theta in the user's units."""
     values = evaluator.hyperparameters.constrained(theta[None])
-    return {name: plain(value[0]) for name, value in values.items()}
+    return {name: _number(value[0]) for name, value in values.items()}
 
 
 def point_and_stderr(
@@ -390,7 +427,7 @@ def point_and_stderr(
     stderr = {}
     for name, value in values.items():
         gradients = slopes(value, step)
-        errors = _delta_method(gradients, covariance)
+        errors = delta_method(gradients, covariance)
         if functions is not None and name in deterministics:
             # Functions of unidentified elements may be identified: if better than by their prior.
             faint = np.sqrt(functions.variance(gradients))
@@ -399,11 +436,11 @@ def point_and_stderr(
         # Constants up to rounding, such as the diagonal of a correlation matrix.
         ranges = np.ptp(np.concatenate([value, prior[name]]), axis=0)
         is_constant = ranges <= 1e-12 * np.abs(value[0])
-        stderr[name] = plain(np.where(is_constant, 0.0, errors))
-    return {name: plain(value[0]) for name, value in values.items()}, stderr
+        stderr[name] = _number(np.where(is_constant, 0.0, errors))
+    return {name: _number(value[0]) for name, value in values.items()}, stderr
 
 
-def _delta_method(gradients: Floats, covariance: Floats) -> Floats:
+def delta_method(gradients: Floats, covariance: Floats) -> Floats:
     """Return standard errors of functions with gradients (..., d); inf, or NaN at a bound."""
     is_infinite = np.isinf(covariance)
     finite = np.where(is_infinite, 0.0, covariance)
@@ -416,7 +453,7 @@ def _delta_method(gradients: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.sqrt(np.where(is_at_bound, np.nan, variance)))
 
 
-def plain(value: Any) -> Any:
+def _number(value: Any) -> Any:
     """Return a float, or an array of several numbers."""
     return float(value) if np.ndim(value) == 0 else np.asarray(value)
 
@@ -450,7 +487,7 @@ def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
 def require_minimiser(optimum: Optimum, caller: str) -> Optimum:
     """Return an optimum without the prior, whose model has not changed since, or raise."""
     expected = identity_of(optimum.evaluator, prior_minimised=False)
-    require_same(optimum.identity, expected, caller)
+    require_same(optimum.search.identity, expected, caller)
     return optimum
 
 
@@ -462,7 +499,7 @@ def require_of_model(result: Any, model: pm.Model, caller: str, level: Level) ->
 def identity_in(result: Any) -> Identity | None:
     """Return the fingerprint in an Optimum, a DataTree or a Dataset; None without one."""
     if isinstance(result, Optimum):
-        return result.identity
+        return result.search.identity
     if isinstance(result, xr.Dataset):
         return from_attributes(result.attrs)
     if not isinstance(result, xr.DataTree):
@@ -472,45 +509,17 @@ def identity_in(result: Any) -> Identity | None:
 
 
 def optima_of(optimum: Optimum, evaluator: Evaluator) -> Floats:
-    """Return the optimum and its comparable rivals, (M, d), in the evaluator's order of elements.
+    """Return the optimum and comparable local optima, (M, d), in the evaluator's order of elements.
 
     The order may differ in a clone of the optimum's model.
     """
-    order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
-    rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
-    return np.array([optimum.theta, *rivals])[:, order]
+    names = optimum.evaluator.hyperparameters.names
+    order = [names.index(name) for name in evaluator.hyperparameters.names]
+    modes = [mode["theta"] for mode in optimum.local_optima if mode["comparable"]]
+    return np.array([optimum.theta, *modes])[:, order]
 
 
 # -- storage ---------------------------------------------------------------------------------------
-
-
-def _attributes(optimum: Optimum) -> dict[str, Any]:
-    search = optimum.search
-    return {
-        "discrepancy": optimum.discrepancy,
-        "converged": int(optimum.converged),
-        "prior": int(optimum.search.prior),
-        "message": optimum.message,
-        "stopped": search.stopped,
-        "n_evaluations": search.n_evaluations,
-        "n_screened": search.n_screened,
-        "n_responses": optimum.n_responses,
-        "seconds": search.seconds,
-        "findings": as_json(optimum.findings),
-        **versions(),
-        **as_attribute(optimum.model),
-        **as_attributes(optimum.identity),
-    }
-
-
-def _trace_dataset(optimum: Optimum) -> xr.Dataset:
-    trace = optimum.search.trace
-    variables = {
-        "theta": (["evaluation", "element"], trace["theta"]),
-        "discrepancy": ("evaluation", trace["discrepancy"]),
-        "evaluations": ("evaluation", trace["evaluations"]),
-    }
-    return xr.Dataset(variables, coords={"element": optimum.names})
 
 
 def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
@@ -533,11 +542,14 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
         "n_runs": n_runs,
     }
     for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
-        by_simulator[key] = [optimum.support.get(name, {}).get(key, np.nan) for name in names]
+        by_simulator[key] = [
+            optimum.search.support.get(name, {}).get(key, np.nan) for name in names
+        ]
     variables: dict[str, Any] = {key: ("simulator", v) for key, v in by_simulator.items()}
     variables["theta"] = ("element", optimum.theta)
     variables["covariance"] = (["element", "other_element"], optimum.covariance)
-    elements = {"element": optimum.names, "other_element": optimum.names}
+    names_of_elements = evaluator.hyperparameters.names
+    elements = {"element": names_of_elements, "other_element": names_of_elements}
     return xr.Dataset(variables, coords={"simulator": names, **elements})
 
 

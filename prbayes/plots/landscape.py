@@ -75,7 +75,7 @@ def plot_landscape(
     -------
     arviz.PlotCollection
         Its ``viz`` has the artists ``landscape`` (``landscape_lines``), ``path``, ``optimum`` and
-        ``rivals``.
+        ``local_optima``.
 
     Raises
     ------
@@ -142,10 +142,11 @@ def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
     evaluator = Evaluator.of(model)
     simulators = [node.name for node in evaluator.nodes or evaluator.measurements]
     expected = list(optimum.scales)
-    if evaluator.hyperparameters.names != optimum.names or simulators != expected:
+    names, expected_names = (e.hyperparameters.names for e in (evaluator, optimum.evaluator))
+    if names != expected_names or simulators != expected:
         raise ValueError(
-            f"model: got hyperparameters and simulators {evaluator.hyperparameters.names} and "
-            f"{simulators}, expected {optimum.names} and {expected}"
+            f"model: got hyperparameters and simulators {names} and "
+            f"{simulators}, expected {expected_names} and {expected}"
         )
     return evaluator
 
@@ -228,7 +229,7 @@ def _draw_marks(panel: Panel, path: Any, optimum: Floats, local_optima: Floats) 
     panel.points("optimum", optimum, VERMILION, marker=DIAMOND, size=90, legend="optimum")
     if local_optima.size:
         look: dict[str, Any] = {"marker": CROSS, "size": 70, "legend": "other optima"}
-        panel.points("rivals", local_optima, VERMILION, **look)
+        panel.points("local_optima", local_optima, VERMILION, **look)
 
 
 # -- the objective and its values on a grid --------------------------------------------------
@@ -294,8 +295,8 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     """Evaluate the objective on a grid of ``points`` along each of one or two hyperparameters."""
     center = free_elements(evaluator, optimum.theta[None])
     path = free_elements(evaluator, optimum.search.trace["theta"])
-    local_optima = np.array([rival["theta"] for rival in optimum.rivals])
-    rivals = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
+    local_optima = np.array([mode["theta"] for mode in optimum.local_optima])
+    modes = free_elements(evaluator, local_optima.reshape(-1, optimum.theta.size))
     prior = free_elements(evaluator, evaluator.hyperparameters.prior_thetas(1000, 0))
     errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
 
@@ -303,7 +304,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     for name in names:
         # The path beyond the prior's bulk, ten draws at each end, does not widen the axis.
         bulk = np.quantile(prior[name], (0.01, 0.99))
-        marked = np.append(np.clip(path[name], *bulk), rivals[name])
+        marked = np.append(np.clip(path[name], *bulk), modes[name])
         # Four standard errors: the normal approximation has a probability of 6e-5 beyond.
         reach = 4 * errors[name]
         if not 0 < reach < np.inf:  # unknown: an axis as wide as the prior
@@ -328,7 +329,7 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     heights = np.full(len(thetas), np.nan)
     heights[ok] = objective(optimum, evaluator, thetas[ok])
     heights[~np.isfinite(heights)] = np.nan
-    marks = [np.stack([x[name] for name in names], axis=-1) for x in (path, rivals, center)]
+    marks = [np.stack([x[name] for name in names], axis=-1) for x in (path, modes, center)]
     return Landscape(axes, heights.reshape(coordinates[0].shape), *marks)
 
 

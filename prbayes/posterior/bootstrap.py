@@ -126,7 +126,7 @@ def _specimen_estimates(
     """Return maximum-likelihood estimates, (draws, d), and whether they converged."""
     refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
     is_infinite = np.isinf(np.diag(optimum.covariance))
-    _require_identified(np.array(optimum.names)[is_infinite].tolist())
+    _require_identified(np.array(optimum.evaluator.hyperparameters.names)[is_infinite].tolist())
     if not parametric:
         return refits.reweighted(dirichlet_weights(refits.evaluator.emulated, draws, seed))
     thetas, converged, _ = zip(*refits.simulated(draws, seed), strict=True)

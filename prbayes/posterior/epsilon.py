@@ -108,12 +108,13 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         ratio = _variance_ratio([information[k] for k in group], epsilons[group])
         epsilons[group] *= ratio
     by_name = {node.name: float(value) for node, value in zip(nodes, epsilons, strict=True)}
-    return Epsilon(by_name, optimum.identity)
+    return Epsilon(by_name, optimum.search.identity)
 
 
 def _variance_ratio(information: list[Information], epsilon: Floats) -> float:
     """Return the ratio of variances of the minimiser with shared and with different specimens."""
-    if len(information) < 2 or any(i.node.metric.minimum is Minimum.UNKNOWN for i in information):
+    minima = [item.node.metric.minimum for item in information]
+    if len(minima) < 2 or Minimum.UNKNOWN in minima:
         return 1.0
     basis = local_sampling(information, epsilon).identified
     if not basis.shape[1]:
@@ -213,7 +214,7 @@ def _by_coverage(information: Information) -> float | None:
     z = np.random.default_rng(0).standard_normal((500, directions.shape[1]))
     thetas = 3.0 * (z @ directions.T)
     distances: Any = 0  # (n_sets, M)
-    for area in information.areas(*information.data_set):
+    for area in information.areas(information.data_sets):
         change = thetas @ area.slopes
         rows = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
         distances = distances + np.array(rows)

@@ -18,7 +18,8 @@ from prbayes.model.evaluator import Evaluator, n_design_runs
 from prbayes.model.locking import locked
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at
-from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
+from prbayes.optimize.minimize import find_optimum, require_finished
+from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior import smc
 from prbayes.posterior.importance import (

@@ -35,7 +35,8 @@ from prbayes.model.parameters import THETAS
 from prbayes.model.random_variable import log_kernel
 from prbayes.model.specimen_preparation import prepared
 from prbayes.optimize.design_refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
-from prbayes.optimize.minimize import Minimisation, find_optimum, require_finished
+from prbayes.optimize.minimize import find_optimum, require_finished
+from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
 from prbayes.posterior.importance import LogDensity
@@ -269,7 +270,7 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
     is_reusable = optimum.model is model and is_current(optimum.evaluator)
     evaluator = optimum.evaluator if is_reusable else Evaluator.of(model)
-    require_same(optimum.identity, identity_of(evaluator), f"{caller}: optimum")
+    require_same(optimum.search.identity, identity_of(evaluator), f"{caller}: optimum")
     return evaluator
 
 

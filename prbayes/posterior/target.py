@@ -117,10 +117,13 @@ def prior_conflicts(
     optimum: Optimum, evaluator: Evaluator, thetas: Floats, size: int = 4096
 ) -> tuple[Finding, ...]:
     """Report hyperparameters whose prior pulls the posterior thetas from the estimate."""
-    comparable = [rival["comparable"] for rival in optimum.rivals]
+    comparable = [mode["comparable"] for mode in optimum.local_optima]
     if optimum.search.prior or any(comparable):
         return ()
-    order = [optimum.names.index(name) for name in evaluator.hyperparameters.names]
+    order = [
+        optimum.evaluator.hyperparameters.names.index(name)
+        for name in evaluator.hyperparameters.names
+    ]
     covariance = optimum.covariance[np.ix_(order, order)]
     is_identified = np.isfinite(np.diag(covariance))
     if not is_identified.any():

@@ -283,9 +283,9 @@ def optima(m: Material) -> list[Section]:
         text = [ending]
         if label in m.live_optima:
             evaluator = m.live_optima[label].evaluator
-            for rival in m.live_optima[label].rivals:
-                place = labelled(evaluator, rival["point"], {}).data_vars
-                text.append(_other_optimum(rival, place, names))
+            for mode in m.live_optima[label].local_optima:
+                place = labelled(evaluator, mode["point"], {}).data_vars
+                text.append(_other_optimum(mode, place, names))
         text.append(
             "Standard errors are those of the curvature of the log-likelihood."
             if m.is_by_specimen
@@ -306,15 +306,15 @@ def _titled(title: str, label: str, results: Mapping[str, Any]) -> str:
     return title if len(results) == 1 else f"{title}: {label}"
 
 
-def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
+def _other_optimum(mode: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
     """Return a sentence on another optimum, by scalars alone if its elements are many."""
     elements = single_elements(point)
     shown = [name for name in names if name in elements]
     if len(shown) > 8:
         shown = [name for name in shown if name in point] or shown
     at = ", ".join(f"{name} = {number(elements[name])}" for name in shown)
-    discrepancy = number(float(rival["discrepancy"]))
-    if rival["comparable"]:
+    discrepancy = number(float(mode["discrepancy"]))
+    if mode["comparable"]:
         judged = "the data could as well come from there"
     else:
         judged = "the data fit it less well; a posterior gives its weight"

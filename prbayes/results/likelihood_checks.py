@@ -332,7 +332,7 @@ def _check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
     if not (optimum.converged and np.isfinite(optimum.covariance).all()):
         reason = "nothing is known of the sampling distribution of the optimum"
         return _not_tested(_CONFLICT, reason)
-    if any(rival["comparable"] for rival in optimum.rivals):
+    if any(mode["comparable"] for mode in optimum.local_optima):
         return _not_tested(_CONFLICT, "the likelihood has several modes")
     names = evaluator.hyperparameters.names
     mean = thetas.reshape(-1, evaluator.hyperparameters.size).mean(axis=0)

@@ -351,7 +351,9 @@ class JointNull(Null):
 
     def _u_values(self, case: Case) -> Floats:
         """Return u-values of the replicates, (r, n)."""
-        require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
+        require_same(
+            case.identity, self.optimum.search.identity, "JointNull: predicted", Level.OPTIMUM
+        )
         evaluator = self.optimum.evaluator
         sampling = self.optimum.sampling()
         bounds = evaluator.reweighted.values()

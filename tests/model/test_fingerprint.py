@@ -272,10 +272,10 @@ def calibrated() -> dict[str, float]:
 
 
 def test_results_have_an_identity(tmp_path: Path) -> None:
-    assert optimum().identity is not None
-    assert optimum().identity.prior_minimised is False
+    assert optimum().search.identity is not None
+    assert optimum().search.identity.prior_minimised is False
     tree = optimum().to_datatree()
-    assert from_attributes(tree["optimum"].attrs) == optimum().identity
+    assert from_attributes(tree["optimum"].attrs) == optimum().search.identity
     posterior().to_netcdf(tmp_path / "draws.nc", engine="h5netcdf")
     with xr.open_datatree(tmp_path / "draws.nc", engine="h5netcdf") as saved:
         found = from_attributes(saved["posterior"].attrs)
@@ -471,8 +471,8 @@ def test_the_prior_in_the_objective_and_a_changed_model_are_refused(use: str) ->
 
 def test_an_optimum_with_the_prior_is_described_as_such() -> None:
     assert with_prior().search.prior
-    assert with_prior().identity is not None
-    assert with_prior().identity.prior_minimised
+    assert with_prior().search.identity is not None
+    assert with_prior().search.identity.prior_minimised
     prb.compare({"without": optimum(), "with": with_prior()}, model=base())
     prb.diagnose(with_prior(), model=base())
     sections = report(optimum=with_prior()).sections

@@ -1,5 +1,8 @@
 """Where designs are refined: thetas around an optimum."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pymc as pm
 import pytest
@@ -10,20 +13,34 @@ from prbayes.inference.asymptotics import Local
 from prbayes.inference.design_error import DesignErrors
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.optimize.design_refinement import (
+    neighbourhood,
     pilot,
     refuse,
     runs_left,
-    spread_along,
-    spread_around,
 )
 from prbayes.propagation.base import DesignError
 
 PRIOR_SD = np.array([2.0, 0.5])
 
 
+def nearby(local: Local | None, covariance: Any, ridge: Any = None) -> Any:
+    """Return thetas around a fit at (1, -1) with a sampling distribution."""
+    hyperparameters = SimpleNamespace(prior_sd=PRIOR_SD, in_support=lambda t: np.ones(len(t), bool))
+    evaluator: Any = SimpleNamespace(hyperparameters=hyperparameters, reweighted={})
+    sampling = None if local is None else SimpleNamespace(local=local)
+    fit: Any = SimpleNamespace(
+        theta=np.array([1.0, -1.0]),
+        sampling=sampling,
+        covariance=covariance,
+        ridge=ridge,
+        pilot=None,
+    )
+    return neighbourhood(evaluator, fit, 0)
+
+
 def test_thetas_have_the_covariance_of_the_optimum() -> None:
     covariance = np.array([[0.04, 0.006], [0.006, 0.0025]])
-    thetas = spread_around(np.array([1.0, -1.0]), covariance, PRIOR_SD)
+    thetas = nearby(None, covariance)
     assert thetas.shape == (256, 2)
     # 256 normal draws: variances to 9%, means to a sixteenth of a standard deviation; 4.5 of them.
     np.testing.assert_allclose(np.diag(np.cov(thetas.T)), np.diag(covariance), rtol=0.4)
@@ -33,15 +50,14 @@ def test_thetas_have_the_covariance_of_the_optimum() -> None:
 
 @pytest.mark.parametrize("unknown", [np.nan, np.inf, 1e6])
 def test_thetas_are_no_wider_than_the_prior(unknown: float) -> None:
-    covariance = np.diag([unknown, 0.0025])
-    sd = spread_around(np.zeros(2), covariance, PRIOR_SD).std(axis=0)
+    sd = nearby(None, np.diag([unknown, 0.0025])).std(axis=0)
     np.testing.assert_allclose(sd, [2.0, 0.05], rtol=0.2)
 
 
 def test_thetas_lie_along_what_the_data_identify() -> None:
     across, along = np.array([[0.6], [0.8]]), np.array([[0.8], [-0.6]])
     local = Local(PRIOR_SD, along, across, np.array([[0.01]]))
-    shifts = (spread_along(np.array([1.0, -1.0]), local) - [1.0, -1.0]) / PRIOR_SD
+    shifts = (nearby(local, local.in_theta, ridge=True) - [1.0, -1.0]) / PRIOR_SD
     np.testing.assert_allclose(shifts @ across, 0.0, atol=1e-12)
     # 256 normal draws: a standard deviation to 4.4%, four of them.
     assert (shifts @ along).std() == pytest.approx(0.1, rel=0.18)

@@ -18,14 +18,13 @@ from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_minimisers import descend
 from prbayes.optimize.design_refinement import refine_at
 from prbayes.optimize.local_optima import (
+    LocalOptimum,
     Reference,
-    Rival,
     are_connected,
     has_barrier,
     mirror_optimum,
-    polished_rivals,
-    rivals_from_prior,
-    verified_rivals,
+    optima_from_prior,
+    verified_optima,
 )
 from prbayes.optimize.objective import Ridge
 from prbayes.propagation.reweighted import designs_restored
@@ -67,30 +66,30 @@ def posterior(name: str) -> xr.DataTree:
 @pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
 def test_both_optima_are_found(name: str) -> None:
     optimum = fit(name)
-    comparable = [r for r in optimum.rivals if r["comparable"]]
+    comparable = [r for r in optimum.local_optima if r["comparable"]]
     assert len(comparable) == 1
-    (rival,) = comparable
+    (other,) = comparable
     # The design is not quite symmetric: a tenth of a standard error.
-    assert abs(optimum.point["mu"] + rival["point"]["mu"] - 2) < optimum.stderr["mu"]
+    assert abs(optimum.point["mu"] + other["point"]["mu"] - 2) < optimum.stderr["mu"]
     assert abs(abs(optimum.point["mu"] - 1) - 1) < 4 * optimum.stderr["mu"]
-    assert abs(np.log(optimum.point["sigma"] / rival["point"]["sigma"])) < 0.1
-    np.testing.assert_allclose(rival["discrepancy"], optimum.discrepancy, rtol=0.05)
+    assert abs(np.log(optimum.point["sigma"] / other["point"]["sigma"])) < 0.1
+    np.testing.assert_allclose(other["discrepancy"], optimum.discrepancy, rtol=0.05)
     evaluator = Evaluator.of(optimum.model)
-    assert evaluator(rival["theta"][None]).discrepancies[0, 0] == pytest.approx(
-        rival["discrepancy"]
+    assert evaluator(other["theta"][None]).discrepancies[0, 0] == pytest.approx(
+        other["discrepancy"]
     )
     (finding,) = optimum.findings
     assert "The data could as well come from mu = " in finding.text
-    assert f"{rival['point']['mu']:.3f}"[:4] in finding.text
+    assert f"{other['point']['mu']:.3f}"[:4] in finding.text
 
 
-def test_rivals_are_minima() -> None:
+def test_local_optima_are_minima() -> None:
     optimum = fit("pr")
     evaluator = Evaluator.of(optimum.model)
-    for theta in (optimum.theta, *(r["theta"] for r in optimum.rivals if r["comparable"])):
+    for theta in (optimum.theta, *(r["theta"] for r in optimum.local_optima if r["comparable"])):
         around = theta + 0.05 * np.vstack([np.eye(2), -np.eye(2)])
         assert (evaluator(around).discrepancies > evaluator(theta[None]).discrepancies).all()
-    values = [r["discrepancy"] for r in optimum.rivals]
+    values = [r["discrepancy"] for r in optimum.local_optima]
     assert values == sorted(values)
 
 
@@ -103,13 +102,13 @@ def test_warnings_are_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_starts() -> None:
     none = prb.minimize(mirrored(METRICS["pr"]), starts=0)
-    assert none.rivals == none.findings == ()
+    assert none.local_optima == none.findings == ()
     np.testing.assert_allclose(none.theta, fit("pr").theta)
     # Each theta costs responses: looked for only if asked.
     propagation = prb.Resimulated(128)
-    assert prb.minimize(mirrored(METRICS["pr"], propagation=propagation)).rivals == ()
+    assert prb.minimize(mirrored(METRICS["pr"], propagation=propagation)).local_optima == ()
     asked = prb.minimize(mirrored(METRICS["pr"], propagation=propagation), starts=8)
-    assert any(r["comparable"] for r in asked.rivals)
+    assert any(r["comparable"] for r in asked.local_optima)
     assert asked.n_responses > 8 * 128
 
 
@@ -118,7 +117,7 @@ def test_a_prior_that_excludes_one_leaves_one() -> None:
         x = pm.Normal.dist(pm.LogNormal("excess", 0, 0.5) + 1, pm.HalfNormal("sigma", 1))
         prb.Simulator("y", parabola, x, metric=METRICS["pr"], observed=DATA, propagation=R256)
     optimum = prb.minimize(model)
-    assert not [r for r in optimum.rivals if r["comparable"]]
+    assert not [r for r in optimum.local_optima if r["comparable"]]
     assert optimum.findings == ()
     assert abs(optimum.point["excess"] - 1) < 4 * optimum.stderr["excess"]
 
@@ -138,14 +137,14 @@ def test_a_worse_optimum_is_left_for_the_better_one() -> None:
     assert abs(found.point["mu"] - 4) < 0.2
     assert found.discrepancy < stuck.discrepancy - 0.1
     # What was the first one is now among the others, and said to be worse.
-    (other,) = found.rivals
+    (other,) = found.local_optima
     assert abs(other["point"]["mu"] + 2) < 0.2
     assert not other["comparable"]
     assert found.findings == ()
 
 
 @pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), "area"])
-def test_a_linear_problem_has_no_rivals(name: str) -> None:
+def test_a_linear_problem_has_no_other_optimum(name: str) -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         prb.Simulator(
@@ -157,7 +156,7 @@ def test_a_linear_problem_has_no_rivals(name: str) -> None:
             propagation=R256,
         )
     optimum = prb.minimize(model)
-    assert optimum.rivals == ()
+    assert optimum.local_optima == ()
     assert optimum.findings == ()
 
 
@@ -166,11 +165,11 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
     evaluator = Evaluator.of(optimum.model)
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
     best = Reference(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
-    assert rivals_from_prior(best, starts=16, seed=0)
-    assert rivals_from_prior(replace(best, noise=1e3), starts=16, seed=0) == []
+    assert optima_from_prior(best, 16, 0)
+    assert optima_from_prior(replace(best, noise=1e3), 16, 0) == []
     # Nor is there one where a search that is held cannot go.
     ridge = Ridge(optimum.theta, np.eye(2), 1e3)
-    assert rivals_from_prior(replace(best, ridge=ridge), starts=16, seed=0) == []
+    assert optima_from_prior(replace(best, ridge=ridge), 16, 0) == []
 
 
 # -- the posterior of two modes
@@ -194,13 +193,13 @@ def test_each_mode_has_the_width_of_its_estimate(name: str) -> None:
 # ------------------------------------------------------------------------------------
 
 
-def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
+def test_a_hyperparameter_without_effect_is_named_and_makes_no_optima() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
         pm.Normal("idle", 3, 2)
         prb.Simulator("y", same, x, metric=METRICS["pr"], observed=OBSERVED, propagation=R256)
     optimum = prb.minimize(model)
-    assert optimum.rivals == ()
+    assert optimum.local_optima == ()
     (finding,) = optimum.findings
     line = str(finding)
     assert "about idle (" in line
@@ -208,13 +207,13 @@ def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
     assert line.endswith("; see docs/optimum_or_abc.md#no-answer.")
 
 
-def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> None:
+def test_local_optima_are_at_the_optimum_along_unidentified_directions() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), 0.5)
         pm.Normal("idle", 3, 2)
         prb.Simulator("y", parabola, x, metric=METRICS["pr"], observed=DATA, propagation=R256)
     optimum = prb.minimize(model)
-    comparable = [r for r in optimum.rivals if r["comparable"]]
+    comparable = [r for r in optimum.local_optima if r["comparable"]]
     assert len(comparable) == 1
     assert comparable[0]["point"]["idle"] == pytest.approx(optimum.point["idle"], abs=1e-6)
     assert len(optimum.findings) == 2
@@ -239,8 +238,8 @@ def test_one_output_of_many_excludes_a_mirror(slope: float, comparable: bool) ->
                 propagation=prb.Reweighted(128),
             )  # fmt: skip
     optimum = prb.minimize(model)
-    assert optimum.rivals
-    assert any(rival["comparable"] for rival in optimum.rivals) == comparable
+    assert optimum.local_optima
+    assert any(other["comparable"] for other in optimum.local_optima) == comparable
     assert ("second-mode" in {f.code for f in optimum.findings}) == comparable
 
 
@@ -274,9 +273,9 @@ def followed(starts: int) -> prb.Optimum:
 
 def test_a_mirror_far_from_the_points_is_found_and_both_are_supported() -> None:
     optimum = followed(16)
-    (rival,) = [r for r in optimum.rivals if r["comparable"]]
-    assert optimum.point["mu"] + rival["point"]["mu"] == pytest.approx(2, abs=0.1)
-    thetas = np.stack([optimum.theta, rival["theta"]])
+    (other,) = [r for r in optimum.local_optima if r["comparable"]]
+    assert optimum.point["mu"] + other["point"]["mu"] == pytest.approx(2, abs=0.1)
+    thetas = np.stack([optimum.theta, other["theta"]])
     for theta in thetas:
         assert not shortcomings(optimum.evaluator, theta[None])
 
@@ -313,14 +312,14 @@ def test_clouds_that_reach_a_mirror_reach_the_best_optimum_as_well() -> None:
     best = around(0)
     there = best.theta.copy()
     there[0] = 2 - there[0]
-    far = Rival(there, 0.0, comparable=True, better=False)
+    far = LocalOptimum(there, 0.0, comparable=True, better=False)
 
     def at_the_best() -> float:
         return float(best.evaluator.support(best.theta[None])["y"]["weight_ess"][0])
 
     bound = best.evaluator.reweighted["y"]
     with designs_restored([bound]):
-        (found,) = verified_rivals(best, [far])
+        (found,) = verified_optima(best, [far])
         beside = at_the_best()
     assert found.theta[0] == pytest.approx(there[0], abs=0.05)
     with designs_restored([bound]):
@@ -342,7 +341,9 @@ def test_what_is_worse_by_more_than_the_noise_is_no_mirror_image() -> None:
 
 def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
     assert mirror_optimum(around(0), followed(0).theta + 0.02) is None
-    assert polished_rivals(around(0), followed(0).theta[None] + 0.02) == []
+    best = around(0)
+    ends, values = best.polish(best.theta[None] + 0.02)
+    assert best.separated(ends, values, float(best(best.theta[None])[0])) == []
 
 
 @dataclass(frozen=True)
@@ -401,4 +402,4 @@ def test_where_a_descent_was_stopped_in_a_valley_is_no_optimum(
     best = Reference(evaluator, np.ones(2), np.ones(1), local, noise=0.01)
     short = partial(descend, max_iterations=iterations)
     monkeypatch.setattr("prbayes.optimize.local_optima.descend", short)
-    assert rivals_from_prior(best, starts=16, seed=0) == []
+    assert optima_from_prior(best, 16, 0) == []

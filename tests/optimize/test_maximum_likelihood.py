@@ -76,7 +76,7 @@ def test_standard_errors_are_those_of_the_fisher_information() -> None:
     exact = N * (np.log(3 * X.std() * np.sqrt(2 * np.pi)) + 0.5)
     assert optimum.discrepancy == pytest.approx(exact, abs=0.1)
     assert optimum.discrepancies == pytest.approx({"y": optimum.discrepancy})
-    assert optimum.rivals == ()
+    assert optimum.local_optima == ()
 
 
 def test_the_mode_with_the_prior() -> None:
@@ -94,7 +94,7 @@ def test_a_folded_response_has_two_modes(codes: list[str]) -> None:
     optimum = fit(folded_model())
     assert codes == ["second-mode"]
     assert "of the posterior's mass" in optimum.findings[0].text
-    (rival,) = optimum.rivals
+    (rival,) = optimum.local_optima
     assert rival["point"]["mu"] == pytest.approx(-optimum.point["mu"], abs=1e-3)
     assert rival["point"]["sigma"] == pytest.approx(optimum.point["sigma"], abs=1e-3)
     # The roots of each specimen are weighted by masses that are right to .01.
@@ -107,7 +107,7 @@ def test_a_start_selects_the_mode(codes: list[str]) -> None:
     for sign in (-1, 1):
         optimum = fit(model, start={"mu": 0.7 * sign, "sigma": 0.4})
         assert np.sign(optimum.point["mu"]) == sign
-        assert optimum.rivals == ()
+        assert optimum.local_optima == ()
     assert codes == []
 
 
@@ -165,7 +165,7 @@ def test_a_ridge_of_four_hyperparameters_is_one_mode(codes: list[str]) -> None:
         prb.Simulator("y", line, x, observed=line(X))
     optimum = fit(model)
     assert codes == ["not-identified"]
-    assert optimum.rivals == ()
+    assert optimum.local_optima == ()
 
 
 def mode(value: float, variance: Any) -> LocalOptimum:

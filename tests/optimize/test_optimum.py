@@ -16,8 +16,7 @@ from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator
 from prbayes.optimize.convergence import apart_from_data
 from prbayes.optimize.optimum import (
-    _delta_method,
-    plain,
+    delta_method,
     point_and_stderr,
     require_refits,
     require_sampling,
@@ -39,17 +38,12 @@ def test_something_else_than_an_optimum_is_refused() -> None:
         require_refits({}, "JointNull", "")
 
 
-def test_one_number_is_a_float() -> None:
-    assert type(plain(1)) is float
-    assert plain([1, 2]).shape == (2,)
-
-
 SCRIPT = """
 import pickle, sys
 import prbayes as prb
 optimum = pickle.loads(open(sys.argv[1], "rb").read())
 print(repr(optimum.discrepancy), repr(optimum.point["mu"]), repr(optimum.stderr["mu"]))
-print(repr(prb.calibrate_epsilon(optimum)["y"]), optimum.model is optimum.evaluator.model)
+print(repr(prb.calibrate_epsilon(optimum)["y"]), optimum.model is optimum.model)
 tree = prb.sample_smc(50, chains=1, model=optimum.model, optimum=optimum, progressbar=False)
 print(repr(float(tree["posterior"]["mu"].mean())))
 """
@@ -121,20 +115,18 @@ COVARIANCE = np.array([[4.0, 1.0], [1.0, 9.0]])
 
 def test_standard_errors_of_sums_and_differences_know_the_correlation() -> None:
     gradients = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, -1.0], [0.0, 0.0]])
-    np.testing.assert_allclose(
-        _delta_method(gradients, COVARIANCE), np.sqrt([4.0, 15.0, 11.0, 0.0])
-    )
+    np.testing.assert_allclose(delta_method(gradients, COVARIANCE), np.sqrt([4.0, 15.0, 11.0, 0.0]))
 
 
 def test_what_depends_on_an_element_that_is_not_identified_is_infinite() -> None:
     covariance = np.array([[4.0, np.inf], [np.inf, np.inf]])
-    found = _delta_method(np.array([[2.0, 0.0], [0.0, 1.0], [0.0, 0.0]]), covariance)
+    found = delta_method(np.array([[2.0, 0.0], [0.0, 1.0], [0.0, 0.0]]), covariance)
     np.testing.assert_array_equal(found[1:], [np.inf, np.nan])  # at a bound nothing is known
     assert found[0] == 4.0  # of the other element alone
 
 
 def test_nothing_known_is_nan() -> None:
-    assert np.isnan(_delta_method(np.ones((1, 2)), np.full((2, 2), np.nan))).all()
+    assert np.isnan(delta_method(np.ones((1, 2)), np.full((2, 2), np.nan))).all()
 
 
 def _factor() -> Evaluator:

@@ -63,9 +63,9 @@ def test_a_curve_over_one_hyperparameter(
 
 def test_other_optima_are_marked(read: SimpleNamespace) -> None:
     optimum = prb.minimize(_one())
-    rivals = ({"theta": -optimum.theta, "point": {}, "discrepancy": 1.0, "comparable": True},)
-    pc = prb.plot_landscape(replace(optimum, rivals=rivals), points=21)
-    np.testing.assert_allclose(read.xy(pc, "rivals", "landscape")[0], -optimum.theta)
+    modes = ({"theta": -optimum.theta, "point": {}, "discrepancy": 1.0, "comparable": True},)
+    pc = prb.plot_landscape(replace(optimum, local_optima=modes), points=21)
+    np.testing.assert_allclose(read.xy(pc, "local_optima", "landscape")[0], -optimum.theta)
     path = read.xy(pc, "asked", "landscape")[0]
     largest = np.abs(optimum.search.trace["theta"]).max()
     np.testing.assert_allclose(np.abs(path).max(), largest)

@@ -76,7 +76,7 @@ def test_the_tree_of_an_optimum() -> None:
     second = calibration["discrepancy"].sel(simulator="second")
     assert float(second) == best.discrepancies["second"]
     assert float(calibration["scale"].sel(simulator="first")) == 0.02
-    for name, support in best.support.items():
+    for name, support in best.search.support.items():
         for key, value in support.items():
             assert float(calibration[key].sel(simulator=name)) == value
     assert tree["trace"].sizes["evaluation"] == best.search.n_evaluations

@@ -17,8 +17,7 @@ from prbayes.inference.resampling import aligned
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import identity_of
 from prbayes.optimize.design_refinement import (
-    _enlarge_samples,
-    _redraw_samples,
+    draw_samples,
     grow,
     refine_at,
 )
@@ -349,9 +348,9 @@ def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
     evaluator = Evaluator.of(model)
     assert aligned(evaluator.nodes)
     far = THETA + np.array([0.5, -1.5, 0.5, -1.5])
-    _redraw_samples(evaluator, far, {"one"})
+    draw_samples(evaluator, far, {"one"})
     assert aligned(evaluator.nodes)
-    _enlarge_samples(evaluator, far, {"two"})
+    draw_samples(evaluator, far, {"two"}, larger=True)
     assert aligned(evaluator.nodes)
     assert {d.n_points for d in evaluator.reweighted.values()} == {2 * SIZES.first}
 

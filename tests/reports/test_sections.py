@@ -253,14 +253,14 @@ def test_what_sets_the_width_of_the_draws(
 
 
 def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
-    rivals = tuple(
+    others = tuple(
         {"point": {"mu": mu, "w": np.ones(2)}, "discrepancy": 0.25, "comparable": comparable}
         for mu, comparable in ((-1.5, True), (3.0, False))
     )
     search = dataclasses.replace(
         calibrated.optimum.search, result=Result.FAILED, details="It stopped."
     )
-    optimum = dataclasses.replace(calibrated.optimum, rivals=rivals, search=search)
+    optimum = dataclasses.replace(calibrated.optimum, local_optima=others, search=search)
     text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
     assert text[0].startswith("The optimiser did not converge after ")
     assert text[0].endswith("of the objective: The minimiser failed. It stopped.")
@@ -274,7 +274,7 @@ def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
     )
     vector = ({"point": {"w": np.array([1.0, 2.0])}, "discrepancy": 0.25, "comparable": True},)
     of_it = {"w": np.array([3.0, 4.0])}
-    optimum = dataclasses.replace(optimum, rivals=vector, point=of_it, stderr=of_it)
+    optimum = dataclasses.replace(optimum, local_optima=vector, point=of_it, stderr=of_it)
     text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
     assert "is at w[0] = 1.000, w[1] = 2.000, with" in text[1]
 
@@ -283,8 +283,8 @@ def test_a_place_of_many_elements_is_told_by_scalars_alone() -> None:
     for size, told in ((7, "mu = 2.000, w[0]"), (8, "mu = 2.000, with")):
         point = {"mu": 2.0, "w": np.ones(size)}
         names = ["mu", *(f"w[{i}]" for i in range(size))]
-        rival = {"discrepancy": 0.1, "comparable": False}
-        assert f"is at {told}" in _other_optimum(rival, point, names)
+        mode = {"discrepancy": 0.1, "comparable": False}
+        assert f"is at {told}" in _other_optimum(mode, point, names)
 
 
 def test_of_a_covariance_standard_deviations_and_correlations_are_read(
@@ -299,8 +299,10 @@ def test_of_a_covariance_standard_deviations_and_correlations_are_read(
     }
     stderr = {name: 0.1 * np.ones(np.shape(value)) for name, value in point.items()}
     stderr["chol_corr"] = np.array([[0.0, 0.1], [0.1, 0.0]])
-    rival = {"point": {**point, "mu": 7.0}, "discrepancy": 0.25, "comparable": True}
-    optimum = dataclasses.replace(calibrated.optimum, point=point, stderr=stderr, rivals=(rival,))
+    mode = {"point": {**point, "mu": 7.0}, "discrepancy": 0.25, "comparable": True}
+    optimum = dataclasses.replace(
+        calibrated.optimum, point=point, stderr=stderr, local_optima=(mode,)
+    )
     found = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum")
     assert [row[0] for row in cells(found.table).rows] == read
     assert "is at mu = 7.000, chol_corr[0,1] = 0.3000, chol_stds[0] = 0.5000, chol" in found.text[1]

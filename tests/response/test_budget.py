@@ -129,7 +129,7 @@ def test_with_stored_responses_the_best_so_far_is_complete() -> None:
     assert optimum.search.stopped == "max_runs = 10 was reached"
     assert not optimum.converged
     assert optimum.discrepancy == pytest.approx(optimum.discrepancies["y"])
-    assert optimum.support["y"]["weight_ess"] > 1
+    assert optimum.search.support["y"]["weight_ess"] > 1
     assert node.bound.n_points == 16
 
 

@@ -269,7 +269,7 @@ def test_an_answer_of_few_specimens_is_refused(propagation: Any) -> None:
 def test_specimens_without_response_are_reported(propagation: Any) -> None:
     model = one_mean(propagation, lambda x: np.where(x > 2.1, np.nan, x))
     best = prb.minimize(model, **QUIET)
-    share = best.support["y"]["lost_mass"]
+    share = best.search.support["y"]["lost_mass"]
     assert 0.001 < share < 0.05
     text = f"y: {share:.1%} of specimens have no response (NaN) and are left out"
     assert text in repr(best)
@@ -351,7 +351,7 @@ def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:
     assert failures.sizes["failure"] > 0
     assert (failures["inputs"].values > 2.0).all()
     assert set(failures["reason"].values) == {"it raised OSError: license server"}
-    share = best.support["y"]["failed_mass"]
+    share = best.search.support["y"]["failed_mass"]
     assert 0 < share < 0.2
     assert f"y: {share:.1%} of specimens fail" in repr(best)
     tree = prb.sample_smc(20, chains=1, model=model, adjustment=None, **QUIET)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,8 @@ from prbayes._validate import Floats
 from prbayes.inference.asymptotics import (
     Local,
     named_direction,
-    one_dimensional,
+    number_parts,
     unidentified_directions,
-    without,
 )
 from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.parameters import THETAS
@@ -30,7 +29,12 @@ def unidentified_findings(
     evaluator: Evaluator, local: Local, excluded: Collection[str] = ()
 ) -> list[Finding]:
     """Report directions that the data identify less than the prior, without excluded names."""
-    hidden = without(local.unidentified, only_through_prior(evaluator))
+    hidden = local.unidentified
+    indirect = only_through_prior(evaluator)
+    if indirect.any():
+        # One, or zero up to rounding for elements on which nothing depends.
+        axes, strength, _ = np.linalg.svd(hidden * ~indirect[:, None], full_matrices=False)
+        hidden = np.asarray(axes[:, strength > 0.5])
     directions = unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
     return [
         Finding(
@@ -60,15 +64,13 @@ def confounding_findings(evaluator: Evaluator, local: Local) -> list[Finding]:
         reason = mixed_directions(local, coefficients, inputs, names)
         reason = reason or correlated_estimates(local, coefficients, inputs, names)
         if reason:
-            findings.append(
-                Finding(
-                    "discrepancy-confounded",
-                    f"{node.name}: the data do not tell the model inadequacy from the inputs: "
-                    f"{reason}; measure under more conditions, state narrower priors, or leave one "
-                    "of them out.",
-                    "inadequacy.md#can-it-be-separated-from-the-scatter-of-the-inputs",
-                )
+            text = (
+                f"{node.name}: the data do not tell the model inadequacy from the inputs: "
+                f"{reason}; measure under more conditions, state narrower priors, or leave one of "
+                "them out."
             )
+            page = "inadequacy.md#can-it-be-separated-from-the-scatter-of-the-inputs"
+            findings.append(Finding("discrepancy-confounded", text, page))
     return findings
 
 
@@ -128,51 +130,37 @@ def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[IntArray, IntA
     """Return the elements of theta above the coefficients only, and above other inputs only."""
     if not has_discrepancy(node.bound.responses.function):
         return np.arange(0), np.arange(0)
-    inputs = node.bound.inputs
+    inputs, model = node.bound.inputs, evaluator.model
     *arguments, coefficients = range(len(inputs.arguments))
-    above_coefficients = _elements_above(evaluator, node, [coefficients])
-    above_inputs = _elements_above(evaluator, node, arguments)
-    return (
-        np.setdiff1d(above_coefficients, above_inputs),
-        np.setdiff1d(above_inputs, above_coefficients),
-    )
-
-
-def _elements_above(evaluator: Evaluator, node: Node, arguments: Iterable[int]) -> IntArray:
-    """Return the elements of theta in the roots above some arguments of a response."""
-    names = {rv.name for rv in node.bound.inputs.roots_above(list(arguments))}
-    model = evaluator.model
-    is_above: list[bool] = []
-    shapes = evaluator.hyperparameters.shapes.values()
-    for value, shape in zip(model.value_vars, shapes, strict=True):
-        size = int(np.prod(shape, dtype=int))
-        is_above += [model.values_to_rvs[value].name in names] * size
-    return np.flatnonzero(is_above)
+    above = []
+    for numbers in ([coefficients], arguments):
+        names = {rv.name for rv in inputs.roots_above(numbers)}
+        is_above: list[bool] = []
+        shapes = evaluator.hyperparameters.shapes.values()
+        for value, shape in zip(model.value_vars, shapes, strict=True):
+            size = int(np.prod(shape, dtype=int))
+            is_above += [model.values_to_rvs[value].name in names] * size
+        above.append(np.flatnonzero(is_above))
+    return np.setdiff1d(above[0], above[1]), np.setdiff1d(above[1], above[0])
 
 
 def breakdown_findings(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[Finding]:
     """Report elements at an edge and simulators at a jump, without a sampling distribution."""
     findings = []
     if at_edge:
-        findings.append(
-            Finding(
-                "flat-edge",
-                f"{', '.join(at_edge)} ran to the edge of the support, where the discrepancy no "
-                "longer changes; perhaps the population has collapsed within the bandwidth of the "
-                "metric: use a smaller bandwidth, or prb.AreaMetric(), which has none.",
-                "choosing_metric.md#advice",
-            )
+        text = (
+            f"{', '.join(at_edge)} ran to the edge of the support, where the discrepancy no longer "
+            "changes; perhaps the population has collapsed within the bandwidth of the metric: use "
+            "a smaller bandwidth, or prb.AreaMetric(), which has none."
         )
+        findings.append(Finding("flat-edge", text, "choosing_metric.md#advice"))
     if at_jump:
-        findings.append(
-            Finding(
-                "jump-at-optimum",
-                f"{', '.join(at_jump)}: points lose their response at the optimum, and the "
-                "discrepancy jumps there by more than it changes otherwise: use prb.AreaMetric(), "
-                "prb.Reweighted(), or more responses.",
-                "choose.md#the-propagation",
-            )
+        text = (
+            f"{', '.join(at_jump)}: points lose their response at the optimum, and the discrepancy "
+            "jumps there by more than it changes otherwise: use prb.AreaMetric(), "
+            "prb.Reweighted(), or more responses."
         )
+        findings.append(Finding("jump-at-optimum", text, "choose.md#the-propagation"))
     return findings
 
 
@@ -193,12 +181,10 @@ def elements_at_edge(
 ) -> tuple[str, ...]:
     """Return the elements that ran to an edge: the population changes, but not its discrepancy.
 
-    So far out that the population is one number, to the last digit, it no longer changes either:
-    then the last point on the way back with the same discrepancy counts. Standard errors are no
-    sign: curvature and noise are both rounding errors at an edge. The way back to the middle of the
-    prior changes the discrepancy, unlike that of a hyperparameter without effect. At the bound of a
-    prior the population itself is constant: that is a minimum under a constraint. ``size`` is the
-    typical size of the objective. The minimiser stops at a relative change below ``tolerance``.
+    The way back to the middle of the prior changes the discrepancy, unlike that of a hyperparameter
+    without effect. At the bound of a prior the population itself is constant: that is a minimum
+    under a constraint. ``size`` is the typical size of the objective. The minimiser stops at a
+    relative change below ``tolerance``.
     """
     hyperparameters = evaluator.hyperparameters
     shift = theta - np.median(hyperparameters.prior_thetas(THETAS, seed), axis=0)
@@ -218,27 +204,19 @@ def elements_at_edge(
     for i in np.flatnonzero((changes_further < unchanged) & (changes_back > unchanged)):
         differs = _populations_differ(evaluator, theta, further[i])
         if not differs:
-            last = _last_unchanged(evaluator, theta, back[i], scales, unchanged)
+            # So far out the population is one number, to the last digit: it counts from the last
+            # point on the way back with the same discrepancy, to a tenth of a spread.
+            low, high = 0.0, 1.0
+            for _ in range(10):
+                half = (low + high) / 2
+                point = theta + half * (back[i] - theta)
+                (value,) = evaluator.total(point[None], scales)
+                low, high = (half, high) if abs(value - center) < unchanged else (low, half)
+            last = theta + low * (back[i] - theta)
             differs = _populations_differ(evaluator, last, last + further[i] - theta)
         if differs:
             at_edge.append(hyperparameters.readable_names[far[i]])
     return tuple(at_edge)
-
-
-def _last_unchanged(
-    evaluator: Evaluator, theta: Floats, back: Floats, scales: Floats, unchanged: float
-) -> Floats:
-    """Return the last point on a straight way where the objective is that at its beginning."""
-    (start,) = evaluator.total(theta[None], scales)
-    low, high = 0.0, 1.0
-    for _ in range(10):  # to a tenth of a spread of an optimum that is a hundred spreads out
-        half = (low + high) / 2
-        (value,) = evaluator.total((theta + half * (back - theta))[None], scales)
-        if abs(value - start) < unchanged:
-            low = half
-        else:
-            high = half
-    return theta + low * (back - theta)
 
 
 def _populations_differ(evaluator: Evaluator, a: Floats, b: Floats) -> bool:
@@ -250,7 +228,8 @@ def _populations_differ(evaluator: Evaluator, a: Floats, b: Floats) -> bool:
     largest = 0.0
     for k, node in enumerate(evaluator.nodes):
         values, weights = evaluator.populations(np.array([a, b]), k)
-        for projection in one_dimensional(node.target, values):
+        for part in number_parts(node.target):
+            projection = part.of(values)
             occurring = np.unique(projection[np.isfinite(projection)])
             below = distribution_function(projection, weights, occurring)
             largest = max(largest, float(np.abs(below[0] - below[1]).max(initial=0.0)))

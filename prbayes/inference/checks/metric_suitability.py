@@ -12,12 +12,14 @@ import numpy as np
 from prbayes._finding import Finding
 from prbayes._stats import quantile
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local, number_parts, one_dimensional
+from prbayes.inference.asymptotics import Local, number_parts
 from prbayes.inference.resampling import dependent
 from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import hessian_of, slopes, stencil
+
+_ADVICE = "choosing_metric.md#advice"
 
 
 def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
@@ -27,22 +29,19 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
         if node.metric.minimum is not Minimum.ABSOLUTE or not node.bound.stored:
             continue
         values, weights = evaluator.populations(theta[None], k)
-        projections = one_dimensional(node.target, values[0])
-        index = min(_tail_index(projection, weights[0]) for projection in projections)
+        parts = number_parts(node.target)
+        index = min(_tail_index(part.of(values[0]), weights[0]) for part in parts)
         # At 1024 quantiles of a half-Cauchy population 1.0, of Student's t with 1.5 degrees of
         # freedom 1.5, of a lognormal one with a spread of 2.5 1.1.
         if index < 1.1:
-            findings.append(
-                Finding(
-                    "heavy-tail",
-                    f"{node.name}: the tail of the simulated responses is so long (tail index "
-                    f"{index:.2f}, of which one or less has no mean) that the area between "
-                    "distribution functions is infinite, or rests on responses beyond all that "
-                    "were computed: use prb.ProbabilityResidual() or prb.KullbackLeibler(), inputs "
-                    "with a mean, or the logarithm of the response.",
-                    "choosing_metric.md#advice",
-                )
+            text = (
+                f"{node.name}: the tail of the simulated responses is so long (tail index "
+                f"{index:.2f}, of which one or less has no mean) that the area between "
+                "distribution functions is infinite, or rests on responses beyond all that were "
+                "computed: use prb.ProbabilityResidual() or prb.KullbackLeibler(), inputs with a "
+                "mean, or the logarithm of the response."
             )
+            findings.append(Finding("heavy-tail", text, _ADVICE))
     return findings
 
 
@@ -79,28 +78,22 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
             observed = observed[np.isfinite(observed)]
             # The sum of kernels at a spacing of 2.5 widths is the density to 9 %, by Poisson's
             # summation 2 exp(-2 (pi / 2.5)^2).
-            is_between = _distance_to_nearest(part.of(values[0]), observed) > 1.25 * width
+            responses = part.of(values[0])
+            finite = np.sort(responses[np.isfinite(responses)])
+            ends = np.concatenate([[-np.inf], finite, [np.inf]])
+            above = np.searchsorted(finite, observed) + 1
+            distance = np.minimum(ends[above] - observed, observed - ends[above - 1])
+            is_between = distance > 1.25 * width
             if is_between.any():
                 listed = ", ".join(f"{value:.4g}" for value in observed[is_between][:3])
-                findings.append(
-                    Finding(
-                        "data-between-runs",
-                        f"{node.name}: {int(is_between.sum())} of {observed.size} observed values "
-                        f"({listed}) lie between responses that are farther apart than the kernel "
-                        "is wide, so that their likelihood is not known: pass a larger "
-                        "prb.Reweighted(n), until the optimum stays, or use prb.KullbackLeibler().",
-                        "choosing_metric.md#advice",
-                    )
+                text = (
+                    f"{node.name}: {int(is_between.sum())} of {observed.size} observed values "
+                    f"({listed}) lie between responses that are farther apart than the kernel is "
+                    "wide, so that their likelihood is not known: pass a larger "
+                    "prb.Reweighted(n), until the optimum stays, or use prb.KullbackLeibler()."
                 )
+                findings.append(Finding("data-between-runs", text, _ADVICE))
     return findings
-
-
-def _distance_to_nearest(values: Floats, points: Floats) -> Floats:
-    """Return the distance of each point from the nearest of some values, (n,)."""
-    finite = np.sort(values[np.isfinite(values)])
-    ends = np.concatenate([[-np.inf], finite, [np.inf]])
-    above = np.searchsorted(finite, points) + 1
-    return np.asarray(np.minimum(ends[above] - points, points - ends[above - 1]))
 
 
 def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[Finding]:
@@ -116,7 +109,15 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[Finding]:
     fewest = min((len(node.observed) for node in nodes), default=enough)
     if len(nodes) < 2 or fewest >= enough or not any(is_biased) or dependent(nodes):
         return []
-    if not _share_hyperparameters(evaluator):
+    # Elements of theta that enter the populations of two simulators.
+    hyperparameters = evaluator.hyperparameters
+    prior_sd = hyperparameters.prior_sd
+    thetas = hyperparameters.initial + np.vstack([0 * prior_sd, np.diag(prior_sd)])
+    count = np.zeros(hyperparameters.size)
+    for k in range(len(nodes)):
+        flat = [root.reshape(len(thetas), -1) for root in evaluator.roots(thetas, k)]
+        count += np.any([(f[1:] != f[0]).any(axis=1) for f in flat], axis=0)
+    if not (count > 1).any():
         return []
     return [
         Finding(
@@ -127,21 +128,6 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[Finding]:
             "prb.ProbabilityResidual(), or give one simulator all specimens of a condition.",
         )
     ]
-
-
-def _share_hyperparameters(evaluator: Evaluator) -> bool:
-    """Return whether an element of theta enters the populations of two simulators."""
-    hyperparameters = evaluator.hyperparameters
-    prior_sd = hyperparameters.prior_sd
-    thetas = hyperparameters.initial + np.vstack([0 * prior_sd, np.diag(prior_sd)])
-    count = np.zeros(hyperparameters.size)
-    for k in range(len(evaluator.nodes)):
-        moves = np.zeros(hyperparameters.size, dtype=bool)
-        for root in evaluator.roots(thetas, k):
-            flat = root.reshape(len(thetas), -1)
-            moves |= (flat[1:] != flat[0]).any(axis=1)
-        count += moves
-    return bool((count > 1).any())
 
 
 def smoothing_bias(
@@ -184,7 +170,7 @@ def smoothing_bias(
         bias = np.abs(shift) / np.where(stderr > 0, stderr, np.inf) / (3 / 4)
         # 89 % intervals cover 85 % at a bias of half a standard error.
         if bias.max() > 0.5:
-            findings.append(_finding(evaluator, k, bias))
+            findings.append(_smoothing_finding(evaluator, k, bias))
     return findings
 
 
@@ -199,9 +185,9 @@ def _gain(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
     return total
 
 
-def _finding(evaluator: Evaluator, k: int, bias: Floats) -> Finding:
-    node = evaluator.nodes[k]
-    worst = int(bias.argmax())
+def _smoothing_finding(evaluator: Evaluator, k: int, bias: Floats) -> Finding:
+    """Report the element with the largest bias, in standard errors, and the kernel for it."""
+    node, worst = evaluator.nodes[k], int(bias.argmax())
     name = evaluator.hyperparameters.readable_names[worst]
     kernel = ""
     parts = number_parts(node.target)
@@ -213,10 +199,9 @@ def _finding(evaluator: Evaluator, k: int, bias: Floats) -> Finding:
     amount = f"about {bias[worst]:.1f} standard errors"
     if bias[worst] > 1.5:
         amount = "more than a standard error"
-    return Finding(
-        "smoothing-bias",
+    text = (
         f"{node.name}: the kernel of the log-likelihood is wide beside what it smooths, as where "
         f"responses lie in groups or a long tail: {name} is off by {amount} for that; use {kernel}"
-        "prb.KullbackLeibler().",
-        "choosing_metric.md#advice",
+        "prb.KullbackLeibler()."
     )
+    return Finding("smoothing-bias", text, _ADVICE)

@@ -1,16 +1,11 @@
 """Checks of the population: the test of its family, and its share without a response.
 
-The test is made from posterior points of the specimens' inputs.
-
 Under the fitted population the normal scores z = ndtri(u) of the inputs are independent standard
-normals, where u are their conditional distribution functions (Rosenblatt 1952): u_j = cdf_j(x_j)
-for independent inputs. Both statistics need the scores z_ik of the points of a specimen and their
-posterior weights w_ik, proportional to a_ik p(x_ik | theta), alone:
+normals, where u are their conditional distribution functions (Rosenblatt 1952). The test needs the
+scores z_ik of the points of a specimen and their posterior weights w_ik alone:
 
-- Z_A (Zhang 2002, J. R. Stat. Soc. B 64, 281) of ndtr(z), where a point of each specimen is drawn
-  by its weight. It sees skewness, tails, gross errors and truncation.
-- The log-likelihood ratio of a mixture of 25 normals to the standard normal. It sees several
-  modes.
+- Z_A (Zhang 2002, J. R. Stat. Soc. B 64, 281), for skewness, tails, gross errors and truncation.
+- The log-likelihood ratio of a mixture of 25 normals to the standard normal, for several modes.
 
 The p-value is that of the smallest p-value of all statistics of all inputs (min-P) against a
 parametric bootstrap with refit. The study is likelihood_guards, section 2.4.
@@ -41,9 +36,8 @@ def normal_scores(u: Floats) -> Floats:
 def zhang_statistic(z: Floats, weights: Floats, draws: int = 8, seed: int = 0) -> Floats:
     """Return the mean Z_A of drawn inputs, (d,), of scores (N, K, d) and weights (N, K).
 
-    A drawn input has the population's distribution, however many roots a specimen has. Posterior
-    means do not: their power is half as large on a folded response. The mean over a few draws
-    removes most of the noise of drawing. Large values reject.
+    A drawn input has the population's distribution, however many roots a specimen has; posterior
+    means do not. The mean over a few draws removes most of the noise of drawing.
     """
     n, points, _ = z.shape
     cumulative = np.cumsum(weights, axis=1)
@@ -59,9 +53,8 @@ def zhang_statistic(z: Floats, weights: Floats, draws: int = 8, seed: int = 0) -
 def mixture_ratio(z: Floats, weights: Floats, width: float = 0.5, steps: int = 100) -> Floats:
     """Return log-likelihood ratios of a mixture to the fitted population, (d,).
 
-    Large values reject. The mixture replaces the population of one input at a time. Its 25 centers
-    are fixed between -3.5 and 3.5, its mixing weights follow from EM. The width of its normals
-    bounds the likelihood: without it, exact data would put a point mass on each root.
+    The mixture replaces the population of one input at a time; its mixing weights follow from EM.
+    The width of its normals bounds the likelihood.
     """
     centers = np.linspace(-3.5, 3.5, 25)
     ratios = []
@@ -76,7 +69,7 @@ def mixture_ratio(z: Floats, weights: Floats, width: float = 0.5, steps: int = 1
 
 
 def population_statistics(z: Floats, weights: Floats, seed: int = 0) -> Floats:
-    """Return Z_A of all inputs, then the mixture's ratio of all inputs, (2 d,).
+    """Return Z_A of all inputs, then the mixture's ratio of all inputs, (2 d,); large ones reject.
 
     Observed and bootstrap samples need the same seed of the drawn inputs.
     """
@@ -96,29 +89,11 @@ class PopulationTest:
 def population_test(
     z: Floats, weights: Floats, null: Sequence[Floats] | Floats, seed: int = 0
 ) -> PopulationTest:
-    """Test whether the family of the population fits the inputs.
-
-    Size .03 to .06 at p <= .05, and power with the full bootstrap of 199 samples (linear, folded
-    and frame problem, 200 data sets each, standard error .035):
-
-    ====================  ==========  ==========
-    N                     20          50
-    ====================  ==========  ==========
-    skewness 1            .22 to .25  .53 to .64
-    two modes             .31 to .40  .81 to .86
-    upper 30 % cut        .19 to .27  .73 to .80
-    5 % gross, 8 sd [1]_  .96 to 1.0  1.00
-    t (4) [1]_            .19 to .28  .32 to .45
-    ====================  ==========  ==========
-
-    With 200 specimens all are 1.00 but t (4), .74 to .91 [1]_. With more inputs than outputs the
-    power is .05 to .12 at 50 specimens: a family of an input that the outputs determine only in
-    part cannot be tested.
-
-    .. [1] Warp-speed bootstrap (Giacomini, Politis and White 2013), 1000 data sets.
+    """Test whether the family of the population fits the inputs; for the power see `power_text`.
 
     ``null`` has the `population_statistics` of bootstrap samples of the fitted population, each
-    with N specimens and refitted; 199 suffice.
+    with N specimens and refitted; 199 suffice. The size is .03 to .06 at p <= .05. Power with 20
+    and 50 specimens against t (4), by a warp-speed bootstrap: .19 to .28, and .32 to .45.
     """
     observed = population_statistics(z, weights, seed)
     null = np.asarray(null)
@@ -130,7 +105,8 @@ def population_test(
 def power_text(n: int, inputs: int = 1, outputs: int = 1) -> str:
     """Return a sentence about the power of the test at p <= .05 with n specimens.
 
-    Means over the three problems of `population_test`, interpolated in log n.
+    Means over a linear, a folded and a frame problem, with 200 data sets each and the full
+    bootstrap of 199 samples (standard error .035), interpolated in log n.
     """
     if outputs < inputs:
         return (
@@ -161,29 +137,24 @@ def population_findings(
     """
     if test.p_value > threshold:
         return ()
-    smallest = np.minimum(test.zhang, test.mixture)
-    worst = labels[int(smallest.argmin())]
-    return (
-        Finding(
-            "population-misfit",
-            f"The family of the population: got p = {test.p_value:.2g} for the inputs of {test.n} "
-            f"specimens, with the smallest p-value for {worst}, expected p > {threshold:g}; "
-            "compare skewed families, two-part families, gross_errors=True, and a limit beyond "
-            "which no specimen was measured.",
-            "likelihood.md#population-misfit",
-        ),
+    worst = labels[int(np.minimum(test.zhang, test.mixture).argmin())]
+    text = (
+        f"The family of the population: got p = {test.p_value:.2g} for the inputs of {test.n} "
+        f"specimens, with the smallest p-value for {worst}, expected p > {threshold:g}; "
+        "compare skewed families, two-part families, gross_errors=True, and a limit beyond "
+        "which no specimen was measured."
     )
+    return (Finding("population-misfit", text, "likelihood.md#population-misfit"),)
 
 
 def failing_region_findings(
     evaluator: Evaluator, theta: Floats, specimens: int = 4096, lost: float = 0.25
 ) -> tuple[Finding, ...]:
-    """Report populations of which a part has no response; no run is made.
+    """Report populations with at least ``lost`` expected specimens without response; no run.
 
     Where the response is NaN no specimen can be measured: the likelihood is that of the population
     truncated to the other inputs (`prbayes.propagation.response_share`). Where it is +inf specimens
-    fail: as none is among the data, a population moves away from there. Regions with an expected
-    number of ``lost`` specimens are reported, with the share of both.
+    fail: as none is among the data, a population moves away from there.
     """
     findings = []
     rng = np.random.default_rng(23)
@@ -200,23 +171,19 @@ def failing_region_findings(
         n = len(simulator.rows)
         if share * n < lost:
             continue
+        meaning = (
+            "the specimens are taken for a sample of the rest, the population truncated to inputs "
+            "with a response. If specimens with these inputs were measured, repair the response; "
+            "if none would fail unseen, return inf"
+        )
         if prepared(likelihood).share is None:
             meaning = (
                 "as no specimen with these inputs is among the data, the population moves away "
                 "from there. If such specimens cannot be measured, return NaN"
             )
-        else:
-            meaning = (
-                "the specimens are taken for a sample of the rest, the population truncated to "
-                "inputs with a response. If specimens with these inputs were measured, repair the "
-                "response; if none would fail unseen, return inf"
-            )
-        findings.append(
-            Finding(
-                "failing-region",
-                f"{simulator.name}: got no finite response for {share:.1%} of the population, "
-                f"expected less than {lost / n:.1%}: {meaning}.",
-                "likelihood.md#failing-region",
-            )
+        text = (
+            f"{simulator.name}: got no finite response for {share:.1%} of the population, "
+            f"expected less than {lost / n:.1%}: {meaning}."
         )
+        findings.append(Finding("failing-region", text, "likelihood.md#failing-region"))
     return tuple(findings)

@@ -77,10 +77,7 @@ def end_of_range(
 
 
 def _is_pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
-    """Return whether the middle of an element's prior is worse by more than noise.
-
-    At the best values of the other elements there: an element that they can replace is not pushed.
-    """
+    """Return whether the middle of an element's prior is worse, whatever the other elements."""
     from scipy.optimize import minimize as scipy_minimize
 
     evaluator, theta = sampling.evaluator, sampling.theta
@@ -123,15 +120,11 @@ def prior_end_findings(
     ends: list[PriorEnd], page: str = "likelihood.md#end-of-a-prior"
 ) -> list[Finding]:
     """Report ends of priors."""
-    return [
-        Finding(
-            "prior-end",
-            f"The data push {end}, and ask for more than it allows: widen the prior, or look at "
-            "units, at the response and at the family of the inputs.",
-            page,
-        )
-        for end in ends
-    ]
+    advice = (
+        "and ask for more than it allows: widen the prior, or look at units, at the response and "
+        "at the family of the inputs."
+    )
+    return [Finding("prior-end", f"The data push {end}, {advice}", page) for end in ends]
 
 
 @dataclass(frozen=True)
@@ -148,29 +141,23 @@ def prior_conflict(
 ) -> PriorConflict:
     """Return p-values and pulls of all hyperparameters.
 
-    Size of one p-value at .05: .04 to .06. Power by hyperparameter with 10, 20 and 50 specimens
-    (linear problem, sharp prior, 1000 data sets, p-values not adjusted): a mean four prior standard
-    deviations off .86, .98, 1.00; a logarithm of the standard deviation three prior standard
-    deviations off .36 to .55, .70 to .76, .94 to .96. The Mahalanobis distance of all
-    hyperparameters together has .66, .91, 1.00 for the mean. ``predictive``, (S, d), are estimates
-    from synthetic data sets at draws of the prior; 1000 suffice. Those that are not finite are left
-    out.
+    ``predictive``, (S, d), are estimates from synthetic data sets at draws of the prior; 1000
+    suffice. Those that are not finite are left out. Size of one p-value at .05: .04 to .06. Power
+    with 10, 20 and 50 specimens (linear problem, sharp prior, 1000 data sets): a mean four prior
+    standard deviations off .86, .98, 1.00; a logarithm of the standard deviation three off .36 to
+    .55, .70 to .76, .94 to .96.
     """
     finite = np.isfinite(predictive)
     below = (finite & (predictive <= estimate)).sum(axis=0)
     above = (finite & (predictive >= estimate)).sum(axis=0)
     p_values = np.minimum(1.0, 2 * (np.minimum(below, above) + 1) / (finite.sum(axis=0) + 1))
-    pulls = np.abs(posterior_mean - estimate) / standard_error
-    return PriorConflict(p_values, _holm(p_values), pulls)
-
-
-def _holm(p_values: Floats) -> Floats:
-    """Return p-values adjusted by Holm's step-down method."""
+    # Holm's step-down method.
     order = np.argsort(p_values)
     factors = np.arange(len(p_values), 0, -1)
     adjusted = np.empty_like(p_values)
     adjusted[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))
-    return adjusted
+    pulls = np.abs(posterior_mean - estimate) / standard_error
+    return PriorConflict(p_values, adjusted, pulls)
 
 
 def conflict_findings(
@@ -207,15 +194,11 @@ def conflict_findings(
     matters = (conflict.adjusted <= threshold) & (conflict.pulls > pull)
     for j in np.flatnonzero(matters).tolist():
         center, sd = prior[:, j].mean(), prior[:, j].std(ddof=1)
-        findings.append(
-            Finding(
-                "prior-conflict",
-                f"{labels[j]}: got prior {center:.3g} +- {sd:.2g}, data {estimate[j]:.3g} +- "
-                f"{standard_error[j]:.2g} (p = {conflict.adjusted[j]:.1g}); the prior pulls the "
-                f"posterior mean to {posterior_mean[j]:.3g}, {conflict.pulls[j]:.1f} standard "
-                f"errors from the data, expected at most {pull:g}; check the units and the prior, "
-                "or widen it.",
-                "likelihood.md#prior-conflict",
-            )
+        text = (
+            f"{labels[j]}: got prior {center:.3g} +- {sd:.2g}, data {estimate[j]:.3g} +- "
+            f"{standard_error[j]:.2g} (p = {conflict.adjusted[j]:.1g}); the prior pulls the "
+            f"posterior mean to {posterior_mean[j]:.3g}, {conflict.pulls[j]:.1f} standard errors "
+            f"from the data, expected at most {pull:g}; check the units and the prior, or widen it."
         )
+        findings.append(Finding("prior-conflict", text, "likelihood.md#prior-conflict"))
     return tuple(findings)
