@@ -316,6 +316,7 @@ def test_diagnosis_without_the_model_says_what_was_not_tested(
 def test_chains_in_different_modes() -> None:
     draws = np.random.default_rng(0).normal(0, 1, (4, 200, 2))
     assert not separate_modes(draws, ["mu", "sigma"])
+    assert not separate_modes(draws[:1], ["mu", "sigma"])
     draws[2, :, 0] += 5
     (finding,) = separate_modes(draws, ["mu", "sigma"])
     assert finding.code == "chains-in-different-modes"
@@ -330,6 +331,14 @@ def test_chains_in_different_modes_take_the_place_of_r_hat(chains: xr.DataTree) 
     assert codes == ["chains-in-different-modes"]
 
 
+def test_a_prior_that_agrees_with_the_data_is_no_conflict(optimum: prb.Optimum) -> None:
+    errors = np.sqrt(np.diag(optimum.covariance))
+    for pull, text in ((0.1, "less than a conflict"), (1.0, "no hyperparameter is in conflict")):
+        checked = _check_conflict(optimum, (optimum.theta + pull * errors)[None, None])
+        assert text in str(checked.remarks[0])
+        assert not checked.findings
+
+
 def test_conflict_of_prior_and_data() -> None:
     observed = np.exp(0.5 * np.random.default_rng(7).normal(1.0, 0.4, N))
     with pm.Model() as model:
@@ -339,8 +348,6 @@ def test_conflict_of_prior_and_data() -> None:
     checked = _check_conflict(optimum, (optimum.theta - [1.5, 0.0])[None, None])
     assert [finding.code for finding in checked.findings] == ["prior-conflict"]
     assert str(checked.findings[0]).startswith("mu: got prior")
-    checked = _check_conflict(optimum, optimum.theta[None, None])
-    assert [finding.code for finding in checked.remarks] == ["prior-agrees"]
 
 
 def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:

@@ -321,6 +321,7 @@ def test_dims_of_another_length_are_refused() -> None:
 
 def test_a_model_prints() -> None:
     assert "Simulator[Line, LogLikelihood]" in shared().str_repr()
+    assert "prbayes_Simulator_rv" in str(shared()["y"].owner.op)
     assert r"\text{Line, LogLikelihood}" in shared().str_repr(formatting="latex")
 
 
