@@ -113,7 +113,8 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
 
 def _variance_ratio(information: list[Information], epsilon: Floats) -> float:
     """Return the ratio of variances of the minimiser with shared and with different specimens."""
-    if len(information) < 2 or any(i.node.metric.minimum is Minimum.UNKNOWN for i in information):
+    minima = [item.node.metric.minimum for item in information]
+    if len(minima) < 2 or Minimum.UNKNOWN in minima:
         return 1.0
     basis = local_sampling(information, epsilon).identified
     if not basis.shape[1]:

@@ -208,7 +208,8 @@ def _fitted_mixture(
         first.append(int(rng.choice(len(points), p=chances / chances.sum())))
         to_last = ((standard - standard[:, first[-1:]]) ** 2).sum(axis=0)
         squares = to_last if len(first) == 1 else np.minimum(squares, to_last)
-    mixture = _Mixture(points[first], np.tile(root / np.sqrt(m), (m, 1, 1)), np.full(m, 1 / m), nu)
+    roots = np.tile(root / np.sqrt(m), (m, 1, 1))
+    mixture = _Mixture(points[first], roots, np.full(m, 1 / m), nu)
     for _ in range(15):
         logs = mixture.log_densities(points)
         logs -= logsumexp(logs, axis=1, keepdims=True)

@@ -239,7 +239,8 @@ def _log_likelihood(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     rows = chains.thetas.reshape(-1, d)
     other_terms = evaluator.log_other(rows).reshape(n_chains, n_draws)
     observed = observed_dataset(evaluator)
-    specimens = list(dict.fromkeys([str(observed[node.name].dims[0]) for node in evaluator.nodes]))
+    names = [str(observed[node.name].dims[0]) for node in evaluator.nodes]
+    specimens = list(dict.fromkeys(names))
     shape = (n_chains, n_draws, *[1] * len(specimens))
     dims = ["chain", "draw", *specimens]
     note = (
@@ -297,7 +298,8 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
     """Draw stored responses by weight, as many as were observed, at thetas (chains, draws, d)."""
     chains, draws, d = thetas.shape
     stored = [k for k, node in enumerate(evaluator.nodes) if node.bound.n_per_theta == 0]
-    size = chains * draws * sum([evaluator.nodes[k].target.observed.size for k in stored])
+    sizes = [evaluator.nodes[k].target.observed.size for k in stored]
+    size = chains * draws * sum(sizes)
     thinned = np.arange(draws)[:: max(1, math.ceil(size / AT_ONCE))]
     leading = (chains, len(thinned))
     rows = thetas[:, thinned].reshape(-1, d)

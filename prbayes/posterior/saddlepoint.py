@@ -228,10 +228,12 @@ def _minimised_on_population(
     prior_sd = evaluator.hyperparameters.prior_sd
 
     def objective(shift: Floats) -> tuple[float, Floats]:
-        thetas = cross(point + shift * prior_sd, 1e-4 * prior_sd)
+        center = point + shift * prior_sd
+        thetas = cross(center, 1e-4 * prior_sd)
         totals = prepared.total(thetas, scales)
-        value, up, down = np.split(totals, [1, 1 + len(shift)])
-        return float(value[0]), (up - down) / 2e-4
+        d = len(shift)
+        up, down = totals[1 : 1 + d], totals[1 + d :]
+        return float(totals[0]), (up - down) / 2e-4
 
     minimum = scipy_minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
     minimiser = move_inside(prepared, point + minimum.x * prior_sd, options)

@@ -126,7 +126,7 @@ def simulation_based_calibration(
             "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"
         )
     settings = SamplingSettings(draws=draws, adjustment=adjustment, random_seed=seed)
-    jobs = [range(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
+    jobs = [range(n)[start : start + _CHUNK] for start in range(0, n, _CHUNK)]
     with shown(progressbar), progress("data sets", n) as advance:
         if executor is None:
             parts = [_analyse(evaluator, job, settings, lambda: advance(1, "")) for job in jobs]

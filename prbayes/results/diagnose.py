@@ -353,7 +353,8 @@ def _check_sampler(tree: xr.DataTree, model: pm.Model | None, *, by_specimen: bo
             table = values.transpose("chain", "draw", ...).values
             flat = table.reshape(*table.shape[:2], -1)
             for j in range(flat.shape[-1]):
-                columns[f"{name}[{j}]" if values.ndim > 2 else str(name)] = flat[..., j]
+                element = f"{name}[{j}]" if values.ndim > 2 else str(name)
+                columns[element] = flat[..., j]
         modes = separate_modes(np.stack(list(columns.values()), axis=-1), list(columns))
     findings = list(modes)
     # Chains in different modes have a large R-hat; ArviZ gives NaN for shorter chains.

@@ -209,7 +209,9 @@ def _labelled(
     """Return predicted responses with dimensions and coordinates."""
     groups = responses.inputs.groups
     group_coords = {} if groups is None else {groups.dim: list(groups.labels)}
-    leading, event = values.shape[1 : 1 + len(group_coords)], values.shape[2 + len(group_coords) :]
+    n_leading = 1 + len(group_coords)
+    leading = values.shape[1:n_leading]
+    event = values.shape[n_leading + 1 :]
     outputs = responses.outputs or Outputs(tuple(range(event[0] if event else 0)))
     output_coords = {outputs.dim: list(outputs.labels)} if event else {}
     sizes = (len(coords["chain"]), len(coords["draw"]), *leading)
@@ -343,7 +345,9 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
     if error is not None:
         flat = values.reshape(-1, error.size)
         is_finite = np.isfinite(flat).all(axis=1)
-        spread = flat[is_finite].std(axis=0) if is_finite.any() else np.full(error.shape, np.nan)
+        spread = np.full(error.shape, np.nan)
+        if is_finite.any():
+            spread = flat[is_finite].std(axis=0)
         share = float(np.max(error / np.where(spread > 0, spread, np.inf)))
         if share > 0.05:
             text = (
