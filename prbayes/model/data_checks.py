@@ -143,7 +143,7 @@ def count_at_ends(
     """Return the numbers of values at the largest and smallest one, (2,), and p-values, (2,).
 
     The hypothesis is that no value is censored; p-values are adjusted for both ends. Two exact
-    values are never equal, so that two values at an end suffice without rounding: size 0, power
+    values are never equal. Without rounding two values at an end therefore suffice: size 0, power
     .98 for 10 % censored of 50 specimens.
 
     For rounded values the null distribution is a bootstrap of normal values with the same step. A

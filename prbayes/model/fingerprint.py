@@ -152,7 +152,7 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
             "n_points": bound.n_runs,
             "batches": batches,
             "epsilon": simulator.epsilon_value,
-            # Stored responses are appended to, so that the first stay the first.
+            # A design grows at its end: the first responses stay the same.
             "responses": _tuples(bound.first_responses[:8].ravel()),
             "points": _points(simulator),
         }

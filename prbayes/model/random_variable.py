@@ -46,7 +46,7 @@ from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
 from prbayes.response.budget import duration
 from prbayes.response.compile import PLAIN
-from prbayes.response.inputs import Inputs
+from prbayes.response.inputs import Inputs, broadcast_batch
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.response import Responses
 
@@ -289,8 +289,7 @@ def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
 class SimulatorRV(RandomVariable):
     """The operation of an observed variable: draws data sets, and carries its simulator.
 
-    Two operations are equal if they carry the same simulator, so that no rewrite of a graph takes
-    one for another.
+    Two operations are equal if they carry the same simulator: no rewrite of a graph merges others.
 
     PyTensor's rewriters keep every operation that they have met. The simulator with all stored
     responses is therefore referenced by applications of the operation, which live as long as a
@@ -382,23 +381,15 @@ class SimulatorRV(RandomVariable):
         *params, size = arguments
         bound = computed(self.simulator).bound
         event = bound.target.event
-        batches = [
-            param.shape[: param.ndim - root.type.ndim]
-            for root, param in zip(bound.inputs.roots, params, strict=True)
-        ]
-        batch = np.broadcast_shapes(*batches)
+        ndims = [root.type.ndim for root in bound.inputs.roots]
+        batch, params = broadcast_batch(params, ndims)
         values = np.empty((*(batch if size is None else size), *event))
-        # One population for each element of a batch of parameters: commonly there is one.
+        # A population for each element of a batch; its specimens are along axes of length one.
         for index in np.ndindex(batch):
-            roots = []
-            for param, leading in zip(params, batches, strict=True):
-                last = index[len(index) - len(leading) :]
-                at = tuple(0 if n == 1 else i for i, n in zip(last, leading, strict=True))
-                roots.append(param[at])
-            # The specimens of a population are along axes of length one.
             places = tuple(slice(None) if n == 1 else i for i, n in zip(index, batch, strict=True))
             shape = values[places].shape
             n_specimens = int(np.prod(shape, dtype=int)) // int(np.prod(event, dtype=int))
+            roots = [param[index] for param in params]
             values[places] = bound.draw(rng, n_specimens, roots).reshape(shape)
         return values
 

@@ -140,9 +140,9 @@ def _bfgs(inverse: Floats, s: Floats, y: Floats, is_first: bool) -> Floats:
     # rho = 0 leaves the matrix as it is.
     rho = np.where(is_curved, 1 / sy, 0.0)
     column = rho[:, None, None] * s[:, :, None]
-    left = np.eye(s.shape[-1]) - column * y[:, None, :]
-    right = np.swapaxes(left, -1, -2)
-    return np.asarray(left @ inverse @ right + column * s[:, None, :])
+    projector = np.eye(s.shape[-1]) - column * y[:, None, :]
+    transposed = np.swapaxes(projector, -1, -2)
+    return np.asarray(projector @ inverse @ transposed + column * s[:, None, :])
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,9 +31,8 @@ def optimum(name: str, family: str, seed: int, n: int = 50, **keywords: Any) -> 
     observed = FAMILIES[family](np.random.default_rng([7, seed, n]), n)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator(
-            "y", same, x, metric=METRICS[name], observed=observed, propagation=R256, **keywords
-        )
+        keywords = {"propagation": R256} | keywords
+        prb.Simulator("y", same, x, metric=METRICS[name], observed=observed, **keywords)
     return prb.minimize(model, starts=0)
 
 
@@ -113,18 +112,8 @@ def test_repeated_measurements_of_a_specimen_are_drawn_together() -> None:
     assert p > 0.05
 
 
-def resimulated(family: str, metric: prb.Metric, n: int = 50) -> prb.Optimum:
-    observed = FAMILIES[family](np.random.default_rng([7, 0, n]), n)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator(
-            "y", same, x, metric=metric, observed=observed, propagation=prb.Resimulated(256)
-        )
-    return prb.minimize(model, starts=0)
-
-
 def test_where_it_is_not_looked_at_a_line_says_why() -> None:
-    found = resimulated("normal", METRICS["kl"])
+    found = optimum("kl", "normal", 0, propagation=prb.Resimulated(256))
     before = found.evaluator.n_responses
     diagnosis = prb.diagnose(found)
     assert found.evaluator.n_responses == before

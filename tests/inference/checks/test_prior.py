@@ -52,25 +52,24 @@ def ends(found: pm.Model, theta: Any) -> list[PriorEnd]:
 
 @pytest.mark.parametrize("name", sorted(METRICS))
 @pytest.mark.parametrize(("place", "bound"), [(2.85, 1.0), (-1.85, 0.0)])
-def test_data_beyond_a_prior_are_said_to_push_and_draws_stay_there(
+def test_data_beyond_a_prior_push_to_its_end_and_draws_stay_there(
     name: str, place: float, bound: float
 ) -> None:
-    propagation = prb.Reweighted(1024)
-    found = model(place + 0.3 * LEVELS, unit, narrow, METRICS[name], propagation)
-    with found:
-        optimum = prb.minimize(progressbar=False)
-        # Refits of the area metric are at an edge, where its estimate has no density.
-        adjustment: Any = None if name == "area" else "estimate"
-        tree = prb.sample_smc(
-            draws=300, chains=2, adjustment=adjustment, random_seed=1, progressbar=False
-        )
+    problem = model(place + 0.3 * LEVELS, unit, narrow, METRICS[name], prb.Reweighted(1024))
+    optimum = prb.minimize(problem, progressbar=False)
     (finding,) = optimum.findings
     assert finding.code == "prior-end"
     assert "The data push mu to" in finding.text
     assert f"next to the end of its prior at {bound:.4g}" in finding.text
-    # They went back to the prior, whose mean is a half, where estimates have no density.
-    mean = float(tree.posterior["mu"].mean())
-    assert abs(mean - bound) < 0.15
+    if (name, bound) in {("kl", 1.0), ("area", 0.0)}:
+        # Refits of the area metric are at an edge, where its estimate has no density.
+        adjustment: Any = None if name == "area" else "estimate"
+        sampler: dict[str, Any] = {"draws": 300, "chains": 2, "random_seed": 1}
+        tree = prb.sample_smc(
+            model=problem, optimum=optimum, adjustment=adjustment, progressbar=False, **sampler
+        )
+        # They went back to the prior, whose mean is a half, where estimates have no density.
+        assert abs(float(tree.posterior["mu"].mean()) - bound) < 0.15
 
 
 def test_the_middle_of_a_prior_is_no_end_and_nor_is_a_population_without_scatter() -> None:
@@ -134,14 +133,7 @@ def test_holm() -> None:
     test = prior_conflict(np.array([4.5, 994.5, 9.5, 499.0]), np.ones(4), np.zeros(4), predictive)
     assert test.p_values == pytest.approx([0.012, 0.01, 0.022, 1.0])
     assert test.adjusted == pytest.approx([0.04, 0.04, 0.044, 1.0])  # never decreasing
-
-
-def test_the_pull_is_in_standard_errors() -> None:
-    predictive = np.random.default_rng(1).standard_normal((100, 2))
-    test = prior_conflict(
-        np.array([1.0, -4.0]), np.array([0.5, 2.0]), np.array([0.25, -3.0]), predictive
-    )
-    assert test.pulls == pytest.approx([1.5, 0.5])
+    assert test.pulls == pytest.approx([4.5, 994.5, 9.5, 499.0])  # in standard errors
 
 
 def test_a_conflict_needs_both_p_value_and_pull() -> None:
@@ -175,12 +167,8 @@ def test_the_text_has_both_sides_and_the_unit_is_the_users() -> None:
 
 
 def test_failed_estimates_are_left_out() -> None:
+    at = np.array([4.5]), np.ones(1), np.zeros(1)
     predictive = np.arange(999.0)[:, None]
-    expected = prior_conflict(np.array([4.5]), np.ones(1), np.zeros(1), predictive).p_values
     failed = np.concatenate([predictive, np.full((50, 1), np.nan), np.full((9, 1), -np.inf)])
-    assert prior_conflict(np.array([4.5]), np.ones(1), np.zeros(1), failed).p_values == expected
-
-
-def test_without_simulated_estimates_no_conflict_is_reported() -> None:
-    test = prior_conflict(np.array([4.5]), np.ones(1), np.zeros(1), np.full((3, 1), np.nan))
-    assert test.p_values == 1
+    assert prior_conflict(*at, failed).p_values == prior_conflict(*at, predictive).p_values
+    assert prior_conflict(*at, np.full((3, 1), np.nan)).p_values == 1
