@@ -19,8 +19,6 @@ from scipy.stats import norm
 import prbayes as prb
 from benchmarks.scoreboard.problems import frame
 from prbayes._finding import Finding
-from prbayes.inference.checks.population import population_statistics, population_test
-from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import specimen_likelihoods
@@ -128,9 +126,6 @@ def outcome(monkeypatch: pytest.MonkeyPatch) -> Callable[[pm.Model], list[str]]:
         return list(codes)
 
     return run
-
-
-# -- reported or refused ---------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -340,9 +335,6 @@ def test_errors_come_before_further_runs() -> None:
             )
         )
     assert sum(runs) <= 64 + 2  # two single ones: a specimen by itself has the same response
-
-
-# -- repaired --------------------------------------------------------------------------------
 
 
 def shift(
@@ -639,70 +631,8 @@ def test_the_posterior_is_exact_in_twenty_data_sets(name: str) -> None:
     assert np.sum(np.array(shifts) <= 0.1) >= 19, np.sort(shifts)[-3:]
 
 
-# -- families, conflicts and sizes, on arrays ------------------------------------------------
-
-
-def skewed(rng: np.random.Generator, n: int) -> Floats:
-    return (rng.gamma(4, 1, n) - 4) / 2
-
-
 def two_modes(rng: np.random.Generator, n: int) -> Floats:
     return rng.choice([-1.0, 1.0], n) + 0.5 * rng.standard_normal(n)
-
-
-def truncated(rng: np.random.Generator, n: int) -> Floats:
-    return np.sort(rng.standard_normal(int(n / 0.7) + 1))[:n]
-
-
-def gross(rng: np.random.Generator, n: int, sd: float) -> Floats:
-    x = rng.standard_normal(n)
-    wrong = rng.choice(n, max(1, n // 20), replace=False)
-    x[wrong] += sd * rng.choice([-1, 1], len(wrong))
-    return x
-
-
-FAMILIES: dict[str, tuple[Callable[[np.random.Generator, int], Floats], int]] = {
-    "skewness 1": (skewed, 200),
-    "two modes": (two_modes, 200),
-    "truncated": (truncated, 200),
-    "5 % gross errors of 4 sd": (partial(gross, sd=4.0), 200),
-    "5 % gross errors of 8 sd": (partial(gross, sd=8.0), 50),
-}
-
-
-def statistics(x: Floats) -> Floats:
-    """Return the statistics of the population test of exactly known inputs."""
-    z = (x - x.mean()) / x.std()
-    return population_statistics(z[:, None, None], np.ones((len(x), 1)))
-
-
-def null_statistics(n: int, size: int = 199) -> Floats:
-    """Return those of normal samples; fitted location and scale leave no other parameter."""
-    rng = np.random.default_rng([n, 9])
-    return np.array([statistics(rng.standard_normal(n)) for _ in range(size)])
-
-
-def p_value(x: Floats, null: Floats) -> float:
-    z = (x - x.mean()) / x.std()
-    return population_test(z[:, None, None], np.ones((len(x), 1)), null).p_value
-
-
-@pytest.mark.long
-def test_other_families_are_reported() -> None:
-    nulls = {n: null_statistics(n) for n in (50, 200)}
-    for name, (draw, n) in FAMILIES.items():
-        assert p_value(draw(np.random.default_rng(2), n), nulls[n]) <= 0.05, name
-    for n, null in nulls.items():
-        assert p_value(np.random.default_rng(3).standard_normal(n), null) > 0.05
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FAMILIES)
-def test_other_families_are_reported_in_nineteen_of_twenty_data_sets(name: str) -> None:
-    draw, n = FAMILIES[name]
-    null = null_statistics(n)
-    flagged = [p_value(draw(np.random.default_rng([seed, 10]), n), null) <= 0.05 for seed in SEEDS]
-    assert np.sum(flagged) >= 19
 
 
 @pytest.mark.long
@@ -710,52 +640,6 @@ def test_the_optimum_reports_another_family() -> None:
     x = 1 + 0.5 * two_modes(np.random.default_rng(4), 100)
     optimum = prb.minimize(model_of(line, normal_input, line(x)), progressbar=False)
     assert [each.code for each in check_optimum(optimum).findings] == ["population-misfit"]
-
-
-@pytest.mark.slow
-def test_the_size_of_the_population_test() -> None:
-    null = null_statistics(50, 999)
-    rng = np.random.default_rng(12)
-    share = np.mean([p_value(rng.standard_normal(50), null) <= 0.05 for _ in range(200)])
-    # Of .05, with a standard error of .015 over 200 data sets and .007 of the null.
-    assert share <= 0.06 + 4 * 0.017
-
-
-def conflict(rng: np.random.Generator, off: float, n: int = 50) -> list[str]:
-    """Return the hyperparameters in conflict: normal inputs, priors of mean and log deviation."""
-    prior_sd = np.array([0.2, 0.3])
-    truth = prior_sd * rng.standard_normal(2)
-    truth[0] = off * prior_sd[0] if off else truth[0]
-    x = truth[0] + np.exp(truth[1]) * rng.standard_normal(n)
-    estimate = np.array([x.mean(), np.log(x.std())])
-    error = np.array([x.std() / np.sqrt(n), 1 / np.sqrt(2 * n)])
-    weight = error**-2.0 / (error**-2.0 + prior_sd**-2.0)
-    prior = prior_sd * rng.standard_normal((1000, 2))
-    scatter = np.stack(
-        [np.exp(prior[:, 1]) / np.sqrt(n), np.full(1000, 1 / np.sqrt(2 * n))], axis=1
-    )
-    predictive = prior + scatter * rng.standard_normal((1000, 2))
-    findings = conflict_findings(
-        ["mu", "log sigma"], prior, estimate, error, weight * estimate, predictive
-    )
-    return [each.text.split(":")[0] for each in findings]
-
-
-def test_a_mean_four_prior_deviations_off_is_reported() -> None:
-    assert conflict(np.random.default_rng(0), 4.0, 20) == ["mu"]
-    assert not conflict(np.random.default_rng(1), 0.0, 20)
-
-
-@pytest.mark.slow
-def test_power_and_size_of_the_conflict() -> None:
-    seen = ["mu" in conflict(np.random.default_rng([seed, 13]), 4.0) for seed in SEEDS]
-    assert np.sum(seen) >= 19
-    rng = np.random.default_rng(14)
-    share = np.mean([bool(conflict(rng, 0.0)) for _ in range(200)])
-    assert share <= 0.06 + 4 * 0.017  # Holm: at most .05, standard error .015
-
-
-# -- size before the fit ---------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -159,13 +159,15 @@ class Interpolant:
         runs = self.z - self.center
         # |a - b|^2 = |a|^2 + |b|^2 - 2 a'b; the digits that small ones lose do not matter in |r|^5.
         ones = np.ones((n, 1))
-        left = np.concatenate([-2 * runs, (runs**2).sum(axis=1, keepdims=True), ones], axis=1)
+        run_factors = np.concatenate(
+            [-2 * runs, (runs**2).sum(axis=1, keepdims=True), ones], axis=1
+        )
         for first in range(0, len(z), step):
             rows = slice(first, first + step)
             points = (z[rows] - self.center).T
-            right = np.stack([*points, np.ones(points.shape[1]), (points**2).sum(axis=0)])
+            point_factors = np.stack([*points, np.ones(points.shape[1]), (points**2).sum(axis=0)])
             square, spare = arrays[:, : n * points.shape[1]].reshape(2, n, -1)
-            np.matmul(left, right, out=square)
+            np.matmul(run_factors, point_factors, out=square)
             yield rows, np.maximum(square, 0.0, out=square), spare
 
 

@@ -271,10 +271,10 @@ def count(
             t = values[i] * inverse - low
             w = weights[0] if equal else weights[r * n + i]
             if 1 - margin <= t < g - 2 - margin:
-                left = math.floor(t)
-                t -= left
+                index = math.floor(t)
+                t -= index
                 for power in range(4):
-                    moments[left + margin, power] += w
+                    moments[index + margin, power] += w
                     w *= t
             elif t < 1 - margin:
                 outside[r, 0] += w
@@ -336,9 +336,9 @@ def read(
         for i in range(n):
             t = values[i] * inverse - low
             if 1 - margin <= t < g - 2 - margin:
-                left = math.floor(t)
-                t -= left
-                c = coefficients[r, left + margin]
+                index = math.floor(t)
+                t -= index
+                c = coefficients[r, index + margin]
                 value = c[2] + t * c[3]
                 value = c[1] + t * value
                 out[r, i] = c[0] + t * value

@@ -6,7 +6,7 @@ A specimen has one row: the outputs of all simulators side by side, NaN where on
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -182,11 +182,12 @@ def _specimen_groups(
     """Return the group of each specimen, None without groups."""
     result = np.full(size, -1, dtype=np.intp)
     for measurement, index in zip(measurements, numbers, strict=True):
-        if measurement.groups is None:
+        groups = measurement.groups
+        if groups is None:
             return None
-        conflicts = (result[index] >= 0) & (result[index] != measurement.groups)
-        result[index] = measurement.groups
-        conflicts |= result[index] != measurement.groups
+        conflicts = (result[index] >= 0) & (result[index] != groups)
+        result[index] = groups
+        conflicts |= result[index] != groups
         if conflicts.any():
             label = np.asarray(measurement.specimens).tolist()[int(np.argmax(conflicts))]
             raise ValueError(
@@ -283,19 +284,13 @@ class SpecimenLikelihood:
     @property
     def hyperparameters(self) -> Hyperparameters:
         """The hyperparameters of the model, those of its evaluator where one was made."""
-        evaluated = self.cache.get("hyperparameters", lambda: None)()
+        evaluated: Hyperparameters | None = self.cache.get("hyperparameters", lambda: None)()
         if evaluated is not None:
-            return evaluated  # type: ignore[no-any-return]
+            return evaluated
         model = self.model()
         if model is None:
             raise RuntimeError("got a simulator whose model is gone; build the model again")
         return Hyperparameters.of(model)
-
-    def cached(self, key: str, compute: Callable[[], Any]) -> Any:
-        """Return a value of the cache, which the first call computes."""
-        if key not in self.cache:
-            self.cache[key] = compute()
-        return self.cache[key]
 
     def observing(self, data: Mapping[str, Any]) -> SpecimenLikelihood:
         """Return the likelihood of other observed values by simulator, with the same runs.

@@ -52,21 +52,17 @@ from prbayes.response.inputs import is_group
 
 def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:
     """Return shared variables of the points, (N, K, *event) by input, and of A, (N, K)."""
-
-    def compute() -> tuple[list[Any], Any]:
-        points = prepared(likelihood).points
+    if "arrays" not in likelihood.cache:
+        points, name = prepared(likelihood).points, likelihood.name
+        coordinates = likelihood.coordinates
         # The proposal is a density of z: p(x) dx = p(x(z)) |dx/dz| dz.
         log_a = points.log_a if likelihood.error_is_known else -points.log_proposal
-        log_a = log_a + likelihood.coordinates.log_jacobian(points.z)
-        name = likelihood.name
-        shared = [
-            pytensor.shared(np.ascontiguousarray(x), name=f"{name}_points_{i}")
-            for i, x in enumerate(likelihood.coordinates.inputs(points.z))
-        ]
-        return shared, pytensor.shared(log_a, name=f"{name}_log_a")
-
-    shared: tuple[list[Any], Any] = likelihood.cached("arrays", compute)
-    return shared
+        log_a = log_a + coordinates.log_jacobian(points.z)
+        x = [np.ascontiguousarray(values) for values in coordinates.inputs(points.z)]
+        shared = [pytensor.shared(v, name=f"{name}_points_{i}") for i, v in enumerate(x)]
+        likelihood.cache["arrays"] = shared, pytensor.shared(log_a, name=f"{name}_log_a")
+    result: tuple[list[Any], Any] = likelihood.cache["arrays"]
+    return result
 
 
 def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
@@ -76,16 +72,14 @@ def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
     """
     shared, shared_log_a = arrays(likelihood)
     log_a = shared_log_a.get_value(borrow=True)
-    points: list[WeightedPoints]
-    cached_log_a, points = likelihood.cache.get("points by group", (None, []))
-    if cached_log_a is not log_a:
+    last: tuple[Any, list[WeightedPoints]] = likelihood.cache.get("points by group", (None, []))
+    if last[0] is not log_a:
         x = [variable.get_value(borrow=True) for variable in shared]
-        points = [
-            WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], log_a[rows])
-            for _, rows in likelihood.by_group
-        ]
-        likelihood.cache["points by group"] = (log_a, points)
-    return points
+        groups = [rows for _, rows in likelihood.by_group]
+        inputs = likelihood.inputs
+        points = [WeightedPoints.of(inputs, [v[rows] for v in x], log_a[rows]) for rows in groups]
+        last = likelihood.cache["points by group"] = (log_a, points)
+    return last[1]
 
 
 def _roots(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats], group: Any) -> list[Any]:

@@ -59,7 +59,9 @@ def prepared(likelihood: SpecimenLikelihood) -> Preparation:
 
     Raise DesignError or ResponseError if the response does not allow the likelihood.
     """
-    preparation: Preparation = likelihood.cached("preparation", lambda: _prepare(likelihood))
+    if "preparation" not in likelihood.cache:
+        likelihood.cache["preparation"] = _prepare(likelihood)
+    preparation: Preparation = likelihood.cache["preparation"]
     return preparation
 
 
@@ -189,7 +191,7 @@ def _emulate(
     if likelihood.calls_response:
         emulation = Emulation.of_function(runs, box, bounds, readings, options)
     emulation, roots = emulate(
-        runs, readings, box, bounds, options, n=n, known=emulation, name=name
+        runs, readings, box, bounds, options, n=n, previous=emulation, name=name
     )
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
@@ -271,8 +273,9 @@ class Populations:
         result = np.zeros(len(thetas))
         for group, rows in likelihood.by_group:
             roots = roots_of(self.hyperparameters, thetas, likelihood.inputs, group)
-            log_share = share.of_populations(likelihood.density, roots, likelihood.coordinates)
-            result += len(rows) * log_share
+            result += len(rows) * share.of_populations(
+                likelihood.density, roots, likelihood.coordinates
+            )
         return result
 
     def _normal_log_density(
@@ -369,10 +372,10 @@ class PopulationDraws:
         """Return the sum over the specimens of log S, the log share with a response, (S,)."""
         return self.populations.log_share(self.thetas, share)
 
-    def specimens(self, n_of_each: int = 16, seed: int = 0) -> Floats:
+    def specimens(self, n_of_each: int = 16) -> Floats:
         """Return coordinates of specimens of all groups and draws, (n, d)."""
         populations, likelihood = self.populations, self.populations.likelihood
-        rng = np.random.default_rng([seed, 3])
+        rng = np.random.default_rng([0, 3])
         parts = []
         for group, _ in likelihood.by_group:
             roots = roots_of(populations.hyperparameters, self.thetas, likelihood.inputs, group)

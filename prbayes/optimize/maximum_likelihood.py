@@ -516,13 +516,13 @@ def other_specimens(
     shared = [arrays(likelihood) for likelihood in likelihoods]
     variables = [v for points, log_a in shared for v in (*points, log_a)]
     values = [value for points, log_a in data for value in (*points, log_a)]
-    before = [variable.get_value() for variable in variables]
+    originals = [variable.get_value() for variable in variables]
     try:
         for variable, value in zip(variables, values, strict=True):
             variable.set_value(np.ascontiguousarray(value), borrow=True)
         yield
     finally:
-        for variable, value in zip(variables, before, strict=True):
+        for variable, value in zip(variables, originals, strict=True):
             variable.set_value(value, borrow=True)
 
 

@@ -55,10 +55,7 @@ def refuse_look(labels: object, pc_kwargs: Mapping[str, Any]) -> None:
 
 
 class Canvas:
-    """A figure with named panels, in order, of a size in inches each.
-
-    ``pc_kwargs`` are keywords of `PlotCollection.wrap`, and ``figsize`` of the whole figure.
-    """
+    """A figure with named panels, in order, of a size in inches each."""
 
     def __init__(
         self, names: Sequence[str], *, size: tuple[float, float], pc_kwargs: dict[str, Any]
@@ -261,11 +258,7 @@ def named(name: str, labels: Mapping[str, str] | None) -> str:
 def refuse_labels(
     labels: Mapping[str, str] | None, shown: Iterable[str], *, evaluator: Evaluator | None = None
 ) -> None:
-    """Raise a `KeyError` if there are labels of unknown names.
-
-    With an evaluator, every label has to be of something in the model or the picture, so that one
-    mapping serves all pictures of a model; otherwise one label at least has to be of a shown name.
-    """
+    """Raise for labels of unknown names; without an evaluator only if no label is shown."""
     if not labels:
         return
     names = list(dict.fromkeys(shown))

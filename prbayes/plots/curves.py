@@ -25,10 +25,7 @@ def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, F
 
 
 def smooth_densities(values: Floats, weights: Floats, grid: Floats) -> Floats:
-    """Return densities, shape (P, g), of weighted samples, (P, n), smoothed by one bandwidth.
-
-    It is the median of Silverman's bandwidths of 40 samples, for the effective numbers of values.
-    """
+    """Return densities, (P, g), of weighted samples, (P, n), by the median bandwidth of 40."""
     samples = _finite_samples(values[:40], weights[:40])
     bandwidths = [silverman(row, w) for row, w in samples]
     bandwidth = float(np.median(bandwidths)) if bandwidths else 0.0
@@ -36,11 +33,7 @@ def smooth_densities(values: Floats, weights: Floats, grid: Floats) -> Floats:
 
 
 def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -> Floats:
-    """Return Gaussian kernel densities of weighted samples, shapes (..., n), on a grid: (..., g).
-
-    Values that are not finite keep their weight: the area under the curve is the share of the
-    finite ones.
-    """
+    """Return kernel densities, (..., g), of samples, (..., n); the area is the finite share."""
     # Densities at the centres of the kernel's cells. A bandwidth below half of the grid's step
     # would not be visible.
     ends = grid[[0, -1]]
@@ -58,11 +51,7 @@ def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -
 
 
 def bounded_density(draws: Floats, grid: Floats) -> Floats:
-    """Return the density of draws, (n,), on a grid, without a dip at the ends of their range.
-
-    Draws are mirrored at the smallest and the largest, where a bound of the support may cut the
-    density; outside their range it is zero. Draws that are all the same have none: NaN.
-    """
+    """Return the density of draws, (n,), mirrored at both ends, on a grid; NaN if equal."""
     weights = np.full(draws.size, 1 / draws.size)
     bandwidth = silverman(draws, weights)
     if not bandwidth > 0:
@@ -87,10 +76,7 @@ def central_levels(prob: float) -> tuple[float, float]:
 
 
 def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, float]:
-    """Return the range between the quantiles at ``tail`` and ``1 - tail`` of most samples, (P, n).
-
-    A tenth of the samples may exceed it on each side; values that are not finite are left out.
-    """
+    """Return the range between quantiles at both tails that a tenth of samples, (P, n), exceed."""
     samples = list(_finite_samples(values, weights))
     low = np.quantile([quantile(row, w, tail) for row, w in samples], 0.1)
     high = np.quantile([quantile(row, w, 1 - tail) for row, w in samples], 0.9)
@@ -103,10 +89,7 @@ def axis_range(
     earlier: tuple[float, float] | None,
     margin: float = 0.03,
 ) -> tuple[float, float]:
-    """Return the range of an axis: data, calibrated population, and the earlier unless far off.
-
-    The earlier population widens the axis by at most half on each side.
-    """
+    """Return the range of data, calibrated and earlier population; the last adds at most half."""
     finite = observed[np.isfinite(observed)]
     low = min(calibrated[0], float(finite.min(initial=np.inf)))
     high = max(calibrated[1], float(finite.max(initial=-np.inf)))
@@ -154,10 +137,7 @@ def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tup
 
 
 def steps(values: Floats, heights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
-    """Return the corners of a step function from low to high, which steps at sorted values.
-
-    It has one height more than values: the first is that before the first value.
-    """
+    """Return the corners of a step function at sorted values; the first height is before them."""
     x = np.concatenate([[low], np.repeat(values, 2), [high]])
     return x, np.repeat(heights, 2)
 
@@ -166,24 +146,7 @@ def steps(values: Floats, heights: Floats, low: float, high: float) -> tuple[Flo
 
 
 def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[Floats]:
-    """Return for each probability the outline of the smallest region that contains it.
-
-    The density is that of a Gaussian kernel along the points' principal axes, by Scott's rule for
-    the effective number of points. The kernel's inflation of the spread is removed: the regions of
-    a normal population are its ellipses.
-
-    Parameters
-    ----------
-    points : ndarray, shape (n, 2)
-        Finite.
-    weights : ndarray, shape (n,)
-    probs : tuple of float
-
-    Returns
-    -------
-    list of ndarray, shape (2, k)
-        Lines one after the other, with NaN between them.
-    """
+    """Return for each probability the outline, (2, k), of the smallest region that contains it."""
     from matplotlib.figure import Figure  # heavy, and only needed for pictures
 
     # Coordinates in which the points have unit covariance: a column of ``axes`` is a unit step.
@@ -208,6 +171,7 @@ def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[
     axes = unit[:, None] * vectors * np.sqrt(np.maximum(variances, least))
     x, y = np.linalg.solve(axes, (points - center).T)
 
+    # A Gaussian kernel along the principal axes, by Scott's rule for the effective sample size.
     # Cells on a plane of 4.2 standard deviations: 2e-4 of a normal population are beyond. A cell is
     # a fifth of the narrowest kernel for which the plane matters.
     edges = np.linspace(-4.2, 4.2, 161)
@@ -215,7 +179,8 @@ def outlines(points: Floats, weights: Floats, probs: tuple[float, ...]) -> list[
     bandwidth = np.sum(w**2) ** (1 / 6)  # n ** (-1 / 6)
     density = gaussian_filter(masses, bandwidth / (edges[1] - edges[0]), mode="constant")
 
-    # The density above which a probability lies, and the lines of this height
+    # The density above which a probability lies, and the lines of this height; without the kernel's
+    # inflation of the spread the regions of a normal population are its ellipses.
     descending = np.sort(density.ravel())[::-1]
     last = np.count_nonzero(descending) - 1
     middles = (edges[:-1] + edges[1:]) / 2

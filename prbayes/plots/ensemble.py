@@ -54,13 +54,7 @@ def read_result(
     *,
     free: bool = False,
 ) -> Ensemble:
-    """Return at most ``n_draws`` populations of a result.
-
-    The model is by default that of the optimum, or the one on the context. With ``free``, the
-    populations cost no response, whatever the propagation. Raise a `TypeError` or `KeyError` for
-    another kind of result or one without a free variable of the model, a `ValueError` if it is of
-    other populations or data, a `DesignError` if stored responses do not support most populations.
-    """
+    """Return at most ``n_draws`` populations of a result; ``free`` ones cost no response."""
     if isinstance(result, Optimum) and (model is None or model is result.model):
         evaluator = result.evaluator
     else:
@@ -169,10 +163,7 @@ def draw_calibrated(
     name: str = "calibrated",
     alpha: float = 0.25,
 ) -> float:
-    """Draw the middle of curves, (P, g), of ``ensemble.every`` in its band; return the top.
-
-    The band contains the share ``prob`` of the draws' curves at each point.
-    """
+    """Draw the middle of curves, (P, g), of ``ensemble.every`` in its band; return the top."""
     middle = middle_of(curves, ensemble)
     top = float(middle.max())
     spread = curves[len(ensemble.center) :]

@@ -202,10 +202,7 @@ def distinct_texts(values: Floats) -> list[str]:
 
 
 def _draw_curve(panel: Panel, surface: Landscape, *, alone: bool) -> None:
-    """Draw the objective over one hyperparameter.
-
-    Path and other optima lie on the curve only if there are no other hyperparameters.
-    """
+    """Draw the objective over one hyperparameter, ``alone`` with path and other optima."""
     finite = np.isfinite(surface.heights)
     x = surface.axes[0][finite]
     heights = surface.heights[finite]

@@ -189,10 +189,7 @@ def margins(evaluator: Evaluator) -> list[Margin]:
 
 
 def select_margins(available: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:
-    """Return margins by name, with or without index, or by ``.dist()``; all by default.
-
-    Raise a `KeyError` if there is no such input.
-    """
+    """Return margins by name, with or without index, or by ``.dist()``; all by default."""
     if inputs is None:
         return available
     if isinstance(inputs, str | TensorVariable):
@@ -227,8 +224,8 @@ def margin_densities(
     nodes = sorted({margin.node for margin in shown})
     # The range of each axis, from specimens of some populations
     ranges: dict[Any, tuple[float, float]] = {}
-    some = thetas[:: max(1, len(thetas) // 40)]
-    few = {k: _draws(evaluator, k, some, 400, seed=0) for k in nodes}
+    thinned = thetas[:: max(1, len(thetas) // 40)]
+    few = {k: _draws(evaluator, k, thinned, 400, seed=0) for k in nodes}
     for margin in shown:
         values = _values(few[margin.node], margin)
         first, last = central_range(values, np.full(values.shape, 1 / values.shape[1]), tail=0.002)

@@ -173,10 +173,7 @@ def _draw(
     estimate: tuple[float, float] | None,
     prob: float,
 ) -> float:
-    """Draw densities, and intervals below them; return the top of the posterior.
-
-    The estimate is the optimum and its standard error.
-    """
+    """Draw densities and intervals, of optimum and standard error too; return the top."""
     low = float(draws.min())
     high = float(draws.max())
     best, error = estimate or (0.0, np.nan)

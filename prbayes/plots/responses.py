@@ -199,15 +199,15 @@ class _Drawing:
             panel.line("measured", (x, y), INK, width=0.9, legend="measured")
             finite = observed[np.isfinite(observed)]
             panel.points("rug", (finite, 0.0), INK, marker="|", size=60)
-        before = np.zeros(1)
+        initial = np.zeros(1)
         if earlier is not None:
-            (before,) = curves_of(*earlier, grid)
+            (initial,) = curves_of(*earlier, grid)
             text = f"before: {self.start}"
-            panel.line("before", (grid, before), VERMILION, style=DASHED, legend=text)
+            panel.line("before", (grid, initial), VERMILION, style=DASHED, legend=text)
         curves = curves_of(*population, grid)
         top = max(top, draw_calibrated(panel, grid, curves, self.ensemble, self.prob))
         # A narrow peak before would dwarf all other curves
-        ylim = (-0.05 * top, 2 * top) if before.max() > 2 * top else None
+        ylim = (-0.05 * top, 2 * top) if initial.max() > 2 * top else None
         failed = np.count_nonzero(np.isinf(observed))
         panel.axes(
             x=self.text,
@@ -244,11 +244,11 @@ class _Drawing:
         x = places[order]
         measured = ((observed - center) / unit)[:, order]
         lines = ((quantiles(*population, LEVELS) - center) / unit)[..., order]
-        before = np.empty((0, x.size))
+        initial = np.empty((0, x.size))
         if earlier is not None:
-            before = ((quantiles(*earlier, LEVELS)[0] - center) / unit)[:, order]
+            initial = ((quantiles(*earlier, LEVELS)[0] - center) / unit)[:, order]
 
-        widest = None if earlier is None else _finite_range(before)
+        widest = None if earlier is None else _finite_range(initial)
         low, high = axis_range(measured, _finite_range(np.median(lines, axis=0)), widest)
         # Lines leave the picture where the specimens have failed.
         room = high - low
@@ -259,7 +259,7 @@ class _Drawing:
         panel.line("measured", _joined(x, measured), GREY, width=0.5, legend="measured")
         if earlier is not None:
             text = f"before: {self.start}"
-            line = _joined(x, np.clip(before, low - room, high + room))
+            line = _joined(x, np.clip(initial, low - room, high + room))
             panel.line("before", line, VERMILION, style=DASHED, legend=text)
         median: Any = {"name": "median, calibrated", "alpha": 0.55}
         draw_calibrated(panel, x, lines[:, 1], self.ensemble, self.prob, **median)
@@ -278,10 +278,7 @@ def _finite_range(values: Floats) -> Limits:
 
 
 def _joined(x: Floats, rows: Floats) -> Floats:
-    """Return several lines, (n, m), as one with gaps between them; only finite values are drawn.
-
-    A line continues after a value that was not measured, and ends where the specimen has failed.
-    """
+    """Return lines, (n, m), as one with gaps; a line continues after missing values."""
     points = [np.column_stack([x, row]) for row in rows]
     return with_gaps([line[np.isfinite(line[:, 1])] for line in points])
 
@@ -382,10 +379,7 @@ def is_curve(outputs: Outputs) -> bool:
 
 
 def quantiles(values: Floats, weights: Floats, levels: Floats) -> Floats:
-    """Return quantiles of outputs of populations, (P, n, m), (P, n), (L,) -> (P, L, m).
-
-    A specimen without a response is left out; one that failed is above all others.
-    """
+    """Return quantiles of outputs, (P, n, m), (P, n), (L,) -> (P, L, m), without NaN."""
     populations, _, m = values.shape
     out = np.empty((populations, len(levels), m))
     is_shared = values.strides[0] == 0  # the same values for all populations, sorted once

@@ -145,10 +145,7 @@ def _between(x: Floats, y: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
 
 
 def _envelope(test: ValidityTest) -> tuple[Floats, tuple[Floats, Floats]]:
-    """Return places, and the lower and upper side of the envelope, with the corners of both.
-
-    The envelope is of sorted values: the smallest make the highest ECDF.
-    """
+    """Return places and sides of the envelope; the smallest values make the highest ECDF."""
     smallest, largest = test.envelope
     places = np.unique(np.concatenate([[0.0], smallest, largest, [1.0]]))
 

@@ -42,7 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy.special import gammaincinv, ndtri, stdtrit
@@ -215,13 +215,9 @@ def _difference(first: Floats, second: Floats) -> float:
     return half_difference(first[finite], second[finite]) if finite.any() else np.inf
 
 
-class _Pattern(NamedTuple):
-    """Specimens with the same outputs measured, and the proposal on their fibres."""
-
-    rows: Indices
-    columns: Indices
-    proposal: FibreProposal | None  # None: nothing is measured
-    error: Floats | None  # (columns,): of the readings; None if they are exact
+# Specimens with the same outputs measured: rows, columns, the proposal on their fibres, None where
+# nothing is measured, and the error of the readings, (columns,), None where they are exact.
+type _Pattern = tuple[Indices, Indices, FibreProposal | None, Floats | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,12 +241,12 @@ class FibreProposals:
         has_error = readings.is_measured & ((readings.error > 0) | (readings.step > 0))
         flags = np.concatenate([readings.is_measured, has_error], axis=1)
         patterns, number = np.unique(flags, axis=0, return_inverse=True)
-        proposals = []
+        proposals: list[_Pattern] = []
         for k, pattern in enumerate(patterns):
             rows = np.flatnonzero(number.ravel() == k)
             columns = np.flatnonzero(pattern[:m])
             if not len(columns):
-                proposals.append(_Pattern(rows, columns, None, None))
+                proposals.append((rows, columns, None, None))
                 continue
             response = _columns(emulation, columns)
             error, reference = None, population
@@ -260,7 +256,7 @@ class FibreProposals:
                 response, reference = with_errors(response, population, error)
             y = readings.values[np.ix_(rows, columns)]
             proposal = fit_fibres(response, y, reference, seed=seed, numbers=rows)
-            proposals.append(_Pattern(rows, columns, proposal, error))
+            proposals.append((rows, columns, proposal, error))
         return cls(emulation, readings, population, seed, proposals)
 
     @one_thread()
@@ -372,8 +368,10 @@ class FibreProposal:
         for block in _blocks(n, points):
             fibres = replace(self.fibres, y=self.fibres.y[block])
             charts = Charts(*(array[block] for array in vars(self.charts).values()))
-            sample = _draw(fibres, charts, points, (1, seed), self.numbers[block], after)
-            x[block], log_a[block] = fibres.population.inputs(sample.z), sample.log_a
+            z, log_a[block], *_ = _draw(
+                fibres, charts, points, (1, seed), self.numbers[block], after
+            )
+            x[block] = fibres.population.inputs(z)
         return x, log_a
 
 
@@ -461,13 +459,9 @@ def without_errors(x: Floats, log_a: Floats, m: int) -> tuple[Floats, Floats]:
     return x[..., :-m], log_a + log_normal
 
 
-class _Sample(NamedTuple):
-    """Points of n specimens, with their charts and Jacobians."""
-
-    z: Floats  # (n, K, d): whitened inputs
-    log_a: Floats  # (n, K)
-    chart: Indices  # (n, K)
-    jacobian: Floats  # (n, K, m, d): with respect to z
+# Points of n specimens: whitened inputs z, (n, K, d), numbers A, (n, K), charts, (n, K), and
+# Jacobians with respect to z, (n, K, m, d).
+type _Sample = tuple[Floats, Floats, Indices, Floats]
 
 
 def _draw(
@@ -503,7 +497,7 @@ def _draw(
     log_units = log_units - np.log(fibres.unit).sum()
     log_a[rows] = log_units - np.log(points) - log_density
     z = np.where(converged[:, None], z, 0.0)
-    return _Sample(
+    return (
         z.reshape(n, points, -1),
         log_a.reshape(n, points),
         slot.reshape(n, points),
@@ -517,9 +511,10 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
     With `turn` the solved directions become the row space of the mean Jacobian, which keeps
     det(J solved) off zero over more of the fibre. The present values count as 4 (d - m) points.
     """
+    z, log_a, chart, jacobian = sample
     d, k = charts.free.shape[2:]
     m = d - k
-    log_weight = sample.log_a - (sample.z**2).sum(axis=2) / 2
+    log_weight = log_a - (z**2).sum(axis=2) / 2
     largest = log_weight.max(axis=1, keepdims=True)
     weight = np.exp(log_weight - np.where(np.isfinite(largest), largest, 0))
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
@@ -527,16 +522,16 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
     location, scale = charts.location.copy(), charts.scale.copy()
     share = np.zeros_like(charts.share)
     for c in range(share.shape[1]):
-        w = np.where(sample.chart == c, weight, 0)
+        w = np.where(chart == c, weight, 0)
         share[:, c] = w.sum(axis=1)
         i = np.flatnonzero(share[:, c] > 1e-6)
         w = w[i] / share[i, c][:, None]
-        squares = weight[i] ** 2 * (sample.chart[i] == c)
+        squares = weight[i] ** 2 * (chart[i] == c)
         size = share[i, c] ** 2 / squares.sum(axis=1)
 
         turns = (size > d) & turn
         turned = i[turns]
-        mean_jacobian = np.einsum("nk,nkmd->nmd", w[turns], sample.jacobian[turned])
+        mean_jacobian = np.einsum("nk,nkmd->nmd", w[turns], jacobian[turned])
         right = np.linalg.svd(mean_jacobian)[2].transpose(0, 2, 1)
         solved[turned, c] = right[..., :m]
         free[turned, c] = right[..., m:]
@@ -550,7 +545,7 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
             root @ root.transpose(0, 2, 1) / Charts.inflation + np.eye(k) - rotation @ transposed
         )
 
-        u = (sample.z[i] - charts.centre[i, None, c]) @ free[i, c]
+        u = (z[i] - charts.centre[i, None, c]) @ free[i, c]
         old = (4.0 * k / (size + 4 * k))[:, None]
         new = (size / (size + 4 * k))[:, None]
         mean = new * (w[:, None, :] @ u)[:, 0] + old * present_location

@@ -191,19 +191,19 @@ def emulate(
     options: PointOptions,
     *,
     n: int | None = None,
-    known: Emulation | None = None,
+    previous: Emulation | None = None,
     seed: int = 0,
     name: str = "response",
 ) -> tuple[Emulation, Roots]:
     """Fit the emulator: runs over a box, then batches at the roots until the bias is small.
 
     ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. The first n
-    runs are in ``box``. ``known`` is the emulation of the same response for other data. Raise
+    runs are in ``box``. ``previous`` is the emulation of the same response for other data. Raise
     DesignError if the response cannot be emulated well enough.
     """
     d = box.shape[1]
     n = first_runs(d) if n is None else n
-    emulation = known
+    emulation = previous
     if emulation is None:
         first = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
         emulation = Emulation.first(run, first, search_box, readings, options, name)
@@ -214,7 +214,7 @@ def emulate(
             # Twice at most: a reading that no inputs reproduce is reported.
             emulation = replace(emulation, box=_widened(emulation.box, roots))
             roots = specimen_roots(emulation, readings, options)
-        enough = (batch >= 2 or known is not None) and emulation.covers(roots.z)
+        enough = (batch >= 2 or previous is not None) and emulation.covers(roots.z)
         if enough and emulation.bias <= options.bias:
             # Zero for the response itself, which no run improves.
             narrowing = 0.0 if emulation.bias == 0 else _narrowing(emulation, readings, roots)

@@ -179,10 +179,7 @@ class Report:
         return _write(file_path(path, "path"), self._html())
 
     def to_markdown(self, folder: str | PathLike[str]) -> Path:
-        """Write ``report.md``, and pictures as files beside it, into a folder.
-
-        The path of ``report.md`` is returned.
-        """
+        """Write ``report.md`` into a folder, with pictures beside it; return its path."""
         folder = folder_path(folder, "folder")
         files: list[str | None] = []
         for i, section in enumerate(self.sections, 1):
@@ -273,10 +270,7 @@ def _literal(value: Any) -> str:
 
 
 def _in_css(text: str) -> str:
-    """Return a text for a string of CSS, escaped but for letters and digits (CSS 2.1, 4.1.3).
-
-    A running title of more than 80 characters would meet the page's number on A4.
-    """
+    """Return a text of at most 80 characters for a string of CSS (CSS 2.1, 4.1.3)."""
     line = " ".join(visible(text).split())
     if len(line) > 80:
         line = line[:79] + "…"

@@ -145,7 +145,7 @@ Request = tuple[tuple[Any, ...], dict[str, Any]] | str
 
 def requests(m: Material) -> dict[str, Request]:
     """Return the arguments of the pictures that the contents of a report allow, by name."""
-    made: dict[str, Request] = {}
+    requested: dict[str, Request] = {}
     posterior = next(iter(m.posteriors.values()), None)
     # An optimum from a file has no evaluator, hence no population.
     optimum = next(iter(m.live_optima.values()), None)
@@ -161,35 +161,36 @@ def requests(m: Material) -> dict[str, Request]:
 
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
-        made["population"] = ((result,), {"model": m.model, **labels})
+        requested["population"] = ((result,), {"model": m.model, **labels})
     if m.model is not None and _computes_responses(m.model):
-        made["responses"] = "it would recompute responses; call prb.plot_responses for it"
-    elif "population" in made:
-        made["responses"] = made["population"]
+        requested["responses"] = "it would recompute responses; call prb.plot_responses for it"
+    elif "population" in requested:
+        requested["responses"] = requested["population"]
         if any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values()):
-            made["outputs"] = made["population"]
+            requested["outputs"] = requested["population"]
     if posterior is not None:
-        known = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
-        made["posterior"] = ((posterior,), {"optimum": optimum, "model": m.model, **known})
+        shown = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
+        requested["posterior"] = ((posterior,), {"optimum": optimum, "model": m.model, **shown})
         if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
-            made["stages"] = ((posterior,), {})
+            requested["stages"] = ((posterior,), {})
     if optimum is not None:
-        made["optimizer"] = ((optimum,), {"col_wrap": 2, **labels})
+        requested["optimizer"] = ((optimum,), {"col_wrap": 2, **labels})
         if m.model is not None:
-            made["landscape"] = ((optimum,), {"model": m.model, **labels})
+            requested["landscape"] = ((optimum,), {"model": m.model, **labels})
     if m.comparison is not None:
         names = m.comparison["hyperparameter"].values
-        made["comparison"] = ((m.comparison,), labels_of(names))
+        requested["comparison"] = ((m.comparison,), labels_of(names))
     if m.tests:
-        made["validity"] = ((m.tests if len(m.tests) > 1 else next(iter(m.tests.values())),), {})
+        tests = m.tests if len(m.tests) > 1 else next(iter(m.tests.values()))
+        requested["validity"] = ((tests,), {})
     tables = [t for t in m.decisions.values() if kind_of_decision(t) == "sensitivity"]
     if tables:
-        made["sensitivity"] = (tuple(tables[:1]), labels_of(tables[0]["factor"].values))
+        requested["sensitivity"] = (tuple(tables[:1]), labels_of(tables[0]["factor"].values))
     if m.validation:
         measured = {name: pair[0] for name, pair in m.validation.items()}
         predicted = {name: pair[1] for name, pair in m.validation.items()}
-        made["prediction"] = ((measured, predicted), labels_of(m.validation))
-    return made
+        requested["prediction"] = ((measured, predicted), labels_of(m.validation))
+    return requested
 
 
 def _computes_responses(model: pm.Model) -> bool:
@@ -202,16 +203,16 @@ def _computes_responses(model: pm.Model) -> bool:
 
 def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Section, ...]:
     """Return the sections with pictures after those that they belong to."""
-    made = requests(material)
+    requested = requests(material)
     illustrated: list[Section] = []
     pictures: list[Section] = []
     for section in sections:
         if section.level == 2:  # pictures come after all parts of the section before
             illustrated += pictures
             pictures = [
-                _picture(illustration, made[name])
+                _picture(illustration, requested[name])
                 for name, illustration in ILLUSTRATIONS.items()
-                if illustration.after == section.title and name in made
+                if illustration.after == section.title and name in requested
             ]
         illustrated.append(section)
     return (*illustrated, *pictures)

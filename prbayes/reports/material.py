@@ -122,11 +122,7 @@ def gather(
     validation: Any = None,
     labels: Mapping[str, str] | None = None,
 ) -> Material:
-    """Check results, and derive the missing ones.
-
-    Raise a `TypeError` or `ValueError` if a result is of another kind, or of other populations or
-    data than the model or the first result.
-    """
+    """Check results, and derive the missing ones."""
     optima = _by_label(optimum, "optimum")
     posteriors = _by_label(posterior, "posterior")
     tests = _by_label(validity, "validity")
@@ -287,10 +283,10 @@ def _require_tested(
         # Up to rounding and ties, in their order: rounded data change half of the values by far
         # less than .02; other data are .3 apart on average.
         distances = [
-            np.median(np.abs(values - known))
+            np.median(np.abs(values - tested_u))
             for values in (u, np.abs(2 * u - 1))
-            for known in tested
-            if known.shape == u.shape
+            for tested_u in tested
+            if tested_u.shape == u.shape
         ]
         if tested and not min(distances, default=1.0) < 0.02:
             raise ValueError(

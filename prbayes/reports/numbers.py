@@ -20,10 +20,7 @@ _SMALLEST, _LARGEST = -4, 7
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """Return a number with so many significant digits, and anything else as its text.
-
-    Four show a change of a thousandth, which no estimate from tens of specimens reaches.
-    """
+    """Return a number with so many significant digits, and anything else as its text."""
     if value is None:
         return NOTHING
     if isinstance(value, bool | np.bool_):
@@ -46,10 +43,7 @@ def number(value: Any, digits: int = 4) -> str:
 
 
 def places(sd: float, digits: int = 3) -> int | None:
-    """Return the number of decimals that show so many significant digits of a spread.
-
-    None where fixed decimals do not suit.
-    """
+    """Return the number of decimals that show so many digits of a spread; None if it has none."""
     if not (math.isfinite(sd) and sd > 0):
         return None
     # Rounded first: 0.0996 with two digits is 0.10, which needs two decimals and not three.
@@ -90,10 +84,7 @@ def percentage(share: float) -> str:
 
 
 def probability(p: float) -> str:
-    """Return a p-value after its sign, such as '= 0.18' or '< 0.001'.
-
-    A null distribution of 9999 replicates does not give the first digit of smaller ones.
-    """
+    """Return a p-value after its sign: '= 0.18' or, beyond 9999 replicates, '< 0.001'."""
     return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
 
 

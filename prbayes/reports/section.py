@@ -123,10 +123,7 @@ class Section:
 
 
 def image(picture: Any) -> bytes:
-    """Return the bytes of a picture; those of a figure are the same each time.
-
-    Raise a `TypeError` or `ValueError` if it is neither bytes of a known kind nor a figure.
-    """
+    """Return the bytes of a picture or figure, the same each time, or raise if it is neither."""
     if isinstance(picture, bytes):
         kind_of(picture)
         return picture
@@ -151,10 +148,7 @@ def image(picture: Any) -> bytes:
 
 
 def is_broad(picture: bytes) -> bool:
-    """Return whether a drawing is so wide that a phone should not shrink it.
-
-    Pictures of one panel are 400 points wide, those of two 650.
-    """
+    """Return whether a drawing has several panels: one is 400 points wide, two are 650."""
     width = re.search(rb'<svg[^>]*\swidth="([0-9.]+)(?:pt)?"', picture[:2000])
     return width is not None and float(width[1]) > 560
 

@@ -131,9 +131,6 @@ def assert_close(ours: Callable[[Any], Floats], expected: Callable[[Any], Floats
         assert np.allclose(ours(point), expected(point), atol=TOLERANCE)
 
 
-# -- several simulators ------------------------------------------------------------------------------
-
-
 def test_a_specimen_has_the_density_of_its_readings_in_both_simulators() -> None:
     assert_close(log_density(shared(), "b"), exact)
     assert values(shared(), "a").shape == (0,)
@@ -286,9 +283,6 @@ def test_draws_of_both_simulators_have_the_shape_of_their_readings() -> None:
     assert b.std() == pytest.approx(np.hypot(0.5, 0.2), rel=0.06)
 
 
-# -- repeated readings -------------------------------------------------------------------------------
-
-
 def test_repeated_readings_share_the_inputs_of_their_specimen() -> None:
     model = fine(repeated())
     assert_close(log_density(model, "y"), lambda point: exact_repeated(point, 0.3))
@@ -321,9 +315,6 @@ def test_a_specimen_with_repeated_readings_counts_once_in_a_held_out_loss() -> N
     held_out = np.isin(LABELS, [0, 19]).astype(float)[None]
     loss = _mean_log_losses(evaluator, thetas, [held_out])
     assert loss.item() == pytest.approx(-(logs[0] + logs[19]) / 2, rel=1e-12)
-
-
-# -- use of results ----------------------------------------------------------------------------------
 
 
 @pytest.mark.long
@@ -371,31 +362,6 @@ def test_routes_from_the_fit_to_a_prediction(make: Callable[[], pm.Model]) -> No
 
 
 @pytest.mark.long
-@pytest.mark.filterwarnings(
-    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
-)
-@pytest.mark.parametrize("make", [two_simulators, repeated])
-@pytest.mark.parametrize("sampler", ["pymc", "nutpie", "numpyro"])
-def test_nuts_has_the_posterior_of_importance_sampling(
-    sampler: str, make: Callable[[], pm.Model]
-) -> None:
-    pytest.importorskip(sampler)
-    model = make()
-    expected = prb.sample(1000, model=model, random_seed=1, progressbar=False).posterior
-    assert expected.attrs["sampler"] == "importance sampling"
-    with model:
-        draws = pm.sample(
-            1000, tune=500, chains=2, cores=1, nuts_sampler=sampler, random_seed=1,
-            progressbar=False,
-        ).posterior  # fmt: skip
-    for name in ("mu", "sigma"):
-        mean, sd = float(expected[name].mean()), float(expected[name].std())
-        # Several hundred effective draws have standard errors of .04 standard deviations.
-        assert abs(float(draws[name].mean()) - mean) < 0.2 * sd
-        assert abs(float(draws[name].std()) / sd - 1) < 0.15
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("make", [two_simulators, repeated])
 def test_other_data_sets_are_of_specimens(make: Callable[[], pm.Model]) -> None:
     optimum = prb.minimize(make(), progressbar=False)
@@ -408,9 +374,6 @@ def test_other_data_sets_are_of_specimens(make: Callable[[], pm.Model]) -> None:
     assert np.isfinite(folds["discrepancy"]).all()
     diagnosis = str(prb.diagnose(optimum))
     assert "20 specimens" in diagnosis or "No problem" in diagnosis
-
-
-# -- refusals ----------------------------------------------------------------------------------------
 
 
 def refused(message: str, of_b: dict[str, Any], **of_a: Any) -> None:

@@ -97,15 +97,9 @@ def pair() -> SimpleNamespace:
     )
     with pm.Model() as model:
         mu = pm.Normal("mu", 1.9, 1.0)
-        prb.Simulator(
-            "frame",
-            response,
-            pm.Normal.dist(mu, 1.0),
-            pm.Normal.dist(0.0, 1.0),
-            metric=prb.Joint(prb.ProbabilityResidual()),
-            observed=data,
-            propagation=prb.Reweighted(4096),
-        )
+        inputs = pm.Normal.dist(mu, 1.0), pm.Normal.dist(0.0, 1.0)
+        given: Any = {"metric": prb.Joint(prb.ProbabilityResidual()), "observed": data}
+        prb.Simulator("frame", response, *inputs, propagation=prb.Reweighted(4096), **given)
     draws = xr.Dataset({"mu": (("chain", "draw"), rng.normal(2.0, 0.01, (2, 50)))})
     tree = xr.DataTree.from_dict({"posterior": draws})
 

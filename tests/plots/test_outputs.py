@@ -134,3 +134,8 @@ def test_what_is_not_there_is_refused(
 ) -> None:
     with pytest.raises(error, match=match):
         prb.plot_outputs(several.posterior, model=several.model, **arguments)
+
+
+def test_a_model_of_single_outputs_is_refused(optimum: prb.Optimum) -> None:
+    with pytest.raises(ValueError, match=r"got simulators \['y'\] of one .* prb.plot_responses"):
+        prb.plot_outputs(optimum)

@@ -1,6 +1,5 @@
 """The posterior of each hyperparameter stands against optimum and prior."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +10,6 @@ import xarray as xr
 from scipy import stats
 
 import prbayes as prb
-from prbayes.plots.canvas import BLUE, VERMILION
 
 
 def test_the_posterior_stands_against_the_optimum(
@@ -32,23 +30,12 @@ def test_the_posterior_stands_against_the_optimum(
         )
         x, y = read.xy(pc, "normal", name)
         np.testing.assert_allclose(y, stats.norm.pdf(x, center, error))
-        assert (read.xy(pc, "interval", name)[1] < 0).all()
+        visuals = ("interval", "mean", "stderr", "optimum")
+        rows = {visual: float(read.xy(pc, visual, name)[1, 0]) for visual in visuals}
+        assert 0 > rows["interval"] == rows["mean"] > rows["stderr"] == rows["optimum"]
         assert min(pc.viz["plot"][name].item().get_yticks()) == 0
     x, y = read.xy(pc, "prior", "sigma")
     np.testing.assert_allclose(y, stats.halfnorm.pdf(x, scale=2), atol=0.06)
-
-
-def test_posterior_and_optimum_have_their_own_colours_and_rows(
-    drawn: Callable[..., Any], read: SimpleNamespace
-) -> None:
-    pc = drawn("posterior")
-    for visual in ("posterior", "interval"):
-        assert read.artist(pc, visual, "mu").get_color() == BLUE
-    for visual in ("normal", "stderr"):
-        assert read.artist(pc, visual, "mu").get_color() == VERMILION
-    visuals = ("interval", "mean", "stderr", "optimum")
-    rows = {visual: float(read.xy(pc, visual, "mu")[1, 0]) for visual in visuals}
-    assert 0 > rows["interval"] == rows["mean"] > rows["stderr"] == rows["optimum"]
 
 
 def test_a_posterior_alone(optimum: prb.Optimum, posterior: xr.DataTree) -> None:

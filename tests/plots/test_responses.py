@@ -145,23 +145,12 @@ def node(outputs: Outputs, name: str = "y") -> Any:
     return SimpleNamespace(name=name, outputs=outputs)
 
 
-@pytest.mark.parametrize(
-    ("outputs", "expected"),
-    [
-        (SINGLE_OUTPUT, False),
-        (Outputs((0, 1, 2)), False),  # columns of an array
-        (Outputs((0, 1, 2), "hour"), True),
-        (Outputs((0.5, 2.0, 3.0), "hour"), True),
-        (Outputs((0.5, 2.0), "hour"), False),
-        (Outputs(("a", "b", "c")), False),
-        (Outputs((1.0, 1.0, 2.0), "hour"), False),
-    ],
-)
-def test_a_curve_has_different_numbers_as_labels(outputs: Outputs, expected: bool) -> None:
-    assert is_curve(outputs) == expected
-
-
 def test_each_output_has_a_panel_but_a_curve_or_many_have_one() -> None:
+    """A curve has three or more different numbers as labels, which a user gave."""
+    hours = [(0, 1, 2), (0.5, 2.0, 3.0)]
+    assert all(is_curve(Outputs(labels, "hour")) for labels in hours)
+    few = [Outputs((0.5, 2.0), "hour"), Outputs((1.0, 1.0, 2.0), "hour"), Outputs(("a", "b", "c"))]
+    assert not any(map(is_curve, [SINGLE_OUTPUT, Outputs((0, 1, 2)), *few]))
     nodes = [
         node(SINGLE_OUTPUT),
         node(Outputs(("a", "b")), "z"),
@@ -239,65 +228,39 @@ def curve(a: Any) -> Any:
     return np.where(y > 13, np.inf, y)
 
 
-@pytest.fixture(scope="module")
-def wear() -> SimpleNamespace:
+def test_a_curve_has_one_panel_from_left_to_right(read: SimpleNamespace) -> None:
     observed = curve(np.linspace(0.5, 2.5, 11))
     observed[0, 2] = np.nan
-    data = xr.DataArray(
-        observed,
-        dims=("specimen", "hour"),
-        coords={"hour": HOURS},
-        attrs={"units": "mm"},
-    )[:, [0, 2, 3]]
+    coords = {"hour": HOURS}
+    data = xr.DataArray(observed, dims=("specimen", "hour"), coords=coords, attrs={"units": "mm"})
     with pm.Model() as model:
-        mu = pm.Normal("mu", 1.5, 0.5)
-        prb.Simulator(
-            "wear",
-            lambda a: curve(a)[..., [0, 2, 3]],
-            pm.Normal.dist(mu, 0.5),
-            metric=prb.Joint(prb.AreaMetric()),
-            observed=data,
-            propagation=prb.Resimulated(512),
-        )
+        a = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), 0.5)
+        given: Any = {"metric": prb.Joint(prb.AreaMetric()), "propagation": prb.Resimulated(512)}
+        response = lambda a: curve(a)[..., [0, 2, 3]]  # noqa: E731
+        prb.Simulator("wear", response, a, observed=data[:, [0, 2, 3]], **given)
     draws = xr.Dataset({"mu": (("chain", "draw"), np.linspace(1.4, 1.6, 20).reshape(2, 10))})
-    tree = xr.DataTree.from_dict({"posterior": draws})
-    pc = prb.plot_responses(tree, model=model)
-    return SimpleNamespace(pc=pc, axis=pc.viz["plot"]["wear"].item())
-
-
-def test_a_curve_has_one_panel_from_left_to_right(
-    wear: SimpleNamespace, read: SimpleNamespace
-) -> None:
-    x, y = read.xy(wear.pc, "after", "wear")
+    pc = prb.plot_responses(xr.DataTree.from_dict({"posterior": draws}), model=model)
+    axis = pc.viz["plot"]["wear"].item()
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("hour", "wear (mm)")
+    assert axis.get_title() == "11 measured specimens, 1 incomplete, 4 failed"
+    x, y = read.xy(pc, "after", "wear")
     np.testing.assert_array_equal(x, [1, 2, 3])
     np.testing.assert_allclose(y, np.array([2, 3, 4]) ** 1.5, rtol=0.03)
-    assert (wear.axis.get_xlabel(), wear.axis.get_ylabel()) == ("hour", "wear (mm)")
-    assert wear.axis.get_title() == "11 measured specimens, 1 incomplete, 4 failed"
-
-
-def test_measured_lines_go_over_what_is_missing_and_end_where_a_specimen_fails(
-    wear: SimpleNamespace, read: SimpleNamespace
-) -> None:
-    x, y = read.xy(wear.pc, "measured", "wear")
+    # Measured lines continue after a missing value, and end where a specimen fails
+    x, y = read.xy(pc, "measured", "wear")
     ends = np.flatnonzero(np.isnan(x))
     np.testing.assert_array_equal(x[: ends[0]], [2, 3])
-    np.testing.assert_array_equal(x[ends[-2] + 1 : ends[-1]], [1, 2])
-    np.testing.assert_allclose(y[ends[-2] + 1 : ends[-1]], [2**2.3, 3**2.3])
+    last = slice(ends[-2] + 1, ends[-1])
+    np.testing.assert_array_equal(x[last], [1, 2])
+    np.testing.assert_allclose(y[last], [2**2.3, 3**2.3])
     assert ends.size == 10
-
-
-def test_the_band_holds_most_of_the_population_and_is_cut_where_it_has_failed(
-    wear: SimpleNamespace, read: SimpleNamespace
-) -> None:
-    low, high = read.sides(wear.pc, "population", "wear", np.array([1.0, 3.0]))
-    assert low[0] == pytest.approx(2 ** stats.norm.ppf(LEVELS[0], 1.5, 0.5), rel=0.03)
-    assert high[0] == pytest.approx(2 ** stats.norm.ppf(LEVELS[2], 1.5, 0.5), rel=0.03)
-    assert np.isfinite(high[1])
-    assert high[1] > wear.axis.get_ylim()[1]
-    inner = np.ptp(read.sides(wear.pc, "band", "wear", np.array([1.0])))
-    assert inner == pytest.approx(
-        0.89 * (2**1.6 - 2**1.4), rel=0.1
-    )  # of the medians between 1.4 and 1.6
+    # The band contains most of the population, and is cut where it has failed
+    low, high = read.sides(pc, "population", "wear", np.array([1.0, 3.0]))
+    quantiles_of = 2 ** stats.norm.ppf(LEVELS[[0, 2]], 1.5, 0.5)
+    np.testing.assert_allclose([low[0], high[0]], quantiles_of, rtol=0.03)
+    assert axis.get_ylim()[1] < high[1] < np.inf
+    inner = np.ptp(read.sides(pc, "band", "wear", np.array([1.0])))
+    assert inner == pytest.approx(0.89 * (2**1.6 - 2**1.4), rel=0.1)  # of medians from 1.4 to 1.6
 
 
 def test_many_outputs_with_names_are_in_their_own_spread(read: SimpleNamespace) -> None:
@@ -308,14 +271,9 @@ def test_many_outputs_with_names_are_in_their_own_spread(read: SimpleNamespace) 
     frame = xr.DataArray(data, dims=("i", "gauge"), coords={"gauge": names})
     with pm.Model() as model:
         a, b = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0), pm.Normal.dist(0.0, 1.0)
-        prb.Simulator(
-            "strain",
-            lambda a, b: (a[..., None] + b[..., None] * np.arange(9)) * unit,
-            *(a, b),
-            metric=prb.MarginalCorrelation(prb.AreaMetric()),
-            observed=frame,
-            propagation=prb.Resimulated(64),
-        )
+        given: Any = {"metric": prb.MarginalCorrelation(prb.AreaMetric()), "observed": frame}
+        response = lambda a, b: (a[..., None] + b[..., None] * np.arange(9)) * unit  # noqa: E731
+        prb.Simulator("strain", response, a, b, propagation=prb.Resimulated(64), **given)
     draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((1, 8)))})
     tree = xr.DataTree.from_dict({"posterior": draws})
     pc = prb.plot_responses(tree, model=model, before=False)

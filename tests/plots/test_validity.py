@@ -1,13 +1,11 @@
 """The u-values of a validity test against their envelope."""
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import arviz as az
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 import prbayes as prb
 from prbayes.plots.validity import _between, in_directions
@@ -62,22 +60,17 @@ def test_the_verdict_stands_in_the_title() -> None:
 def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
     for shift, inside in ((0.0, True), (1.2, False)):
         test = validity(shift)
-        pc = prb.plot_validity(test)
-        band = polygon(pc.viz["envelope"]["u"].item())
-        half = len(band) // 2
+        path = prb.plot_validity(test).viz["envelope"]["u"].item().get_paths()[0]
         v = np.linspace(0.011, 0.989, 200)
-        sides = [np.sort(part[:, 0]) for part in (band[:half], band[half:])]
-        assert all(side[0] == 0 for side in sides)
         low, high = (np.searchsorted(test.envelope[i], v, side="right") / 20 for i in (1, 0))
         ecdf = np.searchsorted(np.sort(test.u_values), v, side="right") / 20
         assert ((low <= ecdf) & (ecdf <= high)).all() == inside
-        path = pc.viz["envelope"]["u"].item().get_paths()[0]
         middle = path.contains_points(np.column_stack([v, (low + high) / 2 + 1e-9]))
         assert middle[high > low].all()
         assert not path.contains_points(np.column_stack([v, high + 0.03]))[high < 0.96].any()
 
 
-def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> None:
+def test_several_tests_of_different_sizes_get_a_panel_each() -> None:
     small = prb.area_test(FRESH[:7], PREDICTED, null=QUICK)
     pc = prb.plot_validity({"all": validity(), "some": small})
     axes = pc.viz["plot"]
@@ -86,9 +79,6 @@ def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> No
         "share of 20 values",
         "share of 7 values",
     ]
-    pc.savefig(tmp_path / "v.png")
-    image = imread(tmp_path / "v.png")[..., :3]
-    assert (image.min(axis=2) < 0.9).mean() > 0.05
 
 
 def test_refusals() -> None:

@@ -39,19 +39,6 @@ def unscaled(response: Any, y: Array) -> Fibres:
     return Fibres(response, STANDARD, np.ones(1), y)
 
 
-def test_the_unit_of_outputs_is_their_spread() -> None:
-    population = ReferencePopulation(np.array([3.0, 0.0]), np.diag([2.0, 0.1]))
-    fibres = Fibres.of(
-        lambda x: (5 * x[:, :1], np.ones((len(x), 1, 2))), np.ones((4, 1)), population
-    )
-    np.testing.assert_allclose(fibres.unit, 10, rtol=0.1)
-    np.testing.assert_allclose(fibres.y * fibres.unit, 1)
-    constant = Fibres.of(
-        lambda x: (np.ones((len(x), 1)), np.zeros((len(x), 1, 2))), np.ones((4, 1)), population
-    )
-    assert constant.unit == 1
-
-
 def test_steps_of_least_norm_end_at_the_nearest_point_of_a_linear_fibre() -> None:
     a = np.array([[3.0, 4.0]])
     fibres = unscaled(lambda x: (x @ a.T, np.broadcast_to(a, (len(x), 1, 2))), np.array([[10.0]]))

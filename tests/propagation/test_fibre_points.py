@@ -88,12 +88,6 @@ def nonlinear_problem(name: str) -> Problem:
         y = np.exp(np.linspace(-2, 2, 9))
         response = differentiated(lambda x: np.exp(x[:, :1]))
         exact = norm(0.3, 0.9).logpdf(np.log(y)) - np.log(y)
-    elif name == "product":
-        y = np.linspace(3, 8, 9)
-        response = differentiated(lambda x: (x[:, :1] + 5) * np.exp(0.3 * x[:, 1:]))
-        shrunk = np.exp(-0.3 * grid)
-        density = norm(0.3, 0.9).pdf(y[:, None] * shrunk - 5) * shrunk * norm(-0.2, 0.9).pdf(grid)
-        exact = np.log(density.sum(axis=1) * step)
     else:
         y = np.linspace(-0.3, 5, 12)
         response = differentiated(lambda x: (x[:, :1] + 0.5) ** 2 + 0.2 * x[:, 1:])
@@ -113,15 +107,12 @@ def problem(name: str) -> Problem:
 
 # Standard errors of log L with 4096 points: largest root mean square error of a specimen, 6 seeds.
 STANDARD_ERRORS = {
-    "linear 2 1": 4.2e-4,
     "linear 3 2": 1.7e-4,
-    "linear 5 2": 2.8e-3,
     "linear 8 4": 3.1e-3,
     "linear 8 1": 9.8e-3,
     "circle": 2.5e-3,
     "sphere": 1.5e-2,
     "exponential": 1.2e-4,
-    "product": 1.4e-4,
     "fold": 2.0e-3,
 }
 
@@ -165,7 +156,7 @@ def test_proposals_of_different_seeds_agree_on_fibres_with_turns() -> None:
     assert np.abs(away).max() < 5 * 0.0022  # standard error from seeds .0022
 
 
-@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
+@pytest.mark.parametrize("scale", [1e-9, 1e6])
 def test_points_do_not_depend_on_units(scale: float) -> None:
     p = problem("fold")
     of_x, of_y = np.array([3.0, 0.01]) * scale, 0.2 / scale
@@ -220,7 +211,7 @@ def test_inputs_where_the_response_has_no_value_have_weight_zero() -> None:
     assert np.abs(error).max() < 5 * 0.0022  # standard error from seeds .0022
 
 
-@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan, 1e300])
+@pytest.mark.parametrize("bad", [np.inf, 1e300])
 def test_infinite_and_huge_responses_are_no_points(bad: float) -> None:
     def response(x: Array) -> tuple[Array, Array]:
         values = np.where(x[:, :1] > 1, bad, x[:, :1] * x[:, 1:])
@@ -366,11 +357,9 @@ def errors(points: SpecimenPoints, exact: Floats, draws: NormalDraws) -> Floats:
     return np.asarray(draws.log_likelihoods(points.z, points.log_a) - exact)
 
 
-# -- closed forms ------------------------------------------------------------------------------------
-
 # Standard errors of log L: largest root mean square error of a specimen and population, six seeds.
-LINEAR = {(2, 1): 2.5e-3, (3, 1): 1.7e-2, (3, 2): 3.6e-3, (4, 2): 1.2e-2}
-PATTERNS = {(2, 0.0): 6.8e-3, (2, 0.1): 1.1e-2, (3, 0.0): 2.5e-2, (3, 0.1): 3.8e-2}
+LINEAR = {(2, 1): 2.5e-3, (4, 2): 1.2e-2}
+PATTERNS = {(2, 0.1): 1.1e-2, (3, 0.0): 2.5e-2}
 
 
 @pytest.mark.parametrize(("d", "m"), LINEAR)
@@ -438,9 +427,6 @@ def test_the_log_proposal_serves_another_error() -> None:
     log_a = other.log_density(points.outputs, emulation.error) - points.log_proposal
     error = draws.log_likelihoods(points.z, log_a) - linear_log_likelihoods(a, other, draws)
     assert np.abs(error).max() < 5 * PATTERNS[2, 0.1]
-
-
-# -- loops -------------------------------------------------------------------------------------------
 
 
 def test_points_are_doubled_until_both_halves_agree() -> None:

@@ -78,13 +78,6 @@ def test_more_outputs_than_inputs_are_least_squares() -> None:
         assert np.allclose(roots.jacobian[i], -(-a / sd[:, None]))
 
 
-def test_the_standard_deviation_may_be_of_each_specimen() -> None:
-    a = np.array([[1.0], [1.0]])
-    y, sd = np.array([[0.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 1.0], [1.0, 0.5]])
-    roots = find_roots(line(a), y, sd, spread_starts(2, 4, BOX), BOX)
-    assert np.allclose(roots.z.ravel(), [0.5, 0.8], atol=1e-6)  # weighted means
-
-
 def test_beyond_a_turning_point_the_root_is_there() -> None:
     """The response reaches 0 and no less: the nearest input is that of the turning point."""
     y, sd = np.array([[-0.1]]), np.array([0.1])

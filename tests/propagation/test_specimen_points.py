@@ -65,9 +65,6 @@ def normal(mean: Any, covariance: Any) -> Density:
     return lambda z: normal_log_density(z, np.atleast_1d(mean), root)
 
 
-# -- linear responses of normal inputs ---------------------------------------------------------------
-
-
 class Linear:
     def __init__(self, d: int, m: int, n: int = 12) -> None:
         rng = np.random.default_rng([d, m])
@@ -84,13 +81,6 @@ class Linear:
         log_mass = -np.linalg.slogdet(scaled.T @ scaled)[1] / 2 - np.log(sd).sum()
         log_mass -= (len(sd) - len(mean)) / 2 * np.log(2 * np.pi)
         return normal_log_density(self.x, mean, np.linalg.cholesky(covariance)) + log_mass
-
-    def exact(self, mean: Floats, covariance: Floats, sd: Any) -> Floats:
-        """Return the log-density of the outputs with errors."""
-        variance = self.matrix @ covariance @ self.matrix.T + np.diag(np.asarray(sd) ** 2)
-        center = self.matrix @ mean + self.offset
-        root = np.linalg.cholesky(variance)
-        return normal_log_density(self.y, center, root)
 
 
 def populations(d: int, count: int = 4) -> list[tuple[Floats, Floats]]:
@@ -126,21 +116,6 @@ def test_a_linear_response_of_normal_inputs(d: int, m: int) -> None:
     assert np.abs(np.mean(differences[0] - differences[1])) < 1e-6
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("d", "m"), SHAPES)
-def test_a_linear_response_with_an_error_of_the_readings(d: int, m: int) -> None:
-    problem = Linear(d, m)
-    problem.y = problem.y + 0.1 * np.random.default_rng(0).normal(size=problem.y.shape)
-    emulation, points = points_of(problem, problem.y, d, error=0.1)
-    sd = np.hypot(emulation.error, 0.1)
-    ours, exact = [], []
-    for mean, covariance in populations(d):
-        ours.append(log_likelihoods(points, normal(mean, covariance)).sum())
-        exact.append(problem.exact(mean, covariance, sd).sum())
-    # Within a few of the tolerance of half differences, .15 nats
-    assert np.abs(np.subtract(ours, exact)).max() < 0.6
-
-
 @pytest.mark.parametrize("d", [1, 2])
 def test_a_missing_output_is_integrated_over(d: int) -> None:
     """One output of d + 1 is missing: the others determine the inputs."""
@@ -154,9 +129,6 @@ def test_a_missing_output_is_integrated_over(d: int) -> None:
     some.matrix = some.matrix[1:]
     exact[::3] = some.sharp(mean, covariance, emulation.error[1:])[::3]
     assert np.allclose(log_likelihoods(points, normal(mean, covariance)), exact, atol=3e-2)
-
-
-# -- several roots -----------------------------------------------------------------------------------
 
 
 def square(z: Floats) -> Floats:
@@ -224,9 +196,6 @@ def test_readings_around_a_turning_point(error: float) -> None:
     assert np.abs(differences).max() < 0.6
 
 
-# -- ends of a support -------------------------------------------------------------------------------
-
-
 def test_the_end_of_a_support_jumps_at_the_largest_specimen() -> None:
     """The likelihood of a uniform population's end is theta^-N above the largest x, else zero."""
     x = np.random.default_rng(0).uniform(-0.8, 0.6, 30)
@@ -244,9 +213,6 @@ def test_the_end_of_a_support_jumps_at_the_largest_specimen() -> None:
     )
     assert total(above) == pytest.approx(-30 * np.log(above + 1) - x.sum(), abs=0.05)
     assert total(x.max() - 1e-3) == -np.inf
-
-
-# -- loops -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -269,9 +235,7 @@ def test_populations_of_readings_with_a_large_error(scatter: float) -> None:
     assert np.sqrt(np.mean(np.square(ranges))) < 0.2
 
 
-@pytest.mark.parametrize(
-    ("measured", "mean", "sd"), [(1, 0.4, 0.5), (3, 0.1, 0.4), (15, -0.45, 0.07)]
-)
+@pytest.mark.parametrize(("measured", "mean", "sd"), [(1, 0.4, 0.5), (15, -0.45, 0.07)])
 def test_censored_specimens_far_from_the_measured_ones(
     measured: int, mean: float, sd: float
 ) -> None:
@@ -401,9 +365,6 @@ def test_batches_of_runs_are_at_the_roots() -> None:
     assert np.mean((fresh > 0.1) & (fresh < 0.7)) > 0.8
 
 
-# -- invariances -------------------------------------------------------------------------------------
-
-
 def of_folded(points: SpecimenPoints, unit: float = 1.0) -> Floats:
     density = normal(0.15 * unit, (0.3 * unit) ** 2)
     return log_likelihoods(points, density)
@@ -435,9 +396,6 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     for name in ("z", "outputs", "log_a", "log_proposal"):
         assert np.array_equal(getattr(first, name), getattr(second, name))
         assert not np.array_equal(getattr(first, name), getattr(third, name))
-
-
-# -- where there is no response ----------------------------------------------------------------------
 
 
 def test_a_response_of_a_part_of_the_box() -> None:

@@ -123,38 +123,31 @@ def test_a_report_computes_no_response(calls: Calls, section: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lacking", "words"),
-    [("package", "no Python package graphviz"), ("program", "no program dot")],
+    "lacking", ["no Python package graphviz", "no program dot", "does not take a name"]
 )
 def test_without_graphviz_there_is_no_graph(
     lacking: str,
-    words: str,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     tmp_path: Path,
     calibrated: Any,
 ) -> None:
-    """A reader of the report is not told what the writer's machine lacks; the log says it."""
-    if lacking == "package":
-        monkeypatch.setitem(sys.modules, "graphviz", None)
-    else:
-        monkeypatch.setenv("PATH", str(tmp_path))
-    with caplog.at_level("INFO", "prbayes"):
-        made = prb.Report("x", model=calibrated.model)
-    assert "Graph" not in [section.title for section in made.sections]
-    assert words in caplog.text
-    assert words not in made._html()
+    """A reader of the report is not told what the writer's machine lacks; the log has it."""
 
-
-def test_a_name_that_graphviz_does_not_take(
-    monkeypatch: pytest.MonkeyPatch, calibrated: Any
-) -> None:
     def fails(_: Any) -> bytes:
         raise subprocess.CalledProcessError(1, "dot")
 
-    monkeypatch.setattr(figures, "_svg", fails)
-    made = prb.Report("x", model=calibrated.model)
-    assert "Graph" not in [section.title for section in made.sections]
+    if lacking == "no Python package graphviz":
+        monkeypatch.setitem(sys.modules, "graphviz", None)
+    elif lacking == "no program dot":
+        monkeypatch.setenv("PATH", str(tmp_path))
+    else:
+        monkeypatch.setattr(figures, "_svg", fails)
+    with caplog.at_level("INFO", "prbayes"):
+        report = prb.Report("x", model=calibrated.model)
+    assert "Graph" not in [section.title for section in report.sections]
+    assert lacking in caplog.text
+    assert lacking not in report._html()
 
 
 def needs_dot() -> None:

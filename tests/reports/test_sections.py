@@ -16,7 +16,7 @@ import prbayes as prb
 from prbayes.optimize.convergence import Result
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import NOTHING, cells
-from prbayes.reports.sections import _other_optimum, data, metric
+from prbayes.reports.sections import _other_optimum, data, metric, optima, posteriors
 from prbayes.response.outputs import Outputs
 
 
@@ -36,45 +36,69 @@ def test_model_and_data(
     assert "y: 30 specimens: 100, 101" in " ".join(section(report, "Data").text)
 
 
-def test_metric_and_epsilon(
+def number_row(row: dict[str, str], *keys: str) -> list[float]:
+    """Return the numbers of some columns."""
+    return [float(row[key]) for key in keys]
+
+
+def test_metric_optimum_and_posterior(
     calibrated: Any, report: prb.Report, page: Any, row: Any, section: Any
 ) -> None:
     _, optimum, posterior, _ = calibrated
-    table = row("posterior", "epsilon", page)
     calibration = posterior["calibration"]
-    assert float(table["epsilon"]) == pytest.approx(float(calibration["epsilon"][0]), rel=1e-3)
-    assert float(table["discrepancy"]) == pytest.approx(
-        float(calibration["discrepancy"].mean()), rel=1e-3
-    )
-    assert float(row("optimum", "epsilon", page)["discrepancy"]) == pytest.approx(
-        optimum.discrepancy, rel=1e-3
-    )
-    assert any(
-        p.startswith("y: KullbackLeibler(") for p in section(report, "Metric and epsilon").text
-    )
+    of_posterior = number_row(row("posterior", "epsilon", page), "epsilon", "discrepancy")
+    expected = [float(calibration["epsilon"][0]), float(calibration["discrepancy"].mean())]
+    np.testing.assert_allclose(of_posterior, expected, rtol=1e-3)
+    of_optimum = float(row("optimum", "epsilon", page)["discrepancy"])
+    assert of_optimum == pytest.approx(optimum.discrepancy, rel=1e-3)
+    text = section(report, "Metric and epsilon").text
+    assert any(line.startswith("y: KullbackLeibler(") for line in text)
+    evaluations = f"after {optimum.search.n_evaluations} evaluations"
+    assert evaluations in " ".join(section(report, "Optimum").text)
+    summary = az.summary(posterior, ci_prob=0.89, ci_kind="eti", round_to="none")
+    for name in ("mu", "sigma", "cv"):
+        error = optimum.stderr[name]
+        estimate = number_row(row(name, "standard error", page), "estimate", "standard error")
+        np.testing.assert_allclose(estimate, [optimum.point[name], error], atol=6e-3 * error)
+        cells_of, exact = row(name, "R-hat", page), summary.loc[name]
+        draws = posterior["posterior"][name].values
+        expected = [draws.mean(), draws.std(ddof=1), *np.quantile(draws, [0.055, 0.945])]
+        estimates = number_row(cells_of, "mean", "sd", "89% from", "to")
+        np.testing.assert_allclose(estimates, expected, atol=exact["sd"] * 6e-3)
+        sizes = number_row(cells_of, "ESS, bulk", "ESS, tail")
+        np.testing.assert_allclose(sizes, exact[["ess_bulk", "ess_tail"]], atol=0.6)
+        assert float(cells_of["R-hat"]) == pytest.approx(exact["r_hat"], abs=6e-4)
+        assert float(cells_of["error of mean"]) == pytest.approx(exact["mcse_mean"], rel=0.06)
 
 
 def test_results_under_different_metrics(calibrated: Any) -> None:
     first = calibrated.optimum.to_datatree()
-    other = first.copy(deep=True)
-    other["calibration"] = (
-        other["calibration"].to_dataset().assign(metric=("simulator", ["Other()"]))
-    )
-    given = dict.fromkeys(("model", "posterior", "validity", "comparison"))
-    (same,) = metric(gather(optimum={"a": first, "b": first}, **given))
+    changed = first.copy(deep=True)
+    table = changed["calibration"].to_dataset()
+    changed["calibration"] = table.assign(metric=("simulator", ["Other()"]))
+    (same,) = metric(gather(optimum={"a": first, "b": first}))
     assert [p.split(": ")[0] for p in same.text[1:]] == ["y"]
-    (different,) = metric(gather(optimum={"a": first, "b": other}, **given))
+    (different,) = metric(gather(optimum={"a": first, "b": changed}))
     assert different.text[2] == "b, y: Other()."
     assert different.text[1].startswith("a, y: KullbackLeibler(")
     assert "Epsilon" not in different.text[0], "optima have none"
     assert "epsilon" not in cells(different.table).header
 
 
-def test_one_measured_value_has_no_spread(calibrated: Any) -> None:
-    nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
-    m = dataclasses.replace(gather(**nothing), observed={"y": np.array([2.5])})
+def test_few_values_and_many_outputs() -> None:
+    m = dataclasses.replace(gather(), observed={"y": np.array([2.5])})
     (row,) = cells(data(m)[0].table).rows
     assert row == ("y", "1", "2.500", "2.500", "2.500", "\u2013")
+    curve = np.random.default_rng(1).normal(size=(5, 40))
+    outputs = {"y": Outputs(tuple(np.arange(40) / 2), "hour")}
+    about, correlations, values = data(
+        dataclasses.replace(m, observed={"y": curve}, outputs=outputs)
+    )
+    rows = cells(about.table).rows
+    assert len(rows) == len(cells(correlations.table).rows) == 12
+    assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
+    assert "y: 12 of 40 outputs are shown." in about.text
+    assert len(values.text) == 41  # of few specimens all outputs are listed
 
 
 # -- several outputs -------------------------------------------------------------------------------
@@ -110,7 +134,7 @@ def frame(measured: Any) -> pm.Model:
 
 
 def test_each_output_has_a_row_and_pairs_have_correlations(frame: Any, measured: Any) -> None:
-    about, correlations, values = data(gather(frame, None, None, None, None))
+    about, correlations, values = data(gather(frame))
     table = cells(about.table)
     assert table.header == (
         *("simulator", "output", "units", "N", "failed", "missing"),
@@ -131,86 +155,28 @@ def test_each_output_has_a_row_and_pairs_have_correlations(frame: Any, measured:
     assert second_listed.removeprefix("frame[second]: ").split(", ")[:3] == [NOTHING, NOTHING, "∞"]
 
 
-def test_a_result_alone_tells_the_same_of_outputs(frame: Any) -> None:
+def test_outputs_and_units_are_those_of_the_model_in_a_result_alone(frame: Any) -> None:
     optimum = prb.minimize(frame)
-    told = data(gather(frame, None, None, None, None))
-    tree = optimum.to_datatree()
-    stored = data(gather(None, tree, None, None, None))
-    for one, other in zip(told, stored, strict=True):
-        assert other.text == one.text
-        if one.table is not None:
-            assert cells(other.table) == cells(one.table)
+    stored = data(gather(optimum=optimum.to_datatree()))
+    for section, of_model in zip(stored, data(gather(frame)), strict=True):
+        assert section.text == of_model.text
+        if section.table is not None:
+            assert cells(section.table) == cells(of_model.table)
     report = prb.Report("Frame", optimum=optimum, model=frame, pictures=False)
-    assert (
-        "on 20 specimens with 2 outputs of frame, by the joint probability residual"
-        in (report.sections[0].text[1])
-    )
-
-
-def test_of_a_curve_some_outputs_have_a_row(calibrated: Any) -> None:
-    nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
-    rng = np.random.default_rng(1)
-    m = dataclasses.replace(
-        gather(**nothing),
-        observed={"y": rng.normal(size=(5, 40))},
-        outputs={"y": Outputs(tuple(np.arange(40) / 2), "hour")},
-    )
-    about, correlations, values = data(m)
-    rows = cells(about.table).rows
-    assert len(rows) == len(cells(correlations.table).rows) == 12
-    assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
-    assert "y: 12 of 40 outputs are shown." in about.text
-    assert len(values.text) == 41  # of few specimens all outputs are listed
-
-
-def test_one_output_tells_its_units_from_memory_and_from_a_result() -> None:
+    data_of = "on 20 specimens with 2 outputs of frame, by the joint probability residual"
+    assert data_of in report.sections[0].text[1]
     values = xr.DataArray([1.0, 2.0, 4.0], dims="specimen", attrs={"units": "N/mm"})
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 2, 1), 1.0)
-        prb.Simulator(
-            "k", np.positive, x, metric=prb.AreaMetric(), observed=values,
-            propagation=prb.Reweighted(64),
-        )  # fmt: skip
+        given: Any = {"metric": prb.AreaMetric(), "propagation": prb.Reweighted(64)}
+        prb.Simulator("k", np.positive, x, observed=values, **given)
     optimum = prb.minimize(model)
-    for given in ((model, None), (None, optimum.to_datatree())):
-        section, values = data(gather(*given, None, None, None))
-        assert values.text[1] == "k: 1.000, 2.000, 4.000."
-        assert section.table["units"].tolist() == ["N/mm"]
+    for material in (gather(model), gather(optimum=optimum.to_datatree())):
+        about, listed = data(material)
+        assert listed.text[1] == "k: 1.000, 2.000, 4.000."
+        assert about.table["units"].tolist() == ["N/mm"]
     picture = prb.plot_responses(optimum)
     assert picture.viz["plot"]["k"].item().get_xlabel() == "k (N/mm)"
-
-
-def test_optimum(calibrated: Any, report: prb.Report, page: Any, row: Any, section: Any) -> None:
-    _, optimum, _, _ = calibrated
-    for name in ("mu", "sigma", "cv"):
-        found = row(name, "standard error", page)
-        assert float(found["standard error"]) == pytest.approx(optimum.stderr[name], rel=6e-3)
-        assert float(found["estimate"]) == pytest.approx(
-            optimum.point[name], abs=optimum.stderr[name] * 6e-3
-        )
-    assert f"after {optimum.search.n_evaluations} evaluations" in " ".join(
-        section(report, "Optimum").text
-    )
-
-
-def test_posterior(calibrated: Any, page: Any, row: Any) -> None:
-    _, _, posterior, _ = calibrated
-    summary = az.summary(posterior, ci_prob=0.89, ci_kind="eti", round_to="none")
-    for name in ("mu", "sigma", "cv"):
-        found, exact = row(name, "R-hat", page), summary.loc[name]
-        draws = posterior["posterior"][name].values
-        low, high = np.quantile(draws, [0.055, 0.945])
-        for key, value in (
-            ("mean", draws.mean()),
-            ("sd", draws.std(ddof=1)),
-            ("89% from", low),
-            ("to", high),
-        ):
-            assert float(found[key]) == pytest.approx(value, abs=exact["sd"] * 6e-3)
-        assert float(found["ESS, bulk"]) == pytest.approx(exact["ess_bulk"], abs=0.6)
-        assert float(found["ESS, tail"]) == pytest.approx(exact["ess_tail"], abs=0.6)
-        assert float(found["R-hat"]) == pytest.approx(exact["r_hat"], abs=6e-4)
-        assert float(found["error of mean"]) == pytest.approx(exact["mcse_mean"], rel=0.06)
 
 
 def test_elements_have_the_same_names_in_every_table(section: Any) -> None:
@@ -243,70 +209,52 @@ def test_elements_have_the_same_names_in_every_table(section: Any) -> None:
         ("none", "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."),
     ],
 )
-def test_what_sets_the_width_of_the_draws(
-    adjustment: str, sentence: str, calibrated: Any, section: Any
+def test_the_width_of_the_draws_is_explained(
+    adjustment: str, sentence: str, calibrated: Any
 ) -> None:
     tree = calibrated.posterior.copy(deep=True)
     tree["posterior"].attrs["adjustment"] = adjustment
-    made = prb.Report("x", posterior=tree, pictures=False)
-    assert section(made, "Posterior").text[1].startswith(sentence)
+    assert posteriors(gather(posterior=tree))[0].text[1].startswith(sentence)
+    tree["posterior"]["cv"][:] = 1.0  # a variable that never moves
+    rows = {row[0]: row for row in cells(posteriors(gather(posterior=tree))[0].table).rows}
+    assert rows["cv"][1] == "1.000"
 
 
-def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
+def test_other_optima_are_reported(calibrated: Any) -> None:
     others = tuple(
-        {"point": {"mu": mu, "w": np.ones(2)}, "discrepancy": 0.25, "comparable": comparable}
+        {"point": {"mu": mu}, "discrepancy": 0.25, "comparable": comparable}
         for mu, comparable in ((-1.5, True), (3.0, False))
     )
     search = dataclasses.replace(
         calibrated.optimum.search, result=Result.FAILED, details="It stopped."
     )
     optimum = dataclasses.replace(calibrated.optimum, local_optima=others, search=search)
-    text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
-    assert text[0].startswith("The optimiser did not converge after ")
-    assert text[0].endswith("of the objective: The minimiser failed. It stopped.")
-    assert text[1] == (
+    (section,) = optima(gather(optimum=optimum))
+    ended, first, second, _ = section.text
+    assert ended.startswith("The optimiser did not converge after ")
+    assert ended.endswith("of the objective: The minimiser failed. It stopped.")
+    assert first == (
         "Another optimum is at mu = -1.500, with discrepancy 0.2500: "
         "the data could as well come from there."
     )
-    assert text[2].endswith(
-        "at mu = 3.000, with discrepancy 0.2500: the data fit it less well; a posterior gives "
-        "its weight."
-    )
-    vector = ({"point": {"w": np.array([1.0, 2.0])}, "discrepancy": 0.25, "comparable": True},)
-    of_it = {"w": np.array([3.0, 4.0])}
-    optimum = dataclasses.replace(optimum, local_optima=vector, point=of_it, stderr=of_it)
-    text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
-    assert "is at w[0] = 1.000, w[1] = 2.000, with" in text[1]
-
-
-def test_a_place_of_many_elements_is_told_by_scalars_alone() -> None:
-    for size, told in ((7, "mu = 2.000, w[0]"), (8, "mu = 2.000, with")):
-        point = {"mu": 2.0, "w": np.ones(size)}
+    assert second.endswith("the data fit it less well; a posterior gives its weight.")
+    # A place of many elements is described by scalars alone
+    for size, beginning in ((7, "mu = 2.000, w[0]"), (8, "mu = 2.000, with")):
+        point = xr.Dataset({"mu": 2.0, "w": ("k", np.ones(size))}).data_vars
         names = ["mu", *(f"w[{i}]" for i in range(size))]
-        mode = {"discrepancy": 0.1, "comparable": False}
-        assert f"is at {told}" in _other_optimum(mode, point, names)
+        rival = {"discrepancy": 0.1, "comparable": False}
+        assert f"is at {beginning}" in _other_optimum(rival, point, names)
 
 
-def test_of_a_covariance_standard_deviations_and_correlations_are_read(
-    calibrated: Any, section: Any
-) -> None:
-    read = ["mu", "chol_corr[0,1]", "chol_stds[0]", "chol_stds[1]"]
-    point = {
-        "mu": 1.0,
-        "chol": np.array([0.5, 0.1, 0.3]),
-        "chol_corr": np.array([[1.0, 0.3], [0.3, 1.0]]),
-        "chol_stds": np.array([0.5, 0.32]),
-    }
+def test_a_covariance_is_shown_by_standard_deviations_and_correlations(calibrated: Any) -> None:
+    expected = ["mu", "chol_corr[0,1]", "chol_stds[0]", "chol_stds[1]"]
+    matrix = np.array([[1.0, 0.3], [0.3, 1.0]])
+    point = {"mu": 1.0, "chol": np.ones(3), "chol_corr": matrix, "chol_stds": np.ones(2)}
     stderr = {name: 0.1 * np.ones(np.shape(value)) for name, value in point.items()}
     stderr["chol_corr"] = np.array([[0.0, 0.1], [0.1, 0.0]])
-    mode = {"point": {**point, "mu": 7.0}, "discrepancy": 0.25, "comparable": True}
-    optimum = dataclasses.replace(
-        calibrated.optimum, point=point, stderr=stderr, local_optima=(mode,)
-    )
-    found = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum")
-    assert [row[0] for row in cells(found.table).rows] == read
-    assert "is at mu = 7.000, chol_corr[0,1] = 0.3000, chol_stds[0] = 0.5000, chol" in found.text[1]
-
+    optimum = dataclasses.replace(calibrated.optimum, point=point, stderr=stderr)
+    (section,) = optima(gather(optimum=optimum))
+    assert [row[0] for row in cells(section.table).rows] == expected
     rng = np.random.default_rng(0)
     r = np.tanh(rng.normal(size=(2, 100)))
     matrices = np.array([[np.ones_like(r), r], [r, np.ones_like(r)]]).transpose(2, 3, 0, 1)
@@ -317,66 +265,38 @@ def test_of_a_covariance_standard_deviations_and_correlations_are_read(
         "chol_stds": (["chain", "draw", "i"], rng.gamma(4.0, size=(2, 100, 2))),
     }
     tree = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
-    made = prb.Report("x", posterior=tree, pictures=False)
-    for title in ("Posterior", "Correlations of the hyperparameters"):
-        (found,) = [each for each in made.sections if each.title == title]
-        assert [row[0] for row in cells(found.table).rows] == read
+    for section in posteriors(gather(posterior=tree)):
+        assert [row[0] for row in cells(section.table).rows] == expected
 
 
-def test_a_variable_that_never_moves_is_shown() -> None:
-    tree = xr.DataTree.from_dict(
-        {"posterior": xr.Dataset({"p": (["chain", "draw"], np.ones((2, 20)))})}
-    )
-    made = prb.Report("x", posterior=tree, pictures=False)
-    (found,) = [section for section in made.sections if section.title == "Posterior"]
-    (row,) = cells(found.table).rows
-    assert row[:2] == ("p", "1.000")
+def test_sections_depend_on_the_results_and_come_in_order(
+    calibrated: Any, report: prb.Report, page: Any
+) -> None:
+    def chapters(report: prb.Report) -> list[str]:
+        return [section.title for section in report.sections if section.level == 2]
 
-
-def test_sections_come_in_order(report: prb.Report, page: Any) -> None:
-    titles = [s.title for s in report.sections if s.level == 2]
-    assert titles == [
-        "Summary",
-        "Model",
-        "Data",
-        "Metric and epsilon",
-        "Optimum",
-        "Posterior",
-        "Comparison",
-        "Diagnostics",
-        "Validity",
-        "Cost and origin",
-    ]
+    of_model = ["Summary", "Model", "Data", "Metric and epsilon"]
+    results = ["Optimum", "Posterior", "Comparison", "Diagnostics", "Validity", "Cost and origin"]
+    assert chapters(report) == [*of_model, *results]
     assert page.text("h1") == "Shaft"
     assert "2 May 2024" in page.text("p")
+    alone = prb.Report("x", model=calibrated.model, pictures=False)
+    assert chapters(alone) == of_model
+    assert "No result of a calibration was given." in alone.sections[0].text[0]
+    tested = prb.Report("x", validity=calibrated.test, pictures=False)
+    assert chapters(tested) == ["Summary", "Validity"]
+    optimum = prb.Report("x", optimum=calibrated.optimum, pictures=False)
+    assert {"Posterior", "Comparison", "Validity"}.isdisjoint(chapters(optimum))
 
 
-def test_what_is_not_given_is_left_out(calibrated: Any) -> None:
-    model, optimum, posterior, test = calibrated
-    have = {
-        "model": prb.Report("x", model=model, pictures=False),
-        "optimum": prb.Report("x", optimum=optimum, pictures=False),
-        "posterior": prb.Report("x", posterior=posterior, pictures=False),
-        "validity": prb.Report("x", validity=test, pictures=False),
-    }
-    titles = {k: {s.title for s in r.sections if s.level == 2} for k, r in have.items()}
-    assert titles["model"] == {"Summary", "Model", "Data", "Metric and epsilon"}
-    assert "No result of a calibration was given." in have["model"].sections[0].text[0]
-    assert titles["validity"] == {"Summary", "Validity"}
-    assert {"Posterior", "Comparison", "Validity"}.isdisjoint(titles["optimum"])
-    assert {"Optimum", "Comparison", "Validity"}.isdisjoint(titles["posterior"])
-
-
-def test_a_hostile_model_is_reported(row: Any, parse: Any) -> None:
-    for name in ("<b>x<b>", "a|b", "p & q"):
-        with pm.Model() as model:
-            x = pm.Normal.dist(pm.Normal(name, 0, 2), 1.0)
-            prb.Simulator(
-                "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
-            )
-        text = prb.Report(name, model=model)._html()
-        assert row(name, "distribution", parse(text))["distribution"] == "Normal(0, 2)"
-        assert "<b>" not in text
+def test_hostile_names_of_a_model_are_text(row: Any, parse: Any) -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("<b>x<b>", 0, 2) + pm.Normal("a|b", 0, 1) + pm.Normal("p & q", 0, 1)
+        x = pm.Normal.dist(mu, 1.0)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    text = prb.Report("<b>x<b>", model=model)._html()
+    assert row("<b>x<b>", "distribution", parse(text))["distribution"] == "Normal(0, 2)"
+    assert "<b>" not in text
 
 
 @pytest.mark.long
@@ -452,6 +372,13 @@ def test_each_kind_of_question_has_a_table() -> None:
     assert float(more.mu[2]) < float(more.mu[1]) < float(more.mu[0])
 
 
+def test_sensitivities_have_a_picture_and_no_question_no_section() -> None:
+    sections = decided(decision=questions()["influence"], pictures=True).sections
+    (picture,) = [s for s in sections if s.title == "Shares of hyperparameters and inputs"]
+    assert picture.picture
+    assert "Decision" not in [section.title for section in decided().sections]
+
+
 def test_the_summary_has_the_probability_and_whether_it_is_accepted() -> None:
     said = decided(decision=questions()).sections[0].text
     (risk,) = [line for line in said if line.startswith("risk: ")]
@@ -472,16 +399,6 @@ def test_nothing_is_decided_by_a_model_that_is_rejected() -> None:
     assert decision.text[0].startswith("The calibrated model was rejected")
     asked = decided(validity=test).sections
     assert not [s for s in asked for line in s.text if "prb.exceedance" in line]
-
-
-def test_there_is_none_unless_asked() -> None:
-    assert "Decision" not in [section.title for section in decided().sections]
-
-
-def test_the_picture_is_of_the_shares() -> None:
-    sections = decided(decision=questions()["influence"], pictures=True).sections
-    (picture,) = [s for s in sections if s.title == "Shares of hyperparameters and inputs"]
-    assert picture.picture
 
 
 def test_what_is_no_decision_or_another_problem_s_is_refused() -> None:
