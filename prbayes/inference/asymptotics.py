@@ -29,6 +29,7 @@ from prbayes.inference.resampling import (
 from prbayes.metrics.base import Discrepancy, Minimum, Part, is_additive
 from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.random_variable import Node
 from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 
 # Avoids division by zero.
@@ -125,12 +126,16 @@ class Information:
     ) -> None:
         self.evaluator = evaluator
         self.k = k  # index of the simulator
-        self.node = evaluator.nodes[k]
         self.theta = theta  # (d,)
         self.prior_sd = evaluator.hyperparameters.prior_sd  # (d,)
         self.n_sets = n_sets  # number of simulated data sets, each of the observed size
         # Factor of the step where the discrepancy is a step function of theta, or jumps.
         self.widened = widened
+
+    @property
+    def node(self) -> Node:
+        """The simulator, which is that of the evaluator after a pickle too."""
+        return self.evaluator.nodes[self.k]
 
     @cached_property
     def stencil(self) -> Stencil:

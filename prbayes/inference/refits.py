@@ -511,7 +511,7 @@ def sampling_obstacle(evaluator: Evaluator) -> str | None:
 def refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why the model cannot be calibrated to other data sets, or None."""
     obstacle = sampling_obstacle(evaluator)
-    if obstacle is None and evaluator.has_other_terms:
+    if obstacle is None and evaluator.other_terms:
         return "the model has likelihood terms or potentials besides its simulators"
     return obstacle
 

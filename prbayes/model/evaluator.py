@@ -80,20 +80,16 @@ class Evaluator:
     simulators: list[PopulationSimulator] = field(init=False, repr=False)
     reweighted: dict[str, ReweightedBound] = field(init=False, repr=False)  # designs by simulator
     responses_per_theta: int = field(init=False)  # number of scalar responses of one theta
-    # Observed variables without a metric of distributions.
-    ordinary: list[Any] = field(init=False, repr=False)
-    has_other_terms: bool = field(init=False)  # whether there are such variables, or potentials
+    # Observed variables without a metric of distributions, and potentials.
+    other_terms: list[Any] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Set the attributes of all simulators, and of the other terms."""
-        rvs = self.model.observed_RVs
-        ordinary = [rv for rv in rvs if not isinstance(rv.owner.op, SimulatorRV)]
         vars(self).update(
             simulators=[*self.nodes, *self.emulated],
             reweighted={n.name: n.reweighted for n in self.nodes if n.reweighted is not None},
             responses_per_theta=sum([node.bound.n_per_theta for node in self.nodes]),
-            ordinary=ordinary,
-            has_other_terms=bool(ordinary or self.model.potentials),
+            other_terms=[*_ordinary(self.model), *self.model.potentials],
         )
 
     @classmethod
@@ -144,7 +140,7 @@ class Evaluator:
                 values = log_likelihoods(likelihood, specimen_params(self, thetas, k))
                 total += values.sum(axis=1)
                 evaluated |= {m.name for m in likelihood.measurements}
-        variables = [rv for rv in self.ordinary if rv.name not in evaluated]
+        variables = [rv for rv in _ordinary(self.model) if rv.name not in evaluated]
         if variables or self.model.potentials:
             if "log_other" not in self.functions:
                 graph = _log_other(self.model, variables)
@@ -221,7 +217,7 @@ class Evaluator:
                 graphs = model.replace_rvs_by_values(graphs)
                 scales = pt.dvector("scales")
                 scaled = sum(graph / scales[k] for k, graph in enumerate(graphs))
-                total = scaled - _log_other(model, self.ordinary)
+                total = scaled - _log_other(model, _ordinary(model))
                 with building("priors"):
                     log_prior = model.logp(vars=model.free_RVs, jacobian=False)
                 value = pt.switch(
@@ -315,6 +311,11 @@ def _unpickled(payload: bytes) -> Evaluator:
     model, targets = cloudpickle.loads(payload)
     evaluator = Evaluator.of(model)
     return evaluator if targets is None else evaluator.with_targets(targets)
+
+
+def _ordinary(model: pm.Model) -> list[Any]:
+    """Return the observed variables without a metric of distributions."""
+    return [rv for rv in model.observed_RVs if not isinstance(rv.owner.op, SimulatorRV)]
 
 
 # Compiled functions.

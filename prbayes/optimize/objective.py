@@ -119,7 +119,7 @@ def initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
     terms = ""
     if prior:
         terms = "minus the log prior (prior=True)"
-    elif evaluator.has_other_terms:
+    elif evaluator.other_terms:
         # Terms that only exclude hyperparameters do not count.
         values = evaluator.log_other(evaluator.hyperparameters.prior_points(64, 0))
         finite = values[np.isfinite(values)]

@@ -363,7 +363,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         result = Result.NO_OVERLAP
     if is_affordable:
         values = evaluator(theta[None]).discrepancies[0]
-    elif len(scales) > 1 or search.prior or evaluator.has_other_terms:
+    elif len(scales) > 1 or search.prior or evaluator.other_terms:
         values = np.full(len(scales), np.nan)
     else:
         values = fit.lowest * scales

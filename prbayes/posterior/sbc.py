@@ -120,7 +120,7 @@ def simulation_based_calibration(
             f"simulation_based_calibration: {obstacle}, and data sets cannot be drawn; "
             "calibrate data of your own simulations with prb.sample_smc"
         )
-    if evaluator.nodes and evaluator.has_other_terms:
+    if evaluator.nodes and evaluator.other_terms:
         raise ValueError(
             "simulation_based_calibration: got a model with likelihood terms or potentials "
             "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"
