@@ -102,7 +102,7 @@ def compared(optima: dict[str, prb.Optimum], data: Any, truth: str) -> tuple[flo
     table = prb.rank(anew, progressbar=False)
     sign = 1.0 if table.candidate.values[0] == truth else -1.0
     other = table.isel(candidate=1)
-    return sign * float(other["difference"]), float(other["stderr"]), bool(other["told_apart"])
+    return sign * float(other["difference"]), float(other["stderr"]), bool(other["significant"])
 
 
 def summary(found: list[tuple[float, float, bool]]) -> dict[str, Any]:

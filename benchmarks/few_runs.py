@@ -48,7 +48,7 @@ def response_of(name: str) -> Response:
     return RESPONSES[name.removeprefix("correlated ")]
 
 
-def outputs_of(name: str) -> Callable[..., Any]:
+def displayed_outputs(name: str) -> Callable[..., Any]:
     """Return the response with an output for each input beside its own: inputs -> (..., m).
 
     Correlated inputs are one argument.
@@ -75,7 +75,7 @@ def observed_of(name: str, seed: int) -> Any:
     if name.startswith("correlated"):
         z[:, 1] = RHO * z[:, 0] + np.sqrt(1 - RHO**2) * z[:, 1]
     x = response.mean + response.sd * z
-    found = outputs_of(name)(x)
+    found = displayed_outputs(name)(x)
     return found[np.isfinite(found).all(axis=1)][:N]
 
 
@@ -103,7 +103,7 @@ def build(name: str, observed: Any, propagation: Any) -> pm.Model:
         metric = prb.Joint(prb.KullbackLeibler())
         prb.Simulator(
             "y",
-            outputs_of(name),
+            displayed_outputs(name),
             *inputs,
             metric=metric,
             observed=observed,

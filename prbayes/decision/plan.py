@@ -149,7 +149,7 @@ def plan(
     True
     """
     caller = "prb.plan"
-    numbers = _specimen_numbers(k)
+    numbers = _validated_counts(k)
     _refuse_candidates(candidates)
     if quantity is not None:
         refuse_quantity(quantity, caller)
@@ -387,7 +387,7 @@ def _ideal_sample(sample: ResponseSample, n: int) -> Floats:
     return np.asarray(values[order][reached(mass[order], steps, normalized=True)])
 
 
-def _specimen_numbers(k: object) -> list[int]:
+def _validated_counts(k: object) -> list[int]:
     """Return numbers of specimens, or raise."""
     if isinstance(k, str | Mapping) or not isinstance(k, Sequence | np.ndarray):
         return [positive_integer(k, "k")]

@@ -349,7 +349,7 @@ def _with_following(
     return best
 
 
-def mixing_weight(
+def weight_of_runs(
     weights: Floats, y: Floats, predictions: Floats, blocks: NDArray[np.intp]
 ) -> float:
     """Return the share of a population that the runs have, from 0 (the emulator alone) to 1.

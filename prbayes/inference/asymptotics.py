@@ -36,7 +36,7 @@ from prbayes.numerics.derivatives import hessian_of, slopes, stencil
 _TINY = np.finfo(float).tiny
 
 
-def number_parts(target: Discrepancy) -> list[Part]:
+def single_output_parts(target: Discrepancy) -> list[Part]:
     """Return the parts that see one number of a specimen: of one output, the metric itself."""
     return [part for part in target.parts if not part.target.event]
 
@@ -89,7 +89,7 @@ def _stencil_around(
         around = Stencil(step, is_wide, values, weights, node.bound.blocks, is_equal)
         stencils.append(around)
         moves = np.zeros(d)  # of a distribution function over a step, by element
-        for part in number_parts(node.target):
+        for part in single_output_parts(node.target):
             projection = part.of(values[:1] if is_equal else values)
             is_usable = np.isfinite(projection[0]) & (weights[0] > 0)
             if not is_usable.any():
@@ -289,7 +289,7 @@ class Information:
 def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> Floats:
     """Return mean squares of the standardised projections of each specimen, (n,)."""
     squares = [np.zeros(len(values))]
-    for part in number_parts(target):
+    for part in single_output_parts(target):
         projection = part.of(values)
         is_finite = np.isfinite(projection)
         finite = np.where(is_finite, projection, 0.0)

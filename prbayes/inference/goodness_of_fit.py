@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import number_parts
+from prbayes.inference.asymptotics import single_output_parts
 from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
 from prbayes.metrics.multivariate import failure_caps
@@ -69,7 +69,7 @@ class FittedSets:
         columns = []
         for k, node in enumerate(evaluator.nodes):
             simulated, weights = evaluator.populations(thetas, k)
-            for part in number_parts(node.target):
+            for part in single_output_parts(node.target):
                 values, rows = part.observed_of(sets.values[k])
                 order = np.argsort(values, kind="stable")
                 samples = np.broadcast_to(part.of(simulated), weights.shape)

@@ -114,7 +114,7 @@ class StackedReadings:
     @classmethod
     def of(cls, measurements: Sequence[Measurement]) -> StackedReadings:
         """Stack the readings of simulators; raise if those of a specimen cannot be combined."""
-        numbers, size = _specimen_numbers(measurements)
+        numbers, size = _validated_counts(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
         readings, scales, repeats = zip(*parts, strict=True)
         log_gross = np.zeros(size)
@@ -133,7 +133,7 @@ class StackedReadings:
         )
 
 
-def _specimen_numbers(measurements: Sequence[Measurement]) -> tuple[list[NDArray[np.intp]], int]:
+def _validated_counts(measurements: Sequence[Measurement]) -> tuple[list[NDArray[np.intp]], int]:
     """Return the specimen of each row, by simulator, and the number of specimens."""
     first: dict[object, int] = {}
     numbers = []

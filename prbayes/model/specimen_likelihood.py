@@ -82,8 +82,10 @@ def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
     return last[1]
 
 
-def _roots(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats], group: Any) -> list[Any]:
-    """Return the values of the inputs' roots, (P, *shape), in the populations of a group."""
+def _parent_values(
+    likelihood: SpecimenLikelihood, params: Mapping[Any, Floats], group: Any
+) -> list[Any]:
+    """Return the values of the parents of the inputs, (P, *shape), in a group's populations."""
     size = len(next(iter(params.values())))
     return [
         np.full(size, group) if is_group(root) else params[root] for root in likelihood.inputs.roots
@@ -99,7 +101,7 @@ def log_likelihoods(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats]
     result = np.empty((len(next(iter(params.values()))), len(likelihood.readings)))
     groups = zip(likelihood.by_group, _points_by_group(likelihood), strict=True)
     for (group, rows), points in groups:
-        roots = _roots(likelihood, params, group)
+        roots = _parent_values(likelihood, params, group)
         result[:, rows] = likelihood.density.log_likelihoods(roots, points)
         if share is not None:
             log_share = share.of_populations(likelihood.density, roots, likelihood.coordinates)
@@ -241,7 +243,7 @@ def draw_readings(
     def draw_outputs() -> Floats:
         inputs: list[Floats] = []
         for group, columns in by_group:
-            roots = _roots(likelihood, params, group)
+            roots = _parent_values(likelihood, params, group)
             drawn, _ = likelihood.density.sampler(roots, len(columns), rng)
             inputs = inputs or [np.empty((size, n, *x.shape[2:])) for x in drawn]
             for whole, part in zip(inputs, drawn, strict=True):

@@ -131,7 +131,7 @@ def neighbourhood(evaluator: Evaluator, fit: Fit, seed: int) -> Floats:
 
 
 def _cover(search: Search, fit: Fit, nearby: Floats, seed: int) -> Restart:
-    """Add points to designs that do not support a fit: a pilot first, then where it led."""
+    """Add points to designs that do not support a fit, around a pilot and its optimum."""
     evaluator, thetas = search.evaluator, fit.pilot
     if thetas is None:
         thetas = nearby = pilot(evaluator, fit.scales, seed=seed)

@@ -37,7 +37,7 @@ from prbayes.inference.checks.metric_suitability import (
     heavy_tails,
     smoothing_bias,
 )
-from prbayes.inference.checks.prior import prior_end_findings, prior_ends
+from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import SamplingDistribution, jumping_simulators
 from prbayes.inference.resampling import SETS
@@ -314,7 +314,7 @@ def find_optimum(evaluator: Evaluator, settings: Minimisation) -> Optimum:
         if trace.count:
             details = (
                 "At the start hardly any simulated response was near the data: the area metric "
-                f"led from there, in {trace.count} evaluations."
+                f"was minimised first, in {trace.count} evaluations."
             )
         record = SearchRecord(Result.STOPPED, details, settings.prior, n_screened=n_screened)
         problem = _Problem(search, settings, advance, n_previous, record)
@@ -544,7 +544,7 @@ def optimum_findings(
     findings += design_error_findings(evaluator, design_error)
     findings += [mode.finding(evaluator) for mode in optima if mode.comparable]
     if sampling is not None:
-        ends = prior_ends(sampling)
+        ends = elements_at_prior_ends(sampling)
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
         findings += prior_end_findings(ends, page)
         names = {end.name for end in ends}

@@ -151,7 +151,7 @@ def _rows(optimum: Optimum) -> list[list[str]]:
     return rows
 
 
-def _sentences(optimum: Optimum) -> list[str]:
+def _failures_and_findings(optimum: Optimum) -> list[str]:
     """Return the shares of specimens that fail or have no response, and the findings."""
     sentences = []
     for name, support in optimum.search.support.items():
@@ -165,14 +165,17 @@ def _sentences(optimum: Optimum) -> list[str]:
 def _text(optimum: Optimum) -> str:
     """Return the estimates, their cost, and the findings."""
     rows = [f"{name} = {value} ± {error}" for name, value, error in _rows(optimum)]
-    return "\n  ".join([_heading(optimum), *rows, *_sentences(optimum)])
+    return "\n  ".join([_heading(optimum), *rows, *_failures_and_findings(optimum)])
 
 
 def _html(optimum: Optimum) -> str:
     """Return the same for a notebook, as a table."""
     header = ["", "estimate", "standard error"]
     return view(
-        _heading(optimum), header=header, rows=_rows(optimum), sentences=_sentences(optimum)
+        _heading(optimum),
+        header=header,
+        rows=_rows(optimum),
+        sentences=_failures_and_findings(optimum),
     )
 
 

@@ -29,7 +29,7 @@ from prbayes.plots.canvas import (
 )
 from prbayes.plots.curves import axis_range, central_range, outlines
 from prbayes.plots.ensemble import read_before, read_result
-from prbayes.plots.responses import Output, outputs_of
+from prbayes.plots.responses import Output, displayed_outputs
 
 # Most outputs of one picture: the pairs of more are too small to be read.
 _MOST = 7
@@ -190,7 +190,7 @@ def _simulator_index(evaluator: Evaluator, simulator: str | None) -> int:
 def _shown_outputs(evaluator: Evaluator, k: int, labels: Sequence[Any] | None) -> list[Output]:
     """Return the outputs of the picture, by their labels or by default."""
     node = evaluator.simulators[k]
-    columns = outputs_of(node, alone=len(evaluator.simulators) == 1)
+    columns = displayed_outputs(node, alone=len(evaluator.simulators) == 1)
     if labels is None:
         varying = []  # by more than rounding
         for output in columns:

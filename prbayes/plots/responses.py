@@ -354,12 +354,12 @@ def panels_of(nodes: Sequence[PopulationSimulator]) -> list[list[Output]]:
     return [
         [Output(node, None, alone)]
         if not node.outputs.event or in_one_panel(node.outputs)
-        else outputs_of(node, alone=alone)
+        else displayed_outputs(node, alone=alone)
         for node in nodes
     ]
 
 
-def outputs_of(node: PopulationSimulator, *, alone: bool) -> list[Output]:
+def displayed_outputs(node: PopulationSimulator, *, alone: bool) -> list[Output]:
     """Return all of several outputs of a simulator."""
     return [Output(node, j, alone) for j in range(len(node.outputs.labels))]
 

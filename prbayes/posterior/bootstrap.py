@@ -136,7 +136,7 @@ def _specimen_estimates(
 def _require_identified(unidentified: Sequence[str]) -> None:
     if unidentified:
         raise ValueError(
-            f"bootstrap: the data tell less than the prior about {', '.join(unidentified)}, along "
-            "which the estimate is arbitrary; use prb.sample_smc, whose posterior falls back on "
-            "the prior there, or fix a hyperparameter"
+            "bootstrap: the data are less informative than the prior about "
+            f"{', '.join(unidentified)}, along which the estimate is arbitrary; use "
+            "prb.sample_smc, whose posterior is the prior there, or fix a hyperparameter"
         )

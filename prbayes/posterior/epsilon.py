@@ -150,8 +150,9 @@ def _epsilon_of(information: Information) -> float:
     epsilon = methods[node.metric.minimum](information)
     if epsilon is None:
         raise ValueError(
-            f"{node.name}: the data tell less than the prior about every hyperparameter, so "
-            "epsilon cannot be calibrated; look at the optimum, widen the priors, or pass epsilon="
+            f"{node.name}: the data are less informative than the prior about every "
+            "hyperparameter, so that epsilon cannot be calibrated; look at the optimum, widen the "
+            "priors, or pass epsilon="
         )
     return epsilon
 

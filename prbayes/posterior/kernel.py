@@ -325,7 +325,7 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
                 f"start: {name}: got shape {value.shape}, expected {expected}, a value for each "
                 "particle"
             )
-    # Variables in their own units first; the initial point stands for transformed ones.
+    # Variables in their own units first; the initial point replaces transformed ones.
     initial = hyperparameters.constrained(hyperparameters.initial[None])
     own_units = [
         np.broadcast_to(values.get(name, initial[name]), (draws, *shape))

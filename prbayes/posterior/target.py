@@ -319,7 +319,7 @@ def refit_likelihood(
     # Data sets in balls around the centers, then around the posterior given these.
     number = options.n_sets // options.rounds
     balls = [
-        sampling.coordinates(center.thetas(_ball(number // len(centers), r, options, i)))
+        sampling.coordinates(center.thetas(_points_of_ball(number // len(centers), r, options, i)))
         for i, center in enumerate(centers)
     ]
     x = np.concatenate(balls)
@@ -340,7 +340,7 @@ def refit_likelihood(
     return likelihood
 
 
-def _ball(number: int, r: int, options: RefitLikelihoodOptions, shift: int = 0) -> Floats:
+def _points_of_ball(number: int, r: int, options: RefitLikelihoodOptions, shift: int = 0) -> Floats:
     """Return evenly spread points of a ball around the estimate, (number, r)."""
     u = sobol(number, r + 1, options.seed + shift)
     directions = ndtri(u[:, :r])
@@ -441,7 +441,7 @@ def _best_starts(
 ) -> Floats:
     """Return the best of some points near the estimate for each data set, (R, r)."""
     sampling = centers[0]
-    ball = _ball(options.n_starts, sampling.stderr.size, options)
+    ball = _points_of_ball(options.n_starts, sampling.stderr.size, options)
     thetas = sampling.thetas(ball)
     is_nearest = nearest(centers, thetas)[0] == 0
     ball, thetas = ball[is_nearest], thetas[is_nearest]

@@ -18,10 +18,10 @@ from prbayes._validate import IN_CACHE, Floats
 from prbayes.emulators.selection import (
     Runs,
     candidate_surfaces,
-    mixing_weight,
     predict_outputs,
     predict_without_blocks,
     select_surfaces,
+    weight_of_runs,
 )
 from prbayes.emulators.surfaces import MultifidelityModel
 from prbayes.numerics.points import base_points, inside
@@ -273,7 +273,7 @@ class DesignEmulator:
     def for_populations(self, weights: Floats) -> DesignEmulator | None:
         """Return the same surfaces for populations; None where the runs alone are as good."""
         runs, left_out = self.runs, self.left_out
-        share = mixing_weight(weights, runs.y, left_out, runs.blocks)
+        share = weight_of_runs(weights, runs.y, left_out, runs.blocks)
         if share > SIZES.runs_alone:
             return None
         share = 0.0 if share < SIZES.runs_negligible else share

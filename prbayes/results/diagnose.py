@@ -262,7 +262,7 @@ def _check_family(optimum: Optimum) -> Checked:
         fitted = FittedSets.of(optimum.sampling(), SETS, 0)
     p_value = np.nan if fitted is None else fitted.p_value
     if fitted is None or np.isnan(p_value):
-        return checked + _not_tested("the data tell too little, or too few refits converge")
+        return checked + _not_tested("the data are uninformative, or too few refits converge")
     misfits = tuple(output_misfits(fitted)) if p_value < UNLIKELY else ()
     misfit = population_misfit(p_value, with_prior=optimum.search.prior)
     return checked + Checked(tuple(misfit), misfits)

@@ -269,7 +269,7 @@ def rank(
     xarray.Dataset
         Dim (candidate), the best first: ``score``, the expected log density of a new specimen;
         ``difference``, the lead of the best one, summed over all specimens, and ``stderr``, its
-        standard error from the differences by specimen; ``told_apart``, whether that is beyond
+        standard error from the differences by specimen; ``significant``, whether that is beyond
         chance; ``verdict``, the same as a sentence; and ``converged``, the share of folds whose
         minimisation converged. Attribute ``verdict`` has all sentences.
 
@@ -310,7 +310,7 @@ def rank(
     ...         y = prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), observed=data)
     ...     optima[family.__name__] = prb.minimize(model)
     >>> table = prb.rank(optima)
-    >>> table.candidate.values.tolist(), bool(table.told_apart[1])
+    >>> table.candidate.values.tolist(), bool(table.significant[1])
     (['LogNormal', 'Normal'], True)
     """
     _require_candidates(candidates)
@@ -415,7 +415,7 @@ def _comparison(tables: Mapping[str, xr.Dataset]) -> xr.Dataset:
             sentences.append(f"{best} predicts better than {label} by {by}")
         else:
             sentences.append(
-                f"the data cannot tell {best} and {label} apart: {best} is ahead by {by}"
+                f"the data do not separate {best} from {label}: {best} is ahead by {by}"
             )
     converged = [float(tables[label]["converged"].mean()) for label in labels]
     return xr.Dataset(
@@ -423,7 +423,7 @@ def _comparison(tables: Mapping[str, xr.Dataset]) -> xr.Dataset:
             "score": ("candidate", scores.mean(axis=-1)),
             "difference": ("candidate", differences),
             "stderr": ("candidate", errors),
-            "told_apart": ("candidate", is_apart),
+            "significant": ("candidate", is_apart),
             "converged": ("candidate", converged),
             "verdict": ("candidate", np.array(sentences)),
         },

@@ -18,11 +18,11 @@ from prbayes.emulators.selection import (
     cross_validated,
     has_enough_runs,
     left_out_predictions,
-    mixing_weight,
     points_needed,
     predict_outputs,
     predict_without_blocks,
     select_surfaces,
+    weight_of_runs,
 )
 from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
 
@@ -220,7 +220,7 @@ BLOCKS = np.arange(N) % 8
 
 
 def weight(predictions: Floats, y: Floats = Y, weights: Floats = EVEN) -> float:
-    return mixing_weight(weights, y, predictions, BLOCKS)
+    return weight_of_runs(weights, y, predictions, BLOCKS)
 
 
 def test_an_emulator_counts_if_its_bias_is_small() -> None:
@@ -251,5 +251,5 @@ def test_levels_are_where_the_populations_are() -> None:
     z = np.random.default_rng(5).standard_normal((440, 1))
     y = np.where(here, 1e-3 * z, z)
     weights, blocks = np.repeat(here.T / 40, 3, axis=0), np.arange(440) % 8
-    assert mixing_weight(weights, y, np.where(here, 3 * y, y), blocks) > 0.5
-    assert mixing_weight(weights, y, np.where(here, y, y + 2.0), blocks) < 0.01
+    assert weight_of_runs(weights, y, np.where(here, 3 * y, y), blocks) > 0.5
+    assert weight_of_runs(weights, y, np.where(here, y, y + 2.0), blocks) < 0.01

@@ -19,8 +19,8 @@ from prbayes.inference.asymptotics import (
     identified_by_area,
     identified_by_curvature,
     local_sampling,
-    number_parts,
     oriented,
+    single_output_parts,
     unidentified_directions,
 )
 from prbayes.inference.resampling import DataSets
@@ -308,9 +308,9 @@ def test_parts_see_one_number_of_a_specimen() -> None:
     rng = np.random.default_rng(1)
     joint = prb.Joint(AREA, directions=5).against(rng.normal(size=(20, 2)))
     values = rng.normal(size=(3, 50, 2))
-    assert [part.of(values).shape for part in number_parts(joint)] == [(3, 50)] * 5
+    assert [part.of(values).shape for part in single_output_parts(joint)] == [(3, 50)] * 5
     correlations = prb.MarginalCorrelation(AREA).against(rng.normal(size=(20, 3)))
-    assert len(number_parts(correlations)) == 3
+    assert len(single_output_parts(correlations)) == 3
 
 
 # -- identified directions -------------------------------------------------------------------------

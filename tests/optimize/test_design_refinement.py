@@ -69,7 +69,7 @@ def test_a_refusal_tells_what_the_data_do_not() -> None:
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
     evaluator = Evaluator.of(model)
     short = shortcomings(evaluator, np.array([[30.0]]))
-    text = "The data tell less than the prior about mu."
+    text = "The data do not identify mu."
     with pytest.raises(DesignError, match=rf"y: .*; narrow the priors, .*\. {text}"):
         refuse(short, evaluator, [Finding("not-identified", text)])
     refuse({}, evaluator, [Finding("not-identified", text)])

@@ -38,7 +38,7 @@ def parabola(x: Any) -> Any:
 
 
 def mirrored(metric: prb.Metric, **keywords: Any) -> pm.Model:
-    """Symmetric about mu = 1, the prior too: the data cannot tell one side from the other."""
+    """Symmetric about mu = 1, the prior too: the data do not separate the sides."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), pm.HalfNormal("sigma", 1))
         prb.Simulator(

@@ -152,7 +152,7 @@ def test_what_cannot_be_bootstrapped_is_refused() -> None:
     optimum = prb.minimize(model, starts=0)
     for parametric in (False, True):
         with pytest.raises(
-            ValueError, match="bootstrap: the data tell less than the prior about idle, along which"
+            ValueError, match="bootstrap: the data are less informative than the prior about idle"
         ):
             prb.bootstrap(optimum, 10, parametric=parametric)
     model = build(METRICS["kl"], prb.Fresh(64))

@@ -126,15 +126,15 @@ def scored(scores: Any, weights: Any = None) -> xr.Dataset:
 def test_the_right_family_is_identified_and_families_alike_are_not() -> None:
     table = prb.rank(skewed(), **QUIET)
     assert table.candidate.values.tolist() == ["lognormal", "normal"]
-    assert table.told_apart.values.tolist() == [False, True]
+    assert table.significant.values.tolist() == [False, True]
     by = f"{float(table.difference[1]):.1f} nats (standard error {float(table.stderr[1]):.1f})"
     assert table.attrs["verdict"] == f"lognormal predicts better than normal by {by}"
     assert table.to_dataframe().shape == (2, 6)
     narrow = np.random.default_rng(2).normal(1.0, 0.1, 30)
     alike = prb.rank({f.__name__: minimized(f, narrow) for f in (normal, lognormal)}, **QUIET)
-    assert not alike.told_apart.any()
+    assert not alike.significant.any()
     best, second = alike.candidate.values
-    assert alike.attrs["verdict"].startswith(f"the data cannot tell {best} and {second} apart: ")
+    assert alike.attrs["verdict"].startswith(f"the data do not separate {best} from {second}: ")
 
 
 @pytest.mark.long
@@ -183,7 +183,7 @@ def test_the_error_of_equal_weights_is_the_usual_one_and_ties_are_no_preference(
     assert table["stderr"].values.max() == pytest.approx(expected)
     same = prb.rank({"a": scored(a), "b": scored(a)})
     assert same.difference.values.tolist() == [0, 0]
-    assert not same.told_apart.any()
+    assert not same.significant.any()
 
 
 def test_the_difference_of_specimens_with_weights() -> None:
@@ -191,7 +191,7 @@ def test_the_difference_of_specimens_with_weights() -> None:
     # A constant advantage for each observation has no error, however they are weighted.
     table = prb.rank({"a": scored(0.2 * weights, weights), "b": scored(np.zeros(40), weights)})
     assert table["stderr"].values.max() == pytest.approx(0, abs=1e-12)
-    assert table.told_apart.values.tolist() == [False, True]
+    assert table.significant.values.tolist() == [False, True]
 
 
 def test_more_candidates_ask_for_more() -> None:
@@ -201,10 +201,10 @@ def test_more_candidates_ask_for_more() -> None:
     # Ahead by 2.2 standard errors.
     ahead = noise + 2.2 / np.sqrt(400)
     two = prb.rank({"a": scored(ahead), "b": scored(0 * noise)})
-    assert two.told_apart.any()
+    assert two.significant.any()
     three = prb.rank({"a": scored(ahead), "b": scored(0 * noise), "c": scored(0 * noise)})
-    assert not three.told_apart.any()
-    assert three.attrs["verdict"].count("cannot tell") == 2
+    assert not three.significant.any()
+    assert three.attrs["verdict"].count("do not separate") == 2
 
 
 @pytest.mark.long
@@ -232,7 +232,7 @@ def test_two_responses_of_several_simulators_with_labels_and_weights() -> None:
     np.testing.assert_array_equal(folds.values.T, expected)
     table = prb.rank(optima, **QUIET)
     assert table.candidate.values[0] == "bent"
-    assert table.told_apart.values.tolist() == [False, True]
+    assert table.significant.values.tolist() == [False, True]
     assert table.attrs["n_specimens"] == 60
 
 
@@ -261,7 +261,7 @@ def test_any_metric_and_propagation_that_can_be_refitted() -> None:
     }
     table = prb.rank(candidates, **QUIET)
     assert table.candidate.values[-1] == "normal, PR"
-    assert not table.told_apart.values[1]
+    assert not table.significant.values[1]
     assert float(table.difference[1]) < 1
 
 

@@ -13,7 +13,7 @@ from prbayes._validate import Floats
 from prbayes.inference.asymptotics import (
     Local,
     named_direction,
-    number_parts,
+    single_output_parts,
     unidentified_directions,
 )
 from prbayes.model.evaluator import Evaluator, only_through_prior
@@ -39,9 +39,9 @@ def unidentified_findings(
     return [
         Finding(
             "not-identified",
-            f"The data tell less than the prior about {direction} (in units of the priors' "
-            "standard deviations): it is not identified by them, and its posterior rests on the "
-            "prior; measure more outputs or conditions, or state what is known.",
+            f"The data are less informative than the prior about {direction} (in units of the "
+            "priors' standard deviations): it is not identified by them, and its posterior rests "
+            "on the prior; measure more outputs or conditions, or state prior knowledge.",
             "optimum_or_abc.md#no-answer",
         )
         for direction in directions
@@ -65,7 +65,7 @@ def confounding_findings(evaluator: Evaluator, local: Local) -> list[Finding]:
         reason = reason or correlated_estimates(local, coefficients, inputs, names)
         if reason:
             text = (
-                f"{node.name}: the data do not tell the model inadequacy from the inputs: "
+                f"{node.name}: the data do not separate the model discrepancy from the inputs: "
                 f"{reason}; measure under more conditions, state narrower priors, or leave one of "
                 "them out."
             )
@@ -228,7 +228,7 @@ def _populations_differ(evaluator: Evaluator, a: Floats, b: Floats) -> bool:
     largest = 0.0
     for k, node in enumerate(evaluator.nodes):
         values, weights = evaluator.populations(np.array([a, b]), k)
-        for part in number_parts(node.target):
+        for part in single_output_parts(node.target):
             projection = part.of(values)
             occurring = np.unique(projection[np.isfinite(projection)])
             below = distribution_function(projection, weights, occurring)

@@ -12,7 +12,7 @@ import numpy as np
 from prbayes._finding import Finding
 from prbayes._stats import quantile
 from prbayes._validate import Floats
-from prbayes.inference.asymptotics import Local, number_parts
+from prbayes.inference.asymptotics import Local, single_output_parts
 from prbayes.inference.resampling import dependent
 from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
@@ -29,7 +29,7 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[Finding]:
         if node.metric.minimum is not Minimum.ABSOLUTE or not node.bound.stored:
             continue
         values, weights = evaluator.populations(theta[None], k)
-        parts = number_parts(node.target)
+        parts = single_output_parts(node.target)
         index = min(_tail_index(part.of(values[0]), weights[0]) for part in parts)
         # At 1024 quantiles of a half-Cauchy population 1.0, of Student's t with 1.5 degrees of
         # freedom 1.5, of a lognormal one with a spread of 2.5 1.1.
@@ -70,7 +70,7 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
         if not node.bound.stored:
             continue
         values, _ = evaluator.populations(theta[None], k)
-        for part in number_parts(node.target):
+        for part in single_output_parts(node.target):
             width = kernel_width(part.target)
             if not width > 0:
                 continue
@@ -141,7 +141,8 @@ def smoothing_bias(
     smoothed = [
         k
         for k, node in enumerate(evaluator.nodes)
-        if node.bound.stored and any(kernel_width(p.target) > 0 for p in number_parts(node.target))
+        if node.bound.stored
+        and any(kernel_width(p.target) > 0 for p in single_output_parts(node.target))
     ]
     if local is None or not smoothed or not local.covariance.size:
         return []
@@ -158,7 +159,7 @@ def smoothing_bias(
     hessian = hessian_of(evaluator.total(thetas, scales), r)
     findings = []
     for k in smoothed:
-        gain = _gain(evaluator, thetas, k) / scales[k]
+        gain = _gain_of_half_width(evaluator, thetas, k) / scales[k]
         # On the way to the other optimum the curvature is the mean of both.
         curvature = (hessian + hessian_of(gain, r) / 2) / size**2
         if not (np.isfinite(curvature).all() and np.linalg.eigvalsh(curvature)[0] > 0):
@@ -174,11 +175,11 @@ def smoothing_bias(
     return findings
 
 
-def _gain(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
+def _gain_of_half_width(evaluator: Evaluator, thetas: Floats, k: int) -> Floats:
     """Return the change of a discrepancy by kernels of half the width, (P,)."""
     values, weights = evaluator.populations(thetas, k)
     total = np.zeros(len(thetas))
-    for part in number_parts(evaluator.nodes[k].target):
+    for part in single_output_parts(evaluator.nodes[k].target):
         projection = part.of(values)
         total += part.share * with_narrower_kernel(part.target, 0.5).of(projection, weights)
         total -= part.share * part.target.of(projection, weights)
@@ -190,7 +191,7 @@ def _smoothing_finding(evaluator: Evaluator, k: int, bias: Floats) -> Finding:
     node, worst = evaluator.nodes[k], int(bias.argmax())
     name = evaluator.hyperparameters.readable_names[worst]
     kernel = ""
-    parts = number_parts(node.target)
+    parts = single_output_parts(node.target)
     if len(parts) == 1:
         # A bias of a tenth, as that of the default kernel for a normal population.
         width = kernel_width(parts[0].target) * np.sqrt(0.1 / bias[worst])

@@ -34,7 +34,7 @@ class PriorEnd:
         return f"{self.name} to {self.value:.4g}, next to the end of its prior at {self.bound:.4g}"
 
 
-def prior_ends(sampling: SamplingDistribution, seed: int = 0) -> list[PriorEnd]:
+def elements_at_prior_ends(sampling: SamplingDistribution, seed: int = 0) -> list[PriorEnd]:
     """Return the elements that the data push to an end of their prior; computes no response.
 
     A lower end at zero without an upper end is not one: that is a population without scatter.

@@ -12,7 +12,12 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.inference.checks.prior import PriorEnd, conflict_findings, prior_conflict, prior_ends
+from prbayes.inference.checks.prior import (
+    PriorEnd,
+    conflict_findings,
+    elements_at_prior_ends,
+    prior_conflict,
+)
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 
@@ -47,7 +52,7 @@ def narrow(name: str) -> Any:
 def ends(found: pm.Model, theta: Any) -> list[PriorEnd]:
     evaluator = Evaluator.of(found)
     sampling = SamplingDistribution.of(evaluator, np.array(theta), np.ones(1))
-    return prior_ends(sampling)
+    return elements_at_prior_ends(sampling)
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))
