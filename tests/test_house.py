@@ -614,6 +614,7 @@ INNER = {
         "pytensor.graph.basic.Variable",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.traversal.ancestors",
+        "pytensor.graph.traversal.walk",
         "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",
     },

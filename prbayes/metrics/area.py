@@ -90,7 +90,7 @@ class AreaDiscrepancy(Discrepancy):
         order, below = ranked(simulated, knots[:-1], kind="quicksort")
         observed_order, observed_below = ranked(self.observed, knots[:-1], kind="quicksort")
         arrays = [order, below, observed_order, observed_below, np.diff(knots)]
-        return RankedBasis(tuple([array[None] for array in arrays]), (self.weights,))
+        return RankedBasis(tuple(array[None] for array in arrays), (self.weights,))
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the area."""
@@ -114,7 +114,7 @@ class AreaSum(PartSum):
         bases = [target.basis(values) for target, values in projected(self.parts, simulated)]
         columns = zip(*[basis.arrays for basis in bases], strict=True)
         arrays = [_padded([row for (row,) in column]) for column in columns]
-        return RankedBasis(tuple(arrays), tuple([part.target.weights for part in self.parts]))
+        return RankedBasis(tuple(arrays), tuple(part.target.weights for part in self.parts))
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the areas times their shares."""

@@ -88,7 +88,7 @@ class Evaluator:
         vars(self).update(
             simulators=[*self.nodes, *self.emulated],
             reweighted={n.name: n.reweighted for n in self.nodes if n.reweighted is not None},
-            responses_per_theta=sum([node.bound.n_per_theta for node in self.nodes]),
+            responses_per_theta=sum(node.bound.n_per_theta for node in self.nodes),
             other_terms=[*_ordinary(self.model), *self.model.potentials],
         )
 
@@ -129,7 +129,7 @@ class Evaluator:
         for node in self.nodes:
             runs = id(node.responses.runs)
             counts[runs] = max(node.responses.count, counts.get(runs, 0))
-        return sum(counts.values()) + sum([m.responses.count for m in self.measurements])
+        return sum(counts.values()) + sum(m.responses.count for m in self.measurements)
 
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
@@ -446,7 +446,7 @@ def coarser_evaluator(evaluator: Evaluator, theta: Floats | None = None) -> Eval
     if bounds == [node.bound for node in evaluator.nodes]:
         return None
     pairs = zip(evaluator.nodes, bounds, strict=True)
-    coarse_nodes = tuple([replace(node, bound=bound) for node, bound in pairs])
+    coarse_nodes = tuple(replace(node, bound=bound) for node, bound in pairs)
     coarse = replace(evaluator, nodes=coarse_nodes, has_graph=False)
     support = {} if theta is None else coarse.support(theta[None])
     for name, values in support.items():

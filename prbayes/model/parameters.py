@@ -47,7 +47,8 @@ class Hyperparameters:
     size: int = field(init=False)  # of theta, d
     names: list[str] = field(init=False)  # of elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'
     readable_names: list[str] = field(init=False)  # by untransformed variables, such as 'sigma'
-    cache: dict[Any, Any] = field(init=False, repr=False)  # compiled functions, and prior draws
+    # Draws of theta from the prior by size and seed.
+    prior_draws: dict[tuple[int, int], Floats] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Set the attributes that follow from the model and the point."""
@@ -67,7 +68,7 @@ class Hyperparameters:
             size=initial.size,
             names=names,
             readable_names=readable_names,
-            cache={},
+            prior_draws={},
         )
 
     @classmethod
@@ -133,17 +134,19 @@ class Hyperparameters:
         """Return which thetas have a finite log prior, shape (P,)."""
         return np.isfinite(self.log_prior(thetas))
 
+    @cached_property
+    @interpreted()
+    def _constrain(self) -> Any:
+        """The compiled function of thetas that returns variables and deterministics."""
+        return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
+
     def constrained(self, thetas: Floats) -> dict[str, Floats]:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
         if not size:  # PyTensor transforms no empty matrices
             return {name: v[:0] for name, v in self.constrained(self.initial[None]).items()}
         variables = self.model.unobserved_RVs
-        if "constrained" not in self.cache:
-            with interpreted():
-                graphs = self.model.replace_rvs_by_values(variables)
-                self.cache["constrained"] = self.compile(graphs)
-        values = self.cache["constrained"](np.ascontiguousarray(thetas))
+        values = self._constrain(np.ascontiguousarray(thetas))
         # Values that do not depend on theta have no leading axis, or one of length one.
         return {
             variable.name: np.array(np.broadcast_to(value, (size, *np.shape(value)[1:])))
@@ -180,33 +183,37 @@ class Hyperparameters:
         theta: Floats = thetas[0]
         return theta
 
+    @cached_property
+    @interpreted()
+    def _transform(self) -> Any:
+        """The compiled function of values of the free variables that returns thetas."""
+        columns = []
+        for value_variable in self.model.value_vars:
+            rv = self.model.values_to_rvs[value_variable]
+            transform = self.model.rvs_to_transforms[rv]
+            value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
+            columns.append(pt.atleast_1d(value).ravel())
+        symbols = [rv.type() for rv in self.model.free_RVs]
+        swap = dict(zip(self.model.free_RVs, symbols, strict=True))
+        theta = graph_replace(pt.concatenate(columns), swap, strict=False)
+        batched = with_leading_axis(symbols)
+        graph = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
+        return compiled(batched, [graph], allow_input_downcast=True)
+
     def thetas_of(self, draws: Sequence[Floats]) -> Floats:
         """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
-        free = self.model.free_RVs
-        if "thetas" not in self.cache:
-            with interpreted():
-                columns = []
-                for value_variable in self.model.value_vars:
-                    rv = self.model.values_to_rvs[value_variable]
-                    transform = self.model.rvs_to_transforms[rv]
-                    value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
-                    columns.append(pt.atleast_1d(value).ravel())
-                symbols = [rv.type() for rv in free]
-                swap = dict(zip(free, symbols, strict=True))
-                theta = graph_replace(pt.concatenate(columns), swap, strict=False)
-                batched = with_leading_axis(symbols)
-                graph = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
-                self.cache["thetas"] = compiled(batched, [graph], allow_input_downcast=True)
-        (thetas,) = self.cache["thetas"](*draws)
+        (thetas,) = self._transform(*draws)
         return np.asarray(thetas)
+
+    @cached_property
+    def _prior_sampler(self) -> PriorSampler:
+        return PriorSampler(self.model.free_RVs)
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        if (size, seed) not in self.cache:
-            if "sampler" not in self.cache:
-                self.cache["sampler"] = PriorSampler(self.model.free_RVs)
-            self.cache[size, seed] = self.thetas_of(self.cache["sampler"](size, seed))
-        return np.array(self.cache[size, seed])
+        if (size, seed) not in self.prior_draws:
+            self.prior_draws[size, seed] = self.thetas_of(self._prior_sampler(size, seed))
+        return self.prior_draws[size, seed].copy()
 
     @cached_property
     def prior_sd(self) -> Floats:

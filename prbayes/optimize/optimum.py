@@ -409,7 +409,7 @@ def n_computed(evaluator: Evaluator) -> int:
     """Return the number of responses computed for a model, without those found in a store."""
     responses = [node.bound.responses for node in evaluator.nodes]
     responses += [measurement.responses for measurement in evaluator.measurements]
-    return sum([r.computed for r in responses])
+    return sum(r.computed for r in responses)
 
 
 def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:

@@ -95,7 +95,7 @@ class EstimateLikelihood:
         """Return the log-density of the score at the estimate, (S, d) -> (S,)."""
         if self.combinations.shape[1] == 0:
             return np.zeros(len(thetas))
-        rows = min([group.rows for group in self.groups])
+        rows = min(group.rows for group in self.groups)
         blocks = []
         for first in range(0, len(thetas), rows):
             block = thetas[first : first + rows]
@@ -174,7 +174,7 @@ def estimate_likelihood(
     # scatter little, the bandwidth is small and the weight in the sum of simulators large.
     nodes = evaluator.nodes
     events = [node.target.event for node in nodes]
-    fewest = min([len(node.observed) for node in nodes])
+    fewest = min(len(node.observed) for node in nodes)
     if any(events) or len(nodes) > 1 or fewest < options.few_specimens:
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
@@ -187,13 +187,13 @@ def estimate_likelihood(
     pairs = [group.population(evaluator, point[None]) for group in score_groups]
     log_weights, scores = zip(*pairs, strict=True)
     untilted = cumulants(log_weights, scores, np.zeros((1, len(point))))
-    size = sum([score.size for score in scores])
+    size = sum(score.size for score in scores)
     combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
     # A hundred standard errors of each element, or the prior's spread if it is less.
     hyperparameters = evaluator.hyperparameters
     is_stored = [node.bound.stored for node in nodes]
     if all(is_stored):
-        n_observed = sum([len(node.observed) for node in nodes])
+        n_observed = sum(len(node.observed) for node in nodes)
         precision = _likelihood_spread(evaluator, point, options) * np.sqrt(n_observed)
         scale = 100 / np.maximum(precision, 100) * hyperparameters.prior_sd
     else:
@@ -466,7 +466,7 @@ def log_density(
         return cumulants([logs[rows] for logs in supported], scores, tilts)
 
     shape = len(supported[0]), scores[0].values.shape[1]
-    size = sum([score.size for score in scores])
+    size = sum(score.size for score in scores)
     result[is_supported] = saddlepoint_density(function, shape, size, options)
     return result
 

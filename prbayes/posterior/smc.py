@@ -653,7 +653,7 @@ def _save(
 
 def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, float]]:
     """Return statistics by chain and stage, NaN after the last one, and the mean evidence."""
-    n_stages = max([len(stages["beta"]) for stages in chains])
+    n_stages = max(len(stages["beta"]) for stages in chains)
     variables = {}
     for name in chains[0]:
         table = np.full((len(chains), n_stages), np.nan)

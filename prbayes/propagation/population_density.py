@@ -117,7 +117,7 @@ class ExponentialForm:
                 return None
             coordinates += of_input
         with np.errstate(invalid="ignore"):
-            is_inside = np.isfinite(sum([u.sum(axis=0) for u, _ in coordinates]))
+            is_inside = np.isfinite(sum(u.sum(axis=0) for u, _ in coordinates))
         inside = np.flatnonzero(is_inside)
         if not inside.size:
             return None

@@ -145,7 +145,7 @@ def fmu(
         parameter_values.append((parameter, parameter.converted(value, "fmu: parameters")))
     model = Simulation(
         unit,
-        tuple([_variable(description, name, "inputs") for name in input_names]),
+        tuple(_variable(description, name, "inputs") for name in input_names),
         {key: _variable(description, name, "outputs") for key, name in output_names.items()},
         tuple(parameter_values),
         grid,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +14,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace
-from pytensor.graph.traversal import ancestors
+from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
@@ -42,7 +41,7 @@ class Inputs:
         self.roots = tuple(roots)  # model variables that the inputs depend on
         self.nested = nested  # whether a ``.dist()`` depends on another one
         self.groups = groups_of("", self.roots)
-        self.event_shapes = tuple([event_shape(x) for x in self.aleatory])
+        self.event_shapes = tuple(event_shape(x) for x in self.aleatory)
         self.event_ndims = [x.type.ndim for x in (*self.aleatory, *self.epistemic)]
         # Numbers of one specimen in each argument, and those that are aleatory.
         self.sizes = []
@@ -55,7 +54,7 @@ class Inputs:
             else:
                 shape = np.shape(argument)
             self.sizes.append(int(np.prod(shape, dtype=int)))
-        self.dimensions = sum([int(np.prod(shape)) for shape in self.event_shapes])
+        self.dimensions = sum(int(np.prod(shape)) for shape in self.event_shapes)
         # Data that can be changed, as `pymc.Data`, by name.
         self.data: dict[str, Any] = {
             str(variable.name or f"shared variable {i}"): variable
@@ -175,15 +174,11 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
 
 def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) -> list[Variable]:
     """Return variables and their ancestors, the nearest first, without those of the ends."""
-    ancestry: dict[Variable, None] = {}
-    queue = deque(variables)
-    while queue:
-        variable = queue.popleft()
-        if variable not in ancestry:
-            ancestry[variable] = None
-            if variable not in ends and variable.owner is not None:
-                queue += variable.owner.inputs
-    return list(ancestry)
+
+    def parents(variable: Variable) -> Any:
+        return None if variable in ends or variable.owner is None else variable.owner.inputs
+
+    return list(walk(variables, parents))
 
 
 def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:

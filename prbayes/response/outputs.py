@@ -32,7 +32,7 @@ class Outputs:
     @property
     def names(self) -> tuple[str, ...]:
         """The labels as text."""
-        return tuple([f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels])
+        return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
 
     def by_key(self, values: Floats) -> dict[str, Floats]:
         """Return outputs in the last axis, (..., m), as a mapping with the response's keys."""
@@ -132,7 +132,7 @@ def _labelled_columns(observed: Any, m: int) -> Outputs:
     else:
         return Outputs(labels)
     are_names = all(isinstance(label, str) for label in labels)
-    return Outputs(labels, dim, tuple([(x, None) for x in labels]) if are_names else (), units)
+    return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else (), units)
 
 
 def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:
