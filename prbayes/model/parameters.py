@@ -47,8 +47,6 @@ class Hyperparameters:
     size: int = field(init=False)  # of theta, d
     names: list[str] = field(init=False)  # of elements: 'sigma_log__', 'mu[1]' or 'mu[Adler]'
     readable_names: list[str] = field(init=False)  # by untransformed variables, such as 'sigma'
-    # Draws of theta from the prior by size and seed.
-    prior_draws: dict[tuple[int, int], Floats] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Set the attributes that follow from the model and the point."""
@@ -68,7 +66,6 @@ class Hyperparameters:
             size=initial.size,
             names=names,
             readable_names=readable_names,
-            prior_draws={},
         )
 
     @classmethod
@@ -206,14 +203,16 @@ class Hyperparameters:
         return np.asarray(thetas)
 
     @cached_property
-    def _prior_sampler(self) -> PriorSampler:
-        return PriorSampler(self.model.free_RVs)
+    def _prior_draws(self) -> tuple[PriorSampler, dict[tuple[int, int], Floats]]:
+        """The sampler of the prior, and its draws of theta by size and seed."""
+        return PriorSampler(self.model.free_RVs), {}
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        if (size, seed) not in self.prior_draws:
-            self.prior_draws[size, seed] = self.thetas_of(self._prior_sampler(size, seed))
-        return self.prior_draws[size, seed].copy()
+        sampler, draws = self._prior_draws
+        if (size, seed) not in draws:
+            draws[size, seed] = self.thetas_of(sampler(size, seed))
+        return draws[size, seed].copy()
 
     @cached_property
     def prior_sd(self) -> Floats:
