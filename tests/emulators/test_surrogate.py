@@ -180,7 +180,7 @@ def test_a_calibration_through_a_surrogate_agrees_with_one_without() -> None:
     for name in ("mu", "sigma"):
         tolerance = 0.02 * direct.stderr[name]
         assert through.point[name] == pytest.approx(direct.point[name], abs=tolerance)
-    assert through.support["y"]["lost_mass"] < 0.01
+    assert through.search.support["y"]["lost_mass"] < 0.01
 
 
 @pytest.mark.long

@@ -383,7 +383,10 @@ def test_a_sum_hides_a_difference(name: str) -> None:
         )  # fmt: skip
     optimum = prb.minimize(model)
     (finding,) = optimum.findings
-    assert "less than the prior about a - 0.5 b[0] (in units of the priors'" in finding.text
+    assert (
+        "less informative than the prior about a - 0.5 b[0] (in units of the priors'"
+        in finding.text
+    )
     assert np.isinf([optimum.stderr["a"], *optimum.stderr["b"]]).all()
 
 

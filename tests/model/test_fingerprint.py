@@ -418,7 +418,9 @@ def test_the_optimum_is_taken_to_the_order_of_a_clone() -> None:
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED)
     found = prb.minimize(model, starts=0, **QUIET)
     clone = clone_model(model)
-    assert Evaluator.of(clone).hyperparameters.names == found.names[::-1], "else this tests nothing"
+    assert (
+        Evaluator.of(clone).hyperparameters.names == found.evaluator.hyperparameters.names[::-1]
+    ), "else this tests nothing"
     arguments: dict[str, Any] = {"chains": 1, "optimum": found, **QUIET}
     draws = [prb.sample_smc(200, model=m, **arguments)["posterior"] for m in (model, clone)]
     for name in ("mu", "sigma"):
