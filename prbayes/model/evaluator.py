@@ -348,6 +348,8 @@ def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
     model = evaluator.model
     free = set(model.free_RVs)
     params = [p for group in _simulator_params(evaluator) for p in group]
+    for likelihood in evaluator.likelihoods:
+        params += [model[str(v.name)] for v in likelihood.variables() if not is_group(v)]
     direct = {v for v in ancestors(params, blockers=free) if v in free}
     joined = free & set(ancestors(list(direct)))
     # A variable comes after those that it depends on.

@@ -25,6 +25,7 @@ from prbayes.inference.checks.prior import PriorEnd, end_of_range, prior_end_fin
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
     Evaluator,
+    only_through_prior,
     specimen_graphs,
     specimen_log_likelihoods,
     specimen_params,
@@ -406,7 +407,8 @@ def _findings(
             )
         )
     names = np.array(evaluator.hyperparameters.readable_names)
-    unidentified = names[np.isinf(np.diag(best.covariance))].tolist()
+    is_direct = ~only_through_prior(evaluator)
+    unidentified = names[np.isinf(np.diag(best.covariance)) & is_direct].tolist()
     flat = [name for name in unidentified if name not in {end.name for end in ends}]
     if flat:
         findings.append(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 
 import prbayes as prb
 from prbayes._finding import Finding, report
@@ -215,3 +216,20 @@ def test_the_number_of_evaluations_is_limited() -> None:
     assert optimum.search.n_evaluations <= most + 40
     # The trace is that of the best descent.
     assert len(optimum.search.trace["theta"]) <= optimum.search.n_evaluations
+
+
+def test_hyperparameters_that_only_the_prior_links_to_the_data_are_not_reported() -> None:
+    who = np.repeat(["a", "b", "c"], 10)
+    data = xr.DataArray(
+        np.random.default_rng(2).normal(1.0, 0.5, 30), {"lab": ("specimen", who)}, "specimen"
+    )
+    with pm.Model(coords={"lab": ["a", "b", "c"]}) as model:
+        m, tau = pm.Normal("m", 1, 1), pm.HalfNormal("tau", 0.5)
+        mu = pm.Normal("mu", m, tau, dims="lab")
+        pm.Normal("next", m, tau)
+        pm.Normal("idle", 0, 1)
+        x = pm.Normal.dist(mu[prb.response.group("lab")], 0.5)
+        prb.Simulator("y", lambda x: x, x, observed=data)
+    (finding,) = fit(model).findings
+    assert finding.code == "not-identified"
+    assert "do not identify idle;" in finding.text
