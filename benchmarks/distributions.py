@@ -557,7 +557,7 @@ def _off(case: Case, evaluator: Evaluator, observed: Any) -> float:
         draws = case.response(case.draw(h, np.random.default_rng([2, seed]), 100_000))
         expected = stats.wasserstein_distance(draws, observed)
         spread = np.mean(np.abs(draws - np.median(draws)))
-        roots = evaluator.roots(_theta(evaluator, h), 0)
+        roots = evaluator.parents(_theta(evaluator, h), 0)
         (found,) = bound.discrepancies(roots, bound.target)
         allowed = 5 * discrepancy_error(bound, roots) + TOLERANCE * spread
         worst = max(worst, abs(found - expected) / max(allowed, 1e-12))

@@ -56,7 +56,7 @@ def fleet(products: int, size: int = 20) -> dict[str, Any]:
     drawn = time.process_time()
     names = evaluator.hyperparameters
     density = PopulationDensity(likelihood.inputs)
-    order = [str(root.name) for root in likelihood.inputs.roots]
+    order = [str(root.name) for root in likelihood.inputs.parents]
     free = [str(rv.name) for rv in evaluator.model.free_RVs]
     weighted = [WeightedPoints.of(likelihood.inputs, *each) for each in zip(x, log_a, strict=True)]
 

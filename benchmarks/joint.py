@@ -229,7 +229,7 @@ class Cell:
                 )
         evaluator = Evaluator.of(model)
         for bound in evaluator.reweighted.values():
-            bound.add([self.near[root.name] for root in bound.inputs.roots], n)
+            bound.add([self.near[root.name] for root in bound.inputs.parents], n)
         return evaluator
 
     def _thetas(self, values: dict[str, Any]) -> Any:

@@ -140,7 +140,7 @@ def away(coarse: Callable[..., Any] | None, n: int, seed: int, reference: Any) -
     evaluator = Evaluator.of(build(stored))
     rng = np.random.default_rng(0)
     near = rng.multivariate_normal(reference.theta, reference.covariance, 64)
-    evaluator.reweighted["y"].reach(evaluator.roots(near, 0), growth=2)
+    evaluator.reweighted["y"].reach(evaluator.parents(near, 0), growth=2)
     optimum = prb.minimize(
         evaluator.model, start=reference.point, starts=0, refine=False, progressbar=False
     )

@@ -327,7 +327,7 @@ def test_a_few_nan_responses_are_fine_and_reported() -> None:
     evaluator = Evaluator.of(model)
     theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
     node = next(iter(nodes(model).values()))
-    lost = node.bound.support(evaluator.roots(theta, 0))["lost_mass"]
+    lost = node.bound.support(evaluator.parents(theta, 0))["lost_mass"]
     np.testing.assert_allclose(lost, norm.cdf(0.8, 2.0, 0.8), atol=0.01)
     assert np.isfinite(evaluator(theta).discrepancies).all()
     tolerant = build(

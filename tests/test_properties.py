@@ -329,7 +329,7 @@ def test_three_propagations_agree_and_gradients_are_differences(problem: dict[st
         theta = evaluator.hyperparameters.unconstrained(
             {"a": problem["at"][0], "b": problem["at"][1]}
         )
-        roots = evaluator.roots(theta[None], 0)
+        roots = evaluator.parents(theta[None], 0)
         (value,) = bound.discrepancies(roots, bound.target)
         found.append(value)
         errors.append(discrepancy_error(bound, roots))

@@ -249,7 +249,7 @@ def _rare_probability(
     evaluator = populations.evaluator
     values = evaluator.hyperparameters.constrained(populations.thetas)
     center = evaluator.hyperparameters.constrained(populations.center[None])
-    names = [str(rv.name) for rv in responses.inputs.roots]
+    names = [str(rv.name) for rv in responses.inputs.parents]
     transform = InverseTransform(responses.name, responses.inputs, [center[name] for name in names])
     sign = -1.0 if quantity.below else 1.0
 
@@ -295,7 +295,7 @@ def _emulator_error(sample: ResponseSample, quantity: Exceedance) -> float:
     if not outputs:
         return 0.0
     thetas = sample.populations.thinned()
-    _, weights = sample.design.populations(sample.populations.evaluator.roots(thetas, sample.k))
+    _, weights = sample.design.populations(sample.populations.evaluator.parents(thetas, sample.k))
     mass = np.nanmean(weights, axis=0)
     means = [mass @ quantity.of_specimen(values, np.nan) for values in outputs]
     return float(np.sqrt(np.sum((np.array(means[1:]) - means[0]) ** 2)))

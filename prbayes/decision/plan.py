@@ -333,7 +333,7 @@ def fisher_information(sample: ResponseSample) -> Floats:
     evaluator = sample.populations.evaluator
     unit = evaluator.hyperparameters.prior_sd
     step = 1e-3 * unit
-    parents = evaluator.roots(cross(sample.populations.center, step), sample.k)
+    parents = evaluator.parents(cross(sample.populations.center, step), sample.k)
     _, weights = sample.design.populations(parents)
     outputs = sample.outputs
     if sample.emulator is None:
@@ -377,7 +377,7 @@ def _at_most(information: Floats, bound: Floats) -> Floats:
 def _ideal_sample(sample: ResponseSample, n: int) -> Floats:
     """Return n specimens at equal steps of probability of the central population."""
     evaluator = sample.populations.evaluator
-    parents = evaluator.roots(sample.populations.center[None], sample.k)
+    parents = evaluator.parents(sample.populations.center[None], sample.k)
     _, weights = sample.design.populations(parents)
     is_observable = observable(sample.outputs, evaluator.nodes[sample.k].target)
     values = sample.outputs[is_observable]

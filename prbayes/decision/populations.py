@@ -85,7 +85,7 @@ class Populations:
         """Return a response with its inputs."""
         name = str(getattr(response, "__name__", type(response).__name__))
         sorted_inputs = read_inputs(name, inputs, self.evaluator.model)
-        refuse_groups(f"{self.caller}: {name}", sorted_inputs.roots)
+        refuse_groups(f"{self.caller}: {name}", sorted_inputs.parents)
         outputs = known_outputs(self.evaluator.simulators, response)
         return Responses(name, response, sorted_inputs, outputs=outputs, **calling)
 
@@ -120,8 +120,8 @@ class Populations:
         k = simulators.index(simulator)
         if simulator.is_emulated:
             if k not in self._emulated_samples:
-                roots = self.evaluator.roots(self.thetas, k)
-                self._emulated_samples[k] = EmulatedSample.of(simulator, roots)
+                parents = self.evaluator.parents(self.thetas, k)
+                self._emulated_samples[k] = EmulatedSample.of(simulator, parents)
             design = self._emulated_samples[k]
             emulator = simulator.emulator(responses)
             values = emulator(design.points_of(responses.inputs))
@@ -187,7 +187,7 @@ class ResponseSample:
 
     def weights(self, thetas: Floats) -> Floats:
         """Return weights of the values in populations, (k, d) -> (k, n), with sum one."""
-        _, weights = self.design.populations(self.populations.evaluator.roots(thetas, self.k))
+        _, weights = self.design.populations(self.populations.evaluator.parents(thetas, self.k))
         weights = weights[:, self._order]
         with np.errstate(invalid="ignore"):
             return weights / weights.sum(axis=1, keepdims=True)
@@ -211,12 +211,12 @@ class ResponseSample:
 
     def refuse_unsupported(self) -> None:
         """Raise if the design does not support the populations, or too many responses are NaN."""
-        roots = self.populations.evaluator.roots(self.populations.thinned(), self.k)
+        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
         if self.design.has_runs:
-            refuse_unsupported(self.responses.name, self.design, roots)
+            refuse_unsupported(self.responses.name, self.design, parents)
         else:
-            self.design.refuse_unsupported(self.responses.name, roots)
-        _, weights = self.design.populations(roots)
+            self.design.refuse_unsupported(self.responses.name, parents)
+        _, weights = self.design.populations(parents)
         lost = float(np.nanmedian(weights[:, is_missing(self.outputs)].sum(axis=1)))
         if lost > self.design.max_lost:
             raise DesignError(

@@ -239,7 +239,7 @@ def input_indices(
     """
     center = sample.populations.center[None]
     unknown = Indices(*np.full((2, 3, len(sample.design.inputs.aleatory)), np.nan))
-    parents = sample.populations.evaluator.roots(center, sample.k)
+    parents = sample.populations.evaluator.parents(center, sample.k)
     try:
         transform = InverseTransform(sample.responses.name, sample.design.inputs, parents)
     except TypeError as error:

@@ -224,9 +224,9 @@ def predictive_inputs(name: str, variables: list[Any], random_seed: int) -> list
     """
     model = model_on_context(None, f"{name}: inputs that are distributions")
     inputs = read_inputs(name, variables, model)
-    roots = PriorSampler(inputs.roots)(POPULATIONS, random_seed)
+    parents = PriorSampler(inputs.parents)(POPULATIONS, random_seed)
     symbols = inputs.placeholders()
-    (is_valid,) = compile_batched(symbols, [valid(inputs, inputs.rebuilt(symbols)[0])])(*roots)
+    (is_valid,) = compile_batched(symbols, [valid(inputs, inputs.rebuilt(symbols)[0])])(*parents)
     usable = np.flatnonzero(np.broadcast_to(is_valid, POPULATIONS))
     if not usable.size:
         raise ValueError(
@@ -235,9 +235,9 @@ def predictive_inputs(name: str, variables: list[Any], random_seed: int) -> list
         )
     # Other draws replace those with invalid parameters, such as a negative standard deviation.
     places = usable[np.arange(POPULATIONS) % usable.size]
-    valid_roots = [values[places] for values in roots]
+    valid_values = [values[places] for values in parents]
     rng = np.random.default_rng(random_seed)
-    aleatory, epistemic = PopulationSampler(inputs)(valid_roots, SPECIMENS, rng)
+    aleatory, epistemic = PopulationSampler(inputs)(valid_values, SPECIMENS, rng)
     # An epistemic value is the same for all specimens.
     return [
         np.broadcast_to(values, (POPULATIONS, SPECIMENS, *values.shape[2:])).astype(np.float64)

@@ -71,12 +71,12 @@ class Continuation:
     def _thetas(self, shares: Floats, coordinates: Floats) -> Floats:
         return np.asarray(np.where(self.is_continued, logit(shares), coordinates))
 
-    def roots(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
-        """Return the roots of the k-th simulator, continued linearly in values beyond the ends."""
-        margin = 1e-3  # part of the interval whose slope continues the roots
+    def parents(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
+        """Return the parents of the k-th simulator, continued linearly beyond the ends."""
+        margin = 1e-3  # part of the interval whose slope continues the parents
         shares = self._shares(coordinates, margin)
-        base = evaluator.roots(self._thetas(shares, coordinates), k)
-        roots = list(base)
+        base = evaluator.parents(self._thetas(shares, coordinates), k)
+        parents = list(base)
         beyond = (self.values(coordinates) - self.lower) / (self.upper - self.lower) - shares
         for i in np.flatnonzero(self.is_continued):
             passed = np.abs(beyond[:, i]) > 1e-12
@@ -85,12 +85,12 @@ class Continuation:
             inside = shares.copy()
             steps = -margin * np.sign(beyond[:, i])
             inside[:, i] += steps
-            moved = evaluator.roots(self._thetas(inside, coordinates), k)
+            moved = evaluator.parents(self._thetas(inside, coordinates), k)
             factors = np.where(passed, beyond[:, i] / np.where(passed, steps, 1.0), 0.0)
-            for j, (root, inner) in enumerate(zip(base, moved, strict=True)):
-                column = factors.reshape(-1, *np.ones(root.ndim - 1, dtype=int))
-                roots[j] = roots[j] + column * (inner - root)
-        return roots
+            for j, (value, inner) in enumerate(zip(base, moved, strict=True)):
+                column = factors.reshape(-1, *np.ones(value.ndim - 1, dtype=int))
+                parents[j] = parents[j] + column * (inner - value)
+        return parents
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,9 +132,9 @@ class ContinuedEvaluator(Evaluator):
         )
         return cls(**fields, continuation=continuation, inner=evaluator)
 
-    def roots(self, thetas: Floats, k: int) -> list[Floats]:
-        """Return the values of the roots of the k-th simulator, shapes (P, *shape)."""
-        return self.continuation.roots(self.inner, thetas, k)
+    def parents(self, thetas: Floats, k: int) -> list[Floats]:
+        """Return the values of the parents of the k-th simulator, shapes (P, *shape)."""
+        return self.continuation.parents(self.inner, thetas, k)
 
 
 def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:

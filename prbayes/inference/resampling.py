@@ -261,9 +261,9 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
         columns = []
         for k, node in zip(group, members, strict=True):
             sampler = PopulationSampler(node.bound.inputs)
-            roots = evaluator.roots(theta[None], k)
+            parents = evaluator.parents(theta[None], k)
             # Four for each specimen; the same for all simulators of the group.
-            aleatory, epistemic = sampler(roots, 4 * total, copy.deepcopy(generator))
+            aleatory, epistemic = sampler(parents, 4 * total, copy.deepcopy(generator))
             columns.append(np.asarray(node.bound.responses(aleatory, epistemic)[0]))
         # A specimen that one simulator cannot measure is measured by none.
         targets = [node.target for node in members]

@@ -199,14 +199,14 @@ class EmulatedSimulator:
             return self._emulated
         return _emulate_at_runs(self.likelihood, responses)
 
-    def populations(self, roots: Sequence[Floats]) -> tuple[Floats, Floats]:
+    def populations(self, parents: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return emulated responses and weights of populations, (k, n) or (k, n, m) and (k, n).
 
         The quasi-random numbers are the same for all calls.
         """
-        size, n = len(roots[0]), _SIZES.specimens
+        size, n = len(parents[0]), _SIZES.specimens
         rng = np.random.default_rng(0)
-        specimens, _ = new_specimens(self.name, self.inputs, list(roots), n, rng)
+        specimens, _ = new_specimens(self.name, self.inputs, list(parents), n, rng)
         flat = [x.reshape(size * n, *x.shape[2:]) for x in specimens]
         values = self._emulated(flat).reshape(size, n, *self.measurement.event)
         return values, np.full((size, n), 1 / n)
@@ -251,18 +251,18 @@ class EmulatedSample:
     has_runs: ClassVar[Literal[False]] = False  # a design has runs as points
 
     @classmethod
-    def of(cls, simulator: EmulatedSimulator, roots: Sequence[Floats]) -> EmulatedSample:
-        """Draw specimens from populations at roots, shapes (k, *shape)."""
-        places = np.linspace(0, len(roots[0]) - 1, _SIZES.populations)
+    def of(cls, simulator: EmulatedSimulator, parents: Sequence[Floats]) -> EmulatedSample:
+        """Draw specimens from populations at parents, shapes (k, *shape)."""
+        places = np.linspace(0, len(parents[0]) - 1, _SIZES.populations)
         rows = np.unique(places.round().astype(int))
-        roots = [root[rows] for root in roots]
+        parents = [parent[rows] for parent in parents]
         of_each = -(-_SIZES.populations * _SIZES.of_each // len(rows) // _SIZES.blocks)
         of_each *= _SIZES.blocks
         specimens, _ = new_specimens(
-            simulator.name, simulator.inputs, list(roots), of_each, np.random.default_rng(0)
+            simulator.name, simulator.inputs, list(parents), of_each, np.random.default_rng(0)
         )
         flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
-        log_p = _log_density(simulator.inputs, roots, flat)
+        log_p = _log_density(simulator.inputs, parents, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))
         blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(rows))
         return cls(simulator, flat, log_mixture, blocks, simulator.inputs, len(log_mixture))
@@ -271,17 +271,17 @@ class EmulatedSample:
         """Return the specimens' values of some inputs."""
         return values_of(self.points, self.inputs, inputs)
 
-    def populations(self, roots: Sequence[Floats]) -> tuple[None, Floats]:
-        """Return nothing, and the weights of the specimens in populations at roots, (k, n)."""
-        log_p = _log_density(self.inputs, roots, self.points) - self.log_mixture
+    def populations(self, parents: Sequence[Floats]) -> tuple[None, Floats]:
+        """Return nothing, and the weights of the specimens in populations at parents, (k, n)."""
+        log_p = _log_density(self.inputs, parents, self.points) - self.log_mixture
         largest = log_p.max(axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):
             weights = np.exp(log_p - largest)
             return None, weights / weights.sum(axis=1, keepdims=True)
 
-    def refuse_unsupported(self, name: str, roots: Sequence[Floats]) -> None:
+    def refuse_unsupported(self, name: str, parents: Sequence[Floats]) -> None:
         """Raise if the weights of most populations are those of a few specimens."""
-        _, weights = self.populations(roots)
+        _, weights = self.populations(parents)
         size = float(np.median(1 / (weights**2).sum(axis=1)))
         if not size >= _SIZES.of_each / 2:
             raise DesignError(
@@ -292,12 +292,12 @@ class EmulatedSample:
             )
 
 
-def _log_density(inputs: Inputs, roots: Sequence[Floats], points: Sequence[Floats]) -> Floats:
+def _log_density(inputs: Inputs, parents: Sequence[Floats], points: Sequence[Floats]) -> Floats:
     """Return log-densities of specimens in populations, (k, n)."""
     function = compiled_log_density(inputs)
     step = max(1, AT_ONCE // len(points[0]))
     parts = []
-    for first in range(0, len(roots[0]), step):
-        (log_p,) = function(*[root[first : first + step] for root in roots], *points)
+    for first in range(0, len(parents[0]), step):
+        (log_p,) = function(*[parent[first : first + step] for parent in parents], *points)
         parts.append(np.broadcast_to(log_p, (len(log_p), len(points[0]))))
     return np.concatenate(parts)

@@ -19,7 +19,7 @@ from prbayes._validate import AT_ONCE, IN_CACHE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, roots_of
+from prbayes.model.parameters import Hyperparameters, parent_values
 from prbayes.model.random_variable import (
     Node,
     SimulatorRV,
@@ -153,7 +153,7 @@ class Evaluator:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
         budget().check()
         node = self.nodes[k]
-        return node.bound.discrepancies(self.roots(thetas, k), target or node.target)
+        return node.bound.discrepancies(self.parents(thetas, k), target or node.target)
 
     def __call__(self, thetas: Floats) -> Evaluation:
         """Evaluate a batch, shape (P, d); an invalid theta does not affect the rest."""
@@ -266,12 +266,12 @@ class Evaluator:
             targets.append(target.metric.with_design(target, bound.first_responses, dimensions))
         return self.with_targets(targets)
 
-    def roots(self, thetas: Floats, k: int) -> list[Floats]:
-        """Return the values of the roots of the k-th of `simulators`, shapes (P, *shape)."""
+    def parents(self, thetas: Floats, k: int) -> list[Floats]:
+        """Return the values of the parents of the k-th of `simulators`, shapes (P, *shape)."""
         if k >= len(self.nodes):
             simulator = self.emulated[k - len(self.nodes)]
-            return roots_of(self.hyperparameters, thetas, simulator.inputs, simulator.place)
-        key = ("roots", *(node.name for node in self.nodes))
+            return parent_values(self.hyperparameters, thetas, simulator.inputs, simulator.place)
+        key = ("parents", *(node.name for node in self.nodes))
         if key not in self.functions:
             params = _simulator_params(self)
             graphs = self.model.replace_rvs_by_values([p for group in params for p in group])
@@ -283,7 +283,7 @@ class Evaluator:
 
     def populations(self, thetas: Floats, k: int) -> tuple[Floats, Floats]:
         """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`."""
-        return self.simulators[k].populations(self.roots(thetas, k))
+        return self.simulators[k].populations(self.parents(thetas, k))
 
     def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
@@ -296,8 +296,8 @@ class Evaluator:
             step = max(1, IN_CACHE // bound.n_points)
             parts = []
             for first in range(0, max(1, len(thetas)), step):
-                roots = self.roots(thetas[first : first + step], k)
-                parts.append(bound.support(roots))
+                parents = self.parents(thetas[first : first + step], k)
+                parts.append(bound.support(parents))
             by_name[node.name] = {
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]
             }
@@ -322,7 +322,7 @@ def _ordinary(model: pm.Model) -> list[Any]:
 
 
 def _simulator_params(evaluator: Evaluator) -> list[list[Any]]:
-    """Return the roots of the nodes in the evaluator's model, which may be a clone."""
+    """Return the parents of the nodes in the evaluator's model, which may be a clone."""
     params = []
     for node in evaluator.nodes:
         application = evaluator.model.named_vars[node.name].owner
@@ -429,7 +429,7 @@ def missing_mass(evaluator: Evaluator, theta: Floats, k: int) -> dict[str, float
 
     No response is computed at the theta that was evaluated last.
     """
-    missing = evaluator.nodes[k].bound.missing(evaluator.roots(theta[None], k))
+    missing = evaluator.nodes[k].bound.missing(evaluator.parents(theta[None], k))
     return {"lost_mass": float(missing.lost[0]), "failed_mass": float(missing.failed[0])}
 
 

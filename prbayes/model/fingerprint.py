@@ -188,7 +188,7 @@ def _inputs(inputs: Inputs) -> str:
     texts = []
     for argument in inputs.arguments:
         if isinstance(argument, int):
-            texts.append(str_for_dist(inputs.aleatory[argument], named_vars=set(inputs.roots)))
+            texts.append(str_for_dist(inputs.aleatory[argument], named_vars=set(inputs.parents)))
         elif argument in inputs.epistemic:
             texts.append(str(argument.name or "an expression"))
         else:

@@ -246,7 +246,7 @@ class SpecimenLikelihood:
         """
         measurements = [m for m in self.measurements if names is None or m.name in names]
         extras = [v for m in measurements for v in m.extras.values()]
-        return tuple(dict.fromkeys([*self.inputs.roots, *extras]))
+        return tuple(dict.fromkeys([*self.inputs.parents, *extras]))
 
     @property
     def error_is_known(self) -> bool:

@@ -284,14 +284,14 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, N
     return np.where(np.isfinite(thetas), thetas, hyperparameters.initial), order
 
 
-def roots_of(
+def parent_values(
     hyperparameters: Hyperparameters, thetas: Floats, inputs: Inputs, group: int | None
 ) -> list[Floats]:
-    """Return the roots of inputs at thetas, in the group with this index, shapes (P, *shape)."""
+    """Return the parents of inputs at thetas, in the group with this index, shapes (P, *shape)."""
     values = hyperparameters.constrained(thetas)
     return [
-        np.full(len(thetas), group) if is_group(root) else values[str(root.name)]
-        for root in inputs.roots
+        np.full(len(thetas), group) if is_group(parent) else values[str(parent.name)]
+        for parent in inputs.parents
     ]
 
 

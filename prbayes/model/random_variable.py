@@ -93,9 +93,9 @@ class Node:
             reweighted=reweighted_of(self.bound),
         )
 
-    def populations(self, roots: Sequence[Floats]) -> tuple[Floats, Floats]:
+    def populations(self, parents: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return responses and weights of populations, (k, n) or (k, n, m) and (k, n)."""
-        return self.bound.populations(list(roots))
+        return self.bound.populations(list(parents))
 
     @property
     def epsilon_value(self) -> float:
@@ -381,7 +381,7 @@ class SimulatorRV(RandomVariable):
         *params, size = arguments
         bound = computed(self.simulator).bound
         event = bound.target.event
-        ndims = [root.type.ndim for root in bound.inputs.roots]
+        ndims = [parent.type.ndim for parent in bound.inputs.parents]
         batch, params = broadcast_batch(params, ndims)
         values = np.empty((*(batch if size is None else size), *event))
         # A population for each element of a batch; its specimens are along axes of length one.
@@ -389,8 +389,8 @@ class SimulatorRV(RandomVariable):
             places = tuple(slice(None) if n == 1 else i for i, n in zip(index, batch, strict=True))
             shape = values[places].shape
             n_specimens = int(np.prod(shape, dtype=int)) // int(np.prod(event, dtype=int))
-            roots = [param[index] for param in params]
-            values[places] = bound.draw(rng, n_specimens, roots).reshape(shape)
+            parents = [param[index] for param in params]
+            values[places] = bound.draw(rng, n_specimens, parents).reshape(shape)
         return values
 
     def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
@@ -438,7 +438,7 @@ def building(terms: str) -> Iterator[None]:
 def _log_density(
     op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
-    """Return the log-density of the observed data: a graph of the roots and of epsilon."""
+    """Return the log-density of the observed data: a graph of the parents and of epsilon."""
     (value,) = values
     data = known_value(value)
     node = computed(op.simulator)

@@ -181,14 +181,14 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     refuse_uncallable(name, response)
     arguments = read_inputs(name, inputs, model)
     for rv in simulators(model):
-        if rv in arguments.roots:
+        if rv in arguments.parents:
             raise TypeError(
                 f"{name}: got inputs that depend on the simulator {rv.name}, expected "
                 "hyperparameters; let one response call the other, or return the outputs of both "
                 "from one response, with prb.Joint(metric)"
             )
-    for root in arguments.roots:
-        refuse_single_precision(f"{name}: {root.name}", root.dtype)
+    for parent in arguments.parents:
+        refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
     groups, measured = None, observed
     if arguments.groups is not None:
         groups, measured = group_indices(name, observed, arguments.groups)
@@ -488,7 +488,7 @@ def _add_simulator(
     group = pt.constant(place, dtype="int64")
     rv = SimulatorDistribution(
         name,
-        *(group if is_group(v) else v for v in inputs.roots),
+        *(group if is_group(v) else v for v in inputs.parents),
         simulator=replace(specification, same_inputs=tuple(same_inputs)),
         observed=_pymc_data(observed, target.observed),
         dims=dims,

@@ -88,7 +88,8 @@ def _parent_values(
     """Return the values of the parents of the inputs, (P, *shape), in a group's populations."""
     size = len(next(iter(params.values())))
     return [
-        np.full(size, group) if is_group(root) else params[root] for root in likelihood.inputs.roots
+        np.full(size, group) if is_group(parent) else params[parent]
+        for parent in likelihood.inputs.parents
     ]
 
 
@@ -101,10 +102,10 @@ def log_likelihoods(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats]
     result = np.empty((len(next(iter(params.values()))), len(likelihood.readings)))
     groups = zip(likelihood.by_group, _points_by_group(likelihood), strict=True)
     for (group, rows), points in groups:
-        roots = _parent_values(likelihood, params, group)
-        result[:, rows] = likelihood.density.log_likelihoods(roots, points)
+        parents = _parent_values(likelihood, params, group)
+        result[:, rows] = likelihood.density.log_likelihoods(parents, points)
         if share is not None:
-            log_share = share.of_populations(likelihood.density, roots, likelihood.coordinates)
+            log_share = share.of_populations(likelihood.density, parents, likelihood.coordinates)
             result[:, rows] -= log_share[:, None]
     gross_share = likelihood.measurements[0].gross_errors
     if gross_share is not False:
@@ -124,7 +125,7 @@ def log_likelihood_graph(
     stacked = likelihood.stacked
     n, count = len(likelihood.readings), log_a.shape[1]
     symbols = likelihood.inputs.placeholders()
-    values = {s: params[r] for s, r in zip(symbols, likelihood.inputs.roots, strict=True)}
+    values = {s: params[r] for s, r in zip(symbols, likelihood.inputs.parents, strict=True)}
     groups = np.zeros(n, dtype=np.intp) if stacked.groups is None else stacked.groups
     flat = [x.reshape((n * count, *x.shape[2:]), ndim=x.ndim - 1) for x in points]
     log_p = _log_density(likelihood, values, flat, pt.repeat(pt.as_tensor(groups), count))
@@ -155,14 +156,14 @@ def _log_density(
 ) -> Any:
     """Return the log-density of points, (n, *event) by input, in populations of groups (n,).
 
-    Values are by the placeholders of the inputs' roots.
+    Values are by the placeholders of the inputs' parents.
     """
     inputs = likelihood.inputs
     symbols = list(values)
     dists, _ = inputs.rebuilt(symbols)
     if likelihood.stacked.groups is not None:
         # A vector of groups in place of one makes vectors of the distributions' parameters.
-        (group,) = (s for s, r in zip(symbols, inputs.roots, strict=True) if is_group(r))
+        (group,) = (s for s, r in zip(symbols, inputs.parents, strict=True) if is_group(r))
         dists = vectorize_graph(dists, {group: groups})
         values = {symbol: value for symbol, value in values.items() if symbol is not group}
     log_p = log_density(inputs, dists, points)
@@ -243,8 +244,8 @@ def draw_readings(
     def draw_outputs() -> Floats:
         inputs: list[Floats] = []
         for group, columns in by_group:
-            roots = _parent_values(likelihood, params, group)
-            drawn, _ = likelihood.density.sampler(roots, len(columns), rng)
+            parents = _parent_values(likelihood, params, group)
+            drawn, _ = likelihood.density.sampler(parents, len(columns), rng)
             inputs = inputs or [np.empty((size, n, *x.shape[2:])) for x in drawn]
             for whole, part in zip(inputs, drawn, strict=True):
                 whole[:, columns] = part
@@ -376,18 +377,20 @@ class SpecimenRV(RandomVariable):  # type: ignore[misc]
         measurement = self.measurement
         # Readings of other simulators, the last parameters, are not part of the population.
         pairs = zip(self.variables, params, strict=False)
-        roots = {root: param for root, param in pairs if not is_group(root)}
-        leading = [param.shape[: param.ndim - root.type.ndim] for root, param in roots.items()]
+        parents = {parent: param for parent, param in pairs if not is_group(parent)}
+        leading = [
+            param.shape[: param.ndim - parent.type.ndim] for parent, param in parents.items()
+        ]
         batch = np.broadcast_shapes(*leading)
         shape = batch if size is None else tuple(int(s) for s in size)
         n = len(measurement.observed) if not shape else shape[-1]
         # The last batch axis is that of the specimens, along which parameters have length one.
         flat = {}
-        for root, param in roots.items():
-            ndim = root.type.ndim
+        for parent, param in parents.items():
+            ndim = parent.type.ndim
             first = param if param.ndim == ndim else param[..., 0, *(slice(None),) * ndim]
             tail = first.shape[first.ndim - ndim :]
-            flat[root] = np.broadcast_to(first, (*batch[:-1], *tail)).reshape(-1, *tail)
+            flat[parent] = np.broadcast_to(first, (*batch[:-1], *tail)).reshape(-1, *tail)
         values = draw_readings(self.likelihood, rng, flat, n, measurement)
         return values.reshape(*shape, *measurement.event)
 
@@ -440,7 +443,7 @@ def _log_density_of_vector(
     if TERMS.get() == "priors" or op.measurement is not op.likelihood.measurements[-1]:
         return pt.zeros(0)
     variables = op.variables
-    roots = {
+    parents = {
         v: p if is_group(v) else p[(0,) * (p.ndim - v.type.ndim)]
         for v, p in zip(variables, params, strict=False)
     }
@@ -449,7 +452,7 @@ def _log_density_of_vector(
     data = [_without_marks(p[(0,) * (p.ndim - m.observed.ndim)]) for p, m in earlier] + [value]
     numbers = {m.name: known_value(v) for m, v in zip(measurements, data, strict=True)}
     likelihood = op.likelihood.observing(numbers)
-    result = log_likelihood_graph(likelihood, roots)
+    result = log_likelihood_graph(likelihood, parents)
     conditions = [
         equal_data(v, m.observed)
         for m, v in zip(likelihood.measurements, data, strict=True)

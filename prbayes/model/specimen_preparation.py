@@ -29,7 +29,7 @@ from prbayes.model.data_checks import (
     unreached,
 )
 from prbayes.model.measurement import SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, log_posterior, roots_of
+from prbayes.model.parameters import Hyperparameters, log_posterior, parent_values
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre_points import fibre_points
@@ -249,15 +249,17 @@ class Populations:
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
         for group, rows in likelihood.by_group:
             if smoothing is None:
-                roots = roots_of(self.hyperparameters, thetas, likelihood.inputs, group)
+                parents = parent_values(self.hyperparameters, thetas, likelihood.inputs, group)
                 points = WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], weights[rows])
-                result[:, rows] = likelihood.density.log_likelihoods(roots, points)
+                result[:, rows] = likelihood.density.log_likelihoods(parents, points)
                 continue
             step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):
                 block = slice(first, first + step)
-                roots = roots_of(self.hyperparameters, thetas[block], likelihood.inputs, group)
-                logs = self._normal_log_density(roots, z[rows].reshape(-1, d), smoothing)
+                parents = parent_values(
+                    self.hyperparameters, thetas[block], likelihood.inputs, group
+                )
+                logs = self._normal_log_density(parents, z[rows].reshape(-1, d), smoothing)
                 logs = np.where(np.isnan(logs), -np.inf, logs)
                 logs = logs.reshape(-1, len(rows), count)
                 result[block, rows] = log_sum_exp(logs + weights[rows])
@@ -272,18 +274,18 @@ class Populations:
         likelihood = self.likelihood
         result = np.zeros(len(thetas))
         for group, rows in likelihood.by_group:
-            roots = roots_of(self.hyperparameters, thetas, likelihood.inputs, group)
+            parents = parent_values(self.hyperparameters, thetas, likelihood.inputs, group)
             result += len(rows) * share.of_populations(
-                likelihood.density, roots, likelihood.coordinates
+                likelihood.density, parents, likelihood.coordinates
             )
         return result
 
     def _normal_log_density(
-        self, roots: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
+        self, parents: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
     ) -> Floats:
         """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
         sampler, rng = self.likelihood.density.sampler, np.random.default_rng(0)
-        sample = self.likelihood.coordinates.of(sampler(roots, specimens, rng)[0], 2)
+        sample = self.likelihood.coordinates.of(sampler(parents, specimens, rng)[0], 2)
         mean = sample.mean(axis=1, keepdims=True)
         centred = sample - mean
         root = np.linalg.cholesky(centred.swapaxes(1, 2) @ centred / specimens + smoothing)
@@ -378,8 +380,10 @@ class PopulationDraws:
         rng = np.random.default_rng([0, 3])
         parts = []
         for group, _ in likelihood.by_group:
-            roots = roots_of(populations.hyperparameters, self.thetas, likelihood.inputs, group)
-            inputs, _ = likelihood.density.sampler(roots, n_of_each, rng)
+            parents = parent_values(
+                populations.hyperparameters, self.thetas, likelihood.inputs, group
+            )
+            inputs, _ = likelihood.density.sampler(parents, n_of_each, rng)
             z = likelihood.coordinates.of(inputs, 2)
             parts.append(z.reshape(-1, z.shape[-1]))
         z = np.concatenate(parts)

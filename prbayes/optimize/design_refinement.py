@@ -283,7 +283,7 @@ def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: flo
 def _components(evaluator: Evaluator, thetas: Floats, k: int) -> list[Floats]:
     """Return the populations at thetas for which a design has points: those of all its groups."""
     members = next((family for family in families(evaluator.nodes) if k in family), [k])
-    by_member = [evaluator.roots(thetas, member) for member in members]
+    by_member = [evaluator.parents(thetas, member) for member in members]
     return [np.concatenate(values) for values in zip(*by_member, strict=True)]
 
 

@@ -240,7 +240,7 @@ def margin_densities(
         grid = np.linspace(low, high, GRID_POINTS)
         if margin.discrete:
             grid = np.arange(np.floor(low), np.ceil(high) + 1)
-        y = _exact(evaluator.simulators[k].inputs, margin, evaluator.roots(thetas, k), grid)
+        y = _exact(evaluator.simulators[k].inputs, margin, evaluator.parents(thetas, k), grid)
         if y is None:
             if k not in many:
                 many[k] = _draws(evaluator, k, thetas, 1600, seed=1)
@@ -257,7 +257,7 @@ def margin_densities(
 def _draws(evaluator: Evaluator, k: int, thetas: Floats, n: int, seed: int) -> Any:
     """Return n specimens of each population of the k-th simulator's aleatory inputs."""
     sampler = PopulationSampler(evaluator.simulators[k].inputs)
-    return sampler(evaluator.roots(thetas, k), n, np.random.default_rng(seed))[0]
+    return sampler(evaluator.parents(thetas, k), n, np.random.default_rng(seed))[0]
 
 
 def _values(draws: Any, margin: Margin) -> Floats:
@@ -265,7 +265,7 @@ def _values(draws: Any, margin: Margin) -> Floats:
     return np.asarray(draws[margin.position][(..., *margin.index)], dtype=np.float64)
 
 
-def _exact(inputs: Inputs, margin: Margin, roots: list[Floats], grid: Floats) -> Floats | None:
+def _exact(inputs: Inputs, margin: Margin, parents: list[Floats], grid: Floats) -> Floats | None:
     """Return the densities, shape (P, g), or None where PyMC has no density of one element."""
     if inputs.nested:
         return None
@@ -287,5 +287,5 @@ def _exact(inputs: Inputs, margin: Margin, roots: list[Floats], grid: Floats) ->
             return None  # a density of all elements together
         logp = logp[(slice(None), *margin.index)]
     function = compile_batched(symbols, [pt.exp(logp)], extra=[x])
-    (density,) = function(*roots, grid.astype(x.dtype))
-    return np.broadcast_to(np.nan_to_num(density), (len(roots[0]), grid.size))
+    (density,) = function(*parents, grid.astype(x.dtype))
+    return np.broadcast_to(np.nan_to_num(density), (len(parents[0]), grid.size))

@@ -310,11 +310,11 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
         drawn = np.full((len(rows), n, *event), np.nan)
         step = max(1, IN_CACHE // node.bound.n_points)
         for first in range(0, len(rows), step):
-            roots = evaluator.roots(rows[first : first + step], k)
-            valid = np.flatnonzero(node.bound.valid(roots))
+            parents = evaluator.parents(rows[first : first + step], k)
+            valid = np.flatnonzero(node.bound.valid(parents))
             if not valid.size:
                 continue
-            values, weights = node.bound.populations([root[valid] for root in roots])
+            values, weights = node.bound.populations([parent[valid] for parent in parents])
             points = values[0]  # of all populations
             cumulative = np.cumsum(np.where(is_missing(points), 0.0, weights), axis=1)
             for place, row in zip(first + valid, cumulative, strict=True):

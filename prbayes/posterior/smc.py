@@ -454,7 +454,7 @@ def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
     missing = {}
     try:
         for k, node in enumerate(evaluator.nodes):
-            errors.append(discrepancy_error(node.bound, evaluator.roots(best[None], k)))
+            errors.append(discrepancy_error(node.bound, evaluator.parents(best[None], k)))
             missing[node.name] = missing_mass(evaluator, best, k)
     except BudgetError as spent:
         return replace(chains, stopped=chains.stopped or str(spent))

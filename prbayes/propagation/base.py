@@ -131,7 +131,7 @@ class Bound(ABC):
         return np.arange(self.n_points) * N_BLOCKS // self.n_points
 
     def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
-        """Return the discrepancy as a scalar graph of the roots' values."""
+        """Return the discrepancy as a scalar graph of the parents' values."""
         # Built on plain symbols: PyMC may clone parameters that are random, and a copy would be
         # drawn, not given.
         symbols = self.inputs.placeholders()
@@ -142,14 +142,14 @@ class Bound(ABC):
 
     @abstractmethod
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
-        """Return the discrepancy as a scalar graph of symbols for the roots' values."""
+        """Return the discrepancy as a scalar graph of symbols for the parents' values."""
 
     @abstractmethod
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
-        """Return responses, (k, n) or (k, n, m), and weights, (k, n), at given roots."""
+        """Return responses, (k, n) or (k, n, m), and weights, (k, n), at given parents."""
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
-        """Return the discrepancies of populations at given roots, (k,); +inf of invalid ones."""
+        """Return the discrepancies of populations at given parents, (k,); +inf of invalid ones."""
         size = len(params[0])
         result = np.full(size, np.inf)
         self.last_missing = Missing(np.full(size, np.nan), np.full(size, np.nan))
@@ -173,17 +173,17 @@ class Bound(ABC):
         return self.last_missing
 
     def valid(self, params: Sequence[Any]) -> Any:
-        """Return which of a batch of roots give valid distributions (sigma > 0), shape (k,)."""
+        """Return which of a batch of parents give valid distributions (sigma > 0), shape (k,)."""
         (is_valid,) = self._valid(*params)
         return np.broadcast_to(is_valid, len(params[0])).astype(bool)
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
         """Draw responses of specimens, (size,) or (size, m), from the points of one population."""
-        roots = [np.asarray(p)[None] for p in params]
+        parents = [np.asarray(p)[None] for p in params]
         no_response = np.full((size, *self.target.event), np.nan)
-        if not self.valid(roots).all():
+        if not self.valid(parents).all():
             return no_response
-        values, weights = self.populations(roots)
+        values, weights = self.populations(parents)
         points = values[0]
         mass = np.where(~is_missing(points), weights[0], 0.0)
         total = mass.sum()
@@ -193,7 +193,7 @@ class Bound(ABC):
 
 
 def discrepancy_error(bound: Bound, params: Sequence[Any]) -> float:
-    """Return the standard error of the discrepancy at given roots, shapes (1, ...).
+    """Return the standard error of the discrepancy at given parents, shapes (1, ...).
 
     By the grouped jackknife over eighths of the responses. Right for random draws (`Fresh`), and an
     upper bound for common points, which are better than random ones.
@@ -211,12 +211,12 @@ def discrepancy_error(bound: Bound, params: Sequence[Any]) -> float:
     return float(np.sqrt((N_BLOCKS - 1) * np.var(without_block)))
 
 
-def valid_roots(bound: Bound, params: Sequence[Floats]) -> list[Floats]:
-    """Return the roots that give valid distributions, or raise if none does."""
+def valid_parents(bound: Bound, params: Sequence[Floats]) -> list[Floats]:
+    """Return the parents that give valid distributions, or raise if none does."""
     refuse_lopsided(bound.name, bound.inputs, params)
     ok = bound.valid(params)
     if not ok.any():
-        names = ", ".join(str(r.name) for r in bound.inputs.roots)
+        names = ", ".join(str(r.name) for r in bound.inputs.parents)
         raise ValueError(
             f"{bound.name}: priors: got invalid parameters of the inputs at all {len(ok)} draws "
             f"of {names}, expected valid ones; give scales a prior on positive numbers, "
@@ -302,8 +302,8 @@ def cost_by_evaluation(n: int) -> RunCost:
 
 def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:
     """Return a trial of the response at points of the prior, (2, 8), and their inputs."""
-    draws = PriorSampler(bound.inputs.roots)(64, seed)  # a few of them at least are valid
-    two = [draw[:2] for draw in valid_roots(bound, draws)]
+    draws = PriorSampler(bound.inputs.parents)(64, seed)  # a few of them at least are valid
+    two = [draw[:2] for draw in valid_parents(bound, draws)]
     aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)
     refuse_all_nan(bound.name, values)

@@ -126,7 +126,7 @@ class DesignSampler:
     def with_runs(
         self, design: Design | None, components: Sequence[Floats], n: int, responses: Responses
     ) -> Design:
-        """Return a design with n more runs at points from populations at roots, (k, *shape)."""
+        """Return a design with n more runs at points from populations at parents, (k, *shape)."""
         inputs = self.mixtures.inputs
         n_batches = 0 if design is None else len(design.batch_sizes)
         # A prime: seeds 0, 1, 2, ... of a user share no batch.
@@ -218,7 +218,7 @@ class DesignSampler:
         return np.where(np.isnan(logs), 1 / logs.shape[1], logs)
 
     def log_weights(self, params: Sequence[Any], design: Design) -> Floats:
-        """Return log p(x given theta) - log g(x) at roots, shapes (k, *shape) -> (k, n)."""
+        """Return log p(x given theta) - log g(x) at parents, shapes (k, *shape) -> (k, n)."""
         if not design.moving:
             logs = self.mixtures.density.at(params, design.sample.points)(slice(None))
             logs -= design.sample.log_density
@@ -238,7 +238,7 @@ class DesignSampler:
 def log_weight_graph(
     inputs: Inputs, params: Sequence[Any], arrays: Sequence[Any], moving: Sequence[int]
 ) -> TensorVariable:
-    """Return log weights of symbols of the roots and of `Design.weight_arrays`, shape (n,)."""
+    """Return log weights of symbols of the parents and of `Design.weight_arrays`, shape (n,)."""
     k = len(inputs.aleatory)
     points, log_g, ends = arrays[:k], arrays[k], arrays[k + 1 :]
     dists, _ = inputs.rebuilt(params)

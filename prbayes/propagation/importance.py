@@ -133,12 +133,12 @@ class MixtureSampler:
         else:
             population = np.searchsorted(np.cumsum(shares), selector, side="right")
         population = np.minimum(population, k - 1)
-        roots = [c[population] for c in components]
+        parents = [c[population] for c in components]
         try:
-            points = list(self._quantiles(*roots, *uniforms))
+            points = list(self._quantiles(*parents, *uniforms))
         except TypeError:  # a distribution without inverse distribution function
             rng = np.random.default_rng(seed)
-            draws, _ = PopulationSampler(self.inputs)(roots, 1, rng)
+            draws, _ = PopulationSampler(self.inputs)(parents, 1, rng)
             points = [x[:, 0] for x in draws]
         refuse_moving_atoms(self.name, self.inputs, points, population)
         counts = np.bincount(population, minlength=k).astype(float)
@@ -162,7 +162,7 @@ class MixtureSampler:
 
     @cached_property
     def _quantiles(self) -> Any:
-        """The compiled inverse distribution functions of roots and uniform numbers."""
+        """The compiled inverse distribution functions of parents and uniform numbers."""
         symbols = self.inputs.placeholders()
         shapes = [x.type.shape for x in self.inputs.aleatory]
         uniforms = [pt.tensor(dtype="float64", shape=shape) for shape in shapes]
@@ -172,7 +172,7 @@ class MixtureSampler:
 
 
 def new_specimens(
-    label: str, inputs: Inputs, roots: list[Floats], n: int, rng: np.random.Generator
+    label: str, inputs: Inputs, parents: list[Floats], n: int, rng: np.random.Generator
 ) -> tuple[list[Floats], list[Floats]]:
     """Return aleatory inputs, (k, n, *event), and epistemic ones of n specimens of k populations.
 
@@ -184,16 +184,16 @@ def new_specimens(
     try:
         placed, epistemic = through_inverses(label, inputs, symbols, uniforms)
     except TypeError:
-        return PopulationSampler(inputs)(roots, n, rng)
+        return PopulationSampler(inputs)(parents, n, rng)
     _, base = base_points(inputs.event_shapes, n, int(rng.integers(2**31)))
     order = rng.permutation(n)
-    k = len(roots[0])
+    k = len(parents[0])
     shifted = []
     for points in base:
         shift = rng.random((k, 1, *points.shape[1:]))
         shifted.append(inside((points[order] + shift) % 1))
     function = compile_batched([*symbols, *uniforms], [*placed, *epistemic])
-    values = function(*roots, *shifted)
+    values = function(*parents, *shifted)
     aleatory = values[: len(placed)]
     return aleatory, [v[:, None] for v in values[len(placed) :]]
 

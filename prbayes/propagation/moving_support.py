@@ -28,7 +28,7 @@ def moving_inputs(
 ) -> tuple[int, ...]:
     """Return the positions of the aleatory inputs whose support moves with the hyperparameters.
 
-    Their density is zero at a point (n, *event) for some roots, (k, *shape), and not for others.
+    Their density is zero at a point (n, *event) for some parents, (k, *shape), and not for others.
     Raise TypeError if one is discrete, has atoms, or has no distribution function in PyMC.
     """
     symbols = inputs.placeholders()

@@ -215,14 +215,14 @@ class PopulationDensity:
         return log_densities
 
     @one_thread()
-    def log_likelihoods(self, roots: Sequence[Floats], points: WeightedPoints) -> Floats:
-        """Return log p(y_i | theta), (S, N), of populations at roots, shapes (S, *shape)."""
+    def log_likelihoods(self, parents: Sequence[Floats], points: WeightedPoints) -> Floats:
+        """Return log p(y_i | theta), (S, N), of populations at parents, shapes (S, *shape)."""
         form, log_a = points.form, points.log_a
         n, count = log_a.shape
         if form is None:
-            return self._by_graph(roots, points)
+            return self._by_graph(parents, points)
         with np.errstate(all="ignore"):
-            (at_anchors,) = self._log_density(*roots, *form.anchors)
+            (at_anchors,) = self._log_density(*parents, *form.anchors)
         natural, is_rounded = form.natural_parameters(at_anchors)
         # A is a statistic whose parameter is one; -inf in a product may become NaN.
         base = np.where(form.is_inside, log_a.T.ravel(), -np.inf)
@@ -240,15 +240,15 @@ class PopulationDensity:
                 total = np.logaddexp(total, part) if k else part
             result[:, first : first + step] = total
         if is_rounded.any():
-            narrow = [root[is_rounded] for root in roots]
+            narrow = [parent[is_rounded] for parent in parents]
             result[:, is_rounded] = self._by_graph(narrow, points).T
         return result.T
 
-    def _by_graph(self, roots: Sequence[Floats], points: WeightedPoints) -> Floats:
+    def _by_graph(self, parents: Sequence[Floats], points: WeightedPoints) -> Floats:
         """Return log-likelihoods by the compiled log-density."""
         log_a = points.log_a
         n, count = log_a.shape
-        result = np.full((len(roots[0]), n), -np.inf)
+        result = np.full((len(parents[0]), n), -np.inf)
         if not log_a.size:
             return result
         flat = [np.ascontiguousarray(v.reshape(n * count, *v.shape[2:])) for v in points.x]
@@ -256,7 +256,7 @@ class PopulationDensity:
         for first in range(0, len(result), step):
             block = slice(first, first + step)
             with np.errstate(all="ignore"):
-                (logs,) = self._log_density(*(root[block] for root in roots), *flat)
+                (logs,) = self._log_density(*(parent[block] for parent in parents), *flat)
             logs = np.where(np.isnan(logs), -np.inf, logs)
             result[block] = log_sum_exp(logs.reshape(-1, n, count) + log_a)
         return result

@@ -234,7 +234,7 @@ class Fresh(Propagation):
 
 
 class FreshBound(Bound):
-    """New random draws at every evaluation, from seeds, roots and the number of evaluations."""
+    """New random draws at every evaluation, from seeds, parents and the number of evaluations."""
 
     random: ClassVar[bool] = True
 
@@ -255,7 +255,7 @@ class FreshBound(Bound):
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""
         self.draws += 1
-        digest = hashlib.blake2b(digest_size=8)  # of the roots, the same in all processes
+        digest = hashlib.blake2b(digest_size=8)  # of the parents, the same in all processes
         for values in params:
             digest.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
         number = int.from_bytes(digest.digest(), "little")
@@ -266,11 +266,11 @@ class FreshBound(Bound):
         return responses, np.broadcast_to(1 / self.n_per_theta, shape)
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
-        """Draw responses of new specimens at one value of the roots."""
-        roots = [np.asarray(p)[None] for p in params]
-        if not self.valid(roots).all():
+        """Draw responses of new specimens at one value of the parents."""
+        parents = [np.asarray(p)[None] for p in params]
+        if not self.valid(parents).all():
             return np.full((size, *self.target.event), np.nan)
-        aleatory, epistemic = self._sampler(roots, size, rng)
+        aleatory, epistemic = self._sampler(parents, size, rng)
         return np.asarray(self.responses(aleatory, epistemic)[0])
 
 
@@ -281,7 +281,7 @@ class FreshOp(OwnOp):
 
     def __init__(self, bound: FreshBound) -> None:
         self.bound = bound
-        self.event_ndims = [r.type.ndim for r in bound.inputs.roots]
+        self.event_ndims = [r.type.ndim for r in bound.inputs.parents]
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Draw, call the response, compare."""

@@ -43,16 +43,16 @@ class ResponseShare:
         return _log_share(inside, log_sum_exp(terms[..., self.with_response :]))
 
     def of_populations(
-        self, density: PopulationDensity, roots: Sequence[Floats], coordinates: Coordinates
+        self, density: PopulationDensity, parents: Sequence[Floats], coordinates: Coordinates
     ) -> Floats:
-        """Return log S of the populations at roots, shapes (S, *shape) -> (S,)."""
+        """Return log S of the populations at parents, shapes (S, *shape) -> (S,)."""
         log_b = self.log_b + coordinates.log_jacobian(self.z)
         x = coordinates.inputs(self.z)
         integrals = []
         for rows in (slice(self.with_response), slice(self.with_response, None)):
             of_rows = [v[None, rows] for v in x]
             points = WeightedPoints.of(density.inputs, of_rows, log_b[None, rows])
-            integrals.append(density.log_likelihoods(roots, points)[:, 0])
+            integrals.append(density.log_likelihoods(parents, points)[:, 0])
         return _log_share(*integrals)
 
 

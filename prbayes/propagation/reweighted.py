@@ -31,7 +31,7 @@ from prbayes.propagation.base import (
     check_arguments,
     refuse_all_nan,
     refuse_nested,
-    valid_roots,
+    valid_parents,
 )
 from prbayes.propagation.design import Design, DesignSampler, log_weight_graph
 from prbayes.propagation.importance import (
@@ -185,7 +185,7 @@ class Reweighted(Propagation):
         if inputs.epistemic:
             labels = [str(e.name or e) for e in inputs.epistemic]
             names = ", ".join(labels)
-            if not any(above in inputs.roots for above in ancestors(inputs.epistemic)):
+            if not any(above in inputs.parents for above in ancestors(inputs.epistemic)):
                 raise TypeError(
                     f"{name}: {names} goes into the response as data whose value may change, while "
                     "responses are stored; pass the value itself, such as "
@@ -252,8 +252,8 @@ class PoorEmulatorError(DesignError):
 class ReweightedBound(Bound):
     """Stored responses with weights p(x given theta) / g(x) for every theta.
 
-    The points of a batch are stratified over a finite list of roots' values. The list is kept, and
-    g is exactly the mixture, over all batches, of the densities at the listed values (balance
+    The points of a batch are stratified over a finite list of values of the parents. The list is kept,
+    and g is exactly the mixture, over all batches, of the densities at the listed values (balance
     heuristic).
     """
 
@@ -285,8 +285,8 @@ class ReweightedBound(Bound):
         # Other responses at runs: more conditions than a study has, fewer than fill the memory.
         self._other_responses: deque[tuple[Responses, Sample]] = deque(maxlen=32)
         # As many components as points would be as good, and cost their square.
-        components = PriorSampler(inputs.roots)(min(config.n, 512), config.random_seed)
-        components = valid_roots(self, components)
+        components = PriorSampler(inputs.parents)(min(config.n, 512), config.random_seed)
+        components = valid_parents(self, components)
         self._design = self._sampler.with_runs(None, components, config.n, responses)
         self.support_moves = bool(self._design.moving)
         runs = self._design.runs
@@ -344,7 +344,7 @@ class ReweightedBound(Bound):
         return float(max(100.0, (15 * root) ** (4 / 3)))
 
     def add(self, components: Sequence[Floats], n: int | None = None) -> None:
-        """Add runs for populations at roots; raise DesignError if data have changed."""
+        """Add runs for populations at parents; raise DesignError if data have changed."""
         now = {name: np.array(shared.get_value()) for name, shared in self.inputs.data.items()}
         changed = [name for name in now if not np.array_equal(self._data[name], now[name])]
         if changed:
@@ -355,19 +355,19 @@ class ReweightedBound(Bound):
                 "the model again with the new ones"
             )
         n = n or self.config.n
-        components = valid_roots(self, components)
+        components = valid_parents(self, components)
         self.design = self._sampler.with_runs(self._design, components, n, self.responses)
 
     def reach(
         self, components: Sequence[Floats], *, same_surfaces: bool = False, growth: int = 1
     ) -> None:
-        """Draw ``growth`` times as many emulated points for populations at roots, without a run.
+        """Draw ``growth`` times as many emulated points for populations at parents, without a run.
 
         To select surfaces for these populations takes most of the time.
         """
         design = replace(self._design, emulated_size=growth * self._design.emulated_size)
         emulator = design.emulator if same_surfaces else None
-        self.design = self._sampler.resampled(design, valid_roots(self, components), emulator)
+        self.design = self._sampler.resampled(design, valid_parents(self, components), emulator)
 
     def points_of(self, inputs: Inputs, points: Sequence[Floats] | None = None) -> list[Floats]:
         """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
@@ -477,14 +477,14 @@ class ReweightedBound(Bound):
         return pt.switch(supported, stored_discrepancy(self.target, form, weights), np.inf)
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
-        """Return the stored responses and their weights at given roots."""
+        """Return the stored responses and their weights at given parents."""
         weights = self._sampler.log_weights(params, self._design)
         normalise(weights)
         values = self._design.sample.values
         return np.broadcast_to(values, weights.shape + values.shape[1:]), weights
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
-        """Return the discrepancies of populations at given roots, (k,); +inf without support."""
+        """Return the discrepancies of populations at given parents, (k,); +inf without support."""
         sample = self._design.sample
         if self._basis[0] is not target or self._basis[1] is not sample:
             self._basis = (target, sample, target.basis(sample.values))
@@ -495,8 +495,8 @@ class ReweightedBound(Bound):
         # A single population leaves little to linear algebra.
         with one_thread() if size > 1 else nullcontext():
             for first in range(0, max(1, size), step):
-                roots = [p[first : first + step] for p in params]
-                weights = self._sampler.log_weights(roots, self._design)
+                parents = [p[first : first + step] for p in params]
+                weights = self._sampler.log_weights(parents, self._design)
                 is_supported = np.isfinite(normalise(weights))
                 weights[~is_supported] = 1 / len(sample)
                 features = basis.features(weights)
@@ -505,7 +505,7 @@ class ReweightedBound(Bound):
         return np.concatenate(parts)
 
     def support(self, params: Sequence[Any]) -> dict[str, Floats]:
-        """Return how well the design supports the populations at given roots, shapes (k,).
+        """Return how well the design supports the populations at given parents, shapes (k,).
 
         Returns
         -------
@@ -538,7 +538,7 @@ def _report_low_ess(bound: ReweightedBound, components: Sequence[Floats]) -> Non
     step = max(1, IN_CACHE // len(runs))
     sizes = []
     for first in range(0, len(components[0]), step):
-        block = [root[first : first + step] for root in components]
+        block = [parent[first : first + step] for parent in components]
         sizes.append(1 / (bound._sampler.weights(runs, block) ** 2).sum(axis=1))
     ess = float(np.median(np.concatenate(sizes)))
     if ess >= bound.required_ess:

@@ -475,7 +475,7 @@ class Coordinates:
         sampler: PopulationSampler | None = None,
     ) -> Coordinates:
         """Return the coordinates of populations of the prior, and bounds of n specimens of each."""
-        roots = PriorSampler(inputs.roots)(populations, 0)
+        roots = PriorSampler(inputs.parents)(populations, 0)
         sampler = PopulationSampler(inputs) if sampler is None else sampler
         rng = np.random.default_rng([0, 11])
 

@@ -55,7 +55,7 @@ def log_density(
 
 @interpreted()
 def compiled_log_density(inputs: Inputs) -> Any:
-    """Return log p(x) as a function of roots (k, *shape), then points (n, *event): (k, n)."""
+    """Return log p(x) as a function of parents (k, *shape), then points (n, *event): (k, n)."""
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     points = [pt.tensor(dtype=x.dtype, shape=(None,) * (x.type.ndim + 1)) for x in inputs.aleatory]
@@ -106,7 +106,7 @@ def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
 
 
 def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None:
-    """Raise if a covariance is not symmetric, at values of the roots, (k, *shape)."""
+    """Raise if a covariance is not symmetric, at values of the parents, (k, *shape)."""
     # Density and draws read one half of the matrix only.
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
@@ -160,7 +160,7 @@ def _density(dist: TensorVariable) -> TensorVariable | None:
 
 def refuse_without_density(name: str, inputs: Inputs) -> None:
     """Raise if PyMC does not know the density of an input."""
-    # With symbols for the roots: a sum of two random variables has no density that PyMC knows.
+    # With symbols for the parents: a sum of two random variables has no density that PyMC knows.
     dists, _ = inputs.rebuilt(inputs.placeholders())
     for dist in dists:
         if not isinstance(dist.owner.op, ELLIPTICAL) and _density(dist) is None:
@@ -200,12 +200,12 @@ class PriorSampler:
     """Draws of variables from the prior, all in one call of a compiled function."""
 
     @interpreted()
-    def __init__(self, roots: Sequence[TensorVariable]) -> None:
-        self._names = ", ".join([str(r.name) for r in roots])
-        self._shapes = [event_shape(r) for r in roots]
+    def __init__(self, drawn: Sequence[TensorVariable]) -> None:
+        self._names = ", ".join([str(v.name) for v in drawn])
+        self._shapes = [event_shape(v) for v in drawn]
         # PyMC gives a `str_repr` to the variables of a model.
-        parents = [v for v in ancestors(roots) if hasattr(v, "str_repr") and is_random(v)]
-        variables = dict.fromkeys([*roots, *parents])
+        parents = [v for v in ancestors(drawn) if hasattr(v, "str_repr") and is_random(v)]
+        variables = dict.fromkeys([*drawn, *parents])
         n = pt.iscalar("n")
         try:
             # Variables that depend on no other are drawn n times; the others follow.
@@ -213,12 +213,12 @@ class PriorSampler:
             for v in variables:
                 if variables.keys() & set(ancestors([v])) == {v}:
                     batches[v] = change_dist_size(v, (n,), expand=True)
-            outputs = vectorize_graph(list(roots), batches)
+            outputs = vectorize_graph(list(drawn), batches)
             self._function = pm.compile([n], outputs, mode=PLAIN)
             self._is_batched = True
         except (NotImplementedError, ValueError, MissingInputError):
             # Not vectorized, or not resized: one draw at a time.
-            self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
+            self._function = pm.compile([n], list(drawn), mode=PLAIN, on_unused_input="ignore")
             self._is_batched = False
 
     def __call__(self, k: int, seed: int) -> list[Floats]:
@@ -267,7 +267,7 @@ class PriorPoints:
 
 
 class PopulationSampler:
-    """Random draws of n specimens from the populations at given roots."""
+    """Random draws of n specimens from the populations at given parents."""
 
     @interpreted()
     def __init__(self, inputs: Inputs) -> None:
@@ -278,7 +278,7 @@ class PopulationSampler:
         batched = with_leading_axis(symbols)
         common = epistemic
 
-        # n specimens of each theta. Distributions that depend on no root are not batched by their
+        # n specimens of each theta. Distributions that depend on no parent are not batched by their
         # parameters: resize them.
         size = (batched[0].shape[0], n)
         per_specimen: dict[Variable, Variable] = {}
@@ -297,10 +297,10 @@ class PopulationSampler:
         except (NotImplementedError, ValueError):
             # Not vectorized by PyTensor: one population at a time.
             self._is_batched, batched = False, symbols
-            # Resized before the roots are replaced, since PyMC resizes a CustomDist with its first
-            # parameters.
+            # Resized before the parents are replaced, since PyMC resizes a CustomDist with its
+            # first parameters.
             resized = [change_dist_size(d, (n,), expand=True) for d in inputs.aleatory]
-            replaced = dict(zip(inputs.roots, symbols, strict=True))
+            replaced = dict(zip(inputs.parents, symbols, strict=True))
             specimens = graph_replace(resized, replaced, strict=False)
         self._event_shapes = inputs.event_shapes
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
@@ -315,9 +315,9 @@ class PopulationSampler:
     def __call__(
         self, params: Sequence[Any], n: int, rng: np.random.Generator
     ) -> tuple[list[Floats], list[Floats]]:
-        """Draw n specimens from each of k populations, at roots (k, *shape).
+        """Draw n specimens from each of k populations, at parents (k, *shape).
 
-        Aleatory inputs are (k, n, *event), epistemic ones (k, 1, *event), or (*event) without root.
+        Aleatory inputs are (k, n, *event), epistemic ones (k, 1, *event), or (*event) without parents.
         """
         _seed(self._function, rng)
         try:

@@ -29,7 +29,7 @@ class Inputs:
         self,
         arguments: Sequence[Any],
         aleatory: Sequence[TensorVariable],
-        roots: Sequence[TensorVariable],
+        parents: Sequence[TensorVariable],
         nested: bool,
     ) -> None:
         # For each argument an int (position in ``aleatory``), a variable (epistemic) or an array.
@@ -38,9 +38,9 @@ class Inputs:
         self.epistemic: tuple[TensorVariable, ...] = tuple(
             [a for a in self.arguments if isinstance(a, Variable)]
         )
-        self.roots = tuple(roots)  # model variables that the inputs depend on
+        self.parents = tuple(parents)  # model variables that the inputs depend on
         self.nested = nested  # whether a ``.dist()`` depends on another one
-        self.groups = groups_of("", self.roots)
+        self.groups = groups_of("", self.parents)
         self.event_shapes = tuple(event_shape(x) for x in self.aleatory)
         self.event_ndims = [x.type.ndim for x in (*self.aleatory, *self.epistemic)]
         # Numbers of one specimen in each argument, and those that are aleatory.
@@ -62,29 +62,29 @@ class Inputs:
             if hasattr(variable, "get_value") and isinstance(variable, TensorVariable)
         }
 
-    def roots_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
-        """Return the roots of the arguments at some positions; constants have none."""
-        ends: set[Variable] = set(self.roots)
-        roots: dict[TensorVariable, None] = {}
+    def parents_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
+        """Return the parents of the arguments at some positions; constants have none."""
+        ends: set[Variable] = set(self.parents)
+        parents: dict[TensorVariable, None] = {}
         for position in positions:
             argument = self.arguments[position]
             x = self.aleatory[argument] if isinstance(argument, int) else argument
             if isinstance(x, Variable):
-                roots.update((v, None) for v in _ancestry([x], ends) if v in ends)
-        return tuple(roots)
+                parents.update((v, None) for v in _ancestry([x], ends) if v in ends)
+        return tuple(parents)
 
     def ordered_as(self, reference: Inputs) -> Inputs:
         """Return the same arguments with the aleatory inputs in the order of a reference."""
         places = [reference.aleatory.index(x) for x in self.aleatory]
         arguments = [places[a] if isinstance(a, int) else a for a in self.arguments]
-        return Inputs(arguments, reference.aleatory, reference.roots, self.nested)
+        return Inputs(arguments, reference.aleatory, reference.parents, self.nested)
 
     def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
-        """Return the aleatory and epistemic inputs with the roots replaced by ``params``."""
-        # In two steps, because params may themselves depend on the roots.
+        """Return the aleatory and epistemic inputs with the parents replaced by ``params``."""
+        # In two steps, because params may themselves depend on the parents.
         symbols = self.placeholders()
         new: Any = [*self.aleatory, *self.epistemic]
-        for old, to in ((self.roots, symbols), (symbols, params)):
+        for old, to in ((self.parents, symbols), (symbols, params)):
             swap = {a: pt.as_tensor(b) for a, b in zip(old, to, strict=True)}
             new = graph_replace(new, swap, strict=False)
         return new[: len(self.aleatory)], new[len(self.aleatory) :]
@@ -102,11 +102,11 @@ class Inputs:
 
     def core(self, params: Sequence[Any]) -> list[Any]:
         """Drop the leading axes of length one that PyMC adds to a node's parameters."""
-        return [p[(0,) * (p.ndim - r.type.ndim)] for p, r in zip(params, self.roots, strict=True)]
+        return [p[(0,) * (p.ndim - r.type.ndim)] for p, r in zip(params, self.parents, strict=True)]
 
     def placeholders(self) -> list[TensorVariable]:
-        """Return a new symbol for each root."""
-        return [r.type(name=r.name) for r in self.roots]
+        """Return a new symbol for each parent."""
+        return [r.type(name=r.name) for r in self.parents]
 
 
 # -- reading ---------------------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     model_variables: set[Variable] = set(model.basic_RVs)
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
-    roots: dict[TensorVariable, None] = {}
+    parents: dict[TensorVariable, None] = {}
     is_nested = False
     for i, x in enumerate(inputs):
         label = f"{name}: input {i + 1}"
@@ -140,7 +140,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             continue
         model_variables.update(filter(is_group, _ancestry([x], model_variables)))
         ancestry = _ancestry([x], model_variables)
-        roots.update(dict.fromkeys([v for v in ancestry if v in model_variables]))
+        parents.update(dict.fromkeys([v for v in ancestry if v in model_variables]))
         latent = [v for v in ancestry if v not in model_variables and is_random(v)]
         _refuse_foreign_variables(x, ancestry, latent, label)
         if x in model_variables or not latent:
@@ -156,20 +156,20 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             parts = set(latent) - {x}
             is_nested = is_nested or (bool(parts) and not _has_marginal_density(x, parts))
         arguments.append(aleatory.index(x))
-    groups_of(name, roots)
+    groups_of(name, parents)
     if not aleatory:
         raise ValueError(
             f"{name}: got {len(inputs)} inputs, none of them aleatory, expected at least one that "
             "varies between specimens; pass a distribution made with `.dist()`, such as "
             "pm.Normal.dist(mu, sigma)"
         )
-    if all(map(is_group, roots)):  # also if there are none
+    if all(map(is_group, parents)):  # also if there are none
         raise ValueError(
             f"{name}: got inputs that depend on no variable of the model, expected hyperparameters "
             "to calibrate; give the `.dist()` parameters that are model variables, such as "
             "mu = pm.Normal('mu', 0, 1)"
         )
-    return Inputs(arguments, aleatory, list(roots), is_nested)
+    return Inputs(arguments, aleatory, list(parents), is_nested)
 
 
 def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) -> list[Variable]:
@@ -409,9 +409,9 @@ def is_group(variable: Variable) -> bool:
     return variable.owner is not None and getattr(variable.owner.op, "is_group", False)
 
 
-def groups_of(name: str, roots: Iterable[Variable]) -> Groups | None:
-    """Return the groups among the roots of inputs, None if there are none; several are refused."""
-    ops = [variable.owner.op for variable in roots if is_group(variable)]
+def groups_of(name: str, parents: Iterable[Variable]) -> Groups | None:
+    """Return the groups among parents of inputs, None if there are none; refuse several."""
+    ops = [variable.owner.op for variable in parents if is_group(variable)]
     if not ops:
         return None
     if len(ops) > 1:
@@ -423,9 +423,9 @@ def groups_of(name: str, roots: Iterable[Variable]) -> Groups | None:
     return Groups(ops[0].dim, ops[0].labels)
 
 
-def refuse_groups(name: str, roots: Iterable[Variable]) -> None:
+def refuse_groups(name: str, parents: Iterable[Variable]) -> None:
     """Raise if inputs of one population depend on the group of a specimen."""
-    groups = groups_of(name, roots)
+    groups = groups_of(name, parents)
     if groups is not None:
         raise TypeError(
             f"{name}: inputs: got one that depends on prb.response.group({groups.dim!r}), expected "

@@ -263,7 +263,7 @@ def _scores(
                     rows = range(len(thetas))
                     totals = np.array([target.of(responses[[i]], weights[[i]])[0] for i in rows])
                 else:
-                    totals = simulator.bound.discrepancies(evaluator.roots(thetas, k), target)
+                    totals = simulator.bound.discrepancies(evaluator.parents(thetas, k), target)
                 inner = getattr(metric, "metric", None)
                 name = type(metric).__name__
                 if isinstance(inner, Metric):

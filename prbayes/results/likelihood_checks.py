@@ -29,7 +29,7 @@ from prbayes.inference.checks.population import (
 )
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.parameters import roots_of
+from prbayes.model.parameters import parent_values
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
@@ -179,7 +179,7 @@ def _population_obstacle(optimum: Optimum) -> str:
 
 
 def score_function(inputs: Inputs) -> Any:
-    """Compile (*roots, *points) -> distribution functions by input, normal scores of MvNormal.
+    """Compile (*parents, *points) -> distribution functions by input, normal scores of MvNormal.
 
     None for dependent inputs, and inputs without a distribution function.
     """
@@ -222,10 +222,10 @@ def scored_specimens(
         z = np.empty((*log_a.shape, likelihood.coordinates.size))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
-            roots = roots_of(evaluator.hyperparameters, theta[None], inputs, place)
+            parents = parent_values(evaluator.hyperparameters, theta[None], inputs, place)
             size = log_a[rows].size
             flat = [x[rows].reshape(size, *x.shape[2:]) for x in points]
-            values, (log_p,) = (function(*roots, *flat) for function in functions)
+            values, (log_p,) = (function(*parents, *flat) for function in functions)
             columns = []
             for dist, value, x in zip(inputs.aleatory, values, flat, strict=True):
                 column = np.broadcast_to(value, (1, *x.shape))[0].reshape(size, -1)
@@ -399,9 +399,9 @@ def _complete_covariance(
     n = _OPTIONS.specimens
     for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
         for place, rows in likelihood.by_group:
-            roots = roots_of(evaluator.hyperparameters, around, likelihood.inputs, place)
-            specimens, _ = sampler([root[:1] for root in roots], n, rng)
-            (log_p,) = log_density(*roots, *[x[0] for x in specimens])
+            parents = parent_values(evaluator.hyperparameters, around, likelihood.inputs, place)
+            specimens, _ = sampler([parent[:1] for parent in parents], n, rng)
+            (log_p,) = log_density(*parents, *[x[0] for x in specimens])
             with np.errstate(invalid="ignore"):
                 scores = slopes(np.broadcast_to(log_p, (len(around), n)), step)
             information += len(rows) / n * scores.T @ scores

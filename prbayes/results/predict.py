@@ -292,7 +292,7 @@ def _predicted(
     by_group = [points]
     if inputs.groups is not None:
         size = len(next(iter(points.values())))
-        (index,) = [str(root.name) for root in inputs.roots if is_group(root)]
+        (index,) = [str(parent.name) for parent in inputs.parents if is_group(parent)]
         places = range(len(inputs.groups.labels))
         by_group = [{**points, index: np.full(size, place)} for place in places]
     results: list[_Predicted] = []
@@ -301,15 +301,15 @@ def _predicted(
         if simulator is not None and not simulator.is_emulated:
             results.append(_resampled_responses(simulator, responses, group_points, n, rng))
             continue
-        roots = [group_points[str(rv.name)] for rv in inputs.roots]
-        specimens, epistemic = new_specimens(responses.name, inputs, roots, n, rng)
+        parents = [group_points[str(rv.name)] for rv in inputs.parents]
+        specimens, epistemic = new_specimens(responses.name, inputs, parents, n, rng)
         if simulator is None:
             values = responses(specimens, epistemic)
             results.append(_Predicted(values, specimens, "new specimens"))
             continue
         emulated = emulated or simulator.emulator(responses)
         values = emulated([x.reshape(-1, *x.shape[2:]) for x in specimens])
-        values = values.reshape(len(roots[0]), n, *emulated.event)
+        values = values.reshape(len(parents[0]), n, *emulated.event)
         runs = len(emulated.z)
         source = f"an interpolant through {runs} runs at those of {simulator.name}"
         if responses.same_as(simulator.responses):
@@ -394,15 +394,15 @@ def _resampled_responses(
     """Return responses of n design points for each population, by systematic resampling."""
     bound = node.reweighted
     assert bound is not None
-    roots = [points[str(rv.name)] for rv in bound.inputs.roots]
+    parents = [points[str(rv.name)] for rv in bound.inputs.parents]
     try:
         values = bound.values_of(responses)
     except PoorEmulatorError:
         with designs_restored([bound]):
             bound.design = bound.design.runs_alone()
             return _resampled_responses(node, responses, points, n, rng)
-    refuse_unsupported(node.name, bound, roots)
-    _, weights = bound.populations(roots)
+    refuse_unsupported(node.name, bound, parents)
+    _, weights = bound.populations(parents)
     levels = (np.arange(n) + rng.random((len(weights), 1))) / n
     rows = rng.permuted(reached(np.nan_to_num(weights), levels, normalized=True), axis=1)
     specimens = [x[rows] for x in bound.points_of(responses.inputs)]
@@ -410,9 +410,9 @@ def _resampled_responses(
     return _Predicted(values[rows], specimens, f"{kind} of {node.name}")
 
 
-def refuse_unsupported(name: str, design: ReweightedBound, roots: list[Floats]) -> None:
+def refuse_unsupported(name: str, design: ReweightedBound, parents: list[Floats]) -> None:
     """Raise if the design does not support most of the populations."""
-    support = design.support(roots)
+    support = design.support(parents)
     # Points without response become NaN, which are counted and reported separately.
     if not shortcoming(support, design.required_ess, 1.0, design.n_points, TOLERABLE):
         return

@@ -436,8 +436,8 @@ class JointNull(Null):
             )
         response, *inputs = tested
         refuse_uncallable(condition.name, response)
-        roots = read_inputs(condition.name, inputs, self.optimum.model)
-        responses = Responses(condition.name, response, roots, outputs=None)
+        read = read_inputs(condition.name, inputs, self.optimum.model)
+        responses = Responses(condition.name, response, read, outputs=None)
         labels = set(condition.labels or ())
         # Simulators that measured these specimens come first.
         shared = [

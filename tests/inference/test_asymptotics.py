@@ -426,6 +426,6 @@ def test_populations_around_an_optimum_are_those_of_the_design_as_it_was() -> No
     item = Information(evaluator, 0, theta, n_sets=20)
     before = identified_by_area(item)
     (bound,) = evaluator.reweighted.values()
-    bound.add([np.atleast_1d(values) for values in evaluator.roots(theta[None], 0)], 512)
+    bound.add([np.atleast_1d(values) for values in evaluator.parents(theta[None], 0)], 512)
     assert bound.n_points == 1536
     np.testing.assert_array_equal(identified_by_area(item), before)

@@ -289,7 +289,7 @@ def test_batches_added_inside_are_undone() -> None:
     inside = []
     for at in (thetas[:3], thetas[3:6]):
         with designs_restored([bound]):
-            bound.add(evaluator.roots(at, 0))
+            bound.add(evaluator.parents(at, 0))
             assert (bound.n_points, len(bound.design.batch_sizes)) == (512, 2)
             inside.append(evaluator(thetas).discrepancies)
         assert (bound.n_points, len(bound.design.batch_sizes)) == (256, 1)
@@ -301,7 +301,7 @@ def test_batches_added_inside_are_undone() -> None:
     np.testing.assert_allclose(graph, before[0, 0], rtol=1e-10)
     # Two designs of equal size are two designs: nothing of the first remains in the second.
     fresh = build(KL, sd=None)
-    fresh.nodes[0].bound.add(fresh.roots(thetas[3:6], 0))
+    fresh.nodes[0].bound.add(fresh.parents(thetas[3:6], 0))
     np.testing.assert_allclose(inside[1], fresh(thetas).discrepancies, rtol=1e-10)
     assert not np.allclose(inside[0], inside[1], rtol=1e-6)
 

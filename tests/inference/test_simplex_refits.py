@@ -136,7 +136,7 @@ def test_refits_are_remembered_and_forgotten_with_the_design() -> None:
     )  # a scale of one simulator changes nothing
     (bound,) = evaluator.reweighted.values()
     with designs_restored([bound]):
-        bound.add(evaluator.roots(np.array([[1.0]]), 0))
+        bound.add(evaluator.parents(np.array([[1.0]]), 0))
         assert simplex_refits(evaluator, *at) is not first
     assert simplex_refits(evaluator, *at) is first
 

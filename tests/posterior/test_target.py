@@ -487,6 +487,6 @@ def test_populations_continue_beyond_the_ends_of_a_prior() -> None:
     np.testing.assert_allclose(continuation.within(coordinates), thetas, atol=1e-6)
     continued = ContinuedEvaluator.continuing(evaluator, continuation)
     outside = np.array([[-0.5, np.log(1.5)], [2.5, np.log(0.5)]])
-    mu_roots, sigma_roots = continued.roots(outside, 0)
+    mu_roots, sigma_roots = continued.parents(outside, 0)
     np.testing.assert_allclose(mu_roots, [-0.5, 2.5], rtol=1e-6)
     np.testing.assert_allclose(sigma_roots, [1.5, 0.5], rtol=1e-6)

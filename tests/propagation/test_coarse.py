@@ -89,7 +89,7 @@ def test_an_emulated_sample_follows_the_coarse_response_at_its_points() -> None:
     for values in bound.design.without_each_block():
         assert off(bound, values) < 0.02
     with designs_restored([bound]):
-        bound.add(evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0), 32)
+        bound.add(evaluator.parents(evaluator.hyperparameters.prior_thetas(32, 3), 0), 32)
         assert bound.design.coarse is not None
         np.testing.assert_allclose(bound.design.coarse[:, 0], coarse(*bound.design.runs.points))
         assert off(bound) < 0.01
@@ -99,7 +99,7 @@ def test_an_emulated_sample_follows_the_coarse_response_at_its_points() -> None:
 def test_runs_may_be_added_where_the_coarse_response_has_no_value() -> None:
     evaluator = Evaluator.of(build(lambda a, b, _: np.where(a > 4, np.nan, coarse(a, b))))
     bound = evaluator.reweighted["y"]
-    roots = evaluator.roots(evaluator.hyperparameters.prior_thetas(32, 3), 0)
+    roots = evaluator.parents(evaluator.hyperparameters.prior_thetas(32, 3), 0)
     bound.add([np.full_like(roots[0], 30.0), *map(np.ones_like, roots[1:])], 16)
     assert bound.n_runs == 80
     assert np.isfinite(bound.design.sample.values).all()

@@ -113,7 +113,7 @@ def test_a_sample_reaches_other_populations_and_the_prior_without_a_run() -> Non
     before = evaluator.support(far)["y"]["weight_ess"]
     with designs_restored([bound]):
         for _ in range(3):
-            bound.reach(evaluator.roots(around(far), 0))
+            bound.reach(evaluator.parents(around(far), 0))
         assert evaluator.support(far)["y"]["weight_ess"] > 2 * before
         mass = np.median(evaluator.support(prior)["y"]["mean_weight"])
         assert mass == pytest.approx(1, abs=0.05)
@@ -157,7 +157,7 @@ def test_a_part_of_a_sample_for_a_while() -> None:
         np.testing.assert_allclose(part_weights, expected, rtol=1e-9)
         np.testing.assert_array_equal(part_values, values[:, rows])
         (part,) = evaluator(THETA).discrepancies
-        bound.add(evaluator.roots(THETA, 0), 32)
+        bound.add(evaluator.parents(THETA, 0), 32)
         assert bound.n_runs == 96
     assert 0 < abs(part[0] - whole[0]) < 0.2 * whole[0]
     assert bound.n_runs == 64
@@ -258,7 +258,7 @@ def test_a_compiled_discrepancy_has_the_sample_that_was_drawn_last() -> None:
     before = evaluator(THETA).discrepancies
     batches = identity_of(evaluator).simulators[0].batches
     compiled = evaluator.model.compile_logp(vars=[evaluator.model["y"]], mode=PLAIN)
-    bound.reach(evaluator.roots(THETA, 0))
+    bound.reach(evaluator.parents(THETA, 0))
     after = evaluator(THETA).discrepancies
     assert 0 < abs(after - before)[0, 0] < 0.05 * before[0, 0]
     prb.set_epsilon(evaluator.model, {"y": 1.0})
@@ -273,7 +273,7 @@ def test_a_compiled_discrepancy_has_the_sample_that_was_drawn_last() -> None:
 def test_the_same_surfaces_are_judged_again_for_other_populations() -> None:
     # Smooth where the prior is, and with a corner at the populations that come next.
     evaluator, bound = design_of(build(lambda a, b: smooth(a, b) + np.abs(b - 0.5)))
-    roots = evaluator.roots(THETA, 0)
+    roots = evaluator.parents(THETA, 0)
     before = bound.design.emulator
     bound.reach(roots, same_surfaces=True)
     same = bound.design.emulator
@@ -379,7 +379,7 @@ def test_samples_are_of_populations_that_matter_and_of_the_prior() -> None:
 
 def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
     evaluator, bound = emulated()
-    roots = evaluator.roots(evaluator.hyperparameters.prior_thetas(2, 0), 0)
+    roots = evaluator.parents(evaluator.hyperparameters.prior_thetas(2, 0), 0)
     sampler = MixtureSampler("y", bound.inputs, PopulationDensity(bound.inputs))
     _, mixture = sampler.draw(roots, 1024, 3, np.array([0.125, 0.875]))
     np.testing.assert_array_equal(mixture.counts, [128, 896])

@@ -103,7 +103,7 @@ def moves(distribution: Callable[[], Any]) -> bool:
     """Return whether the support of an input moves, at points of 64 populations of the prior."""
     with pm.Model() as model:
         inputs = read_inputs("y", [distribution()], model)
-    components = PriorSampler(inputs.roots)(64, 0)
+    components = PriorSampler(inputs.parents)(64, 0)
     sampler = MixtureSampler("y", inputs, PopulationDensity(inputs))
     points, _ = sampler.draw(components, 64, 0)
     return moving_inputs("y", inputs, components, points) == (0,)

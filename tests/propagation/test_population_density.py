@@ -52,7 +52,7 @@ def inputs_of(*families: Callable[..., Any]) -> Inputs:
 
 def by_name(inputs: Inputs, values: dict[str, Any]) -> list[Any]:
     """Return values of the roots, in their order."""
-    return [values[str(root.name)] for root in inputs.roots]
+    return [values[str(root.name)] for root in inputs.parents]
 
 
 def log_likelihoods(inputs: Inputs, roots: Sequence[Any], x: Sequence[Any], log_a: Any) -> Any:

@@ -172,7 +172,7 @@ def test_inputs_that_pymc_draws_by_functions_of_its_own(make: Any, expected: Any
     (node,) = first_use(model).values()
     found = node.bound
     given = {"mu": np.array([2.0]), "sigma": np.array([0.5])}
-    values, weights = found.populations([given[str(r.name)] for r in found.inputs.roots])
+    values, weights = found.populations([given[str(r.name)] for r in found.inputs.parents])
     assert values.shape == weights.shape == (1, 400)
     # A fixed seed: far from the one in a thousand that another distribution would give.
     assert stats.kstest(values[0], expected.cdf).pvalue > 0.01

@@ -231,7 +231,7 @@ def test_populations_are_drawn_at_their_own_roots() -> None:
             pt.constant(4.0) * 1,
         ]
     )
-    names = [str(r.name) for r in inputs.roots]
+    names = [str(r.name) for r in inputs.parents]
     given = {"mu": np.array([1.0, 5.0, 9.0]), "sigma": np.array([0.1, 0.2, 0.3])}
     sampler = PopulationSampler(inputs)
     params = [given[n] for n in names]
@@ -282,7 +282,7 @@ def test_random_walks_have_pymc_s_density_and_no_other() -> None:
     refuse_without_density("y", inputs)
     values = {"mu": np.array([0.5, -0.3]), "sigma": np.array([0.7, 1.2])}
     points = np.random.default_rng(1).normal(size=(5, 4))
-    roots = [values[str(root.name)] for root in inputs.roots]
+    roots = [values[str(root.name)] for root in inputs.parents]
     found = compiled_log_density(inputs)(*roots, points)[0]
     steps = np.diff(points, axis=1)
     for row, m, s in zip(found, values["mu"], values["sigma"], strict=True):

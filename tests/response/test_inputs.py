@@ -48,7 +48,7 @@ def test_inputs_are_sorted_in_the_order_of_the_arguments() -> None:
     inputs, (_, z, x, doubled, _, _), roots = read(make)
     assert inputs.aleatory == (z, x)
     assert inputs.epistemic == (doubled,)
-    assert set(inputs.roots) == set(roots)
+    assert set(inputs.parents) == set(roots)
     assert not inputs.nested
     assert inputs.event_shapes == ((2,), ())
     assert inputs.event_ndims == [1, 0, 0]
@@ -67,7 +67,7 @@ def test_roots_are_the_model_variables_above_the_inputs_only() -> None:
     inputs, _, (mu, _) = read(
         lambda mu, sigma: [pm.Normal.dist(pt.exp(mu), 1.0), pm.Data("d", 1.0)]
     )
-    assert inputs.roots == (mu,)
+    assert inputs.parents == (mu,)
 
 
 def test_a_dist_below_another_is_nested() -> None:

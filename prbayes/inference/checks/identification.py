@@ -134,7 +134,7 @@ def _separate_elements(evaluator: Evaluator, node: Node) -> tuple[IntArray, IntA
     *arguments, coefficients = range(len(inputs.arguments))
     above = []
     for numbers in ([coefficients], arguments):
-        names = {rv.name for rv in inputs.roots_above(numbers)}
+        names = {rv.name for rv in inputs.parents_above(numbers)}
         is_above: list[bool] = []
         shapes = evaluator.hyperparameters.shapes.values()
         for value, shape in zip(model.value_vars, shapes, strict=True):

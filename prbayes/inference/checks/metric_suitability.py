@@ -115,7 +115,7 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[Finding]:
     thetas = hyperparameters.initial + np.vstack([0 * prior_sd, np.diag(prior_sd)])
     count = np.zeros(hyperparameters.size)
     for k in range(len(nodes)):
-        flat = [root.reshape(len(thetas), -1) for root in evaluator.roots(thetas, k)]
+        flat = [parent.reshape(len(thetas), -1) for parent in evaluator.parents(thetas, k)]
         count += np.any([(f[1:] != f[0]).any(axis=1) for f in flat], axis=0)
     if not (count > 1).any():
         return []

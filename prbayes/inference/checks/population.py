@@ -164,7 +164,7 @@ def failing_region_findings(
         if np.isfinite(emulation.y).all():
             continue
         sampler = PopulationSampler(likelihood.inputs)
-        drawn, _ = sampler(evaluator.roots(theta[None], k), specimens, rng)
+        drawn, _ = sampler(evaluator.parents(theta[None], k), specimens, rng)
         z = likelihood.coordinates.of([x[0] for x in drawn], 1)
         fails = emulation.fails(np.clip(z, emulation.box[0], emulation.box[1]))
         share = float(fails.mean())
