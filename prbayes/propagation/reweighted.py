@@ -252,9 +252,9 @@ class PoorEmulatorError(DesignError):
 class ReweightedBound(Bound):
     """Stored responses with weights p(x given theta) / g(x) for every theta.
 
-    The points of a batch are stratified over a finite list of values of the parents. The list is kept,
-    and g is exactly the mixture, over all batches, of the densities at the listed values (balance
-    heuristic).
+    The points of a batch are stratified over a finite list of values of the parents. The list is
+    kept, and g is exactly the mixture, over all batches, of the densities at the listed values
+    (balance heuristic).
     """
 
     stored: ClassVar[bool] = True

@@ -317,7 +317,8 @@ class PopulationSampler:
     ) -> tuple[list[Floats], list[Floats]]:
         """Draw n specimens from each of k populations, at parents (k, *shape).
 
-        Aleatory inputs are (k, n, *event), epistemic ones (k, 1, *event), or (*event) without parents.
+        Aleatory inputs are (k, n, *event), epistemic ones (k, 1, *event), or (*event) without
+        parents.
         """
         _seed(self._function, rng)
         try:
