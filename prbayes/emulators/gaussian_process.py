@@ -14,8 +14,7 @@ from prbayes._validate import Floats, positive_number
 from prbayes.emulators.surfaces import Predict, Surface
 from prbayes.numerics.threads import one_thread
 
-# Points for the lengths: with half as many, errors on eight inputs are six times as large; twice as
-# many gain a third and take eight times as long (benchmarks/emulators.py).
+# Points for the lengths and the nugget: the time grows with the cube of their number.
 MOST_TUNED = 256
 
 # From squared distances to the correlation, and minus twice its slope.

@@ -333,7 +333,7 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
             product = product + (even_change * odd_change * lengths).sum(axis=-1)
             even_square = even_square + (even_change**2 * lengths).sum(axis=-1)
             odd_square = odd_square + (odd_change**2 * lengths).sum(axis=-1)
-        # Correlation of the changes. Half or twice of .35 changes no answer.
+        # Correlation of the changes on both sides of theta.
         is_identified &= product > 0.35 * np.sqrt(even_square * odd_square)
     return np.asarray(vectors[:, is_identified])
 

@@ -33,7 +33,7 @@ from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import designs_restored
 
 _log = logging.getLogger("prbayes")
-# Batches after which a design is refused; half or twice changes no answer.
+# Batches of runs after which a design is refused.
 MAX_ROUNDS = 8
 # Share of it for points and for emulators: together they then have it all.
 _SHARE = np.sqrt(0.5)

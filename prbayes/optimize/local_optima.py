@@ -25,14 +25,14 @@ from prbayes.optimize.objective import Ridge
 from prbayes.optimize.optimum import point_at
 
 # Share of the noise floor that is about the difference of the discrepancy between the fit of the
-# data and the truth; half or twice changes no optimum.
+# data and the truth.
 _NOISE_SHARE = 0.3
 # Difference, in multiples of the noise, up to which data could come from either optimum: three make
 # about the noise floor.
 _COMPARABLE = 3.0
 # Multiples of the noise that are nothing: descents stop there.
 _NEGLIGIBLE = 0.01
-# Points of the prior for each start; half and twice as many find the same optima.
+# Points of the prior that are compared for each start.
 _POINTS_PER_START = 8
 
 

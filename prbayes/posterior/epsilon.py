@@ -210,8 +210,7 @@ def _by_coverage(information: Information) -> float | None:
     axes = basis @ (vectors * np.sqrt(np.maximum(variances, 0)))
     directions = axes * information.prior_sd[:, None]  # (d, r), a standard error long
     # Thetas around the optimum, three times as wide as the sampling distribution, to reach all
-    # posteriors. Half or twice their number changes epsilon by 3%, half of the width by 2%, and
-    # twice the width by 11%.
+    # posteriors.
     z = np.random.default_rng(0).standard_normal((500, directions.shape[1]))
     thetas = 3.0 * (z @ directions.T)
     distances: Any = 0  # (n_sets, M)

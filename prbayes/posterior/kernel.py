@@ -33,10 +33,10 @@ from prbayes.response.store import StoreError
 
 @dataclass(frozen=True)
 class KernelOptions:
-    """Limits of the mutation, which a study chose."""
+    """Limits of the mutation."""
 
     # Mean absolute correlation with the previous particles, below which draws are new: .036 among
-    # 500 independent ones. Half or twice moves a mean no more than another seed does.
+    # 500 independent ones.
     correlation: float = 0.05
     tempered_correlation: float = 0.3  # before the last stage; later stages forget the rest
     # Beside the hard ends of a uniform population 25 steps leave posteriors a tenth too wide.

@@ -87,6 +87,21 @@ def test_exact_and_differenced_gradients_agree() -> None:
     np.testing.assert_allclose(gradient, exact[1], rtol=1e-5)
 
 
+def test_batches_and_the_compiled_objective_agree_with_other_terms() -> None:
+    with model() as observed:
+        pm.Normal("z", observed["mu"], 0.2, observed=[0.5, 0.9])
+        pm.Potential("limit", -((observed["sigma"] - 1.0) ** 2))
+    evaluator, scales = Evaluator.of(observed), np.array([0.7])
+    theta = np.array([0.4, -0.3])
+    compiled = evaluator.objective(prior=False, gradient=False)(theta, scales)[0]
+    np.testing.assert_allclose(evaluator.total(theta[None], scales), [compiled], rtol=1e-12)
+    point = evaluator.hyperparameters.constrained(theta[None])
+    mu, sigma = point["mu"][0], point["sigma"][0]
+    other = stats.norm.logpdf([0.5, 0.9], mu, 0.2).sum() - (sigma - 1.0) ** 2
+    distance = evaluator.discrepancies(theta[None], 0)[0] / 0.7
+    np.testing.assert_allclose(compiled, distance - other, rtol=1e-10)
+
+
 def test_an_inverse_distribution_function_without_gradient_is_differenced() -> None:
     """PyTensor has no gradient of the gamma distribution's in its shape."""
     observed = np.random.default_rng(5).gamma(16, 1 / 16, 60)
