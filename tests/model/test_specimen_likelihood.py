@@ -18,7 +18,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.model.evaluator import Evaluator
+from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import draw_readings, specimen_likelihoods
 from prbayes.propagation.base import DesignError
 from prbayes.response.compile import PLAIN
@@ -287,6 +287,10 @@ def test_each_group_is_truncated_by_itself() -> None:
         log_p = stats.norm.logpdf(data.values[keep], means, sd)
         expected.append(log_p - stats.norm.logcdf(LIMIT, means, sd))
     assert np.allclose(ours, expected[1] - expected[0], atol=2e-3)
+    # The same without a graph, as the optimiser and importance sampling evaluate it.
+    thetas = np.array([[*np.ravel(point["mu"]), point["sigma_log__"]] for point in points])
+    (arrays,) = specimen_log_likelihoods(Evaluator.of(model), thetas).values()
+    assert np.allclose(arrays[1] - arrays[0], ours, atol=1e-9)
 
 
 def test_simulators_with_equal_inputs_stay_apart() -> None:

@@ -84,6 +84,11 @@ def test_the_density_of_a_mean_of_exponential_variables() -> None:
     found = log_density([logs], [Scores(nodes[:, None] - 1.0, 5)])
     expected = stats.gamma(5, scale=1 / (5 * rates)).logpdf(1.0)
     np.testing.assert_allclose(found - found[1], expected - expected[1], atol=5e-3)
+    # At other means of one population: the variance at the saddlepoint is their square.
+    means = np.array([0.7, 1.0, 1.3])  # above, the largest node is too small
+    at_means = [log_density([logs[1:2]], [Scores(nodes[:, None] - mean, 5)])[0] for mean in means]
+    expected = stats.gamma(5, scale=1 / 5).logpdf(means)
+    np.testing.assert_allclose(at_means - at_means[1], expected - expected[1], atol=5e-3)
 
 
 def test_combinations_without_variation_are_dropped() -> None:
