@@ -88,7 +88,7 @@ def test_exact_and_differenced_gradients_agree() -> None:
 
 
 def test_batches_and_the_compiled_objective_agree_with_other_terms() -> None:
-    with model() as observed:
+    with normal_model(prb.Resimulated(256)) as observed:
         pm.Normal("z", observed["mu"], 0.2, observed=[0.5, 0.9])
         pm.Potential("limit", -((observed["sigma"] - 1.0) ** 2))
     evaluator, scales = Evaluator.of(observed), np.array([0.7])
