@@ -63,9 +63,8 @@ from prbayes.propagation.charts import (
 from prbayes.propagation.roots import Response
 from prbayes.propagation.specimen_emulation import (
     Emulation,
-    PointOptions,
+    EmulationProblem,
     extended,
-    first_runs,
     half_difference,
     require_accurate,
     spread_out,
@@ -92,44 +91,34 @@ type Posterior = Callable[[Floats, Floats, Floats | None], Draws]
 
 
 def fibre_points(
-    run: Callable[[Floats], Floats],
-    readings: Readings,
-    bounds: Floats,
-    prior_specimens: Floats,
-    posterior: Posterior,
-    options: PointOptions,
-    *,
-    n: int | None = None,
-    seed: int = 0,
-    name: str = "response",
+    problem: EmulationProblem, bounds: Floats, prior_specimens: Floats, posterior: Posterior
 ) -> tuple[Emulation, SpecimenPoints]:
-    """Emulate a response with n first runs, and draw points on the fibres of all specimens.
+    """Emulate a response, and draw points on the fibres of all specimens.
 
-    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response; the middle
-    99 % of the prior predictive population lies within [-1, 1]. ``posterior`` maps points
-    (N, K, d), their numbers (N, K), and None or a covariance by which populations are smoothed, to
-    draws. Raise DesignError if the emulator is too inaccurate, or `most_points` are not enough.
+    The middle 99 % of the prior predictive population lies within [-1, 1] in each coordinate.
+    ``posterior`` maps points (N, K, d), their numbers (N, K), and None or a covariance by which
+    populations are smoothed, to draws. Raise DesignError if the emulator is too inaccurate, or
+    `most_points` are not enough.
     """
+    readings, options, seed = problem.readings, problem.options, problem.seed
     d = bounds.shape[1]
-    n = first_runs(d) if n is None else n
+    n = problem.n_first(d)
     population = ReferencePopulation.from_sample(prior_specimens)
     # Wider than the population by half; even points of a box would be in its corners.
     first = np.clip(population.inputs(1.5 * ndtri(sobol(n, d, seed))), *bounds)
-    emulation = Emulation.first(run, first, bounds, readings, options, name)
+    emulation = Emulation.first(problem, first, bounds)
     rng = np.random.default_rng([seed, 1])
     count, batch_size = 256, max(n // 2, options.fresh)
     for batch in range(6):
-        points, draws = _reliable_draws(
-            emulation, readings, population, posterior, count, options, seed + batch, name
-        )
+        numbered = replace(problem, seed=seed + batch)
+        points, draws = _reliable_draws(emulation, numbered, population, posterior, count)
         count = points.z.shape[1]
         population = ReferencePopulation.from_sample(draws.specimens())
         if batch >= 2 and emulation.bias <= options.bias:
             break
         fresh = _fresh(points, draws, batch_size, bounds, rng)
-        half = batch_size // 2
-        emulation = extended(emulation, run, fresh, readings, options, name, half)
-    require_accurate(emulation, readings, options, name)
+        emulation = extended(emulation, problem, fresh, batch_size // 2)
+    require_accurate(emulation, problem)
     # Points on fibres cost more than those around roots, and their error falls more slowly.
     unit = options.half_difference * _per_hyperparameter(draws)
     count = 128
@@ -144,7 +133,7 @@ def fibre_points(
         if difference <= largest:
             return emulation, replace(joined(*halves), difference=difference)
         if is_last:
-            raise _monte_carlo_error(name, 2 * count, difference, largest)
+            raise _monte_carlo_error(problem.name, 2 * count, difference, largest)
         halves = [
             joined(half, proposal.draw(count, after=count))
             for half, proposal in zip(halves, proposals, strict=True)
@@ -154,13 +143,10 @@ def fibre_points(
 
 def _reliable_draws(
     emulation: Emulation,
-    readings: Readings,
+    problem: EmulationProblem,
     population: ReferencePopulation,
     posterior: Posterior,
     count: int,
-    options: PointOptions,
-    seed: int,
-    name: str,
 ) -> tuple[SpecimenPoints, Draws]:
     """Return points, at first ``count``, and draws at which both halves of the points agree.
 
@@ -168,10 +154,11 @@ def _reliable_draws(
     where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
     narrow the reference population, until it narrows no more; then points are doubled.
     """
+    readings = problem.readings
     free = population.root.shape[0] - int(readings.is_measured.sum(axis=1).min())
     narrows = False
     while True:
-        points = FibreProposals.fitted(emulation, readings, population, seed).draw(count)
+        points = FibreProposals.fitted(emulation, readings, population, problem.seed).draw(count)
         if not narrows:
             draws = posterior(points.z, points.log_a, None)
             halves = slice(count // 2), slice(count // 2, None)
@@ -181,8 +168,8 @@ def _reliable_draws(
             limit = _per_hyperparameter(draws)
             if difference <= limit:
                 return points, draws
-            if 2 * count > options.most_points:
-                raise _monte_carlo_error(name, count, difference, limit)
+            if 2 * count > problem.options.most_points:
+                raise _monte_carlo_error(problem.name, count, difference, limit)
         smoothing = count ** (-2 / (free + 4)) * population.root @ population.root.T
         specimens = posterior(points.z, points.log_a, smoothing).specimens()
         narrow = ReferencePopulation.from_sample(specimens)

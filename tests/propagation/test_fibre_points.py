@@ -16,7 +16,7 @@ from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.charts import ReferencePopulation
 from prbayes.propagation.fibre_points import fibre_points, fit_fibres, with_errors, without_errors
-from prbayes.propagation.specimen_emulation import Emulation, PointOptions
+from prbayes.propagation.specimen_emulation import Emulation, EmulationProblem, PointOptions
 from prbayes.propagation.specimen_points import SpecimenPoints
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
@@ -325,13 +325,10 @@ def points_of(
 ) -> tuple[Emulation, SpecimenPoints]:
     d = draws.means.shape[1]
     prior = 0.4 * np.random.default_rng(1).standard_normal((2048, d))
-    settings = {"n": 16 * d + 32, "seed": 0} | options
-    most = settings.pop("most_points", PointOptions().most_points)
-    options_of_points = PointOptions(most_points=most)
+    settings = {"n": 16 * d + 32} | options
     bounds = np.stack([prior.min(axis=0), prior.max(axis=0)])
-    return fibre_points(
-        response, readings, bounds, prior, draws.posterior, options_of_points, **settings
-    )
+    problem = EmulationProblem(response, readings, **settings)
+    return fibre_points(problem, bounds, prior, draws.posterior)
 
 
 def linear_response(d: int, m: int) -> tuple[Floats, Callable[[Floats], Floats]]:
@@ -442,7 +439,7 @@ def test_points_are_doubled_until_both_halves_agree() -> None:
     error = errors(points, linear_log_likelihoods(a, readings, draws), draws).sum(axis=1)
     assert error.std() < 0.15
     with pytest.raises(DesignError, match=r"got two halves of 256 points .*ProbabilityResidual"):
-        points_of(lambda z: z @ a.T, readings, draws, most_points=256)
+        points_of(lambda z: z @ a.T, readings, draws, options=PointOptions(most_points=256))
 
 
 @dataclass(frozen=True)
