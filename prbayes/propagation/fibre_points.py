@@ -355,7 +355,7 @@ class FibreProposal:
         for block in _blocks(n, points):
             fibres = replace(self.fibres, y=self.fibres.y[block])
             charts = Charts(*(array[block] for array in vars(self.charts).values()))
-            z, log_a[block], *_ = _draw(
+            z, log_a[block], _ = _draw(
                 fibres, charts, points, (1, seed), self.numbers[block], after
             )
             x[block] = fibres.population.inputs(z)
@@ -376,10 +376,8 @@ def fit_fibres(
     """Fit proposals to the fibres of measured outputs y, (N, m) with m < d.
 
     Charts at the modes, more charts until ``tries`` random points of the fibres are covered, then
-    rounds of adaptation to 256 weighted points each. Charts turn in all rounds but the last, before
-    which the cover is repeated: without that, single specimens lacked up to .35 in log L.
-    ``population`` should cover the plausible populations. A specimen has the same points alone as
-    in a batch if its number is the same.
+    rounds of adaptation to 256 weighted points each. ``population`` should cover the plausible
+    populations. A specimen has the same points alone as in a batch if its number is the same.
 
     Examples
     --------
@@ -403,16 +401,10 @@ def fit_fibres(
     parts = [Charts.empty(0, most_charts, d, y.shape[1])]
     for block in _blocks(len(y), 256):
         part, label = replace(fibres, y=fibres.y[block]), numbers[block]
-        charts = charts_at_modes(part, 8, most_charts)
         normal = ndtri(_shifted_sobol(tries, d, (0, seed), label))
-        charts = cover(part, charts, normal)
+        charts = cover(part, charts_at_modes(part, 8, most_charts), normal)
         for r in range(rounds):
-            last = r == rounds - 1
-            if last and r > 0:
-                # Charts that turned end elsewhere; those of the last round keep their directions.
-                charts = cover(part, charts, normal)
-            sample = _draw(part, charts, 256, (2 + r, seed), label)
-            charts = _adapted(charts, sample, turn=not last)
+            charts = _adapted(charts, _draw(part, charts, 256, (2 + r, seed), label))
         parts.append(charts)
     arrays = zip(*(vars(part).values() for part in parts), strict=True)
     return FibreProposal(fibres, Charts(*map(np.concatenate, arrays)), numbers)
@@ -446,9 +438,8 @@ def without_errors(x: Floats, log_a: Floats, m: int) -> tuple[Floats, Floats]:
     return x[..., :-m], log_a + log_normal
 
 
-# Points of n specimens: whitened inputs z, (n, K, d), numbers A, (n, K), charts, (n, K), and
-# Jacobians with respect to z, (n, K, m, d).
-type _Sample = tuple[Floats, Floats, Indices, Floats]
+# Points of n specimens: whitened inputs z, (n, K, d), numbers A, (n, K), and charts, (n, K).
+type _Sample = tuple[Floats, Floats, Indices]
 
 
 def _draw(
@@ -484,28 +475,20 @@ def _draw(
     log_units = log_units - np.log(fibres.unit).sum()
     log_a[rows] = log_units - np.log(points) - log_density
     z = np.where(converged[:, None], z, 0.0)
-    return (
-        z.reshape(n, points, -1),
-        log_a.reshape(n, points),
-        slot.reshape(n, points),
-        np.where(converged[:, None, None], jacobian, 0.0).reshape(n, points, *jacobian.shape[1:]),
-    )
+    return z.reshape(n, points, -1), log_a.reshape(n, points), slot.reshape(n, points)
 
 
-def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
+def _adapted(charts: Charts, sample: _Sample) -> Charts:
     """Return charts with location, scale and share of their weighted points.
 
-    With `turn` the solved directions become the row space of the mean Jacobian, which keeps
-    det(J solved) off zero over more of the fibre. The present values count as 4 (d - m) points.
+    The present values count as 4 (d - m) points.
     """
-    z, log_a, chart, jacobian = sample
-    d, k = charts.free.shape[2:]
-    m = d - k
+    z, log_a, chart = sample
+    k = charts.free.shape[3]
     log_weight = log_a - (z**2).sum(axis=2) / 2
     largest = log_weight.max(axis=1, keepdims=True)
     weight = np.exp(log_weight - np.where(np.isfinite(largest), largest, 0))
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
-    free, solved = charts.free.copy(), charts.solved.copy()
     location, scale = charts.location.copy(), charts.scale.copy()
     share = np.zeros_like(charts.share)
     for c in range(share.shape[1]):
@@ -513,31 +496,14 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
         share[:, c] = w.sum(axis=1)
         i = np.flatnonzero(share[:, c] > 1e-6)
         w = w[i] / share[i, c][:, None]
-        squares = weight[i] ** 2 * (chart[i] == c)
-        size = share[i, c] ** 2 / squares.sum(axis=1)
-
-        turns = (size > d) & turn
-        turned = i[turns]
-        mean_jacobian = np.einsum("nk,nkmd->nmd", w[turns], jacobian[turned])
-        right = np.linalg.svd(mean_jacobian)[2].transpose(0, 2, 1)
-        solved[turned, c] = right[..., :m]
-        free[turned, c] = right[..., m:]
-
-        # Present location and scale in the new directions
-        rotation = free[i, c].transpose(0, 2, 1) @ charts.free[i, c]
-        transposed = rotation.transpose(0, 2, 1)
-        present_location = (rotation @ charts.location[i, c][..., None])[..., 0]
-        root = rotation @ charts.scale[i, c]
-        present = (
-            root @ root.transpose(0, 2, 1) / Charts.inflation + np.eye(k) - rotation @ transposed
-        )
-
-        u = (z[i] - charts.centre[i, None, c]) @ free[i, c]
+        size = 1 / (w**2).sum(axis=1)
         old = (4.0 * k / (size + 4 * k))[:, None]
         new = (size / (size + 4 * k))[:, None]
-        mean = new * (w[:, None, :] @ u)[:, 0] + old * present_location
+        u = (z[i] - charts.centre[i, None, c]) @ charts.free[i, c]
+        mean = new * (w[:, None, :] @ u)[:, 0] + old * charts.location[i, c]
         centred = u - mean[:, None]
         covariance = (centred * w[..., None]).transpose(0, 2, 1) @ centred
+        present = scale[i, c] @ scale[i, c].transpose(0, 2, 1) / Charts.inflation
         covariance = new[..., None] * covariance + old[..., None] * present
         location[i, c] = mean
         scale[i, c] = np.linalg.cholesky(Charts.inflation * covariance)
@@ -545,7 +511,7 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
     share = 0.9 * share + 0.1 * has_chart / np.maximum(has_chart.sum(axis=1, keepdims=True), 1)
     share = np.where(has_chart, share, 0)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-300)
-    return replace(charts, free=free, solved=solved, location=location, scale=scale, share=share)
+    return replace(charts, location=location, scale=scale, share=share)
 
 
 def _shifted_sobol(points: int, dimensions: int, key: tuple[int, int], numbers: Indices) -> Floats:

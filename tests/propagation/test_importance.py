@@ -299,6 +299,7 @@ def test_left_out_emulators_differ_where_the_emulator_is_wrong() -> None:
     assert bound.design.runs_alone().without_each_block() == []
 
 
+@pytest.mark.long
 def test_an_optimum_from_few_runs_is_that_of_many() -> None:
     few = prb.minimize(build(known=True), starts=0, progressbar=False)
     many = build(known=True, n=4096, emulator=None)
