@@ -161,7 +161,7 @@ def censored(bound: Any) -> Any:
     return pm.Censored.dist(pm.Normal.dist(0.0, 1.0), lower=bound, upper=5.0)
 
 
-@pytest.mark.parametrize("dist", [mixture_of_a_point, pm.DiracDelta.dist, censored])
+@pytest.mark.parametrize("dist", [mixture_of_a_point, censored])
 def test_a_value_that_has_probability_and_moves_is_refused(dist: Callable[[Any], Any]) -> None:
     with pytest.raises(TypeError, match=r"values that move .* have probability .*prb.Fresh\(\)"):
         stored(lambda: dist(pm.Normal("a", 0, 1)))

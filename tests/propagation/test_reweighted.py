@@ -426,7 +426,7 @@ def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> N
         first_use(
             model_of(
                 lambda: pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=k), 0.1 * np.eye(k)),  # noqa: B023
-                1024,
+                256,
                 response=lambda x: x.sum(axis=-1),
                 observed=[0.0, 1.0, 2.0],
                 emulator=None,

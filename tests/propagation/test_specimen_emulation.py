@@ -92,13 +92,9 @@ def test_the_bounds_are_those_of_data_sets_of_the_prior() -> None:
 @pytest.mark.parametrize(
     ("dist", "is_log"),
     [
-        (lambda f: pm.LogNormal.dist(0.0, f), True),  # ratio of the ends exp(5.2) = 170
-        (lambda f: pm.LogNormal.dist(0.0, 0.2 * f), False),  # exp(1.03) = 2.8
+        (lambda f: pm.LogNormal.dist(0.0, 0.2 * f), False),  # ratio of the ends exp(1.03) = 2.8
         (lambda f: pm.LogNormal.dist(0.0, 0.5 * f), True),  # exp(2.6) = 13
         (lambda f: pm.Normal.dist(0.0, 100.0 * f), False),  # has negative values
-        (lambda f: pm.Gamma.dist(0.5, f), True),
-        (lambda f: pm.Uniform.dist(1.0, 5.0 * f), False),
-        (lambda f: pm.Uniform.dist(0.001, 5.0 * f), True),
     ],
 )
 def test_positive_inputs_over_more_than_a_decade_are_logarithms(dist: Any, is_log: bool) -> None:

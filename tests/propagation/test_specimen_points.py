@@ -121,9 +121,9 @@ def test_a_linear_response_of_normal_inputs(d: int, m: int) -> None:
     assert np.abs(np.mean(differences[0] - differences[1])) < 1e-6
 
 
-@pytest.mark.parametrize("d", [1, 2])
-def test_a_missing_output_is_integrated_over(d: int) -> None:
-    """One output of d + 1 is missing: the others determine the inputs."""
+def test_a_missing_output_is_integrated_over() -> None:
+    """One output of three is missing: the others determine both inputs."""
+    d = 2
     problem = Linear(d, d + 1)
     y = problem.y.copy()
     y[::3, 0] = np.nan
@@ -226,7 +226,7 @@ def test_the_end_of_a_support_jumps_at_the_largest_specimen() -> None:
 def test_populations_of_readings_with_a_large_error(scatter: float) -> None:
     """y = z + error: the population is narrower than the error, as wide, or wider."""
     ranges = []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng([5, seed])
         y = 0.2 + scatter * rng.normal(size=(20, 1)) + 0.3 * rng.normal(size=(20, 1))
         _, points = points_of(lambda z: z, y, 1, error=0.3, unit=3.0)
@@ -307,6 +307,20 @@ def test_roots_on_a_steep_branch_are_not_missing() -> None:
     assert np.bincount(roots.specimen).tolist() == [3] * 12
 
 
+def test_starts_are_doubled_while_simulated_specimens_miss_their_inputs() -> None:
+    """Two cubic outputs have up to nine roots, of which twelve starts miss one in twelve."""
+
+    def cubic(z: Floats) -> Floats:
+        return (1.8 * z) ** 3 - 2 * z + z[:, ::-1] * [0.3, 0.2]
+
+    x = 0.1 + 0.3 * np.random.default_rng(0).standard_normal((25, 2))
+    emulation, roots = emulate(EmulationProblem(cubic, readings(cubic(x))), cube(2), cube(2, 1.5))
+    data = readings(cubic(x))
+    few = specimen_roots(emulation, data, PointOptions())
+    many = specimen_roots(emulation, data, PointOptions(starts=len(emulation.z)))
+    assert len(few.z) < len(roots.z) == len(many.z)
+
+
 def test_points_of_a_mirror_population_stay_at_its_roots() -> None:
     """One of two populations is as narrow as the error of the emulator; the other is wide."""
 
@@ -377,7 +391,7 @@ def of_folded(points: SpecimenPoints, unit: float = 1.0) -> Floats:
 FOLDED = (0.2 + 0.1 * np.random.default_rng(4).random(12))[:, None] ** 2
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1e6])
+@pytest.mark.parametrize("unit", [1e-6])
 def test_units_of_inputs_and_outputs_shift_the_log_likelihood(unit: float) -> None:
     _, points = points_of(square, FOLDED, 1)
     _, other = points_of(lambda z: unit * square(z / unit), unit * FOLDED, 1, unit=unit)
