@@ -83,7 +83,9 @@ def test_families_are_those_of_scipy(name: str) -> None:
     found = log_likelihoods(inputs, roots, [X], LOG_A)
     assert ExponentialForm.of(inputs.aleatory, [X.ravel()]) is not None
     logs = np.stack([of_scipy(a, b).logpdf(X) for a, b in zip(FIRST, SECOND, strict=True)])
-    assert np.allclose(found, logsumexp(logs + LOG_A, axis=2), rtol=1e-12, atol=1e-12)
+    # The normaliser of a truncated distribution has fewer digits in PyMC.
+    digits = 1e-8 if name == "truncated" else 1e-12
+    np.testing.assert_allclose(found, logsumexp(logs + LOG_A, axis=2), rtol=digits, atol=digits)
     assert np.allclose(found, by_graph(inputs, roots, [X], LOG_A), rtol=1e-12, atol=1e-12)
     # Invalid parameters, and points outside of the support, have no density.
     roots = by_name(inputs, {"a0": np.ones(4), "b0": np.array([-1.0, 0.0, np.nan, 1.0])})
