@@ -45,9 +45,7 @@ def fleet(products: int, size: int = 20) -> dict[str, Any]:
     for first in range(0, products, BLOCK):
         readings = Readings.exact(np.concatenate(data[first : first + BLOCK]))
         roots = specimen_roots(emulation, readings, likelihood.options)
-        points = draw_points(
-            emulation.values, emulation.error, readings, roots, emulation.box, likelihood.options
-        )
+        points = draw_points(emulation, readings, roots, likelihood.options)
         block = min(BLOCK, products - first)
         inputs = [v.reshape(block, size, -1) for v in coordinates.inputs(points.z)]
         x += list(zip(*inputs, strict=True))

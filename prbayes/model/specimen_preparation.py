@@ -197,9 +197,7 @@ def _emulate(
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
     error, is_known = emulation.error, likelihood.error_is_known
-    points = draw_points(
-        emulation.values, error, readings, roots, emulation.box, options, error_is_known=is_known
-    )
+    points = draw_points(emulation, readings, roots, options, error_is_known=is_known)
     findings: list[Finding] = [
         *_data_findings(likelihood, several_roots=bool((points.n_roots > 1).any())),
         *misfit_findings(name, readings, roots, error),

@@ -57,10 +57,7 @@ def drawn(
     problem: EmulationProblem, box: Floats, search_box: Floats
 ) -> tuple[Emulation, SpecimenPoints]:
     emulation, roots = emulate(problem, box, search_box)
-    data, options, seed = problem.readings, problem.options, problem.seed
-    points = draw_points(
-        emulation.values, emulation.error, data, roots, search_box, options, seed=seed
-    )
+    points = draw_points(emulation, problem.readings, roots, problem.options, seed=problem.seed)
     return emulation, points
 
 
@@ -333,8 +330,8 @@ def test_points_of_a_mirror_population_stay_at_its_roots() -> None:
     y = symmetric(x)
     data, box = readings(y), cube(2, 1.5)
     emulation, roots = emulate(EmulationProblem(symmetric, data), cube(2), box)
-    error = np.array([3e-4, 3e-4])
-    points = draw_points(emulation.values, error, data, roots, box, PointOptions())
+    emulation = replace(emulation, error=np.array([3e-4, 3e-4]))
+    points = draw_points(emulation, data, roots, PointOptions())
     for side in (x, x[:, ::-1]):
         away = np.abs(points.z - side[:, None]).max(axis=2).min(axis=1)
         assert away.max() < 0.01
