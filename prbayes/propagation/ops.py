@@ -44,7 +44,7 @@ class OwnOp(Op):
         """Return the name, and what to do where a backend has no form of it."""
         return (
             f"{type(self).__name__}, which is computed by NumPy: PyTensor's JAX mode and NumPyro "
-            "take prb.Reweighted alone, with several outputs that of smaller max_points; use that, "
+            "take prb.Reweighted alone, with a smaller max_points for several outputs; use that, "
             "or nuts_sampler='nutpie' or 'pymc'"
         )
 
