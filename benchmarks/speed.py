@@ -7,8 +7,7 @@ hyperparameter, in standard deviations of the exact posterior, as a median over 
 
     uv run python -m benchmarks.speed [--jobs NAME ...]
 
-pyABC and sbi run in environments of their own (see scoreboard/README.md): ``--pyabc PYTHON``,
-``--sbi PYTHON``. ``--jobs`` measures some jobs and keeps the results of the others.
+``--jobs`` measures some jobs and keeps the results of the others.
 """
 
 from __future__ import annotations
@@ -71,13 +70,11 @@ JOBS = {
     "PR, 1 output of 1 input": Job("outputs", "1 of 1", 3),
     "PR, 1 output of 2 inputs": Job("outputs", "1 of 2", 3),
     "PR, 2 outputs of 2 inputs": Job("outputs", "2 of 2", 3),
-    "1000 products": Job("fleet", "1000", 1),
     "memory linear": Job("memory", "linear", 1),
     "memory frame": Job("memory", "frame", 1),
     "import": Job("imports", "", 1),
     "README": Job("readme", "", 1),
 }
-PROGRAMS = {"pyABC": "pyABC Wasserstein", "sbi": "sbi"}
 
 
 @dataclass(frozen=True)
@@ -110,7 +107,6 @@ COMPARISONS = (
                "PR, 1 output of 1 input", 2.0),
     Comparison("PR, two outputs of two inputs, warm", "PR, 2 outputs of 2 inputs", "warm",
                "PR, 1 output of 2 inputs", 1.5),
-    Comparison("1000 products of 20 specimens, CPU s", "1000 products", "cold", "", 10.0),
     Comparison("linear 50, memory above import and Numba, MiB", "memory linear", "added", "", 100.0),
     Comparison("frame 20, memory above import and Numba, MiB", "memory frame", "added", "", 100.0),
     Comparison("import of what the README needs, above PyMC's, CPU s", "import", "added", "", 0.6),
@@ -318,10 +314,6 @@ def measured(job: Job) -> dict[str, Any]:
     if job.kind in TIMED:
         problem = {"metric": "linear", "outputs": None}.get(job.kind, job.argument)
         return timed(TIMED[job.kind](job.argument), problem, job.repeats)
-    if job.kind == "fleet":
-        from benchmarks.fleet import fleet
-
-        return fleet(int(job.argument))
     if job.kind == "memory":
         return memory(job.argument)
     return imports() if job.kind == "imports" else readme()
@@ -346,23 +338,6 @@ def in_process(name: str, *, empty_caches: bool = False) -> dict[str, Any]:
     return result
 
 
-def of_program(name: str, python: str | None) -> dict[str, Any]:
-    """Return the figures of a program in an environment of its own, on the linear problem."""
-    if python is None:
-        return {"error": "not installed"}
-    with tempfile.TemporaryDirectory() as folder:
-        command = [
-            python, "-m", f"benchmarks.scoreboard.rivals.{name.lower()}", "--rivals", PROGRAMS[name],
-            "--problems", "linear", "--sizes", "50", "--replicates", "1", "--store", folder,
-        ]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            return {"error": done.stderr.strip().splitlines()[-1][:300]}
-        (path,) = Path(folder).glob("*.json")
-        (row,) = json.loads(path.read_text(encoding="utf-8"))["found"]["rows"]
-    return {"cold": row["cpu"], "warm": row["cpu"], "runs": row["runs"]}
-
-
 def rows(jobs: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of the table: figure, aim, and whether it is met."""
     result = []
@@ -379,9 +354,7 @@ def rows(jobs: dict[str, Any]) -> list[dict[str, Any]]:
 def main() -> None:
     """Measure jobs one after another, and keep their figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--jobs", nargs="+", default=[*JOBS, *PROGRAMS, "first use"])
-    parser.add_argument("--pyabc", help="the Python with pyABC")
-    parser.add_argument("--sbi", help="the Python with sbi")
+    parser.add_argument("--jobs", nargs="+", default=[*JOBS, "first use"])
     parser.add_argument("--child", choices=list(JOBS), help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
@@ -391,20 +364,12 @@ def main() -> None:
         print(json.dumps(measured(JOBS[arguments.child])))
         return
     jobs = record.load(arguments.out, {"jobs": {}})["jobs"]
-    pythons = {"pyABC": arguments.pyabc, "sbi": arguments.sbi}
     for name in arguments.jobs:
-        if name in PROGRAMS:
-            jobs[name] = of_program(name, pythons[name])
-        elif name == "first use":
-            jobs[name] = in_process("likelihood linear", empty_caches=True)
-        else:
-            jobs[name] = in_process(name)
+        is_first = name == "first use"
+        job = "likelihood linear" if is_first else name
+        jobs[name] = in_process(job, empty_caches=is_first)
         print(f"{name:32s}", jobs[name], flush=True)
         record.save(arguments.out, {"jobs": jobs, "rows": rows(jobs)})
-    for row in rows(jobs):
-        print(
-            f"{row['what']:64s} {row['value']:8.3f} {row['ratio']:8.3f} {row['aim']:6.2f} {row['met']}"
-        )
 
 
 if __name__ == "__main__":

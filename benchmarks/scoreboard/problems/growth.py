@@ -156,10 +156,5 @@ PROBLEM = Problem(
     data=data,
     reference=reference,
     truth=TRUTH,
-    published=(
-        "of the authors' data, synthetic likelihood: mean RT 651 589 (sd 2403), mean k1 1.6665 "
-        "(.0321), sd k1 .2122 (.0142), 480 000 runs; exact: 651 866 (2082), 1.6649 (.0284), .2073 "
-        "(.0120)",
-    ),
     separate=True,
 )
