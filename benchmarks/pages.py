@@ -366,18 +366,20 @@ def joint() -> Iterator[Row]:
 
 
 def speed() -> Iterator[Row]:
-    """Return the rows of CPU seconds, memory and import beside their aims."""
-    for row in found("speed")["rows"]:
-        ratio = short(row["ratio"], 3) if row["against"] else ""
-        value = f"{row['value']:.0f}" if row["value"] >= 20 else short(row["value"])
-        aim = short(row["aim"]) if row["aim"] < 1 else f"{row['aim']:g}"
-        yield [row["what"], row["against"], value, ratio, aim, "yes" if row["met"] else "no"]
+    """Yield CPU seconds, memory and import beside their aims."""
+    from benchmarks.speed import rows
+
+    for c, value, ratio in rows(single("speed")):
+        shown = f"{value:.0f}" if value >= 20 else short(value)
+        aim = short(c.aim) if c.aim < 1 else f"{c.aim:g}"
+        met = "yes" if ratio <= c.aim else "no"
+        yield [c.text, c.against, shown, short(ratio, 3) if c.against else "", aim, met]
 
 
 def speed_jobs() -> Iterator[Row]:
-    """Return the rows of CPU seconds by job."""
-    for name, job in found("speed")["jobs"].items():
-        if job.keys() & {"error", "bias", "runs"}:
+    """Yield CPU seconds by job."""
+    for name, job in single("speed").items():
+        if job.keys() & {"error", "bias"}:
             cells = [short(job[key]) if key in job else "" for key in _OF_JOBS]
             yield [name, *cells, job.get("error", "")]
 
@@ -587,13 +589,6 @@ def thermal_tests() -> Iterator[Row]:
         yield [name, *after, f"{row['halves']:.0f} of them"]
 
 
-def libraries() -> Iterator[Row]:
-    """Yield libraries' emulators."""
-    for name, row in found("emulators").items():
-        errors = [f"{mean:.2f} ({worst:.1f})" for mean, worst in (row["smooth"], row["not smooth"])]
-        yield [name, *errors, short(row["seconds"])]
-
-
 def _matrix(key: str, several: bool) -> Iterator[Row]:
     """Yield rivals over the problems of the scoreboard."""
     return scoreboard.matrix(found("scoreboard"), key, several)
@@ -635,7 +630,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "many inputs": many_inputs,
     "at a fold": at_a_fold,
     "two fidelities": two_fidelities,
-    "libraries": libraries,
     "planning": plans,
     "risk, errors": risk_errors,
     "risk, coverage": risk_coverage,

@@ -5,36 +5,31 @@ caches on disk filled, *warm* the median of the others. Imports are apart. *Firs
 caches. A ratio is of two jobs of the same command; bias and width are those of the worst
 hyperparameter, in standard deviations of the exact posterior, as a median over the data sets.
 
-    uv run python -m benchmarks.speed [--jobs NAME ...]
-
-``--jobs`` measures some jobs and keeps the results of the others.
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 uv run python -m benchmarks.speed
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import logging
 import os
 import re
 import resource
-import subprocess
-import sys
 import tempfile
 import time
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks import record
+from benchmarks.study import Study
 
-OUT = record.RESULTS / "speed.json"
 README = Path(__file__).parents[1] / "README.md"
 SIZES = {"linear": 50, "frame": 20}
+FIRST_USE = "first use"  # last: its caches are of its own
 
 
 @dataclass(frozen=True)
@@ -74,6 +69,7 @@ JOBS = {
     "memory frame": Job("memory", "frame", 1),
     "import": Job("imports", "", 1),
     "README": Job("readme", "", 1),
+    FIRST_USE: Job("likelihood", "linear", 6),
 }
 
 
@@ -311,6 +307,7 @@ TIMED = {
 
 def measured(job: Job) -> dict[str, Any]:
     """Return the figures of a job, in this process."""
+    logging.disable(logging.WARNING)
     if job.kind in TIMED:
         problem = {"metric": "linear", "outputs": None}.get(job.kind, job.argument)
         return timed(TIMED[job.kind](job.argument), problem, job.repeats)
@@ -322,55 +319,27 @@ def measured(job: Job) -> dict[str, Any]:
 # -- processes -------------------------------------------------------------------------------------
 
 
-def in_process(name: str, *, empty_caches: bool = False) -> dict[str, Any]:
+def row(name: str, number: int) -> dict[str, Any]:
     """Return the figures of a job in a new process."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
-        if empty_caches:
-            environment |= {
+        if name == FIRST_USE:
+            os.environ |= {
                 "NUMBA_CACHE_DIR": folder, "PYTENSOR_FLAGS": f"base_compiledir={folder}"
             }  # fmt: skip
-        command = [sys.executable, "-m", "benchmarks.speed", "--child", name]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        return {"error": done.stderr.strip().splitlines()[-1][:300]}
-    result: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return result
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            return pool.submit(measured, JOBS[name]).result()
 
 
-def rows(jobs: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows of the table: figure, aim, and whether it is met."""
-    result = []
+def rows(jobs: dict[str, Any]) -> Iterator[tuple[Comparison, float, float]]:
+    """Yield the rows of the table: a figure, and its ratio to that of another job."""
     for c in COMPARISONS:
         value = jobs.get(c.job, {}).get(c.figure)
         other = jobs.get(c.against, {}).get(c.figure) if c.against else 1.0
-        if value is None or other is None:
-            continue
-        row = {"what": c.text, "against": c.against, "value": value, "ratio": value / other}
-        result.append(row | {"aim": c.aim, "met": value / other <= c.aim})
-    return result
+        if value is not None and other is not None:
+            yield c, value, value / other
 
 
-def main() -> None:
-    """Measure jobs one after another, and keep their figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--jobs", nargs="+", default=[*JOBS, "first use"])
-    parser.add_argument("--child", choices=list(JOBS), help=argparse.SUPPRESS)
-    parser.add_argument("--out", type=Path, default=OUT)
-    arguments = parser.parse_args()
-    warnings.simplefilter("ignore")
-    logging.disable(logging.WARNING)
-    if arguments.child:
-        print(json.dumps(measured(JOBS[arguments.child])))
-        return
-    jobs = record.load(arguments.out, {"jobs": {}})["jobs"]
-    for name in arguments.jobs:
-        is_first = name == "first use"
-        job = "likelihood linear" if is_first else name
-        jobs[name] = in_process(job, empty_caches=is_first)
-        print(f"{name:32s}", jobs[name], flush=True)
-        record.save(arguments.out, {"jobs": jobs, "rows": rows(jobs)})
-
+STUDY = Study("speed", __doc__, JOBS, row, 1, failures=(Exception,))
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import record
-from prbayes._progress import shown
 
 Rows = list[Any]
 _SECONDS = 20.0  # between two writes of the results
@@ -79,6 +78,8 @@ class Study:
 
     def attempt(self, cell: str, number: int) -> Any:
         """Return a row, or the text of a failure."""
+        from prbayes._progress import shown  # late: some studies measure the import
+
         logging.disable(logging.WARNING)
         try:
             with shown(False):
