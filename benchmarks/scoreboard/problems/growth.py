@@ -129,20 +129,13 @@ def reference(size: int, replicate: int) -> Reference:
 def _curvature(function: Any, at: Any) -> Any:
     """Return the inverse of the Hessian by central differences."""
     steps = 0.02 * np.eye(len(at))
-    hessian = [
-        [
-            (
-                function(at + a + b)
-                - function(at + a - b)
-                - function(at - a + b)
-                + function(at - a - b)
-            )
-            / 0.0016
-            for b in steps
-        ]
-        for a in steps
-    ]
-    return np.linalg.inv(np.array(hessian))
+
+    def second(a: Any, b: Any) -> Any:
+        upper = function(at + a + b) - function(at + a - b)
+        lower = function(at - a + b) - function(at - a - b)
+        return (upper - lower) / 0.0016
+
+    return np.linalg.inv(np.array([[second(a, b) for b in steps] for a in steps]))
 
 
 PROBLEM = Problem(
