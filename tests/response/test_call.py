@@ -210,6 +210,14 @@ def test_a_failure_is_replaced_or_ends_the_run(
         np.testing.assert_array_equal(np.isnan(run(function, kind)[0]), STEEP)
 
 
+def test_policies_and_their_defaults() -> None:
+    assert [policy.tries for policy in (Abort(), Replace(), Retry(), Retry(2))] == [1, 1, 2, 3]
+    last = Replace(np.inf)
+    assert (last.final, Retry(2, then=last).final) == (last, last)
+    assert Abort() == Abort(on_nan=False) == Retry(then=Abort()).final
+    assert repr(Retry().then) == "Replace(value=nan)"
+
+
 def test_retried_once_and_then_it_works() -> None:
     calls: dict[float, int] = {}
 
