@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -170,18 +168,6 @@ def test_shared_variables_are_those_of_the_one_who_asks(
     assert total(mine, mine)(1.0)[0].shape == (3,)
     total(pytensor.shared(np.zeros((3, 1))), double)
     assert len(compilations) == 3
-
-
-@pytest.mark.long
-def test_values_that_are_shared_go_with_the_last_function(compilations: list[Any]) -> None:
-    values = pytensor.shared(np.zeros(5))
-    x = pt.dscalar()
-    function = compiled([x], [x + values])
-    gone = weakref.ref(values)
-    del values, function
-    gc.collect()
-    assert gone() is None
-    assert len(compilation._cache) == len(compilations) == 1
 
 
 @pytest.mark.parametrize("what", ["generator", "operation", "inside", "large"])

@@ -242,25 +242,6 @@ def test_a_server_that_dies_and_comes_back_in_mid_study_loses_nothing(tmp_path: 
         server.kill()
 
 
-@pytest.mark.exact
-def test_a_specimen_that_fails_now_and_then_is_tried_again_by_policy() -> None:
-    seen: set[float] = set()
-
-    def evaluate(handler: Told, x: float, y: float) -> None:
-        if x in seen:
-            give(handler, x, y)
-        else:
-            seen.add(x)
-            handler.say("500 Internal Server Error", 500)
-
-    with telling(evaluate) as server:
-        retry = prb.response.Retry(1, then=prb.response.Abort())
-        values, node = responses(prb.umbridge(server.url), on_failure=retry)
-    x = node.reweighted.design.runs.points[0]
-    np.testing.assert_array_equal(values, np.stack([x - 4.0, x * x * 2.0], axis=1))
-    assert node.bound.responses.computed == 32
-
-
 # -- what goes wrong -------------------------------------------------------------------------------
 
 
