@@ -362,17 +362,6 @@ def test_responses_of_each_version_and_constant_are_kept_apart(tmp_path: Path) -
     assert tally.computed == N
 
 
-def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", columns=2, version="1")
-    with pytest.raises(ResponseError, match=r"\d+ responses are kept in"):
-        run(fails_above_two, store=store)
-    assert len(store) == int(np.argmax(STEEP))  # all that came before the first steep point
-    n_kept = len(store)
-    values, tally = run(times, store=store)
-    np.testing.assert_array_equal(values, 2 * X)
-    assert tally.computed == N - n_kept
-
-
 def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
     class Cluster(Executor):
         """Begins when all chunks were submitted."""
@@ -414,7 +403,8 @@ def test_what_is_being_computed_when_one_fails_is_kept(
 
     points = Points([np.arange(12.0)], [True])
     store = Store(tmp_path, "y", columns=1)
-    with Pool(2) as pool, pytest.raises(ResponseError, match="too steep"):
+    kept = r"too steep.*; 3 responses are kept in" if error is ArithmeticError else "too steep"
+    with Pool(2) as pool, pytest.raises(ResponseError, match=kept):
         respond(CallSettings("y", prb.scalar(function), pool, store), points, Tally())
     values, known = store.find(points.keys())
     np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
