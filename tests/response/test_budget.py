@@ -16,7 +16,7 @@ from line_problem import build, line
 
 import prbayes as prb
 from prbayes.response import BudgetError
-from prbayes.response.budget import budget, limited, unlimited
+from prbayes.response.budget import budget, duration, limited, unlimited
 
 QUIET: dict[str, Any] = {"progressbar": False}
 
@@ -63,6 +63,14 @@ def test_responses_are_granted_as_long_as_there_are_some() -> None:
     # A budget holds in its own thread.
     with limited(None, 1), ThreadPoolExecutor(1) as other:
         assert other.submit(lambda: budget().grant(5, least=5)).result() == 5
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(1.25, "1.2 s"), (75.0, "75 s"), (150.0, "2.5 min"), (9000.0, "2.5 h"), (2e5, "2.3 days")],
+)
+def test_a_time_is_written_in_the_unit_in_which_it_reads_best(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
 
 
 # -- minimize --------------------------------------------------------------------------------------

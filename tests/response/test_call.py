@@ -521,6 +521,20 @@ def test_what_is_no_response_is_refused(result: Any, message: str) -> None:
     np.testing.assert_array_equal(checked([1, True, np.nan], (3,), [])[0], [1.0, 1.0, np.nan])
 
 
+def test_a_batch_has_the_time_of_all_of_its_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[float | None] = []
+
+    def time_limit(seconds: float | None) -> Any:
+        limits.append(seconds)
+        return nullcontext()
+
+    monkeypatch.setattr("prbayes.response.call.time_limit", time_limit)
+    for function in (times, prb.scalar(times)):
+        compute(function, line(3), False, 2.0)
+    compute(times, line(3), False)
+    assert limits == [6.0, 2.0, 2.0, 2.0, None]
+
+
 def test_points_that_fail_are_found_by_halving() -> None:
     seen: list[int] = []
 
