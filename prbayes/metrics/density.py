@@ -69,7 +69,7 @@ def silverman(sample: Floats, weights: Floats) -> float:
 
 def twice_silverman(sample: Floats, weights: Floats) -> float:
     """Return two Silverman bandwidths: the default of the metrics that smooth both sides alike."""
-    return float(1.8 * spread(sample, weights) * (weights**2).sum() ** 0.2)
+    return 2 * silverman(sample, weights)
 
 
 def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:

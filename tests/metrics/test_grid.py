@@ -135,7 +135,8 @@ def test_adjoint_equals_finite_differences(estimator: Any, batch: tuple[int, ...
     cells = estimator.cells(OBSERVED, EQUAL)
     x, w = draw(9, *batch, 8)
     x[..., :4] = -40.0, 50.0, INF, cells.centers[1] + 0.3 * cells.widths[0]
-    # Beyond the ends, where a kernel reaches back.
+    # Just beyond the last value that is binned, and where a kernel reaches back.
+    x[..., 1] = cells.centers[-1] + (getattr(cells, "margin", 4) - 0.5) * cells.widths[0]
     x[..., 4:6] = cells.centers[0] - 0.7 * H, cells.centers[-1] + 1.3 * H
     cotangent = np.random.default_rng(8).normal(size=(*batch, cells.widths.size))
     adjoint = partial(cells.adjoint, for_sample=True)

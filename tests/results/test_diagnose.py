@@ -144,7 +144,7 @@ def test_particles_that_stick(noise: float, is_reason: bool) -> None:
 def test_a_posterior_without_a_free_variable_is_refused() -> None:
     tree = normal_tree([0, 0])
     del tree["posterior"]["sigma"]
-    with pytest.raises(KeyError, match=r"got no \['sigma'\]"):
+    with pytest.raises(KeyError, match=r"got a result without \['sigma'\]"):
         prb.diagnose(tree, model=optimum().model)
 
 
