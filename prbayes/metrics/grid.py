@@ -181,9 +181,11 @@ class BinCells(Cells):
         rows = int(np.prod(batch, dtype=int))
         # The cells of all rows are counted at once: the bins, below, above, and NaN.
         cells = self.centers.size + 3
-        cell = self._cell(sample).reshape(rows, n) + cells * np.arange(rows)[:, None]
+        first = cells * np.arange(rows)
+        cell = self._cell(sample).reshape(rows, n) + first[:, None]
         w = np.broadcast_to(weights, sample.shape)
-        counts = np.bincount(cell.ravel(), w.ravel(), rows * cells).reshape(*batch, cells)
+        counts = np.bincount(cell.ravel(), w.ravel(), rows * cells)
+        counts = counts.reshape(*batch, cells)
         return cast(Floats, counts[..., :-1] / self.widths[0])
 
     def reading(self, points: Floats, weights: Floats) -> Floats:
@@ -210,8 +212,10 @@ class BinCells(Cells):
         if for_sample:
             batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
             return np.zeros((*batch, sample.shape[-1]))
-        padded = np.concatenate([cotangent, np.zeros_like(cotangent[..., :1])], axis=-1)
-        return np.take_along_axis(padded / self.widths[0], self._cell(sample), axis=-1)
+        of_nan = np.zeros_like(cotangent[..., :1])
+        padded = np.concatenate([cotangent, of_nan], axis=-1)
+        by_weight = padded / self.widths[0]
+        return np.take_along_axis(by_weight, self._cell(sample), axis=-1)
 
 
 def compiled(loop: Callable[..., None]) -> Callable[..., None]:

@@ -239,9 +239,12 @@ def _normalised(log_weights: Floats) -> Floats:
     """Return weights of sum one by row, equal ones where all are zero."""
     log_weights = np.where(np.isfinite(log_weights), log_weights, -np.inf)
     largest = log_weights.max(axis=1, keepdims=True)
-    weights = np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
+    largest = np.where(np.isfinite(largest), largest, 0.0)
+    weights = np.exp(log_weights - largest)
     total = weights.sum(axis=1, keepdims=True)
-    return np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1 / weights.shape[1])
+    has_weight = total > 0
+    relative = weights / np.where(has_weight, total, 1.0)
+    return np.where(has_weight, relative, 1 / weights.shape[1])
 
 
 # -- draws -----------------------------------------------------------------------------------

@@ -161,20 +161,18 @@ def test_another_constant_is_another_response() -> None:
     np.testing.assert_allclose(three, two + 1)
 
 
-def test_without_stored_points_every_specimen_is_computed() -> None:
-    response = Counted()
-    with ThreadPoolExecutor(2) as pool:
-        y = predict(response, n_samples=100, stored=False, executor=pool)
-    assert response.count == y.attrs["responses"] == 600
-    assert y.attrs["source"] == "new specimens"
-
-
 def test_a_store_keeps_the_responses(tmp_path: Path) -> None:
     response = Counted()
     for _ in range(2):
         model, x = build()
         prb.predict(POSTERIOR, response, x, model=model, store=tmp_path, name="later")
     assert response.count == 512 + 1  # one again, to find out whether it is the same response
+    # Without stored points every specimen is computed.
+    response = Counted()
+    with ThreadPoolExecutor(2) as pool:
+        y = predict(response, n_samples=100, stored=False, executor=pool)
+    assert response.count == y.attrs["responses"] == 600
+    assert y.attrs["source"] == "new specimens"
     with pytest.raises(ValueError, match="a function called <lambda>, expected a name"):
         prb.predict(POSTERIOR, lambda x: x, x, model=model, store=tmp_path)
 
