@@ -76,8 +76,6 @@ def test_results_without_a_problem(tmp_path: Path) -> None:
     with xr.open_datatree(tmp_path / "tree.nc") as loaded:
         assert prb.diagnose(loaded).ok
     assert prb.diagnose(prb.bootstrap(optimum(), draws=100), model=model).ok
-    for means, draws in (([0.0], 500), ([0.0, 0.0], 3), ([0.0] * 4, 50)):
-        assert prb.diagnose(normal_tree(means, draws), model=model).ok
 
 
 def test_chains_that_disagree() -> None:
@@ -90,17 +88,13 @@ def test_chains_that_disagree() -> None:
     assert "sigma" not in message
     assert "twice" not in message  # deterministics do not count twice
     # A shift of half a standard deviation is found with enough draws.
-    assert prb.diagnose(normal_tree([0, 0, 0, 0.1], 100), model=model).ok
     assert "chains-disagree" in codes(normal_tree([0, 0, 0, 0.5], 2000), model)
-
-
-@pytest.mark.parametrize(("every", "is_enough"), [(3, True), (6, False)])
-def test_a_quarter_of_few_draws_needs_to_be_independent(every: int, is_enough: bool) -> None:
-    tree = normal_tree([0, 0, 0, 0], 240)
-    for name in ("mu", "sigma"):
-        values = tree["posterior"][name].values
-        values[:] = np.repeat(values[:, ::every], every, axis=1)
-    assert ("few-independent-draws" in codes(tree, optimum().model)) != is_enough
+    # Few chains or draws have no findings.
+    for means, draws in (([0, 0, 0, 0.1], 100), ([0.0], 500), ([0.0, 0.0], 3), ([0.0] * 4, 50)):
+        assert prb.diagnose(normal_tree(means, draws), model=model).ok
+    del tree["posterior"]["sigma"]
+    with pytest.raises(KeyError, match=r"got a result without \['sigma'\]"):
+        prb.diagnose(tree, model=model)
 
 
 def test_r_hat_of_independent_draws_is_below_the_limit() -> None:
@@ -113,17 +107,23 @@ def test_r_hat_of_independent_draws_is_below_the_limit() -> None:
     assert (excess > _NOISE / 2).sum() >= 15
 
 
-def test_few_different_draws() -> None:
-    """One particle survived, and its copies were moved by roundings."""
-    tree = normal_tree([0.0])
+def test_few_different_or_independent_draws() -> None:
+    model, tree = optimum().model, normal_tree([0.0])
     rng = np.random.default_rng(2)
-    for name in ("mu", "sigma"):
-        tree["posterior"][name].values[:] = 5.2 * (1 + 5e-15 * rng.normal(size=(1, 500)))
-    text = str(prb.diagnose(tree, model=optimum().model))
+    draws = [tree["posterior"][name].values for name in ("mu", "sigma")]
+    for values in draws:  # one particle survived, and its copies were moved by roundings
+        values[:] = 5.2 * (1 + 5e-15 * rng.normal(size=(1, 500)))
+    text = str(prb.diagnose(tree, model=model))
     assert "Of 500 draws only 1 differ in chain 0, expected at least 50" in text
-    for name in ("mu", "sigma"):
-        tree["posterior"][name].values[:] = np.repeat(rng.normal(5.2, 1e-6, (1, 100)), 5, axis=1)
-    assert "repeated-draws" not in codes(tree, optimum().model)
+    for values in draws:
+        values[:] = np.repeat(rng.normal(5.2, 1e-6, (1, 100)), 5, axis=1)
+    assert "repeated-draws" not in codes(tree, model)
+    # A quarter of few draws needs to be independent.
+    for every, is_enough in ((3, True), (6, False)):
+        tree = normal_tree([0, 0, 0, 0], 240)
+        for values in (tree["posterior"][name].values for name in ("mu", "sigma")):
+            values[:] = np.repeat(values[:, ::every], every, axis=1)
+        assert ("few-independent-draws" in codes(tree, model)) != is_enough
 
 
 @pytest.mark.parametrize(("noise", "is_reason"), [(1.5, True), (0.5, False)])
@@ -139,13 +139,6 @@ def test_particles_that_stick(noise: float, is_reason: bool) -> None:
     assert "Particles hardly moved in the last stage of chains 0, 1 (0.0" in text
     reason = f"The discrepancy is too noisy (its Monte Carlo error is {noise} epsilon)"
     assert (reason in text) == is_reason
-
-
-def test_a_posterior_without_a_free_variable_is_refused() -> None:
-    tree = normal_tree([0, 0])
-    del tree["posterior"]["sigma"]
-    with pytest.raises(KeyError, match=r"got a result without \['sigma'\]"):
-        prb.diagnose(tree, model=optimum().model)
 
 
 @pytest.mark.long
@@ -174,14 +167,12 @@ def test_a_stored_optimum_has_the_findings_of_the_optimum() -> None:
     assert diagnosis.messages[:2] == ("It is flat.", "So so.")
     assert "did not converge (The minimiser failed. It stopped)" in diagnosis.messages[2]
     assert diagnosis.support.sizes == {"simulator": 1, "sample": 1}
-
-
-def test_an_edge_is_reported_once() -> None:
-    finding = Finding("flat-edge", "mu ran to the edge.")
+    # An edge is reported once.
+    edge_finding = Finding("flat-edge", "mu ran to the edge.")
     search = replace(optimum().search, result=Result.AT_EDGE, at_edge=("mu",))
-    edge = replace(optimum(), search=search, findings=(finding,))
+    edge = replace(optimum(), search=search, findings=(edge_finding,))
     for result in (edge, edge.to_datatree()):
-        assert prb.diagnose(result).findings == (finding,)
+        assert prb.diagnose(result).findings == (edge_finding,)
 
 
 # -- designs
@@ -209,10 +200,8 @@ def test_support_is_judged_by_simulator() -> None:
     diagnosis = prb.diagnose(idata)
     assert diagnosis.ok
     assert diagnosis.support.sizes["simulator"] == 0
-
-
-def test_no_refinement_is_advised_where_responses_are_missing() -> None:
-    idata = sampled()[1].copy(deep=True)
+    # No refinement is advised where responses are missing.
+    idata["calibration"] = calibration
     idata["calibration"]["lost_mass"].values[:] = 0.2
     (message,) = [m for m in prb.diagnose(idata).messages if "lost mass" in m]
     assert "lost mass: 20.0% of a population's weight" in message
