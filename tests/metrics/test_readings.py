@@ -6,6 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytensor
+import pytensor.tensor as pt
 import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
@@ -13,6 +15,7 @@ from scipy.stats import norm
 from prbayes.metrics.readings import Readings, averaged, log_interval_probability
 
 NAN, INF = np.nan, np.inf
+PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
 
 
 def readings(values: Any, **given: Any) -> Readings:
@@ -114,6 +117,8 @@ def test_intervals_and_their_mirror_images() -> None:
     near = np.abs(low) < 4
     exact = np.log(norm.cdf(high[near]) - norm.cdf(low[near]))
     np.testing.assert_allclose(value[near], exact, rtol=1e-8)
+    graph = log_interval_probability(pt.as_tensor(low), pt.as_tensor(high), pt)
+    np.testing.assert_allclose(graph.eval(mode=PYTHON), value, rtol=1e-9)
     narrow = log_interval_probability(low[near], low[near] + 1e-9)
     np.testing.assert_allclose(narrow, norm.logpdf(low[near]) + np.log(1e-9), rtol=1e-5)
 
