@@ -15,7 +15,7 @@ from prbayes._validate import Floats
 from prbayes.inference.checks.prior import (
     PriorEnd,
     conflict_findings,
-    elements_at_prior_ends,
+    ends_by_metric,
     prior_conflict,
 )
 from prbayes.inference.refits import SamplingDistribution
@@ -52,7 +52,7 @@ def narrow(name: str) -> Any:
 def ends(found: pm.Model, theta: Any) -> list[PriorEnd]:
     evaluator = Evaluator.of(found)
     sampling = SamplingDistribution.of(evaluator, np.array(theta), np.ones(1))
-    return elements_at_prior_ends(sampling)
+    return ends_by_metric(sampling)
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))
