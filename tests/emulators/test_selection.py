@@ -11,10 +11,10 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.selection import (
+    CANDIDATES,
     FOLDS,
     CrossValidation,
     Runs,
-    candidate_surfaces,
     cross_validated,
     has_enough_runs,
     left_out_predictions,
@@ -159,18 +159,10 @@ def test_of_too_many_runs_some_far_ones_are_kept(monkeypatch: pytest.MonkeyPatch
 def test_units_do_not_matter() -> None:
     known = runs(two)
     other = Runs(1e6 * known.x + 5, 1e-9 * known.y, known.importance, known.blocks)
-    models, predictions = select_surfaces(candidate_surfaces(*known.x.shape), known)
-    others, again = select_surfaces(candidate_surfaces(*known.x.shape), other)
+    models, predictions = select_surfaces(CANDIDATES, known)
+    others, again = select_surfaces(CANDIDATES, other)
     assert [type(m) for m in models] == [type(m) for m in others]
     np.testing.assert_allclose(again * 1e9, predictions, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize(("n", "d"), [(16, 2), (32, 8), (256, 8)])
-def test_a_polynomial_has_a_third_as_many_terms_as_there_are_runs(n: int, d: int) -> None:
-    *_, spline = candidate_surfaces(n, d)
-    assert isinstance(spline, RadialBasis)
-    assert spline.terms(d) <= n / 3 or spline.degree == 2
-    assert all(isinstance(model, GaussianProcess) for model in candidate_surfaces(257, d))
 
 
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern"])

@@ -15,8 +15,8 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import GaussianProcess
 from prbayes.emulators.selection import (
+    CANDIDATES,
     Runs,
-    candidate_surfaces,
     left_out_predictions,
     predict_outputs,
     select_surfaces,
@@ -153,7 +153,7 @@ def runs(function: Any = fine, coarse: Any = rough) -> Runs:
 
 
 def selected(known: Runs) -> tuple[Any, Floats]:
-    return select_surfaces(candidate_surfaces(*known.x.shape), known)
+    return select_surfaces(CANDIDATES, known)
 
 
 def error(known: Runs, function: Any = fine, coarse: Any = rough) -> float:
