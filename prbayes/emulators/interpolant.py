@@ -55,37 +55,21 @@ class Interpolant:
         moments = [self.weights, *(column[:, None] * self.weights for column in self.z.T)]
         # d|r|^5 / dz_a = 5 |r|^3 r_a
         of_cubes = 5 * np.concatenate(moments, axis=1).T
+        derivative = legder(np.eye(int(self.powers.max()) + 1))  # columns of Legendre series
         for rows, square, cube in self._distances(z):
             np.sqrt(square, out=cube)
             cube *= square
-            terms = _terms(_legendre(self._scaled(z[rows]), self.powers), self.powers)
-            stacked = self._polynomial_with_slopes @ terms
-            polynomial, *slopes = stacked.reshape(d + 1, m, -1)
+            single = _legendre(self._scaled(z[rows]), self.powers)
+            polynomial = self.coefficients.T @ _terms(single, self.powers)
             steepness, *by_axis = (of_cubes @ cube).reshape(d + 1, m, -1)
             square *= cube
             values[rows] = (polynomial - self.weights.T @ square).T
             for a in range(d):
-                jacobian[rows, :, a] = (by_axis[a] - z[rows, a] * steepness + slopes[a]).T
+                factors = single.copy()
+                factors[:, a] = derivative.T @ single[:-1, a]
+                slope = self.coefficients.T @ _terms(factors, self.powers) / self.half_width[a]
+                jacobian[rows, :, a] = (by_axis[a] - z[rows, a] * steepness + slope).T
         return values, jacobian
-
-    @cached_property
-    def _polynomial_with_slopes(self) -> Floats:
-        """Coefficients of the polynomial and of its d partial derivatives, ((1 + d) m, terms)."""
-        degree = int(self.powers.max())
-        base = (degree + 1) ** np.arange(self.powers.shape[1] - 1, -1, -1)
-        codes = self.powers @ base  # increasing
-        rows = [self.coefficients.T]
-        for a, half_width in enumerate(self.half_width):
-            slope = np.zeros_like(self.coefficients)
-            # P'_p = (2 p - 1) P_{p-1} + (2 p - 5) P_{p-3} + ...
-            for reduction in range(1, degree + 1, 2):
-                lower = self.powers[:, a] - reduction
-                exists = np.flatnonzero(lower >= 0)
-                places = np.searchsorted(codes, codes[exists] - reduction * base[a])
-                factors = 2 * lower[exists, None] + 1
-                slope[places] += factors * self.coefficients[exists]
-            rows.append(slope.T / half_width)
-        return np.concatenate(rows)
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m), without the Jacobian."""
