@@ -72,8 +72,8 @@ def groups(nodes: Sequence[Node]) -> list[list[int]]:
         return []
     numbers, total = specimens(nodes)
     measures = np.array([np.isin(np.arange(total), number) for number in numbers])
-    n_groups, group = connected_components(measures @ measures.T)
-    return [np.flatnonzero(group == g).tolist() for g in range(n_groups)]
+    _, group = connected_components(measures @ measures.T)
+    return [np.flatnonzero(group == g).tolist() for g in np.unique(group)]
 
 
 def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:

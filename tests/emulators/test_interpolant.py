@@ -84,19 +84,6 @@ def test_left_out_errors_are_those_of_refits(d: int, monkeypatch: pytest.MonkeyP
         np.testing.assert_allclose(surface.left_out[i], error, rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize("d", [1, 2])
-def test_nearly_equal_runs_leave_the_surface_smooth(d: int) -> None:
-    z = design(RUNS[d], d)
-    close = np.concatenate([z, z[:8] + 1e-7])
-    elsewhere = np.random.default_rng(1).uniform(-0.9, 0.9, (50, d))
-    surface, reference = (fit_interpolant(x, smooth(x)) for x in (close, z))
-    error, usual = (
-        np.abs(fit.values(elsewhere) - smooth(elsewhere)).max() for fit in (surface, reference)
-    )
-    assert error < 5 * usual + 1e-6
-    assert np.abs(surface(close[:8])[1]).max() < 20
-
-
 def test_contradicting_close_runs_are_smoothed() -> None:
     """The last digits of a response must not become steep slopes."""
     z = design(40, 2)

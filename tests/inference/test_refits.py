@@ -211,8 +211,14 @@ def test_errors_of_designs_of_two_inputs(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(design_errors, "_minimum", lambda *_: np.array([next(ends)]))
     assert design_errors._error_of_emulators(sampling) == pytest.approx(np.sqrt(3) * 0.1)
     # Eight parts, two inputs: 1/2 + 1/4 as the power of the size.
-    ends = iter(8.0 * np.array([-1, 1, -1, 1, -1, 1, -1, 1]) * np.sqrt(7 / 8))
+    spread = 8.0 * np.array([-1, 1, -1, 1, -1, 1, -1, 1]) * np.sqrt(7 / 8)
+    ends = iter(spread)
     np.testing.assert_allclose(design_errors._error_of_points(sampling), 8 / 8**0.75)
+    # Runs alone count as independent; half of the blocks have to have a minimum.
+    for lost, expected in ((0, 8 / 8**0.5), (5, np.inf)):
+        ends = iter(np.where(np.arange(8) < lost, np.inf, spread))
+        error = design_errors._error_of_points(of_two_outputs())
+        np.testing.assert_allclose(error, expected)
 
 
 # -- a metric prepared for each data set -----------------------------------------------------------
@@ -225,16 +231,13 @@ def of_two_outputs(metric: prb.Metric = KL) -> SamplingDistribution:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         z = pm.Normal.dist(0, pm.HalfNormal("tau", 1))
-        prb.Simulator(
-            *("y", lambda x, z: np.stack([x, x + z], axis=-1), x, z),
-            metric=prb.Joint(metric),
-            observed=np.column_stack([a, a + b]),
-            propagation=prb.Reweighted(1024, emulator=None),
-        )
+        data = {"observed": np.column_stack([a, a + b]), "metric": prb.Joint(metric)}
+        data["propagation"] = prb.Reweighted(1024, emulator=None)
+        prb.Simulator("y", lambda x, z: np.stack([x, x + z], axis=-1), x, z, **data)
     return sampling_at(model, 1.0, np.log(0.5), np.log(0.3))
 
 
-@pytest.mark.parametrize("name", ["kl", "area"])
+@pytest.mark.parametrize("name", ["kl", slow("area")])
 def test_a_prepared_metric_is_that_of_the_other_data(name: str) -> None:
     sampling = of_two_outputs(METRICS[name])
     sets = simulated_sets(sampling.evaluator, sampling.theta, 8, seed=5)
@@ -285,12 +288,10 @@ def two(name: str) -> tuple[Evaluator, DataSets]:
     with pm.Model() as model:
         mu = pm.Normal("mu", 0, 2)
         for k, factor in enumerate((1.0, 3.0)):
-            prb.Simulator(
-                *(f"y{k}", lambda x, factor=factor: factor * x, pm.Normal.dist(mu, 0.5)),
-                metric=METRICS[name],
-                observed=factor * OBSERVED[:30],
-                propagation=prb.Reweighted(128),
-            )
+            data = {"observed": factor * OBSERVED[:30], "propagation": prb.Reweighted(128)}
+            x = pm.Normal.dist(mu, 0.5)
+            response = lambda x, factor=factor: factor * x  # noqa: E731
+            prb.Simulator(f"y{k}", response, x, metric=METRICS[name], **data)
     evaluator = Evaluator.of(model)
     return evaluator, reweighted_sets(evaluator, 3)
 
