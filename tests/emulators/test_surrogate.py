@@ -175,9 +175,9 @@ def test_reweighted_refuses_an_answer_that_rests_on_points_outside() -> None:
 
 def test_resimulated_stops_at_the_range_if_it_aborts() -> None:
     strict = prb.Surrogate.fit(growth, {"x": (-1.5, 1.0)}, 24, outside=Abort())
-    evaluator = Evaluator.of(model_of(lambda x: strict, propagation=prb.Resimulated(64)))
+    model = model_of(lambda x: strict, propagation=prb.Resimulated(64))
     with pytest.raises(ResponseError, match="outside its design: x from"):
-        evaluator(np.array([[1.0, 0.0]]))
+        Evaluator.of(model)(np.array([[1.0, 0.0]]))
 
 
 # -- a coarse response -----------------------------------------------------------------------------
@@ -324,14 +324,14 @@ def test_a_design_where_populations_are_predicts_many_inputs_better() -> None:
         inputs = [*(pm.Normal.dist(m[i], 0.5) for i in range(5)), (0.0, 1.0)]
         process = prb.surrogate.GaussianProcess()
         there, evenly = (
-            prb.Surrogate.fit(many, inputs, 64, points=points, model=process)
+            prb.Surrogate.fit(many, inputs, 96, points=points, model=process)
             for points in ("predictive", "even")
         )
     assert there.ranges == evenly.ranges
     # Each by its own distribution, the last one evenly; inside the ranges, which is no warning.
     np.testing.assert_allclose(there.points.std(axis=0)[:5], np.sqrt(1.25), rtol=0.1)
     np.testing.assert_allclose(np.quantile(there.points[:, 5], [0.1, 0.9]), [0.1, 0.9], atol=0.02)
-    x = [*(1.0 + 0.5 * np.random.default_rng(0).standard_normal((5, 300))), 0.5]
+    x = [*(1.0 + 0.5 * np.random.default_rng(0).standard_normal((5, 1000))), 0.5]
     assert spread(there, x) < 0.6 * spread(evenly, x)
 
 

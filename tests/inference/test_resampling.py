@@ -275,10 +275,10 @@ def test_one_data_set_as_it_would_be_measured(weights: Any) -> None:
         np.testing.assert_allclose(own["y"].sum(), 1)
         np.testing.assert_allclose(data["y"] @ own["y"], sets.weights[0][2] @ sets.values[0])
         other = evaluator.observing(data, weights=own)
-        np.testing.assert_array_equal(other.nodes[0].target.weights, own["y"])
+        np.testing.assert_allclose(other.nodes[0].target.weights, own["y"])
     # Bootstrap weights belong to the observed specimens.
     np.testing.assert_array_equal(data["y"], OBSERVED)
-    np.testing.assert_array_equal(own["y"], bootstrap.weights[0][2])
+    np.testing.assert_allclose(own["y"], bootstrap.weights[0][2])
     if weights is None:
         # Specimens of equal weights have a row each, although some points are drawn twice.
         data, own = one_set(evaluator, simulated, 2)
