@@ -166,9 +166,8 @@ class Runs:
         return np.asarray(self.blocks == np.unique(self.blocks)[:, None])
 
 
-# Processes with a length for each input. Either is the better one for some responses, and their
-# errors are those of libraries' processes (`python -m benchmarks.emulators`). Splines around a
-# polynomial are better only where processes err by less than 1e-4 standard deviations.
+# Processes with a length for each input. Either is the better one for some responses. Splines
+# around a polynomial are better only where processes err by less than 1e-4 standard deviations.
 CANDIDATES = (GaussianProcess("squared_exponential"), GaussianProcess("matern"))
 
 
