@@ -34,7 +34,7 @@ from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.maximum_likelihood import simulation_obstacle, specimen_refits
-from prbayes.optimize.optimum import Optimum
+from prbayes.optimize.optimum import Optimum, require_minimiser
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs, aleatory_names
@@ -84,6 +84,8 @@ _CACHE: WeakKeyDictionary[Optimum, Checked] = WeakKeyDictionary()
 def check_optimum(optimum: Optimum) -> Checked:
     """Return the reports of the emulator and the test of the population about an optimum."""
     if optimum not in _CACHE:
+        if not _population_obstacle(optimum):
+            require_minimiser(optimum, "diagnose")
         emulators = Checked(remarks=emulator_remarks(optimum.evaluator))
         _CACHE[optimum] = emulators + _check_population(optimum)
     return _CACHE[optimum]
