@@ -139,18 +139,6 @@ def test_a_linear_problem_has_no_other_optimum(name: str) -> None:
     assert optimum.local_optima == optimum.findings == ()
 
 
-def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
-    optimum = fit("pr")
-    evaluator = Evaluator.of(optimum.model)
-    local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
-    best = Reference(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
-    assert optima_from_prior(best, 16, 0)
-    assert optima_from_prior(replace(best, noise=1e3), 16, 0) == []
-    # Nor is there one where a search that is held cannot go.
-    ridge = Ridge(optimum.theta, np.eye(2), 1e3)
-    assert optima_from_prior(replace(best, ridge=ridge), 16, 0) == []
-
-
 # -- the posterior of two modes ----------------------------------------------------------------------
 
 
@@ -272,9 +260,13 @@ class Landscape:
         return np.random.default_rng(seed).normal(size=(n, 2))
 
 
-def reference(formula: Any, theta: Any, covariance: Any, noise: float) -> Reference:
+def reference(
+    formula: Any, theta: Any, covariance: Any, noise: float, prior_sd: Any = (2.0, 0.5)
+) -> Reference:
+    """Return a reference whose parameters may have other units than the formula."""
     evaluator: Any = Landscape(formula)
-    local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.asarray(covariance))
+    standardised = np.asarray(covariance) / np.outer(prior_sd, prior_sd)
+    local = Local(np.array(prior_sd), np.eye(2), np.zeros((2, 0)), standardised)
     return Reference(evaluator, np.array(theta), np.ones(1), local, noise)
 
 
@@ -308,6 +300,20 @@ def test_what_a_barrier_separates_is_judged_by_the_noise(
     assert replace(best, noise=0.99).separated(ends, values, lowest) == []
 
 
+def test_the_other_hollow_is_found_from_points_of_the_prior() -> None:
+    best = reference(two_hollows, [1.0, 1.0], 0.01 * np.eye(2), 0.1)
+    (other,) = optima_from_prior(best, 16, 0)
+    np.testing.assert_allclose(other.theta, [-1.0025, 1.0], atol=0.01)
+    assert other.value == pytest.approx(two_hollows(*other.theta))
+    # A candidate is a start as well; alone, its point of the prior ends at the reference.
+    for candidates in ([], [np.array([-0.5, 0.5])]):
+        assert len(optima_from_prior(best, 1, 0, candidates)) == len(candidates)
+    # Neither a barrier below the noise nor a penalty that pulls to the reference separates them.
+    assert optima_from_prior(replace(best, noise=1.5), 16, 0) == []
+    ridge = Ridge(best.theta, np.eye(2), 1e3)
+    assert optima_from_prior(replace(best, ridge=ridge), 16, 0) == []
+
+
 def valley(x: Floats, y: Floats) -> Floats:
     """A bent valley with one minimum, at (1, 1)."""
     return np.asarray((1 - x) ** 2 + 100 * (y - x**2) ** 2)
@@ -318,7 +324,7 @@ def test_where_a_descent_was_stopped_in_a_valley_is_no_optimum(
     iterations: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     covariance = 0.01 * np.linalg.inv([[802.0, -400.0], [-400.0, 200.0]])
-    best = reference(valley, [1.0, 1.0], covariance, noise=0.01)
+    best = reference(valley, [1.0, 1.0], covariance, 0.01, (1.0, 1.0))
     short = partial(descend, max_iterations=iterations)
     monkeypatch.setattr("prbayes.optimize.local_optima.descend", short)
     assert optima_from_prior(best, 16, 0) == []

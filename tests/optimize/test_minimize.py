@@ -233,30 +233,6 @@ def test_given_epsilons_weigh_the_simulators() -> None:
     np.testing.assert_allclose(optimum.stderr["mu"], noise**0.5 / precision.sum(), rtol=0.02)
 
 
-@pytest.mark.slow
-def test_vector_hyperparameters_of_a_multivariate_input() -> None:
-    covariance = np.array([[1.0, 0.5], [0.5, 1.0]])
-    data = np.random.default_rng(4).multivariate_normal([1.0, 2.0], covariance, 30)
-    with pm.Model(coords={"axis": ["a", "b"]}) as model:
-        mean = pm.MvNormal("mean", [0.0, 0.0], 4 * np.eye(2), dims="axis")
-        x = pm.MvNormal.dist(mean, covariance)
-        for i, name in enumerate(("first", "second")):
-            given = {"metric": METRICS["kl"], "propagation": prb.Reweighted(64)}
-            prb.Simulator(name, lambda x, i=i: x[..., i], x, observed=data[:, i], **given)
-        pm.Deterministic("gap", mean[1] - mean[0])
-    optimum = prb.minimize(model)
-    assert optimum.evaluator.hyperparameters.names == ["mean[a]", "mean[b]"]
-    assert optimum.point["mean"].shape == optimum.stderr["mean"].shape == (2,)
-    # A quadratic in each mean; correlation does not matter to marginal conditions.
-    off = np.abs(optimum.point["mean"] - data.mean(axis=0))
-    assert (off < 0.25 * optimum.stderr["mean"]).all()
-    np.testing.assert_allclose(optimum.stderr["mean"], 1 / 30**0.5, rtol=0.1)
-    np.testing.assert_allclose(optimum.point["gap"], np.diff(optimum.point["mean"])[0], rtol=1e-12)
-    tree = optimum.to_datatree()
-    assert tree["optimum"]["mean"].dims == ("axis",)
-    assert list(tree["optimum"]["axis"].values) == ["a", "b"]
-
-
 # -- supports --------------------------------------------------------------------------------------
 
 
@@ -518,21 +494,6 @@ def test_standard_errors_against_refitting_200_data_sets_with_minimize(name: str
     fits = [pair(prb.minimize(normal_model(name, observed=y), **options)) for y in data]
     # Both sides have a relative standard error of 5% for the area metric, one side for the residual.
     np.testing.assert_allclose(errors(optimum), np.std(fits, axis=0, ddof=1), rtol=4 * 0.07)
-
-
-@pytest.mark.long
-def test_a_users_own_metric_is_minimised_and_has_standard_errors() -> None:
-    def moments(z: Any, observed: Any, w: Any) -> Any:
-        first = (z * w).sum(axis=-1) - observed.mean()
-        return first**2 + ((z**2 * w).sum(axis=-1) - (observed**2).mean()) ** 2
-
-    # The minimiser is exact on its design, whose moments are not quite those of the population.
-    for n, tolerance in ((256, 0.03), (1024, 3e-4)):
-        model = normal_model(prb.FunctionMetric(moments, weighted=True), prb.Reweighted(n))
-        optimum = prb.minimize(model, method="Nelder-Mead")
-        # Those of the mean and of the standard deviation of 50 normal values.
-        np.testing.assert_allclose(errors(optimum), [SD / 50**0.5, SD / 100**0.5], rtol=0.25)
-        assert (np.abs(pair(optimum) - [MEAN, SD]) < tolerance * errors(optimum)).all()
 
 
 # -- what it costs ---------------------------------------------------------------------------------
