@@ -228,9 +228,8 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
     names = set(evaluator.reweighted)
     is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if not is_emulated or errors.emulators > _SHARE * AGREE:
-        # The error of a design of several inputs falls with about the power .65 of its size
-        # (benchmarks/dimensions.py). At most twice as many runs at a time: the estimate of the
-        # error is itself uncertain.
+        # The error of a design of several inputs is taken to fall with the power .65 of its size.
+        # At most twice as many runs at a time: the estimate of the error is itself uncertain.
         factor = float(min(2.0, (errors.whole / AGREE) ** (1 / 0.65)))
         if _add_runs(evaluator, thetas, names, factor):
             return True
