@@ -21,18 +21,16 @@ from numpy.typing import NDArray
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
 from prbayes.inference.checks.population import failing_region_findings
-from prbayes.inference.checks.prior import PriorEnd, end_of_range, prior_end_findings
+from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
     Evaluator,
     only_through_prior,
     specimen_graphs,
     specimen_log_likelihoods,
-    specimen_params,
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_likelihood import arrays, draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.points import farthest_rows
@@ -344,47 +342,14 @@ def share_mode(
     return True
 
 
-def _prior_ends(evaluator: Evaluator, optimum: Mode, objective: _Objective) -> list[PriorEnd]:
-    """Return the hyperparameters that the data push to a finite end of their prior.
-
-    At the median of the prior the log-likelihood is lower by more than three nats.
-    """
-    from scipy.optimize import minimize as scipy_minimize
-
-    hyperparameters = evaluator.hyperparameters
-    theta, unit = optimum.theta, hyperparameters.prior_sd
-    flat = np.flatnonzero(np.isinf(np.diag(optimum.covariance))).tolist()
-    prior = hyperparameters.prior_thetas(THETAS, 0) if flat else np.empty(0)
-    ends = []
-    for i in flat:
-        below = float((prior[:, i] <= theta[i]).mean())
-        if 0.05 <= below <= 0.95:
-            continue
-        value, bound = end_of_range(evaluator, theta, i, is_upper=below > 0.5)
-        if not np.isfinite(bound):
-            continue
-        start = theta.copy()
-        start[i] = np.median(prior[:, i])
-
-        def along(u: Floats, start: Floats = start, i: int = i) -> float:
-            return objective(start + np.insert(u, i, 0.0) * unit)[0]
-
-        origin = np.zeros(theta.size - 1)
-        lowest = along(origin)
-        if theta.size > 1 and np.isfinite(lowest):
-            options = {"maxfev": 100 * theta.size, "xatol": 1e-2, "fatol": 1e-2}
-            lowest = scipy_minimize(along, origin, method="Nelder-Mead", options=options).fun
-        if lowest > optimum.value + 3.0:
-            ends.append(PriorEnd(hyperparameters.readable_names[i], value, bound))
-    return ends
-
-
 def _findings(
     evaluator: Evaluator, objective: _Objective, modes: list[Mode], weights: Floats
 ) -> list[Finding]:
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
-    ends = _prior_ends(evaluator, best, objective)
+    is_flat = np.isinf(np.diag(best.covariance))
+    # Three nats: a likelihood ratio of twenty.
+    ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
     findings = list(failing_region_findings(evaluator, best.theta))
     findings += prior_end_findings(ends)
     if np.isnan(best.covariance).any():
@@ -457,22 +422,22 @@ type SpecimenData = tuple[list[Floats], Floats]
 
 def specimen_pool(
     likelihood: SpecimenLikelihood,
-    params: Mapping[Any, Floats],
+    values: Mapping[str, Floats],
     rng: np.random.Generator,
     size: int = 2000,
 ) -> Callable[[np.random.Generator], SpecimenData]:
     """Simulate at least ``size`` specimens of one population, with their points.
 
-    ``params`` has the values of the variables without the group, (1, *shape). Return a function
+    ``values`` are those of the model's variables by name, (1, *shape). Return a function
     that draws a data set: for each observed specimen one with its group and missing outputs.
     """
     n = len(likelihood.readings)
     copies = max(1, -(-size // n))
-    values = draw_readings(likelihood, rng, params, copies * n)[0].reshape(copies * n, -1)
-    observed, shape = likelihood.readings, values.shape
+    drawn = draw_readings(likelihood, rng, values, copies * n)[0].reshape(copies * n, -1)
+    observed, shape = likelihood.readings, drawn.shape
     missing = np.full(shape, np.nan)
     readings = Readings(
-        np.where(np.resize(observed.is_measured, shape), values, np.nan),
+        np.where(np.resize(observed.is_measured, shape), drawn, np.nan),
         np.resize(observed.error, shape),
         np.resize(observed.step, shape),
         missing,
@@ -484,9 +449,7 @@ def specimen_pool(
     options = replace(options, half_difference=options.half_difference * np.sqrt(copies))
     emulation = prepared(likelihood).emulation
     roots = specimen_roots(emulation, readings, options)
-    points = draw_points(
-        emulation.values, emulation.error, readings, roots, emulation.box, options, seed=1
-    )
+    points = draw_points(emulation, readings, roots, options, seed=1)
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
     inputs = likelihood.coordinates.inputs(points.z)
 
@@ -583,10 +546,8 @@ class SpecimenRefits:
         """Yield estimates of simulated data sets, whether they converged, and the data."""
         evaluator = self.evaluator
         rng = np.random.default_rng([seed, 21])
-        pools = [
-            specimen_pool(likelihood, specimen_params(evaluator, self.theta[None], k), rng)
-            for k, likelihood in enumerate(evaluator.likelihoods)
-        ]
+        values = evaluator.hyperparameters.constrained(self.theta[None])
+        pools = [specimen_pool(likelihood, values, rng) for likelihood in evaluator.likelihoods]
         rng = np.random.default_rng([seed, 22])
         for _ in range(draws):
             data = [pool(rng) for pool in pools]
