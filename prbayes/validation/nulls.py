@@ -365,7 +365,8 @@ class JointNull(Null):
         points = simulated_points(
             evaluator, populations, self.replicates, self.random_seed, more=n_new
         )
-        x, converged = refit(sampling, sets_at(evaluator, populations, points))
+        data = sets_at(evaluator, [values[0] for values, _ in populations], points)
+        x, converged = refit(sampling, data)
         # With fewer the replicates would be those of unusual data sets.
         if converged.mean() < 0.5:
             raise ValueError(
