@@ -34,7 +34,7 @@ from prbayes.model.specimen_likelihood import (
     specimen_likelihoods,
 )
 from prbayes.model.specimen_preparation import prepared
-from prbayes.propagation.base import Bound
+from prbayes.propagation.base import Bound, responding_weights
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
@@ -282,8 +282,12 @@ class Evaluator:
         return [np.broadcast_to(value, (len(thetas), *np.shape(value)[1:])) for value in values]
 
     def populations(self, thetas: Floats, k: int) -> tuple[Floats, Floats]:
-        """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`."""
-        return self.simulators[k].populations(self.parents(thetas, k))
+        """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`.
+
+        As metrics compare them: points without response have no weight.
+        """
+        values, weights = self.simulators[k].populations(self.parents(thetas, k))
+        return values, responding_weights(values, weights)
 
     def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""

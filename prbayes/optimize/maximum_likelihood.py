@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
-from prbayes.inference.checks.population import failing_region_findings
+from prbayes.inference.checks.population import failing_region_findings, refuse_lost_specimens
 from prbayes.inference.checks.prior import PriorEnd, end_of_range, prior_end_findings
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
@@ -393,6 +393,7 @@ def _findings(
 ) -> list[Finding]:
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
+    refuse_lost_specimens(evaluator, best.theta)
     ends = _prior_ends(evaluator, best, objective)
     findings = list(failing_region_findings(evaluator, best.theta))
     findings += prior_end_findings(ends)
