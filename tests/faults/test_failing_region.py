@@ -22,9 +22,7 @@ STORED = prb.Reweighted(256)
 COMMON = prb.Resimulated(256)
 
 
-def model(
-    limit: float, metric: Any, propagation: Any = STORED, failed: float = np.nan
-) -> pm.Model:
+def model(limit: float, metric: Any, propagation: Any = STORED, failed: float = np.nan) -> pm.Model:
     """Return a normal population whose response fails below a limit."""
 
     def response(x: Floats) -> Floats:
@@ -169,7 +167,7 @@ def test_observed_values_beside_finite_responses_are_accepted(
     x, y, complete_values = region(12.0, d=2)
     observed = np.r_[np.random.default_rng(1).normal(9, 1, 40)]
     check_failing_region("y", observed, [x[:, :1], x[:, 1:]], y, 0.05)
-    # Values outside the responses are not those of a failing region without a failing run nearby.
+    # Values outside the responses are not in a failing region without failing runs nearby.
     check_failing_region("y", np.array([-20.0, 9.0]), [x[:, :1], x[:, 1:]], y, 0.05)
     check_failing_region("y", np.array([99.0]), [x], complete_values, 0.05)
     check_failing_region("y", np.array([99.0]), [x[:20]], y[:20], 0.05)
