@@ -88,12 +88,12 @@ def check_failing_region(
     is_apart = np.zeros(columns.shape, dtype=bool)
     for j, column in enumerate(columns.T):
         order = np.argsort(values[is_finite, j], kind="stable")
-        known, beside = values[is_finite, j][order], is_beside[order]
-        right = np.clip(np.searchsorted(known, column), 1, known.size - 1)
-        nearest = right - (column - known[right - 1] < known[right] - column)
-        first = np.clip(nearest - 4, 0, known.size - 9)
-        steps = np.diff(known)[first[:, None] + np.arange(8)]
-        distance = np.abs(column - known[nearest])
+        outputs, beside = values[is_finite, j][order], is_beside[order]
+        right = np.clip(np.searchsorted(outputs, column), 1, outputs.size - 1)
+        nearest = right - (column - outputs[right - 1] < outputs[right] - column)
+        first = np.clip(nearest - 4, 0, outputs.size - 9)
+        steps = np.diff(outputs)[first[:, None] + np.arange(8)]
+        distance = np.abs(column - outputs[nearest])
         with np.errstate(invalid="ignore"):  # an output that failed, or was not measured
             is_apart[:, j] = beside[nearest] & (distance > apart * np.median(steps, axis=1))
         is_apart[:, j] &= np.isfinite(column)

@@ -79,9 +79,9 @@ def responding_weights(values: Floats, weights: Floats) -> Floats:
         is_lost = is_lost.any(axis=-1)
     if not is_lost.any():
         return weights
-    kept = np.where(is_lost, 0.0, weights)
-    total = kept.sum(axis=-1, keepdims=True)
-    return np.divide(kept, total, out=kept, where=total > 0)
+    responding = np.where(is_lost, 0.0, weights)
+    total = responding.sum(axis=-1, keepdims=True)
+    return np.divide(responding, total, out=responding, where=total > 0)
 
 
 class Bound(ABC):

@@ -115,14 +115,14 @@ def test_populations_that_lose_specimens_are_refused(
     metric: Any, propagation: Any, limit: float
 ) -> None:
     """Without responses below the limit, 5 and 18 of 40 specimens could not be measured."""
-    with pytest.raises(DesignError, match="no run has a finite|lost mass: .* of "):
+    with pytest.raises(DesignError, match=r"no run has a finite|lost mass: .* of "):
         prb.minimize(model(limit, metric, propagation))
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("route", [prb.minimize, prb.sample, prb.sample_smc])
 def test_the_likelihood_refuses_populations_without_response(route: Any) -> None:
-    with pytest.raises(DesignError, match="lost mass: got .* without a response"):
+    with pytest.raises(DesignError, match=r"lost mass: got .* without a response"):
         route(model=model(8.0, prb.LogLikelihood()))
 
 

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize as scipy_minimize
 from scipy.special import ndtr, ndtri
 
 from prbayes._finding import Finding
@@ -203,7 +203,7 @@ def lost_mass_shift(evaluator: Evaluator, theta: Floats, scales: Floats, stderr:
 
     simplex = np.vstack([np.zeros(theta.size), np.eye(theta.size)])
     options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-9, "maxfev": 200 * theta.size}
-    minimum = minimize(counted, np.zeros(theta.size), method="Nelder-Mead", options=options)
+    minimum = scipy_minimize(counted, np.zeros(theta.size), method="Nelder-Mead", options=options)
     return np.asarray(minimum.x)
 
 
