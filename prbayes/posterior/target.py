@@ -33,10 +33,8 @@ from prbayes.inference.resampling import (
     groups,
     observable,
     observed_set,
-    points_along,
-    sets_at,
+    sets_along,
     specimens,
-    stored_populations,
 )
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
@@ -389,8 +387,7 @@ def _draw(
         )
     x, thetas = x[is_supported], thetas[is_supported]
     rng = np.random.default_rng([options.seed, seed])
-    points = points_along(evaluator, thetas, rng)
-    data = sets_at(evaluator, stored_populations(evaluator, thetas), points)
+    data, points = sets_along(evaluator, thetas, rng)
     starts = x if len(centers) == 1 else _best_starts(centers, data, options)
     estimates, converged = refit(sampling, data, starts, is_rough=True)
     if converged.mean() < options.converged:
