@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +46,7 @@ from prbayes.optimize.optimum import Optimum, optima_of
 from prbayes.posterior.importance import LogDensity, importance_sample, laplace
 from prbayes.posterior.saddlepoint import (
     Cumulants,
+    EstimateLikelihood,
     SaddlepointOptions,
     Scores,
     cumulants,
@@ -86,7 +86,13 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     """Return the posterior given the metrics' own estimate, by scores or refits, or raise."""
     require_density(evaluator)
     is_mean = score_obstacle(evaluator) is None
-    likelihood = (estimate_likelihood if is_mean else refit_likelihood)(evaluator, optimum)
+    likelihood_of = estimate_likelihood if is_mean else refit_likelihood
+    return _target_of(likelihood_of(evaluator, optimum))
+
+
+def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
+    """Return the posterior of a likelihood given the estimate, with the model's other terms."""
+    evaluator = likelihood.evaluator
 
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
@@ -297,7 +303,7 @@ def refit_likelihood(
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
     # Identified directions are known from all stored responses; an eighth is enough for the rest.
     theta = continuation.within(thetas[:1])[0]
-    evaluator = coarser_evaluator(evaluator, theta) or evaluator
+    evaluator = coarser_evaluator(evaluator, theta)
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0])
@@ -350,14 +356,9 @@ def _points_of_ball(number: int, r: int, options: RefitLikelihoodOptions, shift:
 
 def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
     """Return coordinates of draws from the posterior, spread out around each optimum, (n, r)."""
-    options, evaluator = likelihood.options, likelihood.evaluator
-
-    def log_likelihood(thetas: Floats) -> Floats:
-        return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
-
-    density = partial(log_posterior, evaluator.hyperparameters, log_likelihood=log_likelihood)
-    modes = laplace(density, likelihood.starts, likelihood.scale)
-    sample = importance_sample(density, modes, number, options.seed)
+    options, target = likelihood.options, _target_of(likelihood)
+    modes = laplace(target.log_posterior, target.starts, target.scale)
+    sample = importance_sample(target.log_posterior, modes, number, options.seed)
     thetas = likelihood.continuation.coordinates(sample.draws)
     x = likelihood.centers[0].coordinates(thetas)
     center_of, _ = nearest(likelihood.centers, thetas)
