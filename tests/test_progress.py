@@ -22,7 +22,6 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=120)
     monkeypatch.setattr(prbayes._progress, "CONSOLE", console)
-    monkeypatch.setattr("prbayes.posterior.smc.CONSOLE", console)
     monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.01)
     return text
 
@@ -97,8 +96,8 @@ def test_a_sampler_without_a_terminal_says_where_it_is(
     assert log.getvalue() == ""
     prb.sample_smc(50, **quiet)
     said = [line for line in log.getvalue().splitlines() if line.startswith("SMC")]
-    assert said[-1] == "SMC chain 2 of 2: beta 1 of 1"
-    assert said[0].startswith("SMC chain 1 of 2: beta 0.")
+    assert said[-1] == f"SMC stages {len(said)} chain 2 of 2: beta 1 of 1"
+    assert said[0].startswith("SMC stages 1 chain 1 of 2: beta 0.")
 
 
 @pytest.mark.parametrize("where", ["hidden", "page"])
@@ -191,7 +190,7 @@ def test_everything_inside_the_sampler_follows_its_keyword(
     monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.0)
     settings = {"model": build(prb.Resimulated(16)), "adjustment": None, "random_seed": 1}
     prb.sample_smc(60, chains=1, progressbar=visible, **settings)
-    assert ("SMC chain 0" in screen.getvalue()) == visible
+    assert ("SMC stages" in screen.getvalue()) == visible
     assert ("evaluations" in screen.getvalue()) == visible
     if not visible:
         assert screen.getvalue() == ""

@@ -14,11 +14,10 @@ from typing import Any, Literal
 import numpy as np
 import pymc as pm
 import xarray as xr
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
 from prbayes._finding import Finding, as_json, report
-from prbayes._progress import CONSOLE, lines, live, shown
+from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import (
@@ -540,20 +539,8 @@ def run_chains(
     saved = [] if checkpoint is None else _saved_states(checkpoint, len(refinements))
     states: list[State] = []  # of the kernels of finished chains
     stopped = ""
-    columns = (
-        TextColumn("SMC chain {task.fields[chain]}"),
-        BarColumn(),
-        TextColumn("beta {task.completed:.4f}"),
-        TextColumn("acceptance {task.fields[rate]:.2f}"),
-        TimeElapsedColumn(),
-    )
-    with (
-        shown(settings.progressbar) as visible,
-        Progress(*columns, console=CONSOLE, disable=not (visible and live())) as progress,
-    ):
-        write = lines()
+    with shown(settings.progressbar), progress("SMC stages") as advance:
         for chain, seed in enumerate(seeds):
-            task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
             kernel = BatchedKernel(
                 settings.draws,
                 None if starts is None else starts[chain],
@@ -565,6 +552,7 @@ def run_chains(
             (stream,) = seed.generate_state(1)
             for node in evaluator.nodes:
                 node.bound.stream, node.bound.draws = int(stream), 0
+            place = f"chain {chain + 1} of {len(seeds)}"
             try:
                 if chain < len(saved):
                     kernel.restore(*saved[chain])
@@ -573,10 +561,9 @@ def run_chains(
                 for _ in kernel.tempered(settings.max_stages):
                     if checkpoint is not None:
                         _save(checkpoint, [*states, kernel.state()], refinements)
-                    progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
-                    write(f"SMC chain {chain + 1} of {len(seeds)}: beta {kernel.beta:.3g} of 1")
+                    advance(1, f"{place}: beta {kernel.beta:.3g} of 1")
             except BudgetError as spent:
-                stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
+                stopped = f"{spent} in {place}"
                 break
             states.append(kernel.state())
     if not states:
