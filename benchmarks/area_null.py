@@ -29,27 +29,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import poisson
 
-SIZES = (
-    *range(1, 21),
-    22,
-    25,
-    28,
-    32,
-    36,
-    40,
-    45,
-    50,
-    60,
-    70,
-    85,
-    100,
-    125,
-    150,
-    200,
-    300,
-    500,
-    1000,
-)
+SIZES = (*range(1, 21), 22, 25, 28, 32, 36, 40, 45, 50, 60, 70, 85, 100, 125, 150, 200, 300, 500,
+         1000)  # fmt: skip
 LEVELS = (0.9999, 0.999, 0.99, 0.975, 0.95, 0.925, *np.round(np.arange(0.9, 0.1, -0.05), 2), 0.1, 0.08, 0.065, 0.05,
           0.04, 0.03, 0.025, 0.02, 0.015, 0.01, 7e-3, 5e-3, 3e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 1e-5, 1e-6)  # fmt: skip
 OUT = Path(__file__).parents[1] / "prbayes" / "validation" / "area_null.csv"

@@ -12,16 +12,13 @@ and SciPy draw from the same distribution at the true h. A propagation works wit
 and is refused if the model cannot be built, or the optimum not be found, and the error says what was
 expected. All else is wrong, or a crash. docs/distributions.md shows the table.
 
-    uv run python -m benchmarks.distributions [--only Gamma] [--out distributions.json]
+    uv run python -m benchmarks.distributions [--cells "Gamma*"]
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -30,11 +27,10 @@ import pytensor.tensor as pt
 from scipy import special, stats
 
 import prbayes as prb
-from benchmarks import record
+from benchmarks.study import Study
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import discrepancy_error
 
-RESULTS = Path(__file__).parent / "results" / "distributions.json"
 PROPAGATIONS = {
     "Reweighted": prb.Reweighted(256),
     "Resimulated": prb.Resimulated(512),
@@ -54,6 +50,7 @@ StickBreakingWeights SymbolicRandomVariable Wishart WishartBartlett ZeroSumNorma
 """
 OTHERS = frozenset(_OTHERS.split())
 
+Dist = Callable[[Any], Any]
 Draw = Callable[[float, np.random.Generator, int], Any]
 
 
@@ -61,7 +58,7 @@ Draw = Callable[[float, np.random.Generator, int], Any]
 class Case:
     """A distribution with a hyperparameter h, and the same one by NumPy or SciPy."""
 
-    dist: Callable[[Any], Any]
+    dist: Dist
     draw: Draw
     truth: float
     of: Literal["scale", "place", "share"] = "scale"  # what h is: positive, real, or below one
@@ -135,6 +132,19 @@ def _ordered(h: float, rng: np.random.Generator, n: int, noise: Callable[..., An
     return np.searchsorted([-1.0, 0.0, 1.5], h + noise(size=n))
 
 
+def _numpy(method: str, *arguments: Any) -> Draw:
+    """Return draws of NumPy, with h in the place of ``...``."""
+
+    def draw(h: float, rng: np.random.Generator, n: int) -> Any:
+        given = [h if each is ... else each for each in arguments]
+        return getattr(rng, method)(*given, size=n)
+
+    return draw
+
+
+_NORMAL = _numpy("normal", ..., 1.0)
+
+
 def _scipy(family: Any, *shape: Any, **keywords: Any) -> Draw:
     """Return draws of SciPy, with h in the place of ``...``."""
 
@@ -146,365 +156,278 @@ def _scipy(family: Any, *shape: Any, **keywords: Any) -> Draw:
     return draw
 
 
+def scale(dist: Dist, draw: Draw, truth: float, *, bounded: bool = False) -> Case:
+    """Return a case with a positive hyperparameter."""
+    return Case(dist, draw, truth, "scale", bounded)
+
+
+def place(dist: Dist, draw: Draw, truth: float = 1.0, *, bounded: bool = False) -> Case:
+    """Return a case with a real hyperparameter."""
+    return Case(dist, draw, truth, "place", bounded)
+
+
+def share(dist: Dist, draw: Draw, truth: float = 0.3) -> Case:
+    """Return a case with a hyperparameter below one."""
+    return Case(dist, draw, truth, "share")
+
+
 CASES = {
-    "AsymmetricLaplace": Case(
+    "AsymmetricLaplace": scale(
         lambda h: pm.AsymmetricLaplace.dist(b=h, kappa=1.5, mu=1.0),
         lambda h, rng, n: stats.laplace_asymmetric.rvs(1.5, 1.0, 1 / h, size=n, random_state=rng),
         2.0,
     ),
-    "Bernoulli": Case(
-        lambda h: pm.Bernoulli.dist(p=h), lambda h, rng, n: rng.random(n) < h, 0.3, "share"
-    ),
-    "Beta": Case(lambda h: pm.Beta.dist(h, 3.0), _scipy(stats.beta, ..., 3.0), 2.0),
-    "Beta, infinite at an edge": Case(
+    "Bernoulli": share(lambda h: pm.Bernoulli.dist(p=h), lambda h, rng, n: rng.random(n) < h),
+    "Beta": scale(lambda h: pm.Beta.dist(h, 3.0), _scipy(stats.beta, ..., 3.0), 2.0),
+    "Beta, infinite at an edge": scale(
         lambda h: pm.Beta.dist(h, 0.5), _scipy(stats.beta, ..., 0.5), 0.6
     ),
-    "BetaBinomial": Case(
+    "BetaBinomial": scale(
         lambda h: pm.BetaBinomial.dist(h, 3.0, 12), _scipy(stats.betabinom, 12, ..., 3.0), 2.0
     ),
-    "Binomial": Case(
-        lambda h: pm.Binomial.dist(12, h), lambda h, rng, n: rng.binomial(12, h, n), 0.3, "share"
-    ),
-    "Categorical": Case(
+    "Binomial": share(lambda h: pm.Binomial.dist(12, h), _numpy("binomial", 12, ...)),
+    "Categorical": share(
         lambda h: pm.Categorical.dist(p=pt.stack([h, 0.5 * (1 - h), 0.5 * (1 - h)])),
         lambda h, rng, n: rng.choice(3, n, p=[h, (1 - h) / 2, (1 - h) / 2]),
-        0.3,
-        "share",
     ),
-    "Cauchy": Case(
-        lambda h: pm.Cauchy.dist(h, 1.0),
-        lambda h, rng, n: h + rng.standard_cauchy(n),
-        1.0,
-        "place",
-        bounded=True,
+    "Cauchy": place(
+        lambda h: pm.Cauchy.dist(h, 1.0), lambda h, rng, n: h + rng.standard_cauchy(n), bounded=True
     ),
-    "Censored": Case(
+    "Censored": place(
         lambda h: pm.Censored.dist(pm.Normal.dist(h, 1.0), -1.0, 2.0),
         lambda h, rng, n: np.clip(rng.normal(h, 1.0, n), -1.0, 2.0),
-        1.0,
-        "place",
     ),
-    "Censored, moving bound": Case(
+    "Censored, moving bound": place(
         lambda h: pm.Censored.dist(pm.Normal.dist(0.0, 1.0), None, h),
         lambda h, rng, n: np.minimum(rng.normal(0.0, 1.0, n), h),
         0.5,
-        "place",
     ),
-    "Censored, discrete": Case(
+    "Censored, discrete": scale(
         lambda h: pm.Censored.dist(pm.Poisson.dist(h), None, 4),
         lambda h, rng, n: np.minimum(rng.poisson(h, n), 4),
         3.0,
     ),
-    "ChiSquared": Case(lambda h: pm.ChiSquared.dist(h), _scipy(stats.chi2, ...), 3.0),
-    "CustomDist": Case(
-        lambda h: pm.CustomDist.dist(h, logp=_normal_logp, random=_normal_draws),
-        lambda h, rng, n: rng.normal(h, 1.0, n),
-        1.0,
-        "place",
+    "ChiSquared": scale(lambda h: pm.ChiSquared.dist(h), _scipy(stats.chi2, ...), 3.0),
+    "CustomDist": place(
+        lambda h: pm.CustomDist.dist(h, logp=_normal_logp, random=_normal_draws), _NORMAL
     ),
-    "CustomDist, by draws alone": Case(
-        lambda h: pm.CustomDist.dist(h, random=_normal_draws),
-        lambda h, rng, n: rng.normal(h, 1.0, n),
-        1.0,
-        "place",
+    "CustomDist, by draws alone": place(
+        lambda h: pm.CustomDist.dist(h, random=_normal_draws), _NORMAL
     ),
-    "CustomDist, of others": Case(
+    "CustomDist, of others": place(
         lambda h: pm.CustomDist.dist(h, dist=_shifted_gamma),
         lambda h, rng, n: h + rng.gamma(2.0, 1.0, n),
-        1.0,
-        "place",
     ),
-    "CustomDist, without draws": Case(
-        lambda h: pm.CustomDist.dist(h, logp=_normal_logp),
-        lambda h, rng, n: rng.normal(h, 1.0, n),
-        1.0,
-        "place",
+    "CustomDist, without draws": place(lambda h: pm.CustomDist.dist(h, logp=_normal_logp), _NORMAL),
+    "DensityDist": place(
+        lambda h: pm.DensityDist.dist(h, logp=_normal_logp, random=_normal_draws), _NORMAL
     ),
-    "DensityDist": Case(
-        lambda h: pm.DensityDist.dist(h, logp=_normal_logp, random=_normal_draws),
-        lambda h, rng, n: rng.normal(h, 1.0, n),
-        1.0,
-        "place",
-    ),
-    "DiracDelta": Case(
-        lambda h: pm.DiracDelta.dist(h), lambda h, rng, n: np.full(n, h), 1.0, "place"
-    ),
-    "DiscreteUniform": Case(
+    "DiracDelta": place(lambda h: pm.DiracDelta.dist(h), lambda h, rng, n: np.full(n, h)),
+    "DiscreteUniform": scale(
         lambda h: pm.DiscreteUniform.dist(0, pt.cast(pt.round(h), "int64")),
         lambda h, rng, n: rng.integers(0, np.round(h), n, endpoint=True),
         6.0,
     ),
-    "DiscreteWeibull": Case(
+    "DiscreteWeibull": share(
         lambda h: pm.DiscreteWeibull.dist(h, 1.2),
         lambda h, rng, n: np.ceil((np.log(rng.random(n)) / np.log(h)) ** (1 / 1.2)) - 1,
         0.7,
-        "share",
     ),
-    "ExGaussian": Case(
+    "ExGaussian": place(
         lambda h: pm.ExGaussian.dist(mu=h, sigma=0.5, nu=1.0),
         lambda h, rng, n: rng.normal(h, 0.5, n) + rng.exponential(1.0, n),
-        1.0,
-        "place",
     ),
-    "Exponential": Case(
+    "Exponential": scale(
         lambda h: pm.Exponential.dist(h), lambda h, rng, n: rng.exponential(1 / h, n), 2.0
     ),
-    "Flat": Case(
-        lambda h: (pm.Normal.dist(h, 1.0), pm.Flat.dist()),
-        lambda h, rng, n: np.arange(n),
-        1.0,
-        "place",
+    "Flat": place(
+        lambda h: (pm.Normal.dist(h, 1.0), pm.Flat.dist()), lambda h, rng, n: np.arange(n)
     ),
-    "Gamma": Case(lambda h: pm.Gamma.dist(h, 1.5), lambda h, rng, n: rng.gamma(h, 1 / 1.5, n), 2.0),
-    "Gamma, infinite at an edge": Case(
-        lambda h: pm.Gamma.dist(h, 1.5), lambda h, rng, n: rng.gamma(h, 1 / 1.5, n), 0.4
+    "Gamma": scale(lambda h: pm.Gamma.dist(h, 1.5), _numpy("gamma", ..., 1 / 1.5), 2.0),
+    "Gamma, infinite at an edge": scale(
+        lambda h: pm.Gamma.dist(h, 1.5), _numpy("gamma", ..., 1 / 1.5), 0.4
     ),
-    "Geometric": Case(
-        lambda h: pm.Geometric.dist(h), lambda h, rng, n: rng.geometric(h, n), 0.3, "share"
-    ),
-    "Gumbel": Case(
-        lambda h: pm.Gumbel.dist(h, 1.0), lambda h, rng, n: rng.gumbel(h, 1.0, n), 1.0, "place"
-    ),
-    "HalfCauchy": Case(
+    "Geometric": share(lambda h: pm.Geometric.dist(h), _numpy("geometric", ...)),
+    "Gumbel": place(lambda h: pm.Gumbel.dist(h, 1.0), _numpy("gumbel", ..., 1.0)),
+    "HalfCauchy": scale(
         lambda h: pm.HalfCauchy.dist(h),
         lambda h, rng, n: h * abs(rng.standard_cauchy(n)),
         1.5,
         bounded=True,
     ),
-    "HalfFlat": Case(
-        lambda h: (pm.Normal.dist(h, 1.0), pm.HalfFlat.dist()),
-        lambda h, rng, n: np.arange(n),
-        1.0,
-        "place",
+    "HalfFlat": place(
+        lambda h: (pm.Normal.dist(h, 1.0), pm.HalfFlat.dist()), lambda h, rng, n: np.arange(n)
     ),
-    "HalfNormal": Case(
+    "HalfNormal": scale(
         lambda h: pm.HalfNormal.dist(h), lambda h, rng, n: abs(rng.normal(0.0, h, n)), 1.5
     ),
-    "HalfStudentT": Case(
+    "HalfStudentT": scale(
         lambda h: pm.HalfStudentT.dist(5.0, h),
         lambda h, rng, n: h * abs(rng.standard_t(5.0, n)),
         1.5,
     ),
-    "HurdleGamma": Case(
-        lambda h: pm.HurdleGamma.dist(0.7, h, 1.5),
-        _hurdle(0.7, lambda h, rng, n: rng.gamma(h, 1 / 1.5, n)),
-        2.0,
+    "HurdleGamma": scale(
+        lambda h: pm.HurdleGamma.dist(0.7, h, 1.5), _hurdle(0.7, _numpy("gamma", ..., 1 / 1.5)), 2.0
     ),
-    "HurdleLogNormal": Case(
+    "HurdleLogNormal": place(
         lambda h: pm.HurdleLogNormal.dist(0.7, h, 0.5),
-        _hurdle(0.7, lambda h, rng, n: rng.lognormal(h, 0.5, n)),
+        _hurdle(0.7, _numpy("lognormal", ..., 0.5)),
         0.5,
-        "place",
     ),
-    "HurdleNegativeBinomial": Case(
+    "HurdleNegativeBinomial": scale(
         lambda h: pm.HurdleNegativeBinomial.dist(0.7, h, 3.0),
         _hurdle(
             0.7, _within(lambda h, rng, n: rng.negative_binomial(3.0, 3 / (3 + h), n), 1, np.inf)
         ),
         4.0,
     ),
-    "HurdlePoisson": Case(
+    "HurdlePoisson": scale(
         lambda h: pm.HurdlePoisson.dist(0.7, h),
-        _hurdle(0.7, _within(lambda h, rng, n: rng.poisson(h, n), 1, np.inf)),
+        _hurdle(0.7, _within(_numpy("poisson", ...), 1, np.inf)),
         4.0,
     ),
-    "HyperGeometric": Case(
+    "HyperGeometric": scale(
         lambda h: pm.HyperGeometric.dist(N=30, k=pt.cast(pt.round(h), "int64"), n=10),
         lambda h, rng, n: rng.hypergeometric(int(np.round(h)), 30 - int(np.round(h)), 10, n),
         12.0,
     ),
     # Its points are constants: beside another input.
-    "Interpolated": Case(
+    "Interpolated": place(
         lambda h: (
             pm.Normal.dist(h, 1.0),
             pm.Interpolated.dist(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0])),
         ),
         lambda h, rng, n: rng.normal(h, 1.0, n) + rng.triangular(0.0, 1.0, 2.0, n),
-        1.0,
-        "place",
     ),
-    "InverseGamma": Case(
+    "InverseGamma": scale(
         lambda h: pm.InverseGamma.dist(4.0, h), lambda h, rng, n: h / rng.gamma(4.0, 1.0, n), 2.0
     ),
-    "Kumaraswamy": Case(
+    "Kumaraswamy": scale(
         lambda h: pm.Kumaraswamy.dist(h, 3.0),
         lambda h, rng, n: (1 - rng.random(n) ** (1 / 3)) ** (1 / h),
         2.0,
     ),
-    "Laplace": Case(
-        lambda h: pm.Laplace.dist(h, 1.0), lambda h, rng, n: rng.laplace(h, 1.0, n), 1.0, "place"
-    ),
-    "LogNormal": Case(
-        lambda h: pm.LogNormal.dist(h, 0.5),
-        lambda h, rng, n: rng.lognormal(h, 0.5, n),
-        0.5,
-        "place",
-    ),
-    "Lognormal": Case(
-        lambda h: pm.Lognormal.dist(0.2, h), lambda h, rng, n: rng.lognormal(0.2, h, n), 0.5
-    ),
-    "Logistic": Case(
-        lambda h: pm.Logistic.dist(h, 1.0), lambda h, rng, n: rng.logistic(h, 1.0, n), 1.0, "place"
-    ),
-    "LogitNormal": Case(
+    "Laplace": place(lambda h: pm.Laplace.dist(h, 1.0), _numpy("laplace", ..., 1.0)),
+    "LogNormal": place(lambda h: pm.LogNormal.dist(h, 0.5), _numpy("lognormal", ..., 0.5), 0.5),
+    "Lognormal": scale(lambda h: pm.Lognormal.dist(0.2, h), _numpy("lognormal", 0.2, ...), 0.5),
+    "Logistic": place(lambda h: pm.Logistic.dist(h, 1.0), _numpy("logistic", ..., 1.0)),
+    "LogitNormal": place(
         lambda h: pm.LogitNormal.dist(h, 1.0),
         lambda h, rng, n: special.expit(rng.normal(h, 1.0, n)),
-        1.0,
-        "place",
     ),
-    "Mixture": Case(
+    "Mixture": place(
         lambda h: pm.Mixture.dist([0.3, 0.7], [pm.Normal.dist(h, 1.0), pm.Gamma.dist(2.0, 1.0)]),
         lambda h, rng, n: np.where(rng.random(n) < 0.3, rng.normal(h, 1.0, n), rng.gamma(2, 1, n)),
-        1.0,
-        "place",
     ),
-    "Mixture, of a share": Case(
+    "Mixture, of a share": share(
         lambda h: pm.Mixture.dist(
             pt.stack([h, 1 - h]), [pm.Normal.dist(-1.0, 1.0), pm.Normal.dist(3.0, 1.0)]
         ),
         lambda h, rng, n: np.where(rng.random(n) < h, -1.0, 3.0) + rng.normal(size=n),
-        0.3,
-        "share",
     ),
-    "Mixture, of a moving point": Case(
+    "Mixture, of a moving point": place(
         lambda h: pm.Mixture.dist([0.3, 0.7], [pm.DiracDelta.dist(h), pm.Normal.dist(0.0, 1.0)]),
         lambda h, rng, n: np.where(rng.random(n) < 0.3, h, rng.normal(size=n)),
-        1.0,
-        "place",
     ),
-    "Mixture, discrete": Case(
+    "Mixture, discrete": scale(
         lambda h: pm.Mixture.dist([0.3, 0.7], [pm.Poisson.dist(h), pm.Poisson.dist(9.0)]),
         lambda h, rng, n: rng.poisson(np.where(rng.random(n) < 0.3, h, 9.0)),
         2.0,
     ),
-    "Moyal": Case(lambda h: pm.Moyal.dist(h, 1.0), _scipy(stats.moyal, ..., 1.0), 1.0, "place"),
-    "NegativeBinomial": Case(
+    "Moyal": place(lambda h: pm.Moyal.dist(h, 1.0), _scipy(stats.moyal, ..., 1.0)),
+    "NegativeBinomial": scale(
         lambda h: pm.NegativeBinomial.dist(h, 3.0),
         lambda h, rng, n: rng.negative_binomial(3.0, 3 / (3 + h), n),
         4.0,
     ),
-    "Normal": Case(
-        lambda h: pm.Normal.dist(h, 1.0), lambda h, rng, n: rng.normal(h, 1.0, n), 1.0, "place"
-    ),
-    "NormalMixture": Case(
+    "Normal": place(lambda h: pm.Normal.dist(h, 1.0), _NORMAL),
+    "NormalMixture": place(
         lambda h: pm.NormalMixture.dist([0.3, 0.7], pt.stack([h, 4.0]), 1.0),
         lambda h, rng, n: np.where(rng.random(n) < 0.3, h, 4.0) + rng.normal(size=n),
-        1.0,
-        "place",
     ),
-    "OrderedLogistic": Case(
+    "OrderedLogistic": place(
         lambda h: pm.OrderedLogistic.dist(eta=h, cutpoints=[-1.0, 0.0, 1.5], compute_p=False),
         lambda h, rng, n: _ordered(h, rng, n, rng.logistic),
         0.5,
-        "place",
     ),
-    "OrderedProbit": Case(
+    "OrderedProbit": place(
         lambda h: pm.OrderedProbit.dist(
             eta=h, cutpoints=[-1.0, 0.0, 1.5], sigma=1.0, compute_p=False
         ),
         lambda h, rng, n: _ordered(h, rng, n, rng.normal),
         0.5,
-        "place",
     ),
-    "Pareto": Case(lambda h: pm.Pareto.dist(h, 1.0), lambda h, rng, n: rng.pareto(h, n) + 1, 4.0),
-    "Pareto, moving threshold": Case(
+    "Pareto": scale(lambda h: pm.Pareto.dist(h, 1.0), lambda h, rng, n: rng.pareto(h, n) + 1, 4.0),
+    "Pareto, moving threshold": scale(
         lambda h: pm.Pareto.dist(4.0, h), lambda h, rng, n: h * (rng.pareto(4.0, n) + 1), 2.0
     ),
-    "Poisson": Case(lambda h: pm.Poisson.dist(h), lambda h, rng, n: rng.poisson(h, n), 3.0),
-    "PolyaGamma": Case(lambda h: pm.PolyaGamma.dist(h, 1.0), _polya_gamma, 2.0),
-    "Rice": Case(lambda h: pm.Rice.dist(nu=h, sigma=1.0), _scipy(stats.rice, ..., 0.0, 1.0), 2.0),
-    "Simulator": Case(
-        lambda h: pm.Simulator.dist(_normal_simulator, h, ndim_supp=0, ndims_params=[0]),
-        lambda h, rng, n: rng.normal(h, 1.0, n),
-        1.0,
-        "place",
+    "Poisson": scale(lambda h: pm.Poisson.dist(h), _numpy("poisson", ...), 3.0),
+    "PolyaGamma": scale(lambda h: pm.PolyaGamma.dist(h, 1.0), _polya_gamma, 2.0),
+    "Rice": scale(lambda h: pm.Rice.dist(nu=h, sigma=1.0), _scipy(stats.rice, ..., 0.0, 1.0), 2.0),
+    "Simulator": place(
+        lambda h: pm.Simulator.dist(_normal_simulator, h, ndim_supp=0, ndims_params=[0]), _NORMAL
     ),
-    "SkewNormal": Case(
+    "SkewNormal": place(
         lambda h: pm.SkewNormal.dist(mu=h, sigma=1.0, alpha=3.0),
         _scipy(stats.skewnorm, 3.0, ..., 1.0),
-        1.0,
-        "place",
     ),
-    "SkewStudentT": Case(
+    "SkewStudentT": place(
         lambda h: pm.SkewStudentT.dist(a=4.0, b=6.0, mu=h, sigma=1.0),
         _scipy(stats.jf_skew_t, 4.0, 6.0, ..., 1.0),
-        1.0,
-        "place",
     ),
-    "StudentT": Case(
+    "StudentT": place(
         lambda h: pm.StudentT.dist(5.0, mu=h, sigma=1.0),
         lambda h, rng, n: h + rng.standard_t(5.0, n),
-        1.0,
-        "place",
     ),
-    "Triangular": Case(
+    "Triangular": share(
         lambda h: pm.Triangular.dist(lower=0.0, upper=3.0, c=3 * h),
         lambda h, rng, n: rng.triangular(0.0, 3 * h, 3.0, n),
-        0.3,
-        "share",
     ),
-    "Truncated": Case(
-        lambda h: pm.Truncated.dist(pm.Normal.dist(h, 1.0), 0.0, 2.5),
-        _within(lambda h, rng, n: rng.normal(h, 1.0, n), 0.0, 2.5),
-        1.0,
-        "place",
+    "Truncated": place(
+        lambda h: pm.Truncated.dist(pm.Normal.dist(h, 1.0), 0.0, 2.5), _within(_NORMAL, 0.0, 2.5)
     ),
-    "Truncated, discrete": Case(
+    "Truncated, discrete": scale(
         lambda h: pm.Truncated.dist(pm.Poisson.dist(h), 1, 8),
-        _within(lambda h, rng, n: rng.poisson(h, n), 1, 8),
+        _within(_numpy("poisson", ...), 1, 8),
         3.0,
     ),
-    "Truncated, moving bound": Case(
+    "Truncated, moving bound": scale(
         lambda h: pm.Truncated.dist(pm.Gamma.dist(2.0, 1.0), h, None),
         lambda h, rng, n: _within(lambda _, r, m: r.gamma(2.0, 1.0, m), h, np.inf)(h, rng, n),
         1.0,
     ),
-    "Truncated, without distribution function": Case(
+    "Truncated, without distribution function": place(
         lambda h: pm.Truncated.dist(pm.SkewNormal.dist(mu=h, sigma=1.0, alpha=3.0), 0.0, 2.5),
         _within(_scipy(stats.skewnorm, 3.0, ..., 1.0), 0.0, 2.5),
-        1.0,
-        "place",
     ),
-    "TruncatedNormal": Case(
-        lambda h: pm.TruncatedNormal.dist(h, 1.0, lower=0.0),
-        _within(lambda h, rng, n: rng.normal(h, 1.0, n), 0.0, np.inf),
-        1.0,
-        "place",
+    "TruncatedNormal": place(
+        lambda h: pm.TruncatedNormal.dist(h, 1.0, lower=0.0), _within(_NORMAL, 0.0, np.inf)
     ),
-    "TruncatedNormal, moving bound": Case(
+    "TruncatedNormal, moving bound": place(
         lambda h: pm.TruncatedNormal.dist(1.0, 1.0, lower=h),
         lambda h, rng, n: _within(lambda _, r, m: r.normal(1.0, 1.0, m), h, np.inf)(h, rng, n),
         0.5,
-        "place",
     ),
-    "Uniform": Case(
-        lambda h: pm.Uniform.dist(0.0, h), lambda h, rng, n: rng.uniform(0.0, h, n), 2.0
-    ),
-    "VonMises": Case(
-        lambda h: pm.VonMises.dist(h, 4.0), lambda h, rng, n: rng.vonmises(h, 4.0, n), 0.5, "place"
-    ),
-    "Wald": Case(lambda h: pm.Wald.dist(h, 3.0), lambda h, rng, n: rng.wald(h, 3.0, n), 2.0),
-    "Weibull": Case(
+    "Uniform": scale(lambda h: pm.Uniform.dist(0.0, h), _numpy("uniform", 0.0, ...), 2.0),
+    "VonMises": place(lambda h: pm.VonMises.dist(h, 4.0), _numpy("vonmises", ..., 4.0), 0.5),
+    "Wald": scale(lambda h: pm.Wald.dist(h, 3.0), _numpy("wald", ..., 3.0), 2.0),
+    "Weibull": scale(
         lambda h: pm.Weibull.dist(h, 2.0), lambda h, rng, n: 2 * rng.weibull(h, n), 2.0
     ),
-    "Weibull, infinite at an edge": Case(
+    "Weibull, infinite at an edge": scale(
         lambda h: pm.Weibull.dist(h, 2.0), lambda h, rng, n: 2 * rng.weibull(h, n), 0.6
     ),
-    "ZeroInflatedBinomial": Case(
+    "ZeroInflatedBinomial": share(
         lambda h: pm.ZeroInflatedBinomial.dist(0.7, 12, h),
-        _hurdle(0.7, lambda h, rng, n: rng.binomial(12, h, n)),
-        0.3,
-        "share",
+        _hurdle(0.7, _numpy("binomial", 12, ...)),
     ),
-    "ZeroInflatedNegativeBinomial": Case(
+    "ZeroInflatedNegativeBinomial": scale(
         lambda h: pm.ZeroInflatedNegativeBinomial.dist(0.7, h, 3.0),
         _hurdle(0.7, lambda h, rng, n: rng.negative_binomial(3.0, 3 / (3 + h), n)),
         4.0,
     ),
-    "ZeroInflatedPoisson": Case(
-        lambda h: pm.ZeroInflatedPoisson.dist(0.7, h),
-        _hurdle(0.7, lambda h, rng, n: rng.poisson(h, n)),
-        4.0,
+    "ZeroInflatedPoisson": scale(
+        lambda h: pm.ZeroInflatedPoisson.dist(0.7, h), _hurdle(0.7, _numpy("poisson", ...)), 4.0
     ),
 }
 
@@ -589,31 +512,12 @@ def _optimum(case: Case, model: pm.Model) -> dict[str, float]:
     return {"optimum": off / float(optimum.stderr["h"]), "converged": float(optimum.converged)}
 
 
-def table(only: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the verdicts on each distribution, by propagation."""
-    for name, case in CASES.items():
-        if only is None or only in name:
-            yield name, {kind: trial(case, each) for kind, each in PROPAGATIONS.items()}
+def row(name: str, number: int) -> dict[str, Any]:
+    """Return the verdicts on a distribution, by propagation."""
+    return {kind: trial(CASES[name], each) for kind, each in PROPAGATIONS.items()}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--only")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    found = {}
-    for name, row in table(arguments.only):
-        found[name] = row
-        print(f"{name:42s}", *(f"{each['verdict']:9s}" for each in row.values()), flush=True)
-        for kind, each in row.items():
-            if each["verdict"] in ("wrong", "crash"):
-                print("   ", kind, each)
-    if arguments.only is None:
-        record.save(arguments.out, found)
-
+STUDY = Study("distributions", __doc__, CASES, row, 1)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

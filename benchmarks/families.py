@@ -1,48 +1,46 @@
-"""Normal or lognormal: how often the right family is told from cross-validated scores, and whether their error is right.
+"""Normal or lognormal: how often cross-validated scores identify the right family, and whether their error is right.
 
 The input's truth is normal or lognormal, with mean 1 and a coefficient of variation; N responses
-are calibrated as both families with a metric, and `prb.rank` says which
-predicts better. Counted are the data sets in which it names the right family, says that it cannot
-tell, and names the wrong one. z is the difference between right and wrong family, less its mean
-over all data sets, in units of the standard error that is stated: its standard deviation is one
-where that is honest.
+are calibrated as both families with a metric, and `prb.rank` says which predicts better. Counted are
+the data sets in which it names the right family, no significant difference, and the wrong one. z is
+the difference between right and wrong family, less its mean over all data sets, in units of the
+stated standard error: its standard deviation is one if that error is right.
 
-One design serves all data sets of a case, and the minimisations of the folds start at the long-run
-optimum, so that a data set takes a tenth of a second. Cases that the file has are not computed again.
+One design serves all data sets of a case, and the minimisations of the folds start at the optimum of
+many data, so that a data set takes a tenth of a second.
 
-    OMP_NUM_THREADS=1 uv run python -m benchmarks.families [--replicates 50] [--processes 2]
+    OMP_NUM_THREADS=1 uv run python -m benchmarks.families [--data-sets 50]
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import cache
 from itertools import product
-from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pymc as pm
 
 import prbayes as prb
-from benchmarks import record
-from benchmarks.metrics import BY_NAME
+from benchmarks.metrics import METRICS
+from benchmarks.study import Study
 
 FAMILIES = ("normal", "lognormal")
-VARIATIONS = (0.1, 0.3, 0.6)
 SIZES = (20, 50, 200)
-METRICS = ("KullbackLeibler", "ProbabilityResidual", "LogLikelihood")
 LINEAR, NONLINEAR = "1 + 2 x", "exp(x)"
 RESPONSES: dict[str, Callable[[Any], Any]] = {LINEAR: lambda x: 1 + 2 * x, NONLINEAR: np.exp}
-# Divergence everywhere; the other metrics, and the other response, in the middle.
-CASES = [(LINEAR, METRICS[0], truth, cv) for cv, truth in product(VARIATIONS, FAMILIES)]
-CASES += [(LINEAR, metric, truth, 0.3) for metric, truth in product(METRICS[1:], FAMILIES)]
-CASES += [(NONLINEAR, METRICS[0], truth, 0.3) for truth in FAMILIES]
-LONG_RUN = 2000  # data that stand for all, from whose optimum minimisations start
+# The divergence everywhere; the other metrics, and the other response, in the middle.
+CASES = [(LINEAR, "KLD", truth, cv) for cv, truth in product((0.1, 0.3, 0.6), FAMILIES)]
+CASES += [(LINEAR, m, truth, 0.3) for m, truth in product(("PR", "log-likelihood"), FAMILIES)]
+CASES += [(NONLINEAR, "KLD", truth, 0.3) for truth in FAMILIES]
+MANY = 2000  # data from whose optimum minimisations start
+
+
+def name_of(response: str, metric: str, truth: str, cv: float, n: int) -> str:
+    """Return the name of a cell."""
+    return f"{response}/{metric}/{truth}/{cv}/{n}"
 
 
 def drawn(truth: str, variation: float, n: int, rng: np.random.Generator) -> Any:
@@ -63,83 +61,54 @@ def calibrated(family: str, response: str, metric: str, data: Any) -> prb.Optimu
             variance = pm.math.log1p((sd / mean) ** 2)
             x = pm.LogNormal.dist(pm.math.log(mean) - variance / 2, pm.math.sqrt(variance))
         prb.Simulator(
-            "y", RESPONSES[response], x, metric=BY_NAME[metric], observed=data,
-            propagation=prb.Reweighted(512), progressbar=False,
+            "y", RESPONSES[response], x, metric=METRICS[metric], observed=data,
+            propagation=prb.Reweighted(512),
         )  # fmt: skip
-        return prb.minimize(progressbar=False)
+        return prb.minimize()
 
 
-def case(chosen: tuple[str, str, str, float], replicates: int) -> list[dict[str, Any]]:
-    """Return the rows of one case, one for each number of data."""
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    response, metric, truth, variation = chosen
-    compute = RESPONSES[response]
-    long_run = compute(drawn(truth, variation, LONG_RUN, np.random.default_rng(1)))
-    optima = {family: calibrated(family, response, metric, long_run) for family in FAMILIES}
-    rows = []
-    for n in SIZES:
-        found = []
-        for i in range(replicates):
-            data = compute(drawn(truth, variation, n, np.random.default_rng([11, n, i])))
-            found.append(compared(optima, data, truth))
-        rows.append(summary(found) | dict(zip(KEYS, (*chosen, n), strict=True)))
-    return rows
+@cache
+def optima(response: str, metric: str, truth: str, variation: float) -> dict[str, prb.Optimum]:
+    """Return the optimum of each family from many data."""
+    data = RESPONSES[response](drawn(truth, variation, MANY, np.random.default_rng(1)))
+    return {family: calibrated(family, response, metric, data) for family in FAMILIES}
 
 
-KEYS = ("response", "metric", "truth", "cv", "n")
-
-
-def compared(optima: dict[str, prb.Optimum], data: Any, truth: str) -> tuple[float, float, bool]:
-    """Return by how much the right family is ahead, the standard error, and whether it is told."""
-    anew = {
+def row(cell: str, number: int) -> tuple[float, float, bool]:
+    """Return by how much the right family is ahead, the standard error, and its significance."""
+    response, metric, truth, variation, n = cell.split("/")
+    rng = np.random.default_rng([11, int(n), number])
+    data = RESPONSES[response](drawn(truth, float(variation), int(n), rng))
+    calibrated_again = {
         family: replace(
-            one,
-            evaluator=one.evaluator.observing({"y": data}),
-            search=replace(one.search, identity=None),
+            optimum,
+            evaluator=optimum.evaluator.observing({"y": data}),
+            search=replace(optimum.search, identity=None),
         )
-        for family, one in optima.items()
+        for family, optimum in optima(response, metric, truth, float(variation)).items()
     }
-    table = prb.rank(anew, progressbar=False)
+    table = prb.rank(calibrated_again, progressbar=False)
     sign = 1.0 if table.candidate.values[0] == truth else -1.0
     other = table.isel(candidate=1)
     return sign * float(other["difference"]), float(other["stderr"]), bool(other["significant"])
 
 
-def summary(found: list[tuple[float, float, bool]]) -> dict[str, Any]:
-    """Return what all data sets of a cell say together."""
-    difference, error, told = (np.array(column) for column in zip(*found, strict=True))
+def summary(rows: list[Any]) -> dict[str, Any]:
+    """Return shares of identified families, and the standard deviation of z."""
+    difference, error, significant = (np.array(column) for column in zip(*rows, strict=True))
     z = (difference - difference.mean()) / error
     return {
-        "right": float((told & (difference > 0)).mean()),
-        "wrong": float((told & (difference < 0)).mean()),
+        "right": float((significant & (difference > 0)).mean()),
+        "wrong": float((significant & (difference < 0)).mean()),
         "difference": float(difference.mean()),
         "stderr": float(error.mean()),
-        "z_sd": float(z.std(ddof=1)),
-        "replicates": len(found),
+        "z_sd": float(z.std(ddof=1)) if len(rows) > 1 else 0.0,
+        "data sets": len(rows),
     }
 
 
-def main() -> None:
-    """Calibrate and compare; print a table and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--replicates", type=int, default=50)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=record.RESULTS / "families.json")
-    arguments = parser.parse_args()
-    rows: list[dict[str, Any]] = record.load(arguments.out, {"rows": []})["rows"]
-    done = {tuple(row[key] for key in KEYS[:4]) for row in rows}
-    left = [chosen for chosen in CASES if chosen not in done]
-    print(f"{'response':9s} {'metric':20s} {'truth':10s} {'cv':>4s} {'N':>4s} {'right':>6s} {'wrong':>6s} "
-          f"{'ahead':>7s} {'se':>6s} {'sd of z':>8s}")  # fmt: skip
-    with ProcessPoolExecutor(arguments.processes, mp_context=get_context("spawn")) as pool:
-        for some in pool.map(case, left, [arguments.replicates] * len(left)):
-            for row in some:
-                print(f"{row['response']:9s} {row['metric']:20s} {row['truth']:10s} {row['cv']:4.1f} {row['n']:4d} "
-                      f"{row['right']:6.2f} {row['wrong']:6.2f} {row['difference']:7.2f} {row['stderr']:6.2f} "
-                      f"{row['z_sd']:8.2f}", flush=True)  # fmt: skip
-            rows += some
-            record.save(arguments.out, {"rows": rows})  # a later run goes on from here
-
+CELLS = [name_of(*case, n) for case, n in product(CASES, SIZES)]
+STUDY = Study("families", __doc__, CELLS, row, 50, summary, has_rows=False)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

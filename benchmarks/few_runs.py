@@ -15,16 +15,15 @@ apart, the nearest counts. Worst is that along the worst principal axis of the s
 times the root of two, as between two designs: what is claimed of it is `Optimum.design_error`.
 Standard errors are compared with those of the reference, as root mean square ratios.
 
-Run: uv run python -m benchmarks.few_runs [--seeds 10]
+    uv run python -m benchmarks.few_runs --cells "*emulated"
+    uv run python -m benchmarks.few_runs --cells "*alone" --data-sets 2
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
 import time
 from collections.abc import Callable
-from pathlib import Path
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -32,14 +31,12 @@ import pymc as pm
 import pytensor.tensor as pt
 
 import prbayes as prb
-from benchmarks import record
 from benchmarks.responses import RESPONSES, Response
+from benchmarks.study import Study
 
-NAMES = ("product", "frame", "correlated frame", "NaN region", "three inputs", "two kinks", "jump")
+NAMES = ("product", "frame", "three inputs", "correlated frame")
 N = 50
 FIRST = 32  # runs for each input
-
-
 RHO = 0.6  # correlation of the inputs of the correlated frame
 
 
@@ -101,13 +98,9 @@ def build(name: str, observed: Any, propagation: Any) -> pm.Model:
             covariance = pt.stacklists([[sds[0] ** 2, both], [both, sds[1] ** 2]])
             inputs = [pm.MvNormal.dist(pt.stack(means), covariance)]
         metric = prb.Joint(prb.KullbackLeibler())
+        outputs = displayed_outputs(name)
         prb.Simulator(
-            "y",
-            displayed_outputs(name),
-            *inputs,
-            metric=metric,
-            observed=observed,
-            propagation=propagation,
+            "y", outputs, *inputs, metric=metric, observed=observed, propagation=propagation
         )
     return model
 
@@ -116,7 +109,7 @@ def fitted(name: str, observed: Any, propagation: Any, reference: Any) -> dict[s
     """Calibrate once, and say how far from the reference."""
     clock = time.perf_counter()
     try:
-        optimum = prb.minimize(build(name, observed, propagation), progressbar=False)
+        optimum = prb.minimize(build(name, observed, propagation))
     except prb.propagation.DesignError as error:
         return {"refused": str(error)[:200]}
     stderr = np.sqrt(np.diag(reference.covariance))
@@ -148,32 +141,31 @@ def along_axes(reference: Any) -> Any:
     return (axes[:, known] / np.sqrt(variances[known])).T / prior_sd
 
 
-def problem(name: str, seeds: int, of_runs_alone: int) -> dict[str, Any]:
-    """Calibrate a problem with several designs, with an emulator and without."""
+@cache
+def reference_of(name: str) -> prb.Optimum:
+    """Return the optimum of resimulated responses."""
     observed = observed_of(name, 1)
-    n = FIRST * response_of(name).d
-    begin = prb.minimize(
-        build(name, observed, prb.Reweighted(n, emulator="auto", random_seed=1000)),
-        progressbar=False,
-    )
-    reference = prb.minimize(
-        build(name, observed, prb.Resimulated(65_536)),
-        start=begin.point,
-        starts=0,
-        progressbar=False,
-    )
-    rows = []
-    for seed in range(seeds):
-        stored = prb.Reweighted(n, emulator="auto", random_seed=seed)
-        rows.append(fitted(name, observed, stored, reference))
-    alone = []
-    for seed in range(of_runs_alone):
+    stored = prb.Reweighted(first_runs(name), emulator="auto", random_seed=1000)
+    begin = prb.minimize(build(name, observed, stored))
+    resimulated = build(name, observed, prb.Resimulated(65_536))
+    return prb.minimize(resimulated, start=begin.point, starts=0)
+
+
+def first_runs(name: str) -> int:
+    """Return the number of runs of the first design."""
+    return FIRST * response_of(name).d
+
+
+def row(cell: str, seed: int) -> dict[str, Any]:
+    """Return the row of a design: with an emulator, or of runs alone."""
+    name, way = cell.split(", ")
+    stored = prb.Reweighted(first_runs(name), emulator="auto", random_seed=seed)
+    if way == "alone":
         stored = prb.Reweighted(1024, emulator=None, max_points=32_768, random_seed=seed)
-        alone.append(fitted(name, observed, stored, reference))
-    return {"inputs": response_of(name).d, "emulated": rows, "alone": alone}
+    return fitted(name, observed_of(name, 1), stored, reference_of(name))
 
 
-def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return runs, error and its claim, and seconds, of several designs; nothing of none."""
     good = [row for row in rows if "off" in row]
     if not good:
@@ -183,7 +175,7 @@ def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
     # Standard errors at another optimum are its own.
     own = [row["stderr"] for row in good if not row["mirrored"]]
     return {
-        "runs": (runs[0], runs[-1]),
+        "runs": [runs[0], runs[-1]],
         "off": float(np.sqrt((off**2).mean())),
         "worst": float(np.sqrt(2 * (along**2).mean(axis=0).max())),
         "claimed": float(np.sqrt(np.mean([row["claimed"] ** 2 for row in good]))),
@@ -193,40 +185,8 @@ def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def summary(rows: list[dict[str, Any]]) -> str:
-    """Return the same in words."""
-    found = figures(rows)
-    if not found:
-        return "refused" if rows else "-"
-    low, high = found["runs"]
-    refused = f", {found['refused']} refused" if found["refused"] else ""
-    return (
-        f"{low} - {high} runs, off {found['off']:.3f} (worst {found['worst']:.3f}, "
-        f"claimed {found['claimed']:.3f}), standard errors off by {found['widths']:.1%}, "
-        f"{found['seconds']:.0f} s{refused}"
-    )
-
-
-def main() -> None:
-    """Print a table and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--alone", type=int, default=2, help="designs without an emulator")
-    parser.add_argument("--problems", nargs="+", default=list(NAMES), choices=NAMES)
-    parser.add_argument("--out", type=Path, default=record.RESULTS / "few_runs.json")
-    parser.add_argument("--only-table", action="store_true")
-    arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    table: dict[str, Any] = record.load(arguments.out, {})
-    for name in arguments.problems:
-        if not arguments.only_table:
-            table[name] = problem(name, arguments.seeds, arguments.alone)
-            record.save(arguments.out, table)
-        if name in table:
-            print(f"{name} ({table[name]['inputs']} inputs)")
-            print(f"   with an emulator: {summary(table[name]['emulated'])}")
-            print(f"   runs alone:       {summary(table[name]['alone'])}", flush=True)
-
+CELLS = [f"{name}, {way}" for name in NAMES for way in ("emulated", "alone")]
+STUDY = Study("few_runs", __doc__, CELLS, row, 10, summary)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -10,8 +10,6 @@ reference is the exact posterior of the readings without a gross error, on a gri
 
 from __future__ import annotations
 
-import argparse
-import logging
 from itertools import product
 from typing import Any
 
@@ -21,21 +19,13 @@ from scipy import stats
 from scipy.special import ndtri
 
 import prbayes as prb
-from benchmarks import record
+from benchmarks.study import Study
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
 
-OUT = record.RESULTS / "gross_errors.json"
-SIZES = (20, 60)
-SHIFTS = (0.0, 4.0, 8.0)
 # Unconstrained ranges of mu, log sigma and logit of the share of gross errors.
 _LOW, _HIGH = np.array([8.5, -1.2, -9.0]), np.array([13.0, 1.6, 2.0])
 _DEGREES = 5.0
-
-
-def readings(size: int, seed: int) -> Floats:
-    """Return readings without gross errors, (size,)."""
-    return np.random.default_rng([seed, size]).normal(10.0, 1.0, size)
 
 
 def moments(theta: Floats, log_w: Floats) -> tuple[Floats, Floats]:
@@ -52,8 +42,7 @@ def posterior(observed: Floats, *, gross_errors: bool) -> tuple[Floats, Floats]:
     with pm.Model() as model:
         mu, sigma = pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3)
         metric = prb.LogLikelihood(gross_errors=gross_errors)
-        x = pm.Normal.dist(mu, sigma)
-        prb.Simulator("y", np.positive, x, metric=metric, observed=observed, progressbar=False)
+        prb.Simulator("y", np.positive, pm.Normal.dist(mu, sigma), metric=metric, observed=observed)
     evaluator = Evaluator.of(model)
     d = evaluator.hyperparameters.size
 
@@ -80,41 +69,33 @@ def exact(values: Floats) -> tuple[Floats, Floats]:
     mu, sigma = (a.ravel() for a in np.meshgrid(np.linspace(8, 12, 801), np.geomspace(0.3, 4, 801)))
     log = stats.norm.logpdf(mu, 10, 3) + stats.halfnorm.logpdf(sigma, scale=3) + np.log(sigma)
     square = ((values - values.mean()) ** 2).sum() + len(values) * (values.mean() - mu) ** 2
-    mean, covariance = moments(
-        np.column_stack([mu, sigma]), log - len(values) * np.log(sigma) - square / (2 * sigma**2)
-    )
+    log_w = log - len(values) * np.log(sigma) - square / (2 * sigma**2)
+    mean, covariance = moments(np.column_stack([mu, sigma]), log_w)
     return mean, np.sqrt(np.diag(covariance))
 
 
-def row(size: int, shift: float, *, gross_errors: bool, data_sets: int) -> dict[str, Any]:
-    """Return mean and standard error of the bias, in exact sd, and mean ratios of sd."""
-    biases, widths = [], []
-    gross = size // 20 if shift else 0
-    for seed in range(data_sets):
-        values = readings(size, seed)
-        center, sd = exact(values[gross:])
-        values[:gross] += shift
-        mean, width = posterior(values, gross_errors=gross_errors)
-        biases.append((mean - center) / sd)
-        widths.append(width / sd)
-    bias, error = np.mean(biases, axis=0), np.std(biases, axis=0, ddof=1) / np.sqrt(data_sets)
-    numbers = {"bias": bias, "error": error, "width": np.mean(widths, axis=0)}
-    cell = {"size": size, "shift": shift, "gross_errors": gross_errors, "data sets": data_sets}
-    return cell | {name: value.round(4).tolist() for name, value in numbers.items()}
+def row(cell: str, seed: int) -> dict[str, Any]:
+    """Return biases in exact standard deviations, and ratios of standard deviations."""
+    size, shift, flag = cell.split("/")
+    values = np.random.default_rng([seed, int(size)]).normal(10.0, 1.0, int(size))
+    gross = int(size) // 20 if float(shift) else 0
+    center, sd = exact(values[gross:])
+    values[:gross] += float(shift)
+    mean, width = posterior(values, gross_errors=flag == "True")
+    return {"bias": ((mean - center) / sd).tolist(), "width": (width / sd).tolist()}
 
 
-def main() -> None:
-    """Compute, print and save."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data-sets", type=int, default=20)
-    arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    rows = []
-    for size, shift, flag in product(SIZES, SHIFTS, (False, True)):
-        rows.append(row(size, shift, gross_errors=flag, data_sets=arguments.data_sets))
-        print(rows[-1], flush=True)
-    record.save(OUT, rows)
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return mean and standard error of the bias, and mean ratios."""
+    biases, widths = (np.array([row[key] for row in rows]) for key in ("bias", "width"))
+    error = biases.std(axis=0, ddof=1) / np.sqrt(len(rows))
+    numbers = {"bias": biases.mean(axis=0), "error": error, "width": widths.mean(axis=0)}
+    rounded = {name: value.round(4).tolist() for name, value in numbers.items()}
+    return rounded | {"data sets": len(rows)}
 
+
+CELLS = [f"{n}/{shift}/{flag}" for n, shift, flag in product((20, 60), (0, 4, 8), (False, True))]
+STUDY = Study("gross_errors", __doc__, CELLS, row, 20, summary, has_rows=False)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -13,11 +13,9 @@ the same data sets: the difference of both has less noise than either.
 
 from __future__ import annotations
 
-import argparse
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -26,35 +24,20 @@ from scipy import optimize, stats
 from scipy.special import betaincinv, i0e, lambertw, logsumexp, ndtr, ndtri
 
 import prbayes as prb
-from benchmarks import record
 from benchmarks.scoreboard import in_pymc
-from benchmarks.scoreboard.problem import (
-    Input,
-    Prior,
-    Reference,
-    half_normal,
-    normal,
-    truncated,
-)
+from benchmarks.scoreboard.problem import Input, Prior, half_normal, normal, truncated
 from benchmarks.scoreboard.problem import Problem as Population
+from benchmarks.study import Study
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import DesignError
 
-OUT = record.RESULTS / "likelihood_coverage.json"
-ROWS = record.RESULTS / "rows" / "likelihood_coverage.json"
 PROB = 0.89
 _POINTS = 4096
 _DEGREES = 5.0
 _AT_ONCE = 4_000_000  # numbers of an array
-# Data sets between two writes of the results.
-_BLOCK = 20
 Functions = Callable[[Any], Any]
-
-
-def _no_reference(size: int, replicate: int) -> Reference:
-    raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -74,10 +57,7 @@ class Problem:
     @property
     def population(self) -> Population:
         """The problem as one of the scoreboard, for its inputs and priors."""
-        return Population(
-            name=self.name, what="", licence="", priors=self.priors, inputs=self.inputs,
-            formula=self.formula, sizes=(self.size,), data=lambda n, k: None, reference=_no_reference,
-        )  # fmt: skip
+        return Population(self.name, "", "", self.priors, self.inputs, self.formula, (self.size,))
 
     def response(self, *x: Any) -> Any:
         """Return outputs, (..., m), or (...) of a single one."""
@@ -298,10 +278,8 @@ def _drawn(components: list[Component], sobol: Any) -> tuple[Any, Any]:
     d = sobol.shape[1] - 2
     radius = np.sqrt(_DEGREES / stats.chi2.ppf(sobol[:, 1], _DEGREES))
     standard = stats.norm.ppf(sobol[:, 2:]) * radius[:, None]
-    centers, factors = (
-        np.array([c for _, c, _ in components]),
-        np.array([r for *_, r in components]),
-    )
+    centers = np.array([center for _, center, _ in components])
+    factors = np.array([root for *_, root in components])
     u = centers[which] + np.einsum("sde,se->sd", factors[which], standard)
     logs = []
     for share, (_, center, root) in zip(shares, components, strict=True):
@@ -350,15 +328,18 @@ def data_set(problem: Problem, likelihood: SpecimenLikelihood, number: int) -> d
     }
     for name, function in functions.items():
         u, weights, k = posterior(problem, function, start)
-        below = {p: float(weights @ (u[:, j] < start[j])) for j, p in enumerate(problem.priors)}
-        mean = weights @ u
-        row[name] = {
-            "below": below,
-            "mean": mean.tolist(),
-            "sd": np.sqrt(weights @ (u - mean) ** 2).tolist(),
-            "k": k,
-        }
+        row[name] = figures_of(problem, u, weights, start, u) | {"k": k}
     return row
+
+
+def figures_of(problem: Problem, u: Any, weights: Any, start: Any, values: Any) -> dict[str, Any]:
+    """Return the distribution function at the truth, and moments of values (S, q), from weights."""
+    mean = weights @ values
+    return {
+        "below": {p: float(weights @ (u[:, j] < start[j])) for j, p in enumerate(problem.priors)},
+        "mean": mean.tolist(),
+        "sd": np.sqrt(weights @ (values - mean) ** 2).tolist(),
+    }
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -391,25 +372,20 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def main() -> None:
-    """Run what is missing."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--data-sets", type=int, default=400)
-    parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
-    arguments = parser.parse_args()
-    logging.disable(logging.WARNING)
-    stored, found = record.load(ROWS, {}), record.load(OUT, {"summary": {}})
-    for name in arguments.problems:
-        problem = PROBLEMS[name]
-        _model, likelihood = likelihood_of(problem)
-        rows = stored.setdefault(name, [])
-        while len(rows) < arguments.data_sets:
-            rows += [data_set(problem, likelihood, len(rows) + i) for i in range(_BLOCK)]
-            found["summary"][name] = summary(rows)
-            record.save(ROWS, stored)
-            record.save(OUT, found)
-            print(name, len(rows), found["summary"][name], flush=True)
+def row(name: str, number: int) -> dict[str, Any]:
+    """Return the row of a data set."""
+    problem = PROBLEMS[name]
+    return data_set(problem, base_likelihood(name), number)
 
+
+@cache
+def base_likelihood(name: str) -> SpecimenLikelihood:
+    """Return the likelihood of a problem, whose first runs serve all data sets."""
+    _model, likelihood = likelihood_of(PROBLEMS[name])
+    return likelihood
+
+
+STUDY = Study("likelihood_coverage", __doc__, PROBLEMS, row, 400, summary, has_rows=False)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

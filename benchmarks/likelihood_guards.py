@@ -6,22 +6,21 @@ runs and the compiled log-likelihood. Each data set goes through what a user cal
 the checks before the fit, and 256 draws of the posterior, by importance sampling, of which `prb.diagnose`
 tests the family of the population and the conflict of prior and data.
 
-    uv run python -m benchmarks.likelihood_guards [--data-sets 200] [--tested 60]
+    uv run python -m benchmarks.likelihood_guards [--data-sets 200]
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
+from functools import cache
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 import prbayes as prb
-from benchmarks import record
 from benchmarks.likelihood_coverage import PROBLEMS, Problem, likelihood_of, thetas_of
 from benchmarks.scoreboard.problem import Input, normal, truncated
+from benchmarks.study import Study
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import arrays
@@ -29,7 +28,6 @@ from prbayes.model.specimen_preparation import Populations, prepared
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.results.likelihood_checks import check_draws
 
-OUT = record.RESULTS / "likelihood_guards.json"
 # With priors that matter beside the data: conflicts are reported where the prior pulls.
 LINEAR = Problem(
     name="linear",
@@ -44,7 +42,7 @@ TESTS = {
     "conflict of prior and data": "prior-conflict",
 }
 CHECKS = ("loops and checks before the fit", *TESTS)
-_BLOCK = 10  # data sets between two writes of the results
+TESTED = 60  # data sets whose draws are tested
 
 
 def observe(likelihood: SpecimenLikelihood, base: SpecimenLikelihood, y: Any) -> list[str]:
@@ -116,35 +114,27 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def main() -> None:
-    """Run what is missing."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--data-sets", type=int, default=200)
-    parser.add_argument("--problems", nargs="+", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--tested", type=int, default=60, help="data sets with tests of draws")
-    arguments = parser.parse_args()
-    logging.disable(logging.WARNING)
-    found = record.load(OUT, {"rows": {}, "summary": {}})
-    for name in arguments.problems:
-        problem = CASES[name]
-        _base_model, base = likelihood_of(problem)
-        model, _ = likelihood_of(problem)
-        evaluator = Evaluator.of(model)
-        (likelihood,) = evaluator.likelihoods
-        populations = Populations(likelihood)
-        rows = found["rows"].setdefault(name, [])
-        for number in range(arguments.data_sets):
-            if number < len(rows) and (number >= arguments.tested or "codes" in rows[number]):
-                continue
-            row = before_the_fit(likelihood, base, readings(problem, number))
-            if number < arguments.tested and "error" not in row:
-                row |= of_draws(evaluator, populations)
-            rows[number : number + 1] = [row]
-            if number % _BLOCK == _BLOCK - 1 or number == arguments.data_sets - 1:
-                found["summary"][name] = summary(rows)
-                record.save(OUT, found)
-                print(name, number + 1, found["summary"][name], flush=True)
+@cache
+def prepared_case(name: str) -> tuple[Evaluator, SpecimenLikelihood, Populations]:
+    """Return an evaluator to be given data, a likelihood with the first runs, and populations."""
+    _base_model, base = likelihood_of(CASES[name])
+    model, _ = likelihood_of(CASES[name])
+    evaluator = Evaluator.of(model)
+    (likelihood,) = evaluator.likelihoods
+    return evaluator, base, Populations(likelihood)
 
+
+def row(name: str, number: int) -> dict[str, Any]:
+    """Return the findings of a data set; those of draws of the first data sets alone."""
+    evaluator, base, populations = prepared_case(name)
+    (likelihood,) = evaluator.likelihoods
+    figures = before_the_fit(likelihood, base, readings(CASES[name], number))
+    if number < TESTED and "error" not in figures:
+        figures |= of_draws(evaluator, populations)
+    return figures
+
+
+STUDY = Study("likelihood_guards", __doc__, CASES, row, 200, summary)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -5,16 +5,13 @@ reference has other points of the response itself: four independent sets of 1024
 reweight the draws. Bias and width are those of the sixteen hyperparameters, in standard deviations
 of the reference; its own error is that of the mean of the sets.
 
-Run: OMP_NUM_THREADS=1 uv run python -m benchmarks.many_inputs [--data 1 2 3]
+    OMP_NUM_THREADS=1 uv run python -m benchmarks.many_inputs [--data-sets 3]
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +19,8 @@ import pymc as pm
 from scipy.special import logsumexp
 
 import prbayes as prb
-from benchmarks import record
 from benchmarks.responses import RESPONSES
+from benchmarks.study import Study
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_preparation import PopulationDraws, Populations, Runs, prepared
 from prbayes.propagation.charts import ReferencePopulation
@@ -34,22 +31,16 @@ RESPONSE = RESPONSES["eight inputs"]
 N, SETS, POINTS = 50, 4, 1024
 
 
-def outputs(*inputs: Any) -> Any:
-    """Return the four outputs of inputs, (..., 4)."""
-    x = np.stack(np.broadcast_arrays(*inputs), axis=-1)
-    return RESPONSE(x.reshape(-1, RESPONSE.d)).reshape(*x.shape[:-1], RESPONSE.outputs)
-
-
 def build(seed: int) -> pm.Model:
     """Return the model with the data of a seed; the priors are off by .3 standard deviations."""
     z = np.random.default_rng([seed, N]).standard_normal((N, RESPONSE.d))
-    observed = outputs(*(RESPONSE.mean + RESPONSE.sd * z).T)
+    observed = RESPONSE.of_columns(*(RESPONSE.mean + RESPONSE.sd * z).T)
     with pm.Model() as model:
         inputs = []
         for i, (mean, sd) in enumerate(zip(RESPONSE.mean, RESPONSE.sd, strict=True)):
             mu = pm.Normal(f"mu{i}", mean + 0.3 * sd, sd)
             inputs.append(pm.Normal.dist(mu, pm.LogNormal(f"sigma{i}", np.log(sd) + 0.1, 0.3)))
-        prb.Simulator("y", outputs, *inputs, observed=observed)
+        prb.Simulator("y", RESPONSE.of_columns, *inputs, observed=observed)
     return model
 
 
@@ -97,20 +88,6 @@ def measured(seed: int, sets: int = SETS, points: int = POINTS) -> dict[str, Any
     }
 
 
-def main() -> None:
-    """Print a table and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--out", type=Path, default=record.RESULTS / "many_inputs.json")
-    arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    rows = []
-    for seed in arguments.data:
-        rows.append(measured(seed))
-        record.save(arguments.out, {"rows": rows})
-        print(seed, figures(rows[-1]), flush=True)
-
-
 def figures(row: dict[str, Any]) -> dict[str, float]:
     """Return the largest and the root mean square bias, and the extreme widths, of a data set."""
     bias, width = np.abs(row["bias"]), np.array(row["width"])
@@ -124,5 +101,7 @@ def figures(row: dict[str, Any]) -> dict[str, float]:
     }
 
 
+STUDY = Study("many_inputs", __doc__, ["eight inputs"], lambda _, number: measured(number + 1), 3)
+
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -1,10 +1,11 @@
-"""The four metrics at their defaults, by the name of their class."""
+"""The four metrics at their defaults, by a short name and by that of their class."""
 
 import prbayes as prb
 
-BY_NAME: dict[str, prb.Metric] = {
-    "ProbabilityResidual": prb.ProbabilityResidual(),
-    "KullbackLeibler": prb.KullbackLeibler(),
-    "AreaMetric": prb.AreaMetric(),
-    "LogLikelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
+METRICS: dict[str, prb.Metric] = {
+    "PR": prb.ProbabilityResidual(),
+    "KLD": prb.KullbackLeibler(),
+    "area": prb.AreaMetric(),
+    "log-likelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
 }
+BY_CLASS = {type(metric).__name__: metric for metric in METRICS.values()}

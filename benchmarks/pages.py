@@ -15,17 +15,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks import record
+from benchmarks.metrics import METRICS
 from benchmarks.scoreboard import table as scoreboard
 from benchmarks.scoreboard.problems import PROBLEMS
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("appendix/*.md")])
-METRICS = {
-    "PR": "ProbabilityResidual",
-    "KLD": "KullbackLeibler",
-    "area": "AreaMetric",
-    "log-likelihood": "LogLikelihood",
-}
 Row = Iterable[str]
 
 
@@ -34,37 +29,36 @@ def found(name: str) -> Any:
     return record.load(record.RESULTS / f"{name}.json", None)
 
 
+def summary(name: str) -> dict[str, Any]:
+    """Return the figures of a study, by cell."""
+    figures: dict[str, Any] = found(name)["summary"]
+    return figures
+
+
+def single(name: str) -> dict[str, Any]:
+    """Return the only row of each cell of a study."""
+    return {cell: rows[0] for cell, rows in found(name)["rows"].items()}
+
+
 def short(value: float, digits: int = 2) -> str:
     """Return a number without the zero before its point."""
     return f"{value:.{digits}f}".replace("0.", ".", 1) if abs(value) < 1 else f"{value:.{digits}f}"
 
 
-def outliers() -> Iterator[Row]:
-    """Yield shifts of posteriors by gross outliers."""
-    table = found("contamination")
-    for label, name in METRICS.items():
-        cell = table[name]
-        shifts = zip(cell["shift"], cell["standard_error"], strict=True)
-        ratios = (f"{ratio:.2f}" for ratio in cell["sd_ratio"])
-        yield [label, *(f"{shift:.2f} ± {error:.2f}" for shift, error in shifts), *ratios]
-
-
 def posterior_coverage() -> Iterator[Row]:
     """Yield coverage of posteriors given the estimate, pooled over groups of cells."""
-    for name, group in found("posterior")["pooled"].items():
-        if "intervals" not in group:  # of an earlier study
-            continue
-        yield [
-            name,
-            f"{short(group['coverage'], 3)} ± {short(group['error'], 3)}",
-            f"{group['intervals']:,}",
-            str(group["failed"]),
-        ]
+    from benchmarks.posterior import groups, pooled
+
+    figures = summary("posterior")
+    for name, has in groups().items():
+        group = pooled(figures, has)
+        coverage = f"{short(group['coverage'], 3)} ± {short(group['error'], 3)}"
+        yield [name, coverage, f"{group['intervals']:,}", str(group["failed"])]
 
 
 def likelihood_ranks() -> Iterator[Row]:
     """Yield coverage and uniformity of the log-likelihood by specimen, by problem."""
-    for problem, table in found("likelihood_coverage")["summary"].items():
+    for problem, table in summary("likelihood_coverage").items():
         for j, (name, within) in enumerate(table["prbayes"]["coverage"].items()):
             exact = table["exact"]["coverage"][name]
             p = short(table["prbayes"]["p of uniformity"][name])
@@ -77,7 +71,7 @@ def likelihood_ranks() -> Iterator[Row]:
 def saddlepoint() -> Iterator[Row]:
     """Yield offsets and widths of posteriors given the estimate, by case and metric."""
     cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for name, cell in found("saddlepoint")["summary"].items():
+    for name, cell in summary("saddlepoint").items():
         study, metric, *rest = name.split(", ")
         if study in ("one", "several"):
             cells.setdefault((rest[-1], metric), []).append(cell)
@@ -95,11 +89,10 @@ def saddlepoint() -> Iterator[Row]:
 
 def saddlepoint_refits() -> Iterator[Row]:
     """Yield offsets and widths of posteriors given estimates by refits, by metric, prior and size."""
-    for name, cell in found("saddlepoint")["summary"].items():
-        study, metric, *rest = name.split(", ")
-        if study != "refits" or "rms offset" not in cell:
+    for name, cell in summary("saddlepoint").items():
+        study, metric, size, prior = name.split(", ")
+        if study != "refits":
             continue
-        size, prior = rest
         offset, largest = (max(cell[f"{key} offset"]) for key in ("rms", "largest"))
         widths = f"{short(min(cell['mean width']))} to {short(max(cell['mean width']))}"
         yield [
@@ -110,22 +103,21 @@ def saddlepoint_refits() -> Iterator[Row]:
 
 # Priors of one simulator of one output, and problems of several.
 _CASES = (
-    "vague", "bounded", "sharp", "conflict", "4 simulators", "8 simulators",
-    "3 outputs", "4 outputs", "8 outputs",
+    "vague", "bounded", "sharp", "conflict", "4 simulators", "8 simulators", "3 outputs", "4 outputs",
 )  # fmt: skip
 
 
 def guard_sizes() -> Iterator[Row]:
     """Yield how often right models are flagged by the guards of the log-likelihood by specimen."""
-    for problem, checks in found("likelihood_guards")["summary"].items():
+    for problem, checks in summary("likelihood_guards").items():
         for check, cell in checks.items():
             share = f"{short(cell['share'], 3)} ± {short(cell['standard error'], 3)}"
             yield [problem, check, str(cell["data sets"]), share]
 
 
 def partial_pooling() -> Iterator[Row]:
-    """Return the rows of groups beside the exact posterior."""
-    table = found("partial_pooling")
+    """Yield the rows of groups beside the exact posterior."""
+    table = summary("groups")["partial pooling"]
     for name in ("m", "tau", "sigma", "mu"):
         row = table[name]
         error = row["scatter of shifts"] / np.sqrt(table["data sets"])
@@ -134,38 +126,37 @@ def partial_pooling() -> Iterator[Row]:
             f"{row['mean']:.3f}",
             f"{row['exact mean']:.3f}",
             f"{row['shift']:+.2f} ± {error:.2f}",
-            f"{row['ratio of sd']:.2f}",
+            f"{row['ratio']:.2f}",
             f"{row['held']:.0%}",
             str(table["data sets"]),
         ]
 
 
 def small_groups() -> Iterator[Row]:
-    """Return the rows of small groups beside the exact posterior."""
-    for cell in found("small_groups")["table"]:
-        columns = [cell["metric"], str(cell["size"])]
-        for name in ("mu", "sigma"):
-            columns += [f"{cell[f'{name} off']:.2f}", f"{cell[f'{name} ratio']:.2f}"]
-            columns.append(f"{cell[f'{name} held']:.0%} ({cell[f'{name} exact held']:.0%})")
+    """Yield the rows of small groups beside the exact posterior."""
+    for name, cell in summary("groups").items():
+        if name == "partial pooling":
+            continue
+        columns = name.split(", ")
+        for part in (cell["mu"], cell["sigma"]):
+            columns += [f"{part['off']:.2f}", f"{part['ratio']:.2f}"]
+            columns.append(f"{part['held']:.0%} ({part['exact held']:.0%})")
         yield [*columns, str(cell["data sets"]), f"{cell['seconds']:.1f}"]
 
 
 def gross_errors() -> Iterator[Row]:
-    """Return the rows of the price and the gain of gross errors in a likelihood by specimen."""
-    for row in found("gross_errors"):
+    """Yield the price and the gain of gross errors in a likelihood by specimen."""
+    for name, row in summary("gross_errors").items():
+        size, shift, flag = name.split("/")
         biases = zip(row["bias"], row["error"], strict=True)
-        yield [
-            str(row["size"]),
-            f"{row['shift']:g} sd" if row["shift"] else "none",
-            str(row["gross_errors"]),
-            " / ".join(f"{bias + 0.0:+.2f} ± {error:.2f}" for bias, error in biases),
-            " / ".join(f"{width:.2f}" for width in row["width"]),
-        ]
+        bias = " / ".join(f"{bias + 0.0:+.2f} ± {error:.2f}" for bias, error in biases)
+        width = " / ".join(f"{width:.2f}" for width in row["width"])
+        yield [size, f"{shift} sd" if shift != "0" else "none", flag, bias, width]
 
 
 def readings_coverage() -> Iterator[Row]:
     """Yield bias, width and coverage of measurement arguments beside the exact posterior."""
-    for case, table in found("readings_coverage")["summary"].items():
+    for case, table in summary("readings_coverage").items():
         for j, (name, within) in enumerate(table["prbayes"]["coverage"].items()):
             exact = table["exact"]["coverage"][name]
             error = np.sqrt(0.89 * 0.11 / (table["data sets"] - table["refused"]))
@@ -233,29 +224,23 @@ def _over(scores: Iterable[Any], shown: Callable[[Any], str]) -> str:
 
 
 def measurement_error() -> Iterator[Row]:
-    """Return the rows of readings with an error."""
-    table = found("measurement_error")
+    """Yield the rows of readings with an error."""
+    table = summary("measurement_error")
     ways = {"ignored": "ignored", "known": "known", "estimated": "from repeats"}
     truth = {"mu": ("mean", 0.0), "sigma": ("standard deviation", 0.3)}
-    for (way, label), (name, (told, value)) in product(ways.items(), truth.items()):
-        row = table[f"{way}/{name}"]
-        yield [
-            label,
-            told,
-            f"{value:g}",
-            f"{row['mean']:.3f}",
-            f"{row['sd']:.3f}",
-            f"{row['held']:.0%}",
-            str(row["data sets"]),
-        ]
+    for (way, label), (name, (text, value)) in product(ways.items(), truth.items()):
+        row = table[way][name]
+        moments = f"{row['mean']:.3f}", f"{row['sd']:.3f}"
+        held, sets = f"{row['held']:.0%}", str(table[way]["data sets"])
+        yield [label, text, f"{value:g}", *moments, held, sets]
 
 
 def sizes() -> Iterator[Row]:
-    """Return the rows of the area test's size."""
-    table = found("validity")["size"]
+    """Yield the area test's size."""
+    table = summary("validity")
     for n0, n in product((15, 30, 100), (10, 20, 50)):
         cells = [
-            short(table[f"{n0}/{n}/{null}"][level], 3)
+            short(table[f"size/{n0}"][f"{n}/{null}"][level], 3)
             for null in ("default", "best fit", "pool, uniform")
             for level in ("0.01", "0.05", "0.1")
         ]
@@ -264,21 +249,21 @@ def sizes() -> Iterator[Row]:
 
 
 def sizes_through() -> Iterator[Row]:
-    """Return the rows of the area test's size, through the whole package."""
-    table = found("validity")["size_through_prbayes"]
+    """Yield the area test's size, through the whole package."""
+    table = summary("validity")
     nulls = {
         "optimum taken as exact, fresh data": "optimum, ExactModel",
         "`JointNull`, the calibration's own data": "own data, JointNull",
         "`ExactModel`, the calibration's own data": "own data, ExactModel",
     }
-    for n0, (label, null) in product((15, 30), nulls.items()):
-        row = table[f"{n0}/20/{null}"]
-        yield [str(n0), label, *(short(value, 3) for value in row.values())]
+    for n0, (label, null) in product(("15", "30"), nulls.items()):
+        shares = table[f"pipeline/{n0}"][null].values()
+        yield [n0, label, *(short(value, 3) for value in shares)]
 
 
 def sizes_of_outputs() -> Iterator[Row]:
-    """Return the rows of the area test of several outputs."""
-    table = found("validity_outputs")["outputs"]
+    """Yield the rejections of the area test of several outputs."""
+    table = summary("validity")
     labels = {
         "0.9": "correlation .9, as calibrated",
         "0.8": "correlation .8",
@@ -287,27 +272,27 @@ def sizes_of_outputs() -> Iterator[Row]:
         "mean + 0.75 sd": "mean + .75 sd",
     }
     for name, label in labels.items():
-        row = f"15/20/{name}"
-        shares = [short(value, 3) for value in table["matching"][row].values()]
-        yield [label, *shares, short(table["Jeffreys"][row]["0.05"], 3)]
+        shares = [short(value, 3) for value in table["outputs/matching"][name].values()]
+        yield [label, *shares, short(table["outputs/Jeffreys"][name]["0.05"], 3)]
 
 
 def power() -> Iterator[Row]:
-    """Return the rows of the power of tests."""
-    for name, row in found("validity")["power"].items():
+    """Yield the power of tests."""
+    (table,) = single("power").values()
+    for name, row in table.items():
         yield [name.replace("|", "\\|"), *(short(value, 3) for value in row.values())]
 
 
 def case_study(points: str) -> Iterator[Row]:
-    """Return the rows of errors in the paper's case study."""
+    """Yield errors in the paper's case study."""
     from benchmarks.paper_case1 import SIZES, collect
     from benchmarks.systems import SYSTEMS
 
-    fits = found("paper_case1")["fits"]
+    fits = found("paper_case1")["rows"]
     for system, n in product(SYSTEMS, SIZES):
-        cells = [collect(fits, points, system, n, metric, "BFGS") for metric in METRICS]
-        if any(cell is None for cell in cells):
-            continue
+        cells = [
+            collect(fits[f"{points}/{system}/{n}/{metric}"], system, "BFGS") for metric in METRICS
+        ]
         yield [system, str(n), *map(_median_errors, cells)]
 
 
@@ -322,138 +307,79 @@ def _failed(cell: Any) -> str:
 
 
 def evaluations() -> Iterator[Row]:
-    """Return the rows of evaluations in the paper's case study."""
+    """Yield evaluations in the paper's case study."""
     from benchmarks.paper_case1 import METHODS, SIZES, collect
     from benchmarks.systems import SYSTEMS
 
-    fits = found("paper_case1")["fits"]
+    fits = found("paper_case1")["rows"]
     for system, method in product(SYSTEMS, METHODS):
         cells = []
         for metric in METRICS:
-            parts = [collect(fits, "sobol", system, n, metric, method) for n in SIZES]
-            every = np.concatenate(parts)
+            rows = [row for n in SIZES for row in fits[f"sobol/{system}/{n}/{metric}"]]
+            every = collect(rows, system, method)
             cells.append(f"{np.median(every[:, 2]):.0f}" + _failed(every))
         yield [system, method.replace("NM", "Nelder-Mead,"), *cells]
 
 
 def scale_factor() -> Iterator[Row]:
-    """Return the rows of the paper's scale factor."""
-    table = found("scale_factor")
-    for maximum, form, method, parameters in product(
-        ("5000.0", "0.005"),
-        ("sum", "integral"),
-        ("BFGS", "Nelder-Mead"),
-        ("raw", "standardised"),
-    ):
-        cells = [
-            f"{n}" if error < 0.01 else f"{n} ({error:.2g})"
-            for n, error in table[f"{maximum}/{form}/{method}/{parameters}"]
-        ]
-        yield [f"{float(maximum):g}", form, method, parameters, *cells]
+    """Yield evaluations by the paper's scale factor."""
+    for name, row in single("scale_factor").items():
+        maximum, *case = name.split("/")
+        if case == ["prbayes"]:
+            continue
+        cells = [f"{n}" if error < 0.01 else f"{n} ({error:.2g})" for n, error in row]
+        yield [f"{float(maximum):g}", *case, *cells]
 
 
 def landscapes() -> Iterator[Row]:
-    """Return the rows of convexity and arrival."""
-    for name, row in found("landscapes").items():
-        yield [
-            *name.split("/"),
-            *(f"{row[key]:.1%}" for key in ("convex", "flat", "arrive")),
-            f"{row['evaluations']:.0f}",
-            f"{row['arrive_guided']:.1%}",
-            f"{row['evaluations_guided']:.0f}",
-        ]
+    """Yield convexity and arrival."""
+    for system, metrics in single("landscapes").items():
+        for metric, row in metrics.items():
+            shares = (f"{row[key]:.1%}" for key in ("convex", "flat", "arrive"))
+            guided = f"{row['arrive_guided']:.1%}", f"{row['evaluations_guided']:.0f}"
+            yield [system, metric, *shares, f"{row['evaluations']:.0f}", *guided]
 
 
-def families(at: tuple[int, ...]) -> Iterator[Row]:
-    """Return the rows of wrong families."""
-    table = found("misspecified")["families"]
-    for truth, n, metric in product(("Weibull", "gamma", "mixture"), at, METRICS):
-        size = [] if len(at) == 1 else [str(n)]
-        figures = table[f"{truth}/{n}/{metric}"][:4]
-        # No negative zero.
-        yield [truth, *size, metric, *(f"{round(value, 3) + 0.0:.3f}" for value in figures)]
-
-
-def ties() -> Iterator[Row]:
-    """Return the rows of rounded and tied data."""
-    for name, (shift, ratio, failed) in found("misspecified")["ties"].items():
-        data, metric = name.split("/")
-        label = "half equal to the median" if "tied" in data else f"{data} sd"
-        label = label.replace("round ", "rounded to ")
-        yield [label, metric, f"{shift:.3f}", f"{ratio:.3f}", str(failed)]
-
-
-def surrogates() -> Iterator[Row]:
-    """Return the rows of a calibration through surrogates."""
-    for row in found("surrogate")["rows"]:
-        error = row["cross_validated"]
-        what = re.sub(r"(Reweighted|Resimulated)\(\d+\)", r"`\g<0>`", row["what"])
-        yield [
-            what,
-            str(row["runs"]),
-            "" if error is None else f"{error:.1%}",
-            f"{row['error']:.3f}",
-        ]
-
-
-# Problems of joint calibration with enough data sets.
-JOINT = ("normal 0", "normal .6", "normal .95", "frame")
+_ENOUGH = 20  # data sets of a cell that is shown
 
 
 def joint() -> Iterator[Row]:
     """Yield errors of joint calibration over those of maximum likelihood, by problem."""
-    from benchmarks.joint import ENOUGH, METHODS, grouped
+    from benchmarks.joint import METHODS, PROBLEMS, grouped
 
     schools = {
         "joint": "`Joint`",
         "correlation": "`MarginalCorrelation`",
         "separate": "separate marginals",
     }
-    cells = found("joint")["cells"]
-    for size, method in product((20, 50, 200), METHODS[1:]):
-        row, sets = [], []
-        for problem in JOINT:
-            cell = cells.get(f"{problem}/{size}/{method}")
-            if cell is None or cell["data sets"] < ENOUGH:
-                break
-            errors = grouped(problem, cell["rmse over likelihood"])
-            row.append(" / ".join(short(error) for error in errors))
-            sets.append(cell["data sets"])
-        else:
-            school, metric = method.split()
-            yield [str(size), f"{schools[school]}, {metric}", str(min(sets)), *row]
-
-
-def joint_memory() -> Iterator[Row]:
-    """Return the rows of the memory of many directions."""
-    for key, cell in found("joint_speed")["memory"].items():
-        metric, outputs, points = key.split("/")
-        basis = f"{cell['basis']:,}" if cell["basis"] else ""
-        seconds = [f"{cell[name]:.2f}" for name in ("objective", "batch")]
-        yield [
-            metric,
-            outputs,
-            str(cell["directions"]),
-            points,
-            f"{cell['peak']:,}",
-            basis,
-            *seconds,
-        ]
+    figures = summary("joint")
+    for size, method in product((20, 50, 200), METHODS):
+        cells = [figures.get(f"{problem}/{size}/{method}") for problem in PROBLEMS]
+        shown = [cell for cell in cells if cell is not None and cell["data sets"] >= _ENOUGH]
+        if len(shown) < len(cells):
+            continue
+        errors = [grouped(cell["rmse over likelihood"]) for cell in shown]
+        school, metric = method.split()
+        sets = str(min(cell["data sets"] for cell in shown))
+        columns = (" / ".join(short(error) for error in of_problem) for of_problem in errors)
+        yield [str(size), f"{schools[school]}, {metric}", sets, *columns]
 
 
 def speed() -> Iterator[Row]:
-    """Return the rows of CPU seconds, memory and import beside their aims."""
-    for row in found("speed")["rows"]:
-        ratio = short(row["ratio"], 3) if row["against"] else ""
-        value = f"{row['value']:.0f}" if row["value"] >= 20 else short(row["value"])
-        aim = short(row["aim"]) if row["aim"] < 1 else f"{row['aim']:g}"
-        yield [row["what"], row["against"], value, ratio, aim, "yes" if row["met"] else "no"]
+    """Yield CPU seconds, memory and import beside their aims."""
+    from benchmarks.speed import rows
+
+    for c, value, ratio in rows(single("speed")):
+        shown = f"{value:.0f}" if value >= 20 else short(value)
+        aim = short(c.aim) if c.aim < 1 else f"{c.aim:g}"
+        met = "yes" if ratio <= c.aim else "no"
+        yield [c.text, c.against, shown, short(ratio, 3) if c.against else "", aim, met]
 
 
 def speed_jobs() -> Iterator[Row]:
-    """Return the rows of CPU seconds by job."""
-    for name, job in found("speed")["jobs"].items():
-        if job.keys() & {"error", "bias", "runs"}:
+    """Yield CPU seconds by job."""
+    for name, job in single("speed").items():
+        if job.keys() & {"error", "bias"}:
             cells = [short(job[key]) if key in job else "" for key in _OF_JOBS]
             yield [name, *cells, job.get("error", "")]
 
@@ -462,46 +388,37 @@ _OF_JOBS = ("cold", "warm", "bias", "width")
 
 
 def scale() -> Iterator[Row]:
-    """Return the rows of time and memory of large problems."""
+    """Yield time and memory of large problems."""
     from benchmarks.scale import THETAS
 
-    metrics = {"ProbabilityResidual": "PR", "AreaMetric": "area metric"}
     after = {"n resimulated": "one theta", "n reweighted": "one theta, after set-up"}
-    for row in found("scale"):
-        kind, size = row["kind"], row.get("size", 0)
-        if kind in after and size >= 1_000_000:
-            name = "Resimulated" if kind == "n resimulated" else "Reweighted"
-            what = f"`{name}({size:_})`, {after[kind]}, {metrics[row['metric']]}"
-            seconds = row["s"] / THETAS
-        elif kind.startswith("particles") and size >= 10_000:
-            name = "Resimulated(100)" if kind == "particles resimulated" else "Reweighted(256)"
-            responses = f"{row['responses']:_} responses"
-            what = f"`{name}`, {size:_} particles sampled, {metrics[row['metric']]}, {responses}"
-            seconds = row["sampling s"]
-        else:
+    names = {
+        "n resimulated": "Resimulated({:_})",
+        "n reweighted": "Reweighted({:_})",
+        "particles resimulated": "Resimulated(100)",
+        "particles reweighted": "Reweighted(256)",
+    }
+    for cell, row in single("scale").items():
+        kind, metric, *size = cell.split("/")
+        if kind == "tasks":
             continue
+        n = int(size[0])
+        name = f"`{names[kind].format(n)}`"
+        if kind in after:
+            what, seconds = f"{name}, {after[kind]}, {metric}", row["s"] / THETAS
+        else:
+            responses = f"{row['responses']:_} responses"
+            what = f"{name}, {n:_} particles sampled, {metric}, {responses}"
+            seconds = row["sampling s"]
         digits = 1 if seconds >= 1 else 3 if seconds < 0.05 else 2
         yield [what.replace("_", " "), f"{seconds:.{digits}f} s", f"{row['MiB']:.0f} MiB"]
 
 
-def busy_workers() -> Iterator[Row]:
-    """Return the rows of workers of a server that are busy."""
-    for row in found("um_bridge"):
-        yield [
-            str(row["workers"]),
-            row["how"],
-            str(row["runs"]),
-            f"{row['wall']:.2f}",
-            f"{row['utilisation']:.1%}",
-            f"{row['lowest']:.1%}",
-        ]
-
-
 def between_runs() -> Iterator[Row]:
-    """Return the rows of emulated populations beside those of runs alone."""
+    """Yield errors of emulated populations beside those of runs alone."""
     from benchmarks.responses import RESPONSES
 
-    table = found("between_runs")
+    table = summary("between_runs")
     for name, response in RESPONSES.items():
         columns = []
         for n in (64, 256):
@@ -510,35 +427,24 @@ def between_runs() -> Iterator[Row]:
         yield [name, str(response.d), str(response.outputs), *columns]
 
 
-def emulator_speed() -> Iterator[Row]:
-    """Return the rows of what it costs to emulate."""
-    for n, cell in found("emulator_speed").items():
-        seconds = [f"{cell[key]:.2f}" for key in ("choose", "say", "left out")]
-        yield [n, *seconds, f"{cell['MiB']:.0f}"]
-
-
 def few_runs() -> Iterator[Row]:
-    """Return the rows of optima from few runs."""
-    from benchmarks.few_runs import figures
+    """Yield optima from few runs."""
+    from benchmarks.few_runs import NAMES, response_of
 
-    for name, cell in found("few_runs").items():
-        emulated, alone = figures(cell["emulated"]), figures(cell["alone"])
-        runs = "{runs[0]} - {runs[1]}".format(**emulated)
+    table = summary("few_runs")
+    for name in NAMES:
+        emulated, alone = table[f"{name}, emulated"], table[f"{name}, alone"]
         columns = [short(emulated[key], 3) for key in ("off", "worst", "claimed")]
-        columns.append(f"{emulated['widths']:.1%}")
-        beside = (
-            [f"{alone['runs'][0]} - {alone['runs'][1]}", short(alone["off"], 3)]
-            if alone
-            else ["", ""]
-        )
-        yield [name, str(cell["inputs"]), runs, *columns, *beside]
+        widths, inputs = f"{emulated['widths']:.1%}", str(response_of(name).d)
+        runs, runs_alone = ("{} - {}".format(*cell["runs"]) for cell in (emulated, alone))
+        yield [name, inputs, runs, *columns, widths, runs_alone, short(alone["off"], 3)]
 
 
 def many_inputs() -> Iterator[Row]:
-    """Return the rows of eight inputs by the log-likelihood."""
+    """Yield the errors of eight inputs by the log-likelihood."""
     from benchmarks.many_inputs import figures
 
-    for row in found("many_inputs")["rows"]:
+    for row in found("many_inputs")["rows"]["eight inputs"]:
         cell = figures(row)
         bias = [short(cell[key]) for key in ("largest", "rms")]
         widths = f"{short(cell['narrowest'])} to {short(cell['widest'])}"
@@ -546,31 +452,28 @@ def many_inputs() -> Iterator[Row]:
 
 
 def at_a_fold() -> Iterator[Row]:
-    """Return the rows of metrics near a fold."""
-    rows = found("at_a_fold")
-    for metric in dict.fromkeys(row["metric"] for row in rows):
-        cells = []
-        for response, size in product(("y", "root of y"), (50, 200)):
-            (row,) = (
-                r for r in rows if (r["metric"], r["response"], r["N"]) == (metric, response, size)
-            )
-            cells.append(f"{short(row['mu'])} / {short(row['sigma'])}")
-        yield [metric, *cells]
+    """Yield errors of metrics near a fold."""
+    from benchmarks.at_a_fold import COMPARED, RESPONSES
+
+    table = summary("at_a_fold")
+    for metric in COMPARED:
+        rows = [table[f"{r}/{n}/{metric}"] for r, n in product(RESPONSES, (50, 200))]
+        yield [metric, *(f"{short(row['mu'])} / {short(row['sigma'])}" for row in rows)]
 
 
 def two_fidelities() -> Iterator[Row]:
-    """Return the rows of errors with a coarse response and without."""
-    from benchmarks.two_fidelities import WAYS, median, rms
+    """Yield errors with a coarse response and without."""
+    from benchmarks.two_fidelities import RUNS, WAYS
 
-    table = found("two_fidelities")
-    for n, errors in table["emulators"].items():
-        optima = table["optima"][n]
-        of_emulators = [short(median(errors[way])) for way in WAYS]
-        yield [n, *of_emulators, *(short(rms(optima[way]), 3) for way in WAYS)]
+    table = summary("two_fidelities")
+    for n in RUNS:
+        emulators = [short(table[f"emulator/{n}/{way}"]) for way in WAYS]
+        optima = [short(table[f"optimum/{n}/{way}"], 3) for way in WAYS]
+        yield [str(n), *emulators, *optima]
 
 
 def plans() -> Iterator[Row]:
-    """Return the rows of expected and found standard deviations."""
+    """Yield expected and found standard deviations."""
     labels = {
         "crack": ("crack growth", "21 + 20"),
         "virkler": ("Virkler", "20 + 24"),
@@ -578,7 +481,7 @@ def plans() -> Iterator[Row]:
     }
     names = {"quantity": "quantile later on", "any": "anything"}
     for problem, (label, specimens) in labels.items():
-        table = found("planning")[problem]
+        table = summary("planning")[problem]
         for key, cell in table["table"].items():
             condition, name = key.split("/")
             low, high = (short(value) for value in cell["5% to 95%"])
@@ -597,40 +500,43 @@ def plans() -> Iterator[Row]:
 
 
 def risk_errors() -> Iterator[Row]:
-    """Return the rows of small probabilities."""
-    for key, cell in found("risk")["errors"].items():
-        name, p, points = key.split("/")
-        source = "stored responses" if points.startswith("0 ") else points
-        errors = [f"{cell[column]:.0%}" for column in ("rms", "stated", "within 2")]
-        yield [name, f"{float(p):.0e}", source, str(cell["repetitions"]), *errors]
+    """Yield errors of small probabilities."""
+    for name, table in summary("risk").items():
+        for key, cell in table.items():
+            if not isinstance(cell, dict):
+                continue
+            p, points = key.split("/")
+            source = "stored responses" if points.startswith("0 ") else points
+            errors = [f"{cell[column]:.0%}" for column in ("rms", "stated", "within 2")]
+            label, sets = name.removeprefix("errors/"), str(table["data sets"])
+            yield [label, f"{float(p):.0e}", source, sets, *errors]
 
 
 def risk_coverage() -> Iterator[Row]:
-    """Return the rows of coverage of bands."""
-    table = found("risk")["coverage"]
+    """Yield coverage of bands."""
+    table = summary("risk")["coverage"]
     labels = {
         "simultaneous": "simultaneous band, the whole function",
         "pointwise, entirely": "pointwise band, the whole function",
         "pointwise": "pointwise band, at one place",
     }
-    for key, share in table["held"].items():
+    for key, share in table.items():
         of, _, band = key.partition("/")
-        what = labels.get(band, "interval of `exceedance`")
-        yield [of, what, str(table["data sets"]), f"{share:.1%}"]
-    for size, shares in found("risk")["exact"].items():
-        for key in ("simultaneous", "pointwise"):
-            yield ["exact posterior, for comparison", labels[key], size, f"{shares[key]:.1%}"]
+        if key != "data sets":
+            what = labels.get(band, "interval of `exceedance`")
+            label = of.replace("exact", "exact posterior, for comparison")
+            yield [label, what, str(table["data sets"]), f"{share:.1%}"]
 
 
 def thermal_conductivity() -> Iterator[Row]:
-    """Return the rows of treatments of the conductivity."""
+    """Yield treatments of the conductivity."""
     for name, row in found("thermal_challenge")["conductivity"].items():
         mean, constant = (f"{row[what]:+.0f}" for what in ("at the mean temperature", "at 500 C"))
         yield [name, f"{row['differences']:.0f}", mean, constant]
 
 
 def thermal_population() -> Iterator[Row]:
-    """Return the rows of the population of the material."""
+    """Yield the population of the material."""
     for name, row in found("thermal_challenge")["population"].items():
         digits = 0 if "rhoCp" in name else 4
         optimum = f"{row['optimum']:.{digits}f} ± {row['error']:.{digits}f}"
@@ -638,7 +544,7 @@ def thermal_population() -> Iterator[Row]:
 
 
 def thermal_capacity() -> Iterator[Row]:
-    """Return the rows of the heat capacity's scatter."""
+    """Yield the heat capacity's scatter."""
     table = found("thermal_challenge")
     for name, row in table["capacity"].items():
         share = row["sd"] / table["sample sd"] - 1
@@ -646,7 +552,7 @@ def thermal_capacity() -> Iterator[Row]:
 
 
 def thermal_slabs() -> Iterator[Row]:
-    """Return the rows of tests of slabs."""
+    """Yield tests of slabs."""
     for name in ("ensemble", "accreditation"):
         row = found("thermal_challenge")[name]
         measured = f"{row['measured']:.0f}"
@@ -657,7 +563,7 @@ def thermal_slabs() -> Iterator[Row]:
 
 
 def thermal_risk() -> Iterator[Row]:
-    """Return the rows of the required probability."""
+    """Yield the required probability."""
     labels = {"device": "published equation", "device_by_differences": "finite differences"}
     for key, row in found("thermal_challenge")["risk"].items():
         name, points = key.split("/")
@@ -668,14 +574,14 @@ def thermal_risk() -> Iterator[Row]:
 
 
 def thermal_shares() -> Iterator[Row]:
-    """Return the rows of sensitivities."""
+    """Yield sensitivities."""
     for name, row in found("thermal_challenge")["sensitivity"].items():
         shares = [f"{short(row[w])} ± {short(row[w + '_error'])}" for w in ("first", "total")]
         yield [name, *shares]
 
 
 def thermal_tests() -> Iterator[Row]:
-    """Return the rows of tests to come."""
+    """Yield tests to come."""
     plan = found("thermal_challenge")["plan"]
     yield ["nothing", *[short(plan["now"], 3)] * 2, ""]
     for name, row in plan["tests"].items():
@@ -683,27 +589,19 @@ def thermal_tests() -> Iterator[Row]:
         yield [name, *after, f"{row['halves']:.0f} of them"]
 
 
-def libraries() -> Iterator[Row]:
-    """Return the rows of libraries' emulators."""
-    for name, row in found("emulators").items():
-        errors = [f"{mean:.2f} ({worst:.1f})" for mean, worst in (row["smooth"], row["not smooth"])]
-        yield [name, *errors, short(row["seconds"])]
-
-
 def _matrix(key: str, several: bool) -> Iterator[Row]:
-    """Return the rows of rivals over the problems of the scoreboard."""
+    """Yield rivals over the problems of the scoreboard."""
     return scoreboard.matrix(found("scoreboard"), key, several)
 
 
 def _scoreboard(problem: str) -> Iterator[Row]:
-    """Return the rows of a problem of the scoreboard."""
+    """Yield a problem of the scoreboard."""
     return scoreboard.rows(found("scoreboard"), problem)
 
 
 # Where the rows of each table are from; the first two lines of it are the page's.
 TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "posterior coverage": posterior_coverage,
-    "outliers": outliers,
     "likelihood, ranks": likelihood_ranks,
     "likelihood, sizes of guards": guard_sizes,
     "saddlepoint": saddlepoint,
@@ -723,23 +621,15 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "readings, coverage": readings_coverage,
     "metric prices": metric_prices,
     "landscapes": landscapes,
-    "wrong families, many data": lambda: families((100_000,)),
-    "wrong families, few data": lambda: families((20, 50)),
-    "ties": ties,
-    "surrogates": surrogates,
     "joint, errors": joint,
-    "joint, memory": joint_memory,
     "speed": speed,
     "speed, jobs": speed_jobs,
     "scale": scale,
-    "busy workers": busy_workers,
     "between runs": between_runs,
-    "emulators, time": emulator_speed,
     "few runs": few_runs,
     "many inputs": many_inputs,
     "at a fold": at_a_fold,
     "two fidelities": two_fidelities,
-    "libraries": libraries,
     "planning": plans,
     "risk, errors": risk_errors,
     "risk, coverage": risk_coverage,

@@ -10,26 +10,21 @@ cracks fail, of which the other may be infinite.
 Exact: of a normal population under the right Haar prior all standard deviations go with the sample's
 own, so that what is expected, and how single ones scatter about it, needs no calibration.
 
-    uv run python -m benchmarks.planning [--data-sets 200] [--problems crack virkler exact]
+    uv run python -m benchmarks.planning [--data-sets 200]
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pymc as pm
 
 import prbayes as prb
-from benchmarks import record
+from benchmarks.study import Study
 
-OUT = record.RESULTS / "planning.json"
 # Of Paris' law: examples/crack_growth.py, and the mean of the fits of examples/virkler.py.
 EXPONENT, STEEPER = 2.6, 2.9
 # Of log C, about as in examples/crack_growth.py.
@@ -114,22 +109,11 @@ def calibrated(problem: Problem, data: dict[str, Any]) -> tuple[Any, pm.Model, A
         mean, spread = problem.priors
         x = problem.family(pm.Normal("mu", *mean), pm.HalfNormal("sigma", spread))
         for name, observed in data.items():
-            prb.Simulator(
-                *(name, problem.conditions[name], x),
-                metric=prb.ProbabilityResidual(),
-                observed=observed,
-                propagation=prb.Reweighted(512),
-                progressbar=False,
-            )
-    optimum = prb.minimize(model, progressbar=False)
-    posterior = prb.sample_smc(
-        500,
-        chains=2,
-        model=model,
-        optimum=optimum,
-        random_seed=1,
-        progressbar=False,
-    )
+            response = problem.conditions[name]
+            metric, stored = prb.ProbabilityResidual(), prb.Reweighted(512)
+            prb.Simulator(name, response, x, metric=metric, observed=observed, propagation=stored)
+    optimum = prb.minimize(model)
+    posterior = prb.sample_smc(500, chains=2, model=model, optimum=optimum, random_seed=1)
     return posterior, model, x
 
 
@@ -177,8 +161,8 @@ def exact(seed: int, first: int = 21, more: int = 20) -> dict[str, Any]:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return by condition and name: means of both, their ratio, and how single ratios scatter."""
-    table = {}
+    """Return by condition and name the ratio of both means, and how single ratios scatter."""
+    table: dict[str, Any] = {}
     for condition in rows[0]:
         for name in rows[0][condition]:
             pairs = np.array([row[condition][name] for row in rows])
@@ -186,33 +170,21 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             ratio = pairs[:, 0] / pairs[:, 1]
             relative = np.std(pairs[:, 0] - pairs[:, 1] * expected / found, ddof=1)
             table[f"{condition}/{name}"] = {
-                "expected": expected,
-                "found": found,
                 "ratio": expected / found,
                 "error": relative / np.sqrt(len(pairs)) / found,
                 "within 15%": float(np.mean(np.abs(np.log(ratio)) < np.log(1.15))),
                 "5% to 95%": np.quantile(ratio, [0.05, 0.95]).tolist(),
             }
-    return table
+    return {"data sets": len(rows), "table": table}
 
 
-def main() -> None:
-    """Compute, print and save."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data-sets", type=int, default=200)
-    parser.add_argument("--problems", nargs="*", default=[*PROBLEMS, "exact"])
-    parser.add_argument("--out", type=Path, default=OUT)
-    arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    for name in arguments.problems:
-        one = exact if name == "exact" else partial(repetition, PROBLEMS[name])
-        rows = [one(seed) for seed in range(arguments.data_sets)]
-        whole = record.load(arguments.out, {})  # of another problem, which may have run meanwhile
-        whole[name] = {"data sets": len(rows), "table": summary(rows)}
-        for key, cell in whole[name]["table"].items():
-            print(name, key, {k: np.round(v, 4).tolist() for k, v in cell.items()}, flush=True)
-        record.save(arguments.out, whole)
+def row(name: str, seed: int) -> dict[str, Any]:
+    """Return the row of a data set."""
+    return exact(seed) if name == "exact" else repetition(PROBLEMS[name], seed)
 
+
+CELLS = [*PROBLEMS, "exact"]
+STUDY = Study("planning", __doc__, CELLS, row, 200, summary, has_rows=False)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -9,22 +9,18 @@ Priors are
 - ``sharp``: a quarter and half of a standard error wide.
 
 Standard errors are those of the population's own inputs at a reference point. No constant of the
-package was chosen on the problems. Rows are stored as they come, so that an interrupted study
-continues where it stopped:
+package was chosen on the problems.
 
-    OMP_NUM_THREADS=1 uv run python -m benchmarks.posterior [--data-sets 40]
-    uv run python -m benchmarks.posterior --only-table
+    OMP_NUM_THREADS=1 uv run python -m benchmarks.posterior [--data-sets 40] [--cells "linear/*"]
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from functools import lru_cache, partial
+from itertools import product
 from typing import Any
 from zlib import crc32
 
@@ -32,10 +28,14 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
-from benchmarks import record
+from benchmarks.study import Study
+from prbayes.model.evaluator import Evaluator
+from prbayes.optimize.minimize import find_optimum
+from prbayes.optimize.objective import Minimisation
+from prbayes.posterior.sample import draw_posterior
+from prbayes.posterior.smc import SamplingSettings
+from prbayes.propagation.reweighted import designs_restored
 
-STORE = record.RESULTS / "posterior"
-OUT = record.RESULTS / "posterior.json"
 SIZES = (10, 20, 50, 200)
 PRIORS = ("vague", "bounded", "sharp")
 METRICS = {
@@ -45,7 +45,6 @@ METRICS = {
 }
 LEVEL = 0.89
 DRAWS = 250  # of each of four chains
-BLOCK = 10  # data sets of a cell before the next one
 
 Variables = list[Any]
 
@@ -186,10 +185,10 @@ def hyperparameters(problem: Problem, prior: str, size: int) -> Variables:
     return variables
 
 
-def build(problem: Problem, prior: str, metric: str, size: int) -> Any:
+@lru_cache(1)
+def evaluator_of(name: str, prior: str, size: int, metric: str) -> Evaluator:
     """Return an evaluator of the problem's model, to be given data."""
-    from prbayes.model.evaluator import Evaluator
-
+    problem = PROBLEMS[name]
     with pm.Model() as model:
         inputs = problem.inputs(*hyperparameters(problem, prior, size))
         part = size // len(problem.responses)
@@ -202,98 +201,37 @@ def build(problem: Problem, prior: str, metric: str, size: int) -> Any:
     return Evaluator.of(model)
 
 
-def analyse(evaluator: Any, problem: Problem, seed: list[int]) -> dict[str, Any]:
+def row(cell: str, number: int) -> dict[str, Any]:
     """Draw a truth and its data, calibrate them, and return the posterior's place and width."""
-    from prbayes.optimize.minimize import find_optimum
-    from prbayes.optimize.objective import Minimisation
-    from prbayes.posterior.sample import draw_posterior
-    from prbayes.posterior.smc import SamplingSettings
+    name, prior, size, metric = cell.split("/")
+    problem, evaluator = PROBLEMS[name], evaluator_of(name, prior, int(size), metric)
+    # Metrics see the same data; truths of other cells are independent.
+    of_cell = crc32(f"{name}/{prior}/{size}".encode())
+    rng = np.random.default_rng([2028, number, of_cell])
+    with designs_restored(evaluator.reweighted.values()):
+        truth = evaluator.hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
+        values = [v[0] for v in evaluator.hyperparameters.constrained(truth).values()]
+        data = {}
+        for node, response in zip(evaluator.nodes, problem.responses, strict=True):
+            n = len(node.observed)
+            specimens = [pm.draw(x, n, random_seed=rng) for x in problem.inputs(*values)]
+            data[node.name] = response(*specimens)
+        return analyse(evaluator.observing(data), truth)
 
-    rng = np.random.default_rng(seed)
-    truth = evaluator.hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
-    values = [v[0] for v in evaluator.hyperparameters.constrained(truth).values()]
-    data = {}
-    for node, response in zip(evaluator.nodes, problem.responses, strict=True):
-        n = len(node.observed)
-        specimens = [pm.draw(x, n, random_seed=rng) for x in problem.inputs(*values)]
-        data[node.name] = response(*specimens)
-    ev = evaluator.observing(data)
+
+def analyse(evaluator: Evaluator, truth: Any) -> dict[str, Any]:
+    """Return where the truth is in the posterior, and what the posterior cost."""
     begun = time.process_time()
-    optimum = find_optimum(ev, Minimisation())
+    optimum = find_optimum(evaluator, Minimisation())
     middle = time.process_time()
-    asked = SamplingSettings(draws=DRAWS, chains=4, optimum=optimum)
-    tree = draw_posterior(ev, asked)
+    tree = draw_posterior(evaluator, SamplingSettings(draws=DRAWS, chains=4, optimum=optimum))
     ended = time.process_time()
-    thetas = np.asarray(tree["calibration"]["theta"]).reshape(-1, ev.size)
+    thetas = np.asarray(tree["calibration"]["theta"]).reshape(-1, truth.size)
     return {
-        "truth": truth[0].tolist(),
         "below": (thetas < truth).mean(axis=0).tolist(),
-        "mean": thetas.mean(axis=0).tolist(),
-        "sd": thetas.std(axis=0).tolist(),
-        "estimate": optimum.theta.tolist(),
         "sampler": tree["posterior"].attrs["sampler"],
         "seconds": [middle - begun, ended - middle],
     }
-
-
-Cell = tuple[str, str, int, str]
-
-
-def cells(
-    problems: list[str], priors: list[str], sizes: list[int], metrics: list[str]
-) -> Iterator[Cell]:
-    """Yield the cells of the study."""
-    for problem in problems:
-        for prior in priors:
-            for size in sizes:
-                for metric in metrics:
-                    yield problem, prior, size, metric
-
-
-def path(cell: Cell) -> Path:
-    """Return where a cell's rows are."""
-    problem, prior, size, metric = cell
-    return STORE / f"{problem.replace(' ', '_')}-{prior}-{size}-{metric}.jsonl"
-
-
-def rows_of(cell: Cell) -> list[dict[str, Any]]:
-    """Return the stored rows of a cell."""
-    file = path(cell)
-    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-
-
-def continue_cell(cell: Cell, until: int) -> None:
-    """Analyse the data sets of a cell that are missing, up to a number."""
-    from prbayes._progress import shown
-    from prbayes.propagation.reweighted import designs_restored
-
-    done = {row["data set"] for row in rows_of(cell)}
-    missing = [i for i in range(until) if i not in done]
-    if not missing:
-        return
-    name, prior, size, metric = cell
-    problem = PROBLEMS[name]
-    evaluator = build(problem, prior, metric, size)
-    # Metrics see the same data; truths of other cells are independent.
-    of_cell = crc32(f"{name}/{prior}/{size}".encode())
-    for i in missing:
-        row: dict[str, Any]
-        try:
-            with shown(False), designs_restored(evaluator.reweighted.values()):
-                row = analyse(evaluator, problem, [2028, i, of_cell])
-        except Exception as error:  # a failure is a result
-            row = {"error": f"{type(error).__name__}: {error}"[:300]}
-        with path(cell).open("a") as file:
-            file.write(json.dumps(rounded({"data set": i, **row})) + "\n")
-
-
-def rounded(value: Any) -> Any:
-    """Return a row with five digits of each number."""
-    if isinstance(value, dict):
-        return {key: rounded(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [rounded(each) for each in value]
-    return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -312,13 +250,24 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def pooled(found: dict[str, dict[str, Any]], keep: Callable[[Cell], bool]) -> dict[str, Any]:
-    """Return mean coverage over the cells that are kept, with its standard error."""
-    chosen = []
-    for key, cell in found.items():
-        problem, prior, size, metric = key.split("/")
-        if cell["data sets"] and keep((problem, prior, int(size), metric)):
-            chosen.append(cell)
+def groups() -> dict[str, Callable[[list[str]], bool]]:
+    """Return groups of cells: whether one has a cell, by its problem, prior, size and metric."""
+    result: dict[str, Callable[[list[str]], bool]] = {"all": lambda cell: True}
+    for names, label in ((METRICS, "{}"), (PRIORS, "{}"), (SIZES, "N = {}"), (PROBLEMS, "{}")):
+        result |= {label.format(name): partial(_has, {str(name)}) for name in names}
+    for metric, prior in product(METRICS, PRIORS):
+        result[f"{metric}, {prior}"] = partial(_has, {metric, prior})
+    result["five new problems"] = lambda cell: cell[0] in NEW
+    return result
+
+
+def _has(names: set[str], cell: list[str]) -> bool:
+    return names <= set(cell)
+
+
+def pooled(figures: dict[str, Any], has: Callable[[list[str]], bool]) -> dict[str, Any]:
+    """Return mean coverage over the cells of a group, with its standard error."""
+    chosen = [figures[key] for key in figures if figures[key]["data sets"] and has(key.split("/"))]
     shares = np.concatenate([cell["coverage"] for cell in chosen])
     counts = np.concatenate([[cell["data sets"]] * len(cell["coverage"]) for cell in chosen])
     coverage = float((shares * counts).sum() / counts.sum())
@@ -326,66 +275,15 @@ def pooled(found: dict[str, dict[str, Any]], keep: Callable[[Cell], bool]) -> di
         "coverage": coverage,
         "error": float(np.sqrt(coverage * (1 - coverage) / counts.sum())),
         "intervals": int(counts.sum()),
-        "lowest": float(shares.min()),
-        "highest": float(shares.max()),
         "failed": sum(cell["failed"] for cell in chosen),
-        "by SMC": sum(cell["by SMC"] for cell in chosen),
-        "seconds": float(np.median([sum(cell["seconds"]) for cell in chosen])),
     }
 
 
-def table() -> dict[str, Any]:
-    """Summarise the stored rows, and print them; cells without rows here stay as they were."""
-    found = dict(record.load(OUT, {"cells": {}})["cells"])
-    for cell in cells(list(PROBLEMS), list(PRIORS), list(SIZES), list(METRICS)):
-        rows = rows_of(cell)
-        if rows:
-            found["/".join(map(str, cell))] = summary(rows)
-    groups: dict[str, Callable[[Cell], bool]] = {"all": lambda cell: True}
-    groups |= {metric: lambda cell, m=metric: cell[3] == m for metric in METRICS}
-    groups |= {prior: lambda cell, p=prior: cell[1] == p for prior in PRIORS}
-    groups |= {f"N = {size}": lambda cell, s=size: cell[2] == s for size in SIZES}
-    groups |= {problem: lambda cell, p=problem: cell[0] == p for problem in PROBLEMS}
-    groups |= {
-        f"{metric}, {prior}": lambda cell, m=metric, p=prior: (cell[3], cell[1]) == (m, p)
-        for metric in METRICS
-        for prior in PRIORS
-    }
-    groups["five new problems"] = lambda cell: cell[0] in NEW
-    figures = {}
-    for name, keep in groups.items():
-        try:
-            figures[name] = pooled(found, keep)
-        except ValueError:  # no cell yet
-            continue
-        row = figures[name]
-        print(
-            f"{name:18s} {row['coverage']:.3f} +- {row['error']:.3f} of {row['intervals']:6d}, cells "
-            f"{row['lowest']:.2f} to {row['highest']:.2f}, failed {row['failed']}, "
-            f"SMC {row['by SMC']}, {row['seconds']:.2f} s"
-        )
-    return {"cells": found, "pooled": figures}
-
-
-def main() -> None:
-    """Run what is missing, then summarise."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data-sets", type=int, default=40)
-    parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
-    parser.add_argument("--priors", nargs="+", default=list(PRIORS), choices=list(PRIORS))
-    parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES))
-    parser.add_argument("--metrics", nargs="+", default=list(METRICS), choices=list(METRICS))
-    parser.add_argument("--only-table", action="store_true")
-    arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    STORE.mkdir(parents=True, exist_ok=True)
-    asked = (arguments.problems, arguments.priors, arguments.sizes, arguments.metrics)
-    if not arguments.only_table:
-        for until in range(BLOCK, arguments.data_sets + BLOCK, BLOCK):
-            for cell in cells(*asked):
-                continue_cell(cell, min(until, arguments.data_sets))
-    record.save(OUT, table())
-
+CELLS = ["/".join(map(str, case)) for case in product(PROBLEMS, PRIORS, SIZES, METRICS)]
+# A failure is a result.
+STUDY = Study(
+    "posterior", __doc__, CELLS, row, 40, summary, failures=(Exception,), block=10, has_rows=False
+)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

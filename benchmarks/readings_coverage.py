@@ -11,10 +11,9 @@ data sets of an argument share the first runs.
 
 from __future__ import annotations
 
-import argparse
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,26 +21,24 @@ import pytensor.tensor as pt
 from scipy.special import logsumexp, ndtr
 
 import prbayes as prb
-from benchmarks import record
 from benchmarks.likelihood_coverage import (
     Functions,
     Problem,
+    figures_of,
     likelihood_of,
     posterior,
     summary,
     thetas_of,
 )
 from benchmarks.scoreboard.problem import Input, Prior, half_normal, normal, truncated
+from benchmarks.study import Study
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import log_likelihood_graph
 from prbayes.model.specimen_preparation import prepared
 
-OUT = record.RESULTS / "readings_coverage.json"
-ROWS = record.RESULTS / "rows" / "readings_coverage.json"
 SIZE = 20
 _AT_ONCE = 4_000_000  # numbers of an array
 _POINTS = 1024  # of the importance sampling
-_BLOCK = 20  # data sets between two writes of the results
 _INPUT = (Input("normal", "mu", "sigma"),)
 _MONOTONE = {"mu": normal(0.0, 1.0), "sigma": half_normal(0.5)}
 _FOLDED = {"mu": truncated(2.0, 1.0, low=1.0), "sigma": half_normal(1.0)}
@@ -371,16 +368,7 @@ def data_set(case: Case, likelihood: SpecimenLikelihood, number: int) -> dict[st
     if 1 / (reweighted**2).sum() < 0.2 * _POINTS:
         results["prbayes"] = posterior(problem, functions["prbayes"], start, _POINTS)
     for name, (u, weights, k) in results.items():
-        theta = thetas_of(problem, u)
-        mean = weights @ theta
-        row[name] = {
-            "below": {
-                p: float(weights @ (u[:, j] < start[j])) for j, p in enumerate(problem.priors)
-            },
-            "mean": mean.tolist(),
-            "sd": np.sqrt(weights @ (theta - mean) ** 2).tolist(),
-            "k": k,
-        }
+        row[name] = figures_of(problem, u, weights, start, thetas_of(problem, u)) | {"k": k}
     return row
 
 
@@ -394,26 +382,19 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return summary(rows) | bias
 
 
-def main() -> None:
-    """Run what is missing."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--data-sets", type=int, default=100)
-    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
-    arguments = parser.parse_args()
-    logging.disable(logging.WARNING)
-    stored, found = record.load(ROWS, {}), record.load(OUT, {"summary": {}})
-    for name in arguments.cases:
-        case = CASES[name]
-        _model, likelihood = likelihood_of(case.problem, case.measurement)
-        rows = stored.setdefault(name, [])
-        while len(rows) < arguments.data_sets:
-            count = min(_BLOCK, arguments.data_sets - len(rows))
-            rows += [data_set(case, likelihood, len(rows) + i) for i in range(count)]
-            found["summary"][name] = table(rows)
-            record.save(ROWS, stored)
-            record.save(OUT, found)
-            print(name, len(rows), found["summary"][name], flush=True)
+def row(name: str, number: int) -> dict[str, Any]:
+    """Return the row of a data set."""
+    return data_set(CASES[name], base_likelihood(name), number)
 
+
+@cache
+def base_likelihood(name: str) -> SpecimenLikelihood:
+    """Return the likelihood of a case, whose first runs serve all data sets."""
+    _model, likelihood = likelihood_of(CASES[name].problem, CASES[name].measurement)
+    return likelihood
+
+
+STUDY = Study("readings_coverage", __doc__, CASES, row, 100, table, has_rows=False)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

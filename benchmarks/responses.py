@@ -35,6 +35,11 @@ class Response:
         """Return the outputs, (n, m), of inputs (n, d); m is one for a function of one output."""
         return self.function(x).reshape(len(x), self.outputs)
 
+    def of_columns(self, *inputs: Any) -> Any:
+        """Return the outputs, (..., m), of as many inputs, each (...)."""
+        x = np.stack(np.broadcast_arrays(*inputs), axis=-1)
+        return self(x.reshape(-1, self.d)).reshape(*x.shape[:-1], self.outputs)
+
 
 # -- smooth ----------------------------------------------------------------------------------------
 

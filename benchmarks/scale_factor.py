@@ -12,17 +12,17 @@ per cent of the standard deviation. Last, `prb.minimize`, whose tolerances are r
 
 from __future__ import annotations
 
-import argparse
-import logging
 import warnings
-from pathlib import Path
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pymc as pm
+from scipy.optimize import minimize
+from scipy.stats import norm
 
 import prbayes as prb
-from benchmarks import record
+from benchmarks.study import Study
 
 MAXIMA = (5000.0, 0.005)
 BASES = (1, 10, 100, 1000)
@@ -31,17 +31,15 @@ BINS = 40
 
 def fit(maximum: float, base: int, form: str, method: str, parameters: str) -> tuple[int, float]:
     """Return the number of evaluations and the largest error, in standard deviations."""
-    from scipy.optimize import minimize
-    from scipy.stats import norm
-
     sd = 1 / (np.sqrt(2 * np.pi) * maximum)
     mean, start = 10 * sd, np.array([12 * sd, 1.5 * sd])
     scale = float(base) ** -np.floor(np.log10(maximum))
     width = 8 * sd / BINS
     centers = mean + width * (np.arange(BINS) - (BINS - 1) / 2)
     q = norm.pdf(centers, mean, sd)
+    is_raw = parameters == "raw"
 
-    def raw(p: Any) -> float:
+    def residual(p: Any) -> float:
         mu, sigma = p
         if not sigma > 0:
             return np.inf
@@ -51,20 +49,13 @@ def fit(maximum: float, base: int, form: str, method: str, parameters: str) -> t
         return float(scale * ((1 / sigma + 1 / sd) / (2 * np.sqrt(np.pi)) - 2 * cross))
 
     def back(t: Any) -> Any:
-        return (
-            np.array([start[0] + t[0] * start[1], start[1] * np.exp(t[1])])
-            if parameters == "standardised"
-            else t
-        )
+        return t if is_raw else np.array([start[0] + t[0] * start[1], start[1] * np.exp(t[1])])
 
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        found = minimize(
-            lambda t: raw(back(t)),
-            np.zeros(2) if parameters == "standardised" else start,
-            method=method,
-        )
-    return int(found.nfev), float(np.abs(back(found.x) - [mean, sd]).max() / sd)
+        first = start if is_raw else np.zeros(2)
+        best = minimize(lambda t: residual(back(t)), first, method=method)
+    return int(best.nfev), float(np.abs(back(best.x) - [mean, sd]).max() / sd)
 
 
 def packages(maximum: float, base: int) -> tuple[int, float, float]:
@@ -81,43 +72,19 @@ def packages(maximum: float, base: int) -> tuple[int, float, float]:
     return optimum.search.n_evaluations, optimum.point["mu"] / sd, optimum.point["sigma"] / sd
 
 
-def main() -> None:
-    """Fit all combinations, print a table, write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=record.RESULTS / "scale_factor.json")
-    arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    out: dict[str, Any] = {}
-    print(
-        "evaluations, finite differences included; in brackets the error in sd where the fit failed"
-    )
-    print(
-        f"{'max q':>6s} {'form':9s} {'method':12s} {'parameters':13s} "
-        + " ".join(f"{f'C = {c}':>15s}" for c in BASES)
-    )
-    for maximum in MAXIMA:
-        for form in ("sum", "integral"):
-            for method in ("BFGS", "Nelder-Mead"):
-                for parameters in ("raw", "standardised"):
-                    found = [fit(maximum, base, form, method, parameters) for base in BASES]
-                    out[f"{maximum}/{form}/{method}/{parameters}"] = found
-                    cells = [f"{n}" if e < 0.01 else f"{n} ({e:.2g})" for n, e in found]
-                    print(f"{maximum:6g} {form:9s} {method:12s} {parameters:13s} "
-                          + " ".join(f"{c:>15s}" for c in cells), flush=True)  # fmt: skip
-    print(
-        "\nprb.minimize, integral form, BFGS: evaluations of value and gradient, mu / sd, sigma / sd"
-    )
-    for maximum in MAXIMA:
-        own = [packages(maximum, base) for base in BASES]
-        out[f"{maximum}/prbayes"] = own
-        print(
-            f"{maximum:6g} "
-            + " ".join(
-                f"C = {c}: {n}, {m:.6f}, {s:.6f};" for c, (n, m, s) in zip(BASES, own, strict=True)
-            )
-        )
-    record.save(arguments.out, out)
+def row(cell: str, number: int) -> list[Any]:
+    """Return the figures of each C."""
+    maximum, *case = cell.split("/")
+    if case == ["prbayes"]:
+        return [packages(float(maximum), base) for base in BASES]
+    form, method, parameters = case
+    return [fit(float(maximum), base, form, method, parameters) for base in BASES]
 
+
+CASES = list(product(("sum", "integral"), ("BFGS", "Nelder-Mead"), ("raw", "standardised")))
+CELLS = [f"{maximum}/{'/'.join(case)}" for maximum, case in product(MAXIMA, CASES)]
+CELLS += [f"{maximum}/prbayes" for maximum in MAXIMA]
+STUDY = Study("scale_factor", __doc__, CELLS, row, 1)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

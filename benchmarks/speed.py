@@ -5,37 +5,31 @@ caches on disk filled, *warm* the median of the others. Imports are apart. *Firs
 caches. A ratio is of two jobs of the same command; bias and width are those of the worst
 hyperparameter, in standard deviations of the exact posterior, as a median over the data sets.
 
-    uv run python -m benchmarks.speed [--jobs NAME ...]
-
-pyABC and sbi run in environments of their own (see scoreboard/README.md): ``--pyabc PYTHON``,
-``--sbi PYTHON``. ``--jobs`` measures some jobs and keeps the results of the others.
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 uv run python -m benchmarks.speed
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import logging
 import os
 import re
 import resource
-import subprocess
-import sys
 import tempfile
 import time
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks import record
+from benchmarks.study import Study
 
-OUT = record.RESULTS / "speed.json"
 README = Path(__file__).parents[1] / "README.md"
 SIZES = {"linear": 50, "frame": 20}
+FIRST_USE = "first use"  # last: its caches are of its own
 
 
 @dataclass(frozen=True)
@@ -71,13 +65,12 @@ JOBS = {
     "PR, 1 output of 1 input": Job("outputs", "1 of 1", 3),
     "PR, 1 output of 2 inputs": Job("outputs", "1 of 2", 3),
     "PR, 2 outputs of 2 inputs": Job("outputs", "2 of 2", 3),
-    "1000 products": Job("fleet", "1000", 1),
     "memory linear": Job("memory", "linear", 1),
     "memory frame": Job("memory", "frame", 1),
     "import": Job("imports", "", 1),
     "README": Job("readme", "", 1),
+    FIRST_USE: Job("likelihood", "linear", 6),
 }
-PROGRAMS = {"pyABC": "pyABC Wasserstein", "sbi": "sbi"}
 
 
 @dataclass(frozen=True)
@@ -110,7 +103,6 @@ COMPARISONS = (
                "PR, 1 output of 1 input", 2.0),
     Comparison("PR, two outputs of two inputs, warm", "PR, 2 outputs of 2 inputs", "warm",
                "PR, 1 output of 2 inputs", 1.5),
-    Comparison("1000 products of 20 specimens, CPU s", "1000 products", "cold", "", 10.0),
     Comparison("linear 50, memory above import and Numba, MiB", "memory linear", "added", "", 100.0),
     Comparison("frame 20, memory above import and Numba, MiB", "memory frame", "added", "", 100.0),
     Comparison("import of what the README needs, above PyMC's, CPU s", "import", "added", "", 0.6),
@@ -315,13 +307,10 @@ TIMED = {
 
 def measured(job: Job) -> dict[str, Any]:
     """Return the figures of a job, in this process."""
+    logging.disable(logging.WARNING)
     if job.kind in TIMED:
         problem = {"metric": "linear", "outputs": None}.get(job.kind, job.argument)
         return timed(TIMED[job.kind](job.argument), problem, job.repeats)
-    if job.kind == "fleet":
-        from benchmarks.fleet import fleet
-
-        return fleet(int(job.argument))
     if job.kind == "memory":
         return memory(job.argument)
     return imports() if job.kind == "imports" else readme()
@@ -330,82 +319,27 @@ def measured(job: Job) -> dict[str, Any]:
 # -- processes -------------------------------------------------------------------------------------
 
 
-def in_process(name: str, *, empty_caches: bool = False) -> dict[str, Any]:
+def row(name: str, number: int) -> dict[str, Any]:
     """Return the figures of a job in a new process."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
-        if empty_caches:
-            environment |= {
+        if name == FIRST_USE:
+            os.environ |= {
                 "NUMBA_CACHE_DIR": folder, "PYTENSOR_FLAGS": f"base_compiledir={folder}"
             }  # fmt: skip
-        command = [sys.executable, "-m", "benchmarks.speed", "--child", name]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        return {"error": done.stderr.strip().splitlines()[-1][:300]}
-    result: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return result
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            return pool.submit(measured, JOBS[name]).result()
 
 
-def of_program(name: str, python: str | None) -> dict[str, Any]:
-    """Return the figures of a program in an environment of its own, on the linear problem."""
-    if python is None:
-        return {"error": "not installed"}
-    with tempfile.TemporaryDirectory() as folder:
-        command = [
-            python, "-m", f"benchmarks.scoreboard.rivals.{name.lower()}", "--rivals", PROGRAMS[name],
-            "--problems", "linear", "--sizes", "50", "--replicates", "1", "--store", folder,
-        ]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            return {"error": done.stderr.strip().splitlines()[-1][:300]}
-        (path,) = Path(folder).glob("*.json")
-        (row,) = json.loads(path.read_text(encoding="utf-8"))["found"]["rows"]
-    return {"cold": row["cpu"], "warm": row["cpu"], "runs": row["runs"]}
-
-
-def rows(jobs: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows of the table: figure, aim, and whether it is met."""
-    result = []
+def rows(jobs: dict[str, Any]) -> Iterator[tuple[Comparison, float, float]]:
+    """Yield the rows of the table: a figure, and its ratio to that of another job."""
     for c in COMPARISONS:
         value = jobs.get(c.job, {}).get(c.figure)
         other = jobs.get(c.against, {}).get(c.figure) if c.against else 1.0
-        if value is None or other is None:
-            continue
-        row = {"what": c.text, "against": c.against, "value": value, "ratio": value / other}
-        result.append(row | {"aim": c.aim, "met": value / other <= c.aim})
-    return result
+        if value is not None and other is not None:
+            yield c, value, value / other
 
 
-def main() -> None:
-    """Measure jobs one after another, and keep their figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--jobs", nargs="+", default=[*JOBS, *PROGRAMS, "first use"])
-    parser.add_argument("--pyabc", help="the Python with pyABC")
-    parser.add_argument("--sbi", help="the Python with sbi")
-    parser.add_argument("--child", choices=list(JOBS), help=argparse.SUPPRESS)
-    parser.add_argument("--out", type=Path, default=OUT)
-    arguments = parser.parse_args()
-    warnings.simplefilter("ignore")
-    logging.disable(logging.WARNING)
-    if arguments.child:
-        print(json.dumps(measured(JOBS[arguments.child])))
-        return
-    jobs = record.load(arguments.out, {"jobs": {}})["jobs"]
-    pythons = {"pyABC": arguments.pyabc, "sbi": arguments.sbi}
-    for name in arguments.jobs:
-        if name in PROGRAMS:
-            jobs[name] = of_program(name, pythons[name])
-        elif name == "first use":
-            jobs[name] = in_process("likelihood linear", empty_caches=True)
-        else:
-            jobs[name] = in_process(name)
-        print(f"{name:32s}", jobs[name], flush=True)
-        record.save(arguments.out, {"jobs": jobs, "rows": rows(jobs)})
-    for row in rows(jobs):
-        print(
-            f"{row['what']:64s} {row['value']:8.3f} {row['ratio']:8.3f} {row['aim']:6.2f} {row['met']}"
-        )
-
+STUDY = Study("speed", __doc__, JOBS, row, 1, failures=(Exception,))
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

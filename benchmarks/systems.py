@@ -15,14 +15,8 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
+from benchmarks.metrics import METRICS
 from prbayes.model.evaluator import Evaluator
-
-METRICS: dict[str, prb.Metric] = {
-    "PR": prb.ProbabilityResidual(),
-    "KLD": prb.KullbackLeibler(),
-    "area": prb.AreaMetric(),
-    "log-likelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
-}
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,16 @@ Emulators: fitted on n runs from the prior; their error is the root mean square 
 points of the prior, in units of the response's standard deviation there, in the mean of outputs.
 Optima: of n runs and a cloud of 16 384 points around the calibrated population; off is the root
 mean square distance from the optimum of Resimulated(65 536), over hyperparameters and seeds, in
-standard errors. With a coarse response that is exact they are off by what the cloud is.
+standard errors.
 
-Run: uv run python -m benchmarks.two_fidelities [--seeds 10]
+    uv run python -m benchmarks.two_fidelities [--data-sets 10]
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
+from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,13 +30,12 @@ import pymc as pm
 from scipy.stats import norm, qmc
 
 import prbayes as prb
-from benchmarks import record
+from benchmarks.study import Study
 from prbayes.emulators.selection import Runs, candidate_surfaces, predict_outputs, select_surfaces
 from prbayes.model.evaluator import Evaluator
 
 N = 50
 RUNS = (32, 64, 128, 256, 512)
-OPTIMA = (32, 64, 128, 256, 512)
 MEAN, SD = np.array([1000.0, 1.0, 2.0]), np.array([80.0, 0.05, 0.2])  # of the population
 FREQUENCIES = np.sqrt(np.array([850.0, 1000.0, 1150.0]))  # around the mean resonance
 # With these, coarse and fine responses correlate .95.
@@ -71,8 +69,6 @@ CASES: dict[str, Callable[..., Any]] = {
     "damping": one_damping,
     "unrelated": unrelated,
 }
-
-
 WAYS = ("without", *CASES)
 
 
@@ -83,13 +79,6 @@ def prior(uniforms: Any) -> Any:
     mean = MEAN + SD * unknown * z[:, :3]
     sd = SD * np.exp(0.3 * unknown * z[:, 3:6])
     return mean + sd * z[:, 6:]
-
-
-def correlations(case: str) -> list[float]:
-    """Return the correlations of fine and coarse response over the prior, of each output."""
-    x = prior(qmc.Sobol(9, seed=7).random(2**14)).T
-    pairs = zip(amplitudes(*x).T, CASES[case](*x).T, strict=True)
-    return [round(float(np.corrcoef(a, b)[0, 1]), 3) for a, b in pairs]
 
 
 def emulator_error(coarse: Callable[..., Any] | None, n: int, seed: int) -> float:
@@ -103,16 +92,6 @@ def emulator_error(coarse: Callable[..., Any] | None, n: int, seed: int) -> floa
     off = predict_outputs(models, runs, at, coarse=there) - truth
     errors = np.sqrt((off**2).mean(axis=0)) / truth.std(axis=0)
     return round(float(errors.mean()), 5)
-
-
-def emulators(seeds: int, found: dict[str, dict[str, list[float]]]) -> Iterator[None]:
-    """Fit emulators that are not yet among those that were found, by runs and coarse response."""
-    for n in RUNS:
-        rows = found.setdefault(str(n), {way: [] for way in WAYS})
-        for way, errors in rows.items():
-            for seed in range(len(errors), seeds):
-                errors.append(emulator_error(CASES.get(way), n, seed))
-        yield
 
 
 def build(propagation: Any) -> pm.Model:
@@ -134,102 +113,42 @@ def build(propagation: Any) -> pm.Model:
     return model
 
 
-def away(coarse: Callable[..., Any] | None, n: int, seed: int, reference: Any) -> list[float]:
+def away(coarse: Callable[..., Any] | None, n: int, seed: int) -> list[float]:
     """Calibrate with n runs, and return how far from the reference, in its standard errors."""
+    fine = reference()
     stored = prb.Reweighted(n, emulator="auto", coarse=coarse, random_seed=seed)
     evaluator = Evaluator.of(build(stored))
     rng = np.random.default_rng(0)
-    near = rng.multivariate_normal(reference.theta, reference.covariance, 64)
+    near = rng.multivariate_normal(fine.theta, fine.covariance, 64)
     evaluator.reweighted["y"].reach(evaluator.parents(near, 0), growth=2)
-    optimum = prb.minimize(
-        evaluator.model, start=reference.point, starts=0, refine=False, progressbar=False
-    )
-    off = (optimum.theta - reference.theta) / np.sqrt(np.diag(reference.covariance))
+    optimum = prb.minimize(evaluator.model, start=fine.point, starts=0, refine=False)
+    off = (optimum.theta - fine.theta) / np.sqrt(np.diag(fine.covariance))
     return [round(float(x), 4) for x in off]
 
 
-def optima(seeds: int, found: dict[str, dict[str, list[list[float]]]]) -> Iterator[None]:
-    """Calibrate with what is not yet among the optima that were found, by runs and response."""
-    fine = build(prb.Resimulated(2**16))
-    reference = prb.minimize(fine, starts=0, progressbar=False)
-    ways = {"without": None, "exact": amplitudes, **CASES}
-    for seed in range(seeds):
-        for n in OPTIMA:
-            rows = found.setdefault(str(n), {way: [] for way in ways})
-            for way, coarse in ways.items():
-                if len(rows[way]) == seed:
-                    rows[way].append(away(coarse, n, seed, reference))
-            yield
+@cache
+def reference() -> prb.Optimum:
+    """Return the optimum of the expensive response, resimulated."""
+    return prb.minimize(build(prb.Resimulated(2**16)), starts=0)
 
 
-def times_fewer(errors: dict[str, dict[str, float]]) -> dict[str, str]:
-    """Return how many times as many runs are needed without the coarse response, by runs with it.
-
-    Between the numbers of runs that were tried errors are powers of it.
-    """
-    runs = np.log([int(n) for n in errors])
-    without = np.log([row["without"] for row in errors.values()])
-    found = {}
-    for n, row in errors.items():
-        wanted = np.log(row["with"])
-        if wanted < without.min():
-            found[n] = f"> {np.exp(runs[-1]) / int(n):.0f}"
-        else:
-            needed = np.interp(-wanted, -np.minimum.accumulate(without), runs)
-            found[n] = f"{np.exp(needed) / int(n):.1f}"
-    return found
+def row(cell: str, seed: int) -> Any:
+    """Return the error of emulators, or the distances of an optimum, on a number of runs."""
+    what, n, way = cell.split("/")
+    if what == "emulator":
+        return emulator_error(CASES.get(way), int(n), seed)
+    return away(CASES.get(way), int(n), seed)
 
 
-def table(errors: dict[str, dict[str, float]]) -> None:
-    """Print errors, and how many runs are saved."""
-    saved = times_fewer(errors)
-    print("       runs   without      with   runs saved, times")
-    for n, row in errors.items():
-        print(f"   {n:>8} {row['without']:9.3f} {row['with']:9.3f}   {saved[n]}", flush=True)
-
-
-def shown(case: str, whole: dict[str, Any]) -> None:
-    """Print the tables of a case."""
-    print(f"{case}: correlates {whole['correlations'][case]} with the fine one")
-    print("  emulators, error in standard deviations of the response")
-    emulators = whole["emulators"].items()
-    table(
-        {n: {"without": median(row["without"]), "with": median(row[case])} for n, row in emulators}
-    )
-    print("  optima, off in standard errors")
-    optima = whole["optima"].items()
-    table({n: {"without": rms(row["without"]), "with": rms(row[case])} for n, row in optima})
-
-
-def median(errors: list[float]) -> float:
-    """Return the median."""
-    return float(np.median(errors))
-
-
-def rms(rows: list[list[float]]) -> float:
-    """Return the root mean square distance."""
+def summary(rows: list[Any]) -> float:
+    """Return the median error of emulators, or the root mean square distance of optima."""
+    if isinstance(rows[0], float):
+        return float(np.median(rows))
     return float(np.sqrt(np.square(rows).mean()))
 
 
-def main() -> None:
-    """Print tables and write JSON; what was found before is not computed again."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--out", type=Path, default=record.RESULTS / "two_fidelities.json")
-    parser.add_argument("--only-table", action="store_true")
-    arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    whole: dict[str, Any] = record.load(arguments.out, {"emulators": {}, "optima": {}})
-    if not arguments.only_table:
-        whole["correlations"] = {case: correlations(case) for case in CASES}
-        for part in (emulators, optima):
-            for _ in part(arguments.seeds, whole[part.__name__]):
-                record.save(arguments.out, whole)
-    for case in CASES:
-        shown(case, whole)
-    exact = [f"{n} runs {rms(row['exact']):.3f}" for n, row in whole["optima"].items()]
-    print(f"optima with a coarse response that is exact: {', '.join(exact)}")
-
+CELLS = [f"{what}/{n}/{way}" for what, n, way in product(("emulator", "optimum"), RUNS, WAYS)]
+STUDY = Study("two_fidelities", __doc__, CELLS, row, 10, summary)
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks import distributions, record
+from benchmarks import distributions
 
-STORED = record.load(distributions.RESULTS, {})
+STORED = {name: row for name, (row,) in distributions.STUDY.stored()["rows"].items()}
 # One for each way that an input is told apart.
 TELLING = {
     "Gamma": ("Reweighted", "Resimulated", "Fresh"),

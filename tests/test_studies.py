@@ -13,13 +13,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import (
-    contamination,
     families,
     likelihood_coverage,
     likelihood_guards,
     posterior,
     readings_coverage,
-    record,
 )
 
 pytestmark = pytest.mark.slow
@@ -27,48 +25,31 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("prior", posterior.PRIORS)
 @pytest.mark.parametrize("metric", posterior.METRICS)
-def test_coverage(metric: str, prior: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(posterior, "STORE", tmp_path)
-    cell = ("linear", prior, 20, metric)
-    # A study continues where it stopped.
-    for until in (10, 40):
-        posterior.continue_cell(cell, until)
-    rows = posterior.rows_of(cell)
-    assert [row["data set"] for row in rows] == list(range(40))
+def test_coverage(metric: str, prior: str) -> None:
+    cell = f"linear/{prior}/20/{metric}"
+    rows = [posterior.STUDY.attempt(cell, number) for number in range(40)]
     found = posterior.summary(rows)
     assert found["failed"] <= 2
     # The standard error of a coverage of .89 of 80 intervals is .035.
     assert abs(np.mean(found["coverage"]) - 0.89) < 4 * 0.035
 
 
-def test_contamination_of_the_probability_residual() -> None:
-    evaluator = contamination.evaluator_of("ProbabilityResidual")
-    shifts = []
-    for i in range(6):
-        data = np.random.default_rng([5, i]).normal(10, 1, contamination.SIZE)
-        dirty = np.r_[data[:-3], np.full(3, 10 + contamination.DISTANCE)]
-        clean, after = (contamination.posterior(evaluator, d) for d in (data, dirty))
-        shifts.append((after[:, 0] - clean[:, 0]) / clean[:, 1])
-    mu, sigma = np.mean(shifts, axis=0)
-    assert abs(mu) < 0.3
-    assert abs(sigma) < 1.3
-
-
-@pytest.mark.parametrize("truth", ["lognormal", "normal"])
-def test_families(truth: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(families, "SIZES", (50,))
+@pytest.mark.parametrize("truth", families.FAMILIES)
+def test_families(truth: str) -> None:
     # At 40 data sets the standard error of a share is at most .08, of one of 5% .035, and that of a
     # standard deviation .11.
-    chosen = (families.LINEAR, "KullbackLeibler", truth)
-    (wide,) = families.case((*chosen, 0.6), 40)
-    # More than half was wanted of both; a normal truth is told in .40 of the study's data sets.
+    figures = []
+    for variation in (0.6, 0.1):
+        cell = families.name_of(families.LINEAR, "KLD", truth, variation, 50)
+        figures.append(families.summary([families.row(cell, number) for number in range(40)]))
+    wide, narrow = figures
+    # More than half was wanted of both; a normal truth is identified in .40 of the study's data sets.
     if truth == "lognormal":
         assert wide["right"] > 0.5
     assert wide["right"] > wide["wrong"]
     assert wide["wrong"] <= 0.025 + 4 * 0.025
-    (narrow,) = families.case((*chosen, 0.1), 40)
     assert narrow["right"] + narrow["wrong"] <= 0.25
-    for found in (wide, narrow):
+    for found in figures:
         assert 0.8 - 4 * 0.09 < found["z_sd"] < 1.25 + 4 * 0.14
 
 
@@ -91,10 +72,7 @@ def test_the_posterior_of_the_likelihood_by_specimen_is_the_exact_one(name: str)
 
 
 def test_the_likelihood_by_specimen_covers_over_a_whole_prior() -> None:
-    results = record.load(likelihood_coverage.OUT, None)
-    for name, rows in results["rows"].items():
-        found = likelihood_coverage.summary(rows)
-        assert rounded(found) == rounded(results["summary"][name])
+    for found in likelihood_coverage.STUDY.stored()["summary"].values():
         assert min(found["prbayes"]["p of uniformity"].values()) > 0.01
         # As if the hyperparameters of a data set were one: the error is at most this one.
         error = (0.89 * 0.11 / found["data sets"]) ** 0.5
@@ -102,7 +80,7 @@ def test_the_likelihood_by_specimen_covers_over_a_whole_prior() -> None:
 
 
 def test_guards_rarely_flag_right_models() -> None:
-    results = record.load(likelihood_guards.OUT, None)
+    results = likelihood_guards.STUDY.stored()
     largest = dict(zip(likelihood_guards.CHECKS, (0.07, 0.06, 0.06), strict=True))
     for name, rows in results["rows"].items():
         found = likelihood_guards.summary(rows)
@@ -112,10 +90,7 @@ def test_guards_rarely_flag_right_models() -> None:
 
 
 def test_measurement_arguments_have_the_exact_posterior() -> None:
-    results = record.load(readings_coverage.OUT, None)
-    for name, rows in results["rows"].items():
-        found = readings_coverage.table(rows)
-        assert rounded(found) == rounded(results["summary"][name])
+    for found in readings_coverage.STUDY.stored()["summary"].values():
         assert np.abs(found["bias"]).max() < 0.1
         error = (0.89 * 0.11 / (found["data sets"] - found["refused"])) ** 0.5
         for within in found["prbayes"]["coverage"].values():

@@ -75,6 +75,10 @@ class Reference:
     sd: dict[str, float]
 
 
+def _none(size: int, replicate: int) -> Any:
+    raise NotImplementedError
+
+
 @dataclass(frozen=True)
 class Problem:
     """Measured responses of specimens, and the population that is looked for."""
@@ -87,14 +91,14 @@ class Problem:
     # NumPy, or another module with its functions, and the inputs -> outputs, one of them or a list.
     formula: Callable[..., Any]
     sizes: tuple[int, ...]  # numbers of specimens
-    data: Callable[[int, int], Any]  # size, replicate -> (N,), or (N, m) of several outputs
-    reference: Callable[[int, int], Reference]  # of the same arguments
+    # Size, replicate -> (N,), or (N, m) of several outputs.
+    data: Callable[[int, int], Any] = _none
+    reference: Callable[[int, int], Reference] = _none  # of the same arguments
     replicates: int = 100  # data sets that can be drawn; 1 of real data
     truth: dict[str, float] | None = None  # of what is told
     told: Callable[[Draws], Draws] = dict  # what is told of hyperparameters
     degrees: int | None = None  # of freedom of outputs that are readings of a curve, with errors
     error: float | None = None  # sd of a reading, where it is known
-    published: tuple[str, ...] = ()  # results of others, with their source
     correlation: str = ""  # the hyperparameter that correlates the first two inputs, if one does
     separate: bool = False  # whether each output was measured on specimens of its own
 

@@ -1,4 +1,4 @@
-"""The scoreboard: every rival's score on every problem, in one file, and two pictures of it.
+"""The scoreboard: every rival's score on every problem, in one file.
 
     uv run python -m benchmarks.scoreboard.table
     uv run python -m benchmarks.pages
@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +25,8 @@ from benchmarks.scoreboard.problems import PROBLEMS, tension_304l
 from benchmarks.scoreboard.score import score
 from benchmarks.scoreboard.study import STORE
 
-PICTURES = Path(__file__).parents[2] / "docs" / "images"
 _ENOUGH = 20  # data sets of a coverage that is told: its standard error is .07
-_ACROSS = 4  # panels of a picture
 _TENSION = tension_304l.PROBLEM.name
-# Axes that are the same in all panels; what lies beyond stands at their edge.
-_LIMITS = {"rms": (0.005, 20.0), "width": (0.25, 8.0)}
-_RUNS, _WIDTHS = (60.0, 3e8), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _COSTS = ("data sets", "failures", "runs", "cpu")
 # In the order of the page: by what a rival is, and prbayes first because the page is its own.
 RIVALS = (
@@ -171,78 +165,13 @@ def cannot(found: dict[str, Any]) -> Iterator[list[str]]:
         yield [rival, "; ".join(problems), reason]
 
 
-def pictures(found: dict[str, Any], folder: Path) -> None:
-    """Draw accuracy against runs, and width against the number of specimens."""
-    import matplotlib.pyplot as plt
-
-    colors = dict(zip(RIVALS, plt.get_cmap("tab20")(np.arange(len(RIVALS))), strict=True))
-    rows = -(-len(found) // _ACROSS)
-    for key, file in (("rms", "accuracy"), ("width", "width")):
-        size = (3.2 * _ACROSS, 2.8 * rows + 0.8)
-        figure, axes = plt.subplots(
-            rows, _ACROSS, figsize=size, squeeze=False, layout="constrained"
-        )
-        for axis, name in zip_longest(axes.ravel(), found):
-            if name is None:
-                axis.set_axis_off()
-            else:
-                _panel(axis, name, found[name], colors, key)
-        label = "sd / reference sd" if key == "width" else "rms error / reference sd"
-        for axis in axes[:, 0]:
-            axis.set_ylabel(f"{label}, worst")
-        told = [axis.get_legend_handles_labels() for axis in axes.ravel()]
-        handles = {t: h for both in told for h, t in zip(*both, strict=True)}
-        figure.legend(handles.values(), handles, loc="outside lower center", ncols=5, frameon=False)
-        figure.savefig(folder / f"scoreboard_{file}.png", dpi=90)
-        plt.close(figure)
-
-
-def _panel(axis: Any, name: str, sizes: dict[str, Any], colors: dict[str, Any], key: str) -> None:
-    """Draw a problem: accuracy at one number of specimens, or width at all of them."""
-    shown = sizes if key == "width" else {size_of(sizes): sizes[size_of(sizes)]}
-    for rival, color in colors.items():
-        marker = "s" if rival.startswith("prbayes") else "o"
-        points = list(_points(shown, rival, key))
-        if not points:
-            continue
-        x, y = zip(*points, strict=True)
-        style = {"marker": marker, "color": color, "label": rival}
-        if x[0]:
-            axis.plot(x, y, linestyle="-" if key == "width" else "none", **style)
-        else:  # runs were not counted
-            axis.axhline(y[0], linestyle=":", **style | {"marker": None})
-    axis.set(title=name, xscale="log", yscale="log", ylim=_LIMITS[key])
-    if key == "width":
-        axis.set_xlabel("specimens")
-        numbers = [float(size) for size in sizes]
-        axis.set_xlim(min(numbers) / 1.5, max(numbers) * 1.5)
-        axis.set_xticks(numbers, list(sizes), minor=False)
-        axis.set_xticks([], minor=True)
-        axis.set_yticks(_WIDTHS, [f"{width:g}" for width in _WIDTHS])
-        axis.set_yticks([], minor=True)
-        axis.axhline(1.0, color="k", lw=0.6)
-    else:
-        axis.set(xlim=_RUNS, xlabel=f"runs of the response, {size_of(sizes)} specimens")
-
-
-def _points(sizes: dict[str, Any], rival: str, key: str) -> Iterator[tuple[float, float]]:
-    for size, cell in sizes.items():
-        one = cell.get(rival)
-        value = None if one is None else worst(one, key)
-        if one is not None and value:
-            kept = np.clip(value, *_LIMITS[key])
-            yield (float(size) if key == "width" else one["runs"]), float(kept)
-
-
 def main() -> None:
-    """Write the scores, and draw."""
+    """Write the scores."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--store", type=Path, default=STORE)
-    parser.add_argument("--pictures", type=Path, default=PICTURES)
     arguments = parser.parse_args()
     found = scores(arguments.store)
     record.save(arguments.store.with_suffix(".json"), found, ("numpy", "scipy"))
-    pictures(found, arguments.pictures)
 
 
 if __name__ == "__main__":

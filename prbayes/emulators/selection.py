@@ -171,9 +171,8 @@ class Runs:
 def candidate_surfaces(n: int, dimensions: int) -> list[Surface]:
     """Return the surfaces that are tried on n runs.
 
-    Processes with a length for each input are best on nearly all responses, and with few runs a
-    spline around a polynomial on near-polynomial ones (`python -m benchmarks.emulators`). With more
-    than 256 runs the spline is best for one of twelve responses, and takes most of the time.
+    Processes have a length for each input. With few runs a spline around a polynomial suits
+    near-polynomial responses. With more than 256 runs it takes most of the time.
     """
     processes: list[Surface] = [GaussianProcess("squared_exponential"), GaussianProcess("matern")]
     if n > 256:

@@ -204,8 +204,7 @@ def failure_caps(observed: Floats) -> Floats:
 def sufficient_directions(m: int) -> int:
     """Return a sufficient number of directions for m outputs, at least two.
 
-    Twice as many as a scatter's shape has parameters. Errors of means, standard deviations and
-    correlations are then those of ten times as many, to 3% (`benchmarks/directions.py`).
+    Twice as many as a scatter's shape has parameters.
     """
     return (m - 1) * (m + 2)
 
@@ -271,9 +270,8 @@ class Joint(LiftedMetric):
     metric : Metric
         Of one output.
     directions : int, optional
-        Their number, (m - 1) (m + 2) for m outputs by default: errors of estimated means, standard
-        deviations and correlations are then those of ten times as many, to 3%
-        (``benchmarks/directions.py``). Fewer than m (m + 1) / 2 miss some correlations.
+        Their number, (m - 1) (m + 2) for m outputs by default, twice as many as a scatter's shape
+        has parameters. Fewer than m (m + 1) / 2 miss some correlations.
     components : int, optional
         More than eight outputs, such as curves, are replaced by their scores on principal
         components of data and design together: the fewest that leave out a hundredth of the

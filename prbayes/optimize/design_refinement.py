@@ -245,8 +245,7 @@ def runs_left(evaluator: Evaluator, errors: DesignErrors) -> int:
 def _growth_factor(evaluator: Evaluator, errors: DesignErrors) -> float:
     """Return the factor by which the number of runs has to grow; one if runs do not help.
 
-    The error of a design of several inputs falls with about the power .65 of its size
-    (benchmarks/dimensions.py).
+    The error of a design of several inputs is taken to fall with the power .65 of its size.
     """
     is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
     if is_emulated and not errors.emulators > _SHARE * AGREE:

@@ -57,7 +57,7 @@ from prbayes.response.response import (
 )
 
 # Largest basis in a compiled graph, 1 GiB, for the largest design. Graphs without a basis are as
-# fast (benchmarks/joint_speed.py), but JAX does not know their operations.
+# fast, but JAX does not know their operations.
 _MAX_BASIS = 1 << 27
 # Weights of a block of populations, 2 MiB, which stay in the cache. A
 # product of matrices reads all stored responses for each block: no fewer populations than these.

@@ -7,9 +7,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks.suppliers import EACH as EACH
-from benchmarks.suppliers import NAMES as NAMES
-from benchmarks.suppliers import exact as exact
-from benchmarks.suppliers import hierarchy as hierarchy
-from benchmarks.suppliers import labelled as labelled
-from benchmarks.suppliers import measured as measured
+from benchmarks.groups import EACH as EACH
+from benchmarks.groups import NAMES as NAMES
+from benchmarks.groups import exact as exact
+from benchmarks.groups import hierarchy as hierarchy
+from benchmarks.groups import labelled as labelled
+from benchmarks.groups import measured as measured

@@ -1,26 +1,18 @@
 """One measured value in twenty is gross: eight standard deviations above the mean.
 
-The reference is of the data without the gross values. Beside the exact posterior of all values with
-an unknown share of gross errors, the rows of ``prbayes likelihood`` are scored by
-
-    python -m benchmarks.scoreboard.problems.contaminated
+The reference is of the data without the gross values.
 """
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
-from scipy.stats import beta, norm
 
 from benchmarks.scoreboard import exact
 from benchmarks.scoreboard.problem import Input, Problem, Reference
 from benchmarks.scoreboard.problems.linear import PRIORS, TRUTH
-from benchmarks.scoreboard.score import score
 
 SHARE, DISTANCE = 0.05, 8.0
 
@@ -56,33 +48,3 @@ PROBLEM = Problem(
     reference=reference,
     truth=TRUTH,
 )
-
-
-def of_all_values(size: int, replicate: int) -> Reference:
-    """Return the exact posterior of all values: a Beta(1, 9) share is uniform over twice the range."""
-    values, counts = np.unique(data(size, replicate), return_counts=True)
-    gross = 1 / (2 * np.ptp(values))
-    share = beta.ppf((np.arange(64) + 0.5) / 64, 1, 9)[:, None]
-
-    def log_likelihood(mu: Any, sigma: Any) -> Any:
-        logs = sum(
-            count * np.log((1 - share) * norm.pdf(value, mu, sigma) + share * gross)
-            for value, count in zip(values, counts, strict=True)
-        )
-        return logsumexp(logs, axis=0)
-
-    return exact.posterior(PRIORS, log_likelihood, points=81)
-
-
-def main() -> None:
-    """Print the score of the stored rows of the log-likelihood by specimen."""
-    from benchmarks.scoreboard.study import STORE, path_of
-
-    path = path_of(STORE, "prbayes likelihood", PROBLEM.name)
-    rows = json.loads(path.read_text(encoding="utf-8"))["found"]["rows"]
-    for size in PROBLEM.sizes:
-        print(size, score(replace(PROBLEM, reference=of_all_values), size, rows))
-
-
-if __name__ == "__main__":
-    main()

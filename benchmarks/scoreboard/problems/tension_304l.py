@@ -142,9 +142,6 @@ PROBLEM = Problem(
     replicates=1,
     told=told,
     degrees=2,
-    published=(
-        "the Laplace study of MatCal's example gives the yield a standard deviation of 3.59 ksi",
-    ),
     correlation="correlation",
 )
 

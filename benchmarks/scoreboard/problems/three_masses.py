@@ -99,7 +99,7 @@ def reference(case: Case, size: int, replicate: int) -> Reference:
     return Reference("exact posterior", center, sd)
 
 
-def _problem(name: str, case: Case, published: tuple[str, ...]) -> Problem:
+def _problem(name: str, case: Case) -> Problem:
     priors = _priors(case)
     ends = [float(end) for pair in case.ends for end in pair]
     return Problem(
@@ -113,27 +113,7 @@ def _problem(name: str, case: Case, published: tuple[str, ...]) -> Problem:
         data=partial(data, case),
         reference=partial(reference, case),
         truth=dict(zip(priors, ends, strict=True)),
-        published=published,
     )
 
 
-PROBLEMS = (
-    _problem(
-        "well separated",
-        SEPARATED,
-        (
-            "IRSM [.81, 1.20] [.80, 1.21] [.80, 1.20]",
-            "IOR and MC [.79, 1.21] [.80, 1.20] [.80, 1.20]",
-            "IDD and MC [.80, 1.20] [.80, 1.19] [.80, 1.20]",
-        ),
-    ),
-    _problem(
-        "close",
-        CLOSE,
-        (
-            "IRSM [7.55, 8.54] [1.80, 2.19] [1.80, 2.20]",
-            "IOR and MC [7.48, 8.50] [1.80, 2.21] [1.80, 2.21]",
-            "IDD and MC [7.46, 8.52] [1.80, 2.20] [1.81, 2.20]",
-        ),
-    ),
-)
+PROBLEMS = (_problem("well separated", SEPARATED), _problem("close", CLOSE))

@@ -14,7 +14,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
-from benchmarks.metrics import BY_NAME
+from benchmarks.metrics import BY_CLASS
 from benchmarks.scoreboard import in_pymc
 from benchmarks.scoreboard.problem import Draws
 from benchmarks.scoreboard.study import Rival, Task, main
@@ -26,7 +26,7 @@ def _of_vector(task: Task) -> Any:
 
 def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     """Return draws of the hyperparameters by a metric."""
-    metric = BY_NAME[settings["metric"]]
+    metric = BY_CLASS[settings["metric"]]
     with pm.Model() as model:
         values = in_pymc.hyperparameters(task.problem)
         inputs = in_pymc.inputs(task.problem, values)
