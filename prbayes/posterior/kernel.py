@@ -341,8 +341,7 @@ class Checkpoint:
     ) -> None:
         self.path = Path(path)
         self.problem = problem
-        # As from JSON, so that settings equal those of a file.
-        self.settings: dict[str, Any] = json.loads(json.dumps(settings))
+        self.settings = dict(settings)
         self.arrays: dict[str, Floats] = {}
         self.note: dict[str, Any] = {}
         if self.path.exists():

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import pymc as pm
 import xarray as xr
+from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
 from prbayes._finding import Finding, as_json, report
@@ -610,9 +611,8 @@ def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, f
         variables[name] = (["chain", "stage"], table)
     coords = {"chain": np.arange(len(chains)), "stage": np.arange(n_stages)}
     logs = np.array([stages["log_marginal_likelihood"][-1] for stages in chains])
-    top = logs.max()
     evidence = {
-        "log_marginal_likelihood": float(top + np.log(np.exp(logs - top).mean())),
+        "log_marginal_likelihood": float(logsumexp(logs) - np.log(logs.size)),
         "log_marginal_likelihood_sd": float(logs.std(ddof=1)) if logs.size > 1 else np.nan,
     }
     return xr.Dataset(variables, coords=coords), evidence

@@ -26,9 +26,8 @@ from prbayes._finding import Finding
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.inference.refits import BatchObjective, SamplingDistribution, refit
+from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import (
-    DataSets,
     groups,
     observable,
     observed_set,
@@ -154,7 +153,6 @@ class RefitLikelihoodOptions:
     """Options of the likelihood given an estimate, from refits."""
 
     n_sets: int = 1024  # synthetic data sets
-    n_starts: int = 64  # points around the estimate as starts of refits, with local optima
     # Rounds that share the data sets. The first ones are drawn in a ball of ``radius`` standard
     # errors around the estimate, later ones from the previous posterior, ``inflation`` times wider.
     rounds: int = 2
@@ -392,7 +390,8 @@ def _draw(
     rng = np.random.default_rng([options.seed, seed])
     points = points_along(evaluator, thetas, rng)
     data = sets_at(evaluator, stored_populations(evaluator, thetas), points)
-    starts = x if len(centers) == 1 else _best_starts(centers, data, options)
+    # Populations at another optimum have their estimates near the first one.
+    starts = x if len(centers) == 1 else np.zeros_like(x)
     estimates, converged = refit(sampling, data, starts, is_rough=True)
     if converged.mean() < options.converged:
         raise ValueError(
@@ -435,23 +434,6 @@ def _log_likelihoods(
             logs = np.log(rows / rows.sum(axis=1, keepdims=True))
         total += (count @ np.ascontiguousarray(logs.T)).T
     return total
-
-
-def _best_starts(
-    centers: Sequence[SamplingDistribution], data: DataSets, options: RefitLikelihoodOptions
-) -> Floats:
-    """Return the best of some points near the estimate for each data set, (R, r)."""
-    sampling = centers[0]
-    ball = _points_of_ball(options.n_starts, sampling.stderr.size, options)
-    thetas = sampling.thetas(ball)
-    is_nearest = nearest(centers, thetas)[0] == 0
-    ball, thetas = ball[is_nearest], thetas[is_nearest]
-    objective = BatchObjective.of(sampling.evaluator, sampling.scales, data)
-    best = [
-        objective(thetas[None], slice(first, first + 16)).argmin(axis=1)
-        for first in range(0, objective.n_sets, 16)
-    ]
-    return np.asarray(ball[np.concatenate(best)])
 
 
 def _continued(evaluator: Evaluator, continuation: Continuation) -> Evaluator:
