@@ -33,6 +33,7 @@ from prbayes.posterior.saddlepoint import (
     EstimateLikelihoodOptions,
     SaddlepointOptions,
     Scores,
+    StoredScores,
     cumulants,
     estimate_likelihood,
     log_density,
@@ -154,6 +155,20 @@ def test_metrics_without_a_mean_score_are_refused() -> None:
     for metric in (prb.AreaMetric(), prb.KullbackLeibler(reverse=True)):
         with pytest.raises(TypeError, match="gradient is no mean"):
             specimen_scores(metric.against(observed), normal_population(1), observed)
+
+
+def test_weights_are_those_of_responses_that_can_be_observed() -> None:
+    evaluator = Evaluator.of(normal_model(KLD, Y, n=64))
+    is_observable = np.arange(64) % 3 > 0
+    values = np.arange(2.0 * is_observable.sum()).reshape(-1, 2)
+    combinations = np.array([[2.0], [-1.0]])
+    stored = StoredScores(0, is_observable, values, 20, combinations, rows=16)
+    thetas = np.array([[0.0, 0.0], [1.0, -0.5]])
+    log_weights, scores = stored.population(evaluator, thetas)
+    _, weights = evaluator.populations(thetas, 0)
+    expected = weights[:, is_observable] / weights[:, is_observable].sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(np.exp(log_weights), expected)
+    np.testing.assert_allclose(scores.values[:, 0], 2 * values[:, 0] - values[:, 1])
 
 
 # -- posteriors --
