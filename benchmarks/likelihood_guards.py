@@ -26,7 +26,7 @@ from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import Populations, prepared
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
-from prbayes.results.likelihood_checks import check_draws
+from prbayes.results.likelihood_checks import check_conflict, check_draws, check_population
 
 # With priors that matter beside the data: conflicts are reported where the prior pulls.
 LINEAR = Problem(
@@ -88,9 +88,10 @@ def of_draws(evaluator: Evaluator, populations: Populations) -> dict[str, Any]:
     points = prepared(likelihood).points
     draws = populations.posterior(points.z, points.log_a).thetas
     result = xr.DataTree.from_dict({"posterior": xr.Dataset()})
-    optimum = None if simulation_obstacle(evaluator) else prb.minimize(evaluator.model)
-    thetas = draws.reshape(2, -1, evaluator.hyperparameters.size)
-    checked = check_draws(evaluator, result, thetas, optimum)
+    checked = check_draws(evaluator, result, draws)
+    if not simulation_obstacle(evaluator):
+        optimum = prb.minimize(evaluator.model)
+        checked += check_population(optimum) + check_conflict(optimum, draws)
     return {
         "codes": [finding.code for finding in checked.findings],
         "untested": [name for name in TESTS if any(name in text for text in checked.untested)],

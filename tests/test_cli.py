@@ -188,6 +188,7 @@ def test_mistakes_get_one_line_and_exit_code_2(
         (["nodims.nc"], "without the dimensions"),
         (["p.nc", "stranger.nc"], "share no hyperparameter"),
         (["p.nc", "--out", "p.nc/report.html"], "cannot write"),
+        (["p.nc", "--markdown", "p.nc"], "cannot write: folder: got"),
         (["p.nc", "--title", " "], "title"),
     ]
     for arguments, message in cases:
@@ -238,36 +239,6 @@ def test_what_is_logged_goes_to_stderr(
     logging.getLogger("prbayes").info("sampling")
     assert logging.getLogger("prbayes").level == level
     assert capsys.readouterr() == ("r.html\n", "" if options else "prbayes: sampling\n")
-
-
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        (np.full((2, 50), np.nan), "got NaN or infinite values only, expected finite ones"),
-        (np.empty((0, 0)), "got no values"),
-    ],
-)
-def test_a_posterior_of_nothing_is_not_reported(
-    values: Any, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    tree = xr.DataTree.from_dict({"posterior": xr.Dataset({"mu": (("chain", "draw"), values)})})
-    tree.to_netcdf(tmp_path / "p.nc", engine="h5netcdf")
-    assert main(["report", str(tmp_path / "p.nc"), "--out", str(tmp_path / "r.html")]) == 2
-    assert text in capsys.readouterr().err
-    assert not (tmp_path / "r.html").exists()
-
-
-def test_crafted_attributes_get_no_traceback(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    own = xr.Dataset({"mu": (("chain", "draw"), np.random.default_rng(1).normal(size=(2, 50)))})
-    own.attrs["model"] = "[" * 50_000
-    tree = xr.DataTree.from_dict({"posterior": own})
-    tree.to_netcdf(tmp_path / "p.nc", engine="h5netcdf")
-    given = ["report", str(tmp_path / "p.nc"), "--no-pictures", "--out", str(tmp_path / "r.html")]
-    assert main(given) == 0
-    assert main([*given, "--markdown", str(tmp_path / "p.nc")]) == 2
-    assert "cannot write: folder: got" in capsys.readouterr().err
 
 
 def test_help_is_there_before_anything_heavy_is_loaded() -> None:

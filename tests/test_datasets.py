@@ -39,15 +39,6 @@ def test_nan_only_after_the_reading_at_which_the_specimen_failed() -> None:
         assert measured.size == lengths.size or measured[-1] >= 1.60
 
 
-def test_two_calls_give_independent_objects() -> None:
-    crack = datasets.crack_growth()
-    crack.crack_length_inch[:] = 0.0
-    crack.attrs["notch_inch"] = 0.0
-    again = datasets.crack_growth()
-    assert float(again.crack_length_inch.max()) == 1.77
-    assert again.attrs["notch_inch"] == 0.90
-
-
 def test_the_virkler_data_are_those_of_their_publications() -> None:
     data = datasets.virkler()
     lengths = data.half_crack_length_mm

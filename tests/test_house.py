@@ -580,7 +580,6 @@ INNER = {
     "response.compile": {
         "pymc.logprob.utils.CheckParameterValue",
         "pytensor.compile.mode.Mode",
-        "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Constant",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.op.Op",

@@ -22,7 +22,7 @@ from prbayes.optimize.maximum_likelihood import other_specimens, specimen_pool, 
 from prbayes.response.distributions import compiled_log_density
 from prbayes.results.diagnose import _check_sampler
 from prbayes.results.likelihood_checks import (
-    _check_conflict,
+    check_conflict,
     influence,
     score_function,
     scored_specimens,
@@ -325,7 +325,7 @@ def test_chains_in_different_modes_take_the_place_of_r_hat(chains: xr.DataTree) 
 def test_a_prior_that_agrees_with_the_data_is_no_conflict(optimum: prb.Optimum) -> None:
     errors = np.sqrt(np.diag(optimum.covariance))
     for pull, text in ((0.1, "less than a conflict"), (1.0, "no hyperparameter is in conflict")):
-        checked = _check_conflict(optimum, (optimum.theta + pull * errors)[None, None])
+        checked = check_conflict(optimum, (optimum.theta + pull * errors)[None])
         assert text in str(checked.remarks[0])
         assert not checked.findings
 
@@ -335,7 +335,7 @@ def test_conflict_of_prior_and_data(problem: Problem) -> None:
         x = pm.Normal.dist(pm.Normal("mu", -1.0, 0.1), pm.HalfNormal("sigma", 1.0))
         prb.Simulator("y", lambda x: np.exp(0.5 * x), x, observed=problem.observed)
     optimum = prb.minimize(model, starts=0, progressbar=False)
-    checked = _check_conflict(optimum, (optimum.theta - [1.5, 0.0])[None, None])
+    checked = check_conflict(optimum, (optimum.theta - [1.5, 0.0])[None])
     assert [finding.code for finding in checked.findings] == ["prior-conflict"]
     assert str(checked.findings[0]).startswith("mu: got prior")
 

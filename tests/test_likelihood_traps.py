@@ -26,7 +26,7 @@ from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.specimen_emulation import PointOptions
 from prbayes.response.failures import ResponseError
-from prbayes.results.likelihood_checks import check_optimum
+from prbayes.results.likelihood_checks import check_population
 
 type Floats = np.ndarray
 SEEDS = range(20)
@@ -639,7 +639,7 @@ def two_modes(rng: np.random.Generator, n: int) -> Floats:
 def test_the_optimum_reports_another_family() -> None:
     x = 1 + 0.5 * two_modes(np.random.default_rng(4), 100)
     optimum = prb.minimize(model_of(line, normal_input, line(x)), progressbar=False)
-    assert [each.code for each in check_optimum(optimum).findings] == ["population-misfit"]
+    assert [each.code for each in check_population(optimum).findings] == ["population-misfit"]
 
 
 @pytest.mark.slow

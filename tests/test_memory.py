@@ -108,16 +108,15 @@ def test_a_design_goes_with_its_model_and_stays_with_what_was_compiled() -> None
 
 @linux
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["build", "minimize_one"])
-def test_five_hundred_calls_grow_by_less_than_twenty_mib(what: str) -> None:
-    assert grown(what, 500) < 20
-
-
-@linux
-@pytest.mark.slow
-def test_ten_calls_of_minimize_grow_little() -> None:
-    # Each evaluator that were kept would be 2 MiB.
-    assert grown("minimize_one", 10) < 10
+@pytest.mark.parametrize(
+    ("what", "calls"),
+    [
+        *(("build", 500), ("minimize_one", 500)),
+        *(("build_by_specimen", 100), ("minimize_by_specimen", 100)),
+    ],
+)
+def test_many_calls_grow_by_less_than_twenty_mib(what: str, calls: int) -> None:
+    assert grown(what, calls) < 20
 
 
 def test_the_support_of_many_populations_is_looked_at_in_parts(
@@ -229,10 +228,3 @@ def test_points_of_a_model_that_was_never_compiled_go() -> None:
     del model, likelihood
     gc.collect()
     assert points() is None
-
-
-@linux
-@pytest.mark.slow
-@pytest.mark.parametrize("what", ["build_by_specimen", "minimize_by_specimen"])
-def test_hundred_calls_by_specimen_grow_by_less_than_twenty_mib(what: str) -> None:
-    assert grown(what, 100) < 20

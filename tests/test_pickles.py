@@ -101,13 +101,8 @@ INSIDE = {
     "propagation.Bound",
 }
 RESULTS: dict[str, Callable[[], Any]] = {
-    "calibrate_epsilon": lambda: prb.calibrate_epsilon(optimum()),
     "sample_smc": posterior,
     "predict": predicted,
-    "bootstrap": lambda: prb.bootstrap(optimum(), 10, **QUIET),
-    "compare": lambda: prb.compare({"optimum": optimum(), "ABC": posterior()}),
-    "cross_validate": lambda: prb.cross_validate(optimum(), **QUIET),
-    "rank": lambda: prb.rank({"a": optimum(), "b": optimum()}, **QUIET),
     "sampling": lambda: optimum().sampling(),
     "to_datatree": lambda: optimum().to_datatree(),
 }

@@ -7,16 +7,15 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hostile import EXECUTORS
 from line_problem import build
 
 import prbayes as prb
@@ -66,20 +65,6 @@ def serial(name: str) -> str:
     return digest(name)
 
 
-@contextmanager
-def spawned(workers: int) -> Iterator[Executor]:
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield pool
-
-
-EXECUTORS: dict[str, Callable[[], Any]] = {
-    "1 thread": lambda: ThreadPoolExecutor(1),
-    "3 threads": lambda: ThreadPoolExecutor(3),
-    "1 process": lambda: spawned(1),
-    "3 processes": lambda: spawned(3),
-}
-
-
 @pytest.mark.parametrize(
     "name",
     ["Resimulated", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Reweighted", "Fresh"))],
@@ -90,36 +75,13 @@ def test_chunks_of_any_size_on_threads_give_the_same_bits(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", EXECUTORS)
+@pytest.mark.parametrize("where", ["processes", "loky", "dask"])
 @pytest.mark.parametrize("response", [prb.scalar(one), many, uneven], ids=["one", "many", "uneven"])
 @pytest.mark.parametrize("name", PROPAGATIONS)
-def test_executors_give_the_same_bits(
-    name: str, response: Any, executor: str, tmp_path: Path
-) -> None:
-    with EXECUTORS[executor]() as pool:
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+def test_executors_give_the_same_bits(name: str, response: Any, where: str, tmp_path: Path) -> None:
+    with EXECUTORS[where]() as pool:
         assert digest(name, response, executor=pool, store=tmp_path, version="1") == serial(name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PROPAGATIONS)
-def test_dask_gives_the_same_bits(name: str) -> None:
-    distributed = pytest.importorskip("distributed")
-    cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-    )
-    with cluster, distributed.Client(cluster) as client:
-        assert digest(name, executor=client.get_executor(pure=False)) == serial(name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PROPAGATIONS)
-def test_loky_gives_the_same_bits(name: str) -> None:
-    loky = pytest.importorskip("joblib.externals.loky")
-    pool = loky.get_reusable_executor(2)
-    try:
-        assert digest(name, executor=pool) == serial(name)
-    finally:
-        pool.shutdown(wait=True, kill_workers=True)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._stats import ENVELOPED, envelope
+from prbayes._stats import ENVELOPED, distribution_function, envelope, quantile
 from prbayes._validate import Floats, positive_integer, share
 from prbayes.decision.populations import Populations, ResponseSample
 from prbayes.decision.quantities import interval_grid
@@ -137,17 +137,13 @@ def _evaluation_points(samples: list[ResponseSample]) -> Floats:
     for sample in samples:
         is_finite = np.isfinite(sample.values)
         weights = sample.mean_weights()[is_finite]
-        middles = (np.cumsum(weights) - weights / 2) / weights.sum()
-        points.append(np.interp(levels, middles, sample.values[is_finite]))
+        points.append(quantile(sample.values[is_finite], weights / weights.sum(), levels))
     return np.unique(np.concatenate(points))
 
 
 def _distribution_functions(sample: ResponseSample, y: Floats) -> Floats:
     """Return the distribution functions of all valid populations at y, (k, m)."""
-    count = np.searchsorted(sample.values, y, side="right")
-    parts = []
-    for weights in sample.weight_batches(sample.populations.thetas):
-        sums = np.cumsum(weights, axis=1)
-        parts.append(np.where(count > 0, sums[:, np.maximum(count - 1, 0)], 0.0))
+    batches = sample.weight_batches(sample.populations.thetas)
+    parts = [distribution_function(sample.values, weights, y) for weights in batches]
     functions = np.concatenate(parts)
     return functions[np.isfinite(functions).all(axis=1)]

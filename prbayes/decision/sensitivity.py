@@ -187,9 +187,10 @@ class Indices:
 
 def _paired_points(n: int, d: int, seed: int) -> tuple[Floats, Floats]:
     """Return two independent sets of n normal vectors by replicate, (r, n, d) each."""
-    sets = [ndtri(sobol(n, 2 * d, seed + 7919 * r)) for r in range(REPLICATES)]
-    first, second = np.split(np.array(sets), 2, axis=-1)
-    return first, second
+    seeds = [seed + 7919 * r for r in range(REPLICATES)]
+    points = np.array([sobol(n, 2 * d, s) for s in seeds])
+    z = ndtri(points)
+    return z[..., :d], z[..., d:]
 
 
 def _hyperparameter_indices(
@@ -336,9 +337,11 @@ def first_order(values: Floats, same: Floats) -> Floats:
     """
     values, same = _complete_pairs(values, same)
     mean = np.nanmean(values + same, axis=1, keepdims=True) / 2
-    a, b = values - mean, same - mean
+    a = values - mean
+    b = same - mean
     covariance = np.nanmean(a * b, axis=1)
-    return _ratio(covariance, np.nanmean(a**2 + b**2, axis=1) / 2)
+    variance = np.nanmean(a**2 + b**2, axis=1) / 2
+    return _ratio(covariance, variance)
 
 
 def total_order(values: Floats, other: Floats) -> Floats:
@@ -350,7 +353,8 @@ def total_order(values: Floats, other: Floats) -> Floats:
     """
     values, other = _complete_pairs(values, other)
     part = np.nanmean((values - other) ** 2, axis=1) / 2
-    return _ratio(part, (np.nanvar(values, axis=1) + np.nanvar(other, axis=1)) / 2)
+    variance = (np.nanvar(values, axis=1) + np.nanvar(other, axis=1)) / 2
+    return _ratio(part, variance)
 
 
 def derivative_bound(squares: Floats, values: Floats) -> Floats:
@@ -396,11 +400,15 @@ class Copula:
 
     def thetas(self, z: Floats) -> Floats:
         """Return the thetas of normal vectors, (..., d)."""
-        position = (z - _SCORES[0]) / (_SCORES[1] - _SCORES[0])
-        below = np.clip(np.floor(position), 0, len(_SCORES) - 2).astype(int)
+        step = _SCORES[1] - _SCORES[0]
+        position = (z - _SCORES[0]) / step
+        last = len(_SCORES) - 2
+        below = np.clip(np.floor(position), 0, last).astype(int)
         columns = np.arange(z.shape[-1])
-        low, high = self.quantiles[below, columns], self.quantiles[below + 1, columns]
-        return np.asarray(low + (position - below) * (high - low))
+        low = self.quantiles[below, columns]
+        high = self.quantiles[below + 1, columns]
+        fraction = position - below
+        return np.asarray(low + fraction * (high - low))
 
     @cached_property
     def root(self) -> Floats:

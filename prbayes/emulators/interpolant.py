@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import legder, legval
@@ -48,48 +49,33 @@ class Interpolant:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
         m, d = self.weights.shape[1], self.z.shape[1]
         if d == 1:
-            return self._on_line(z)
+            return self.values(z), self._slopes_on_line(z)[..., None]
         values = np.empty((len(z), m))
         jacobian = np.empty((len(z), m, d))
         moments = [self.weights, *(column[:, None] * self.weights for column in self.z.T)]
         # d|r|^5 / dz_a = 5 |r|^3 r_a
         of_cubes = 5 * np.concatenate(moments, axis=1).T
+        derivative = legder(np.eye(int(self.powers.max()) + 1))  # columns of Legendre series
         for rows, square, cube in self._distances(z):
             np.sqrt(square, out=cube)
             cube *= square
-            terms = _terms(_legendre(self._scaled(z[rows]), self.powers), self.powers)
-            stacked = self._polynomial_with_slopes @ terms
-            polynomial, *slopes = stacked.reshape(d + 1, m, -1)
+            single = _legendre(self._scaled(z[rows]), self.powers)
+            polynomial = self.coefficients.T @ _terms(single, self.powers)
             steepness, *by_axis = (of_cubes @ cube).reshape(d + 1, m, -1)
             square *= cube
             values[rows] = (polynomial - self.weights.T @ square).T
             for a in range(d):
-                jacobian[rows, :, a] = (by_axis[a] - z[rows, a] * steepness + slopes[a]).T
+                factors = single.copy()
+                factors[:, a] = derivative.T @ single[:-1, a]
+                slope = self.coefficients.T @ _terms(factors, self.powers) / self.half_width[a]
+                jacobian[rows, :, a] = (by_axis[a] - z[rows, a] * steepness + slope).T
         return values, jacobian
-
-    @cached_property
-    def _polynomial_with_slopes(self) -> Floats:
-        """Coefficients of the polynomial and of its d partial derivatives, ((1 + d) m, terms)."""
-        degree = int(self.powers.max())
-        base = (degree + 1) ** np.arange(self.powers.shape[1] - 1, -1, -1)
-        codes = self.powers @ base  # increasing
-        rows = [self.coefficients.T]
-        for a, half_width in enumerate(self.half_width):
-            slope = np.zeros_like(self.coefficients)
-            # P'_p = (2 p - 1) P_{p-1} + (2 p - 5) P_{p-3} + ...
-            for reduction in range(1, degree + 1, 2):
-                lower = self.powers[:, a] - reduction
-                exists = np.flatnonzero(lower >= 0)
-                places = np.searchsorted(codes, codes[exists] - reduction * base[a])
-                factors = 2 * lower[exists, None] + 1
-                slope[places] += factors * self.coefficients[exists]
-            rows.append(slope.T / half_width)
-        return np.concatenate(rows)
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m), without the Jacobian."""
         if self.z.shape[1] == 1:
-            return self._on_line(z, has_slopes=False)[0]
+            radial, polynomial = self._on_line
+            return np.asarray(radial(z[:, 0]) + legval(self._scaled(z)[0], polynomial).T)
         values = np.empty((len(z), self.weights.shape[1]))
         for rows, square, length in self._distances(z):
             np.sqrt(square, out=length)
@@ -100,49 +86,28 @@ class Interpolant:
         return values
 
     @cached_property
-    def _pieces(self) -> tuple[Floats, Floats, Floats]:
-        """Sorted runs of one input, middles of the pieces between them, and their polynomials.
+    def _on_line(self) -> tuple[Any, Floats]:
+        """The radial functions of one input, and the Legendre series of the polynomial.
 
-        Between two runs the radial functions are a polynomial of degree five. Its coefficients,
-        (6, pieces, m), are those of powers of the distance from the middle of the piece.
+        Between two runs the radial functions are a polynomial of degree five.
         """
+        from scipy.interpolate import PPoly  # takes long to import
+
         order = np.argsort(self.z[:, 0])
         runs, weights = self.z[order, 0], self.weights[order]
-        middles = np.concatenate([runs[:1], (runs[1:] + runs[:-1]) / 2, runs[-1:]])
-        distances = middles[:, None] - runs
-        side = np.where(np.arange(len(middles))[:, None] > np.arange(len(runs)), 1.0, -1.0)
-        powers = [-comb(5, p) * (side * distances ** (5 - p)) @ weights for p in range(6)]
-        return runs, middles, np.stack(powers)
-
-    def _on_line(self, z: Floats, *, has_slopes: bool = True) -> tuple[Floats, Floats]:
-        """Return values and Jacobian at points of one input, (k, 1) -> (k, m), (k, m, 1)."""
-        runs, middles, coefficients = self._pieces
-        polynomial = self._legendre_series
-        values = np.empty((len(z), self.weights.shape[1]))
-        jacobian = np.zeros_like(values)
-        step = max(1, IN_CACHE // 64)
-        for first in range(0, len(z), step):
-            rows = slice(first, first + step)
-            column = z[rows, 0]
-            piece = np.searchsorted(runs, column)
-            t = (column - middles[piece])[:, None]
-            u = (column - self.center) / self.half_width
-            value = coefficients[5][piece]
-            slope = np.zeros_like(value)
-            for coefficient in coefficients[4::-1]:
-                slope = slope * t + value if has_slopes else slope
-                value = value * t + coefficient[piece]
-            values[rows] = value + legval(u, polynomial[0]).T
-            if has_slopes:
-                jacobian[rows] = slope + legval(u, polynomial[1]).T
-        return values, jacobian[..., None]
-
-    @cached_property
-    def _legendre_series(self) -> tuple[Floats, Floats]:
-        """Coefficients of the polynomial of one input and of its derivative, (terms, m)."""
+        ends = np.concatenate([runs[:1] - 1, runs, runs[-1:] + 1])
+        distances = ends[:-1, None] - runs
+        side = np.where(distances < 0, -1.0, 1.0)
+        pieces = [-comb(5, p) * (side * distances**p) @ weights for p in range(6)]
         series = np.zeros_like(self.coefficients)
         series[self.powers[:, 0]] = self.coefficients
-        return series, legder(series) / self.half_width
+        return PPoly(np.stack(pieces), ends), series
+
+    def _slopes_on_line(self, z: Floats) -> Floats:
+        """Return derivatives at points of one input, (k, 1) -> (k, m)."""
+        radial, polynomial = self._on_line
+        slopes = legval(self._scaled(z)[0], legder(polynomial)).T / self.half_width
+        return np.asarray(radial(z[:, 0], 1) + slopes)
 
     def _scaled(self, z: Floats) -> Floats:
         """Return the polynomial's variables, (k, d) -> (d, k)."""

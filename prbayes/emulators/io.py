@@ -29,11 +29,11 @@ class SavedSurrogate:
     fields: dict[str, Any]  # of the surrogate
     kind: str  # name of the surface's class
     model: Surface | None  # the surface, if it ships with prbayes
-    follows_coarse: bool
+    joined: bool | None  # whether a coarse response is an input of it; None if it follows none
     probes: Floats  # (k,) or (k, m): values of the surface at fixed points, which identify it
 
 
-def write(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
+def write(path: str | PathLike[str], surrogate: Any, joined: bool | None, probes: Floats) -> None:
     """Write a surrogate and its values at fixed points as netCDF."""
     responses = surrogate.responses
     output = ["output"] if responses.ndim > 1 else []
@@ -50,7 +50,7 @@ def write(path: str | PathLike[str], surrogate: Any, probes: Floats) -> None:
         "outside": str(surrogate.outside.value) if hasattr(surrogate.outside, "value") else None,
         "noise": surrogate.noise,
         "n_runs": surrogate.n_runs,
-        "joined": None if surrogate.coarse is None else surrogate._joined,
+        "joined": joined,
         "outputs": None if names is None else names.keys,
     }
     data = xr.Dataset(
@@ -84,7 +84,6 @@ def read(path: str | PathLike[str]) -> SavedSurrogate:
         if outputs is not None:
             keys = [(str(key), None if size is None else int(size)) for key, size in outputs]
             outputs = outputs_of_keys(keys)
-        joined = config.get("joined")
         fields = {
             "domain": _ranges(config["inputs"], data["low"].values, data["high"].values),
             "points": data["points"].values,
@@ -93,10 +92,9 @@ def read(path: str | PathLike[str]) -> SavedSurrogate:
             "outside": Abort() if outside is None else Replace(float(outside)),
             "noise": config["noise"],
             "n_runs": config["n_runs"],
-            "_joined": bool(joined),
             "_named": outputs,
         }
-        return SavedSurrogate(fields, kind, model, joined is not None, data["probes"].values)
+        return SavedSurrogate(fields, kind, model, config.get("joined"), data["probes"].values)
     # Damaged files raise any error of the library that meets the damage.
     except Exception as error:
         raise StoreError(

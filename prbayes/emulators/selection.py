@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import comb
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from prbayes._validate import Floats
 from prbayes.emulators.gaussian_process import MOST_TUNED, GaussianProcess
 from prbayes.emulators.surfaces import (
     MultifidelityModel,
-    RadialBasis,
     Surface,
     predict,
     tuned_for_remainder,
@@ -168,20 +166,9 @@ class Runs:
         return np.asarray(self.blocks == np.unique(self.blocks)[:, None])
 
 
-def candidate_surfaces(n: int, dimensions: int) -> list[Surface]:
-    """Return the surfaces that are tried on n runs.
-
-    Processes have a length for each input. With few runs a spline around a polynomial suits
-    near-polynomial responses. With more than 256 runs it takes most of the time.
-    """
-    processes: list[Surface] = [GaussianProcess("squared_exponential"), GaussianProcess("matern")]
-    if n > 256:
-        return processes
-    degree = 2
-    # At most a third as many terms as runs.
-    while degree < 8 and 3 * comb(dimensions + degree + 1, dimensions) <= n:
-        degree += 1
-    return [*processes, RadialBasis("quintic", degree=degree)]
+# Processes with a length for each input. Either is the better one for some responses. Splines
+# around a polynomial are better only where processes err by less than 1e-4 standard deviations.
+CANDIDATES = (GaussianProcess("squared_exponential"), GaussianProcess("matern"))
 
 
 def has_enough_runs(model: Any, n: int, dimensions: int) -> bool:

@@ -47,6 +47,89 @@ _log = logging.getLogger("prbayes")
 
 
 @dataclass(frozen=True, eq=False)
+class FittedSurface:
+    """A surface through the usable runs of a design, or one for each output."""
+
+    domain: Ranges
+    unit: Floats  # (n, d): the design in the unit cube
+    usable: NDArray[np.bool_]  # (n,): which runs have only finite outputs
+    surface: Any  # fitted in the unit cube
+    coarse: Callable[..., Any] | None
+
+    @classmethod
+    def of(
+        cls,
+        model: Any,
+        domain: Ranges,
+        points: Floats,
+        responses: Floats,
+        coarse: Callable[..., Any] | None,
+        *,
+        joined: bool,
+    ) -> FittedSurface:
+        """Fit a surface to runs; ``joined`` makes the coarse response one of its inputs."""
+        unit, usable = domain.scaled(points), _usable(responses)
+        x, y = unit[usable], responses[usable]
+        surface: Any
+        if y.ndim > 1:
+            surface = partial(_outputs, [fitted(model, x, output) for output in y.T])
+        elif coarse is None:
+            surface = fitted(model, x, y)
+        else:
+            following = MultifidelityModel(model, model, joined)
+            coarse_values = _coarse_at("surrogate", coarse, domain, points)[usable]
+            surface = fit_multifidelity(following, x, y, coarse_values)
+        return cls(domain, unit, usable, surface, coarse)
+
+    def __call__(self, columns: Floats) -> Floats:
+        """Return values at rows inside the ranges, (n,) or (n, m)."""
+        # Rounding may put a point on the edge outside.
+        unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
+        if self.coarse is None:
+            return np.asarray(self.surface(unit))
+        coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
+        n_lost = (~np.isfinite(coarse)).sum()
+        if n_lost:
+            report(
+                Finding(
+                    "coarse-without-number",
+                    f"surrogate: coarse: got no number at {n_lost} of {len(unit)} points, where "
+                    "the surface goes on without it.",
+                )
+            )
+        return np.asarray(self.surface(unit, coarse))
+
+    @property
+    def joined(self) -> bool | None:
+        """Whether a coarse response is an input of the surface; None if it follows none."""
+        return None if self.coarse is None else self.surface.scaling is not None
+
+    def probes(self) -> Floats:
+        """Return values at 64 fixed points, which identify the surface."""
+        return self(self.domain.at(sobol(64, self.domain.dimensions, 0)))
+
+    @cached_property
+    def _trees(self) -> tuple[Any, Any]:
+        """Search trees of all runs and of the usable ones."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.unit), cKDTree(self.unit[self.usable])
+
+    def nearest(self, columns: Floats) -> NDArray[np.intp]:
+        """Return the run that is nearest to each row, (n,)."""
+        return np.asarray(self._trees[0].query(self.domain.scaled(columns))[1])
+
+    def nearby(self, residuals: Floats, columns: Floats) -> Floats:
+        """Return the residuals of the nearest usable runs, (n, k, ...)."""
+        usable, unit = residuals[self.usable], self.domain.scaled(columns)
+        # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
+        k = min(len(usable), 4 * (unit.shape[1] + 1))
+        # Points that are not finite are outside: any neighbours will do.
+        _, nearest = self._trees[1].query(np.where(np.isfinite(unit), unit, 0.5), k=k)
+        return np.asarray(usable[nearest])
+
+
+@dataclass(frozen=True, eq=False)
 class Surrogate:
     """A surface through runs of an expensive response, to be called in its place.
 
@@ -103,13 +186,11 @@ class Surrogate:
     error: CrossValidation
     noise: int | None = None
     coarse: Callable[..., Any] | None = None
-    # Whether the coarse response is among the inputs of the surface, too.
-    _joined: bool = field(repr=False, default=False)
     # Not empty after the first warning of points outside.
     _warned: list[bool] = field(repr=False, default_factory=list)
     # Names of the outputs in the response's mapping; None without names.
     _named: Outputs | None = field(repr=False, default=None)
-    _surface: Any = field(repr=False, default=None)  # fitted, in the unit cube
+    _surface: FittedSurface = field(repr=False, kw_only=True)
 
     @classmethod
     def fit(
@@ -242,9 +323,10 @@ class Surrogate:
             *(domain, design, responses, model, outside, tally.computed),
             error=CrossValidation(residuals, _spread(y)),
             coarse=coarse,
-            _joined=bool(joined),
             _named=tally.named,
-            _surface=_fitted_surface(model, domain, design, responses, coarse, joined=bool(joined)),
+            _surface=FittedSurface.of(
+                model, domain, design, responses, coarse, joined=bool(joined)
+            ),
         )
         if predictive is not None:
             values = surrogate._at(predictive)
@@ -311,7 +393,7 @@ class Surrogate:
             In units of the response.
         """
         columns, batch = self.domain.columns(inputs)
-        residuals = self._nearby(self.domain.scaled(columns))
+        residuals = self._surface.nearby(self.error.residuals, columns)
         rms = np.sqrt((residuals**2).mean(axis=1))
         return np.asarray(rms.reshape((*batch, *self.responses.shape[1:])))
 
@@ -349,7 +431,7 @@ class Surrogate:
             raise ValueError(
                 f"path: got {path}, whose folder does not exist, expected one that does"
             )
-        write(path, self, _probes(self))
+        write(path, self, self._surface.joined, self._surface.probes())
 
     @classmethod
     def load(
@@ -387,83 +469,50 @@ class Surrogate:
                 f"Surrogate.load: got no model, expected the {saved.kind} it was fitted with; "
                 "pass model="
             )
-        if saved.follows_coarse and coarse is None:
+        follows_coarse = saved.joined is not None
+        if follows_coarse and coarse is None:
             raise TypeError(
                 "Surrogate.load: got no coarse response, expected the one that the surrogate "
                 "follows: a file does not keep it; pass coarse="
             )
-        coarse = coarse if saved.follows_coarse else None
+        coarse = coarse if follows_coarse else None
         fields = saved.fields
-        runs = fields["domain"], fields["points"], fields["responses"]
-        surface = _fitted_surface(model, *runs, coarse, joined=fields["_joined"])
-        surrogate = cls(**fields, model=model, coarse=coarse, _surface=surface)
-        spread = np.asarray(_spread(surrogate.responses[_usable(surrogate.responses)]))
+        responses = fields["responses"]
+        surface = FittedSurface.of(
+            *(model, fields["domain"], fields["points"], responses, coarse),
+            joined=bool(saved.joined),
+        )
+        spread = np.asarray(_spread(responses[surface.usable]))
         size = np.where(spread > 0, spread, 1.0)
-        probes, expected = _probes(surrogate) / size, saved.probes / size
+        probes, expected = surface.probes() / size, saved.probes / size
         # The tolerance is above rounding on another processor, below the effect of a setting.
         if not np.allclose(probes, expected, rtol=0, atol=1e-6, equal_nan=True):
-            and_coarse = ", and the same coarse response" if saved.follows_coarse else ""
+            and_coarse = ", and the same coarse response" if follows_coarse else ""
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
                 f"{saved.kind} that was saved in this file, expected the same one with the same "
                 f"settings (and a fixed seed of its own){and_coarse}"
             )
-        return surrogate
-
-    @cached_property
-    def _trees(self) -> tuple[Any, Any]:
-        """Search trees of all runs and of the usable ones, in the unit cube."""
-        from scipy.spatial import cKDTree
-
-        unit = self.domain.scaled(self.points)
-        return cKDTree(unit), cKDTree(unit[_usable(self.responses)])
-
-    def _surface_at(self, columns: Floats, unit: Floats) -> Floats:
-        """Return values of the surface at rows, and at the same rows in the unit cube."""
-        if self.coarse is None:
-            return np.asarray(self._surface(unit))
-        coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
-        n_lost = (~np.isfinite(coarse)).sum()
-        if n_lost:
-            report(
-                Finding(
-                    "coarse-without-number",
-                    f"surrogate: coarse: got no number at {n_lost} of {len(unit)} points, where "
-                    "the surface goes on without it.",
-                )
-            )
-        return np.asarray(self._surface(unit, coarse))
+        return cls(**fields, model=model, coarse=coarse, _surface=surface)
 
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
         if not len(columns):
             return np.empty((0, *self.responses.shape[1:]))
-        # Rounding may put a point on the edge outside.
-        unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
-        values = self._surface_at(columns, unit)
+        values = self._surface(columns)
         if self.noise is not None:
             # One of the k residuals nearby, with either sign, by a hash of the input.
-            residuals = self._nearby(unit)
+            residuals = self._surface.nearby(self.error.residuals, columns)
             n, k = residuals.shape[:2]
             number, sign = np.divmod(hashed_rows(columns, self.noise), np.uint64(2))
             place = (number % np.uint64(k)).astype(np.intp)
             signs = np.where(sign == 0, 1.0, -1.0).reshape(n, *(1 for _ in residuals.shape[2:]))
             values = values + residuals[np.arange(n), place] * signs
-        failed = ~_usable(self.responses)
-        if failed.any():
-            _, nearest = self._trees[0].query(unit)
-            is_failed = failed[nearest]
+        if not self._surface.usable.all():
+            nearest = self._surface.nearest(columns)
+            is_failed = ~self._surface.usable[nearest]
             values[is_failed] = self.responses[nearest[is_failed]]
         return values
-
-    def _nearby(self, unit: Floats) -> Floats:
-        """Return the residuals at the nearest design points that did not fail, (n, k, ...)."""
-        residuals = self.error.residuals[_usable(self.responses)]
-        # Eight or more residuals give an rms to a quarter or better, 1 / sqrt(2 k).
-        k = min(len(residuals), 4 * (unit.shape[1] + 1))
-        # Points that are not finite are outside: any neighbours will do.
-        _, nearest = self._trees[1].query(np.where(np.isfinite(unit), unit, 0.5), k=k)
-        return np.asarray(residuals[nearest])
 
 
 def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
@@ -480,32 +529,6 @@ def hashed_rows(x: Floats, random_seed: int) -> NDArray[np.uint64]:
         h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         h = h ^ (h >> np.uint64(31))
     return h
-
-
-def _fitted_surface(
-    model: Any,
-    domain: Ranges,
-    points: Floats,
-    responses: Floats,
-    coarse: Callable[..., Any] | None,
-    *,
-    joined: bool,
-) -> Any:
-    """Return a surface through the usable runs, or one for each output, in the unit cube."""
-    usable = _usable(responses)
-    x, y = domain.scaled(points)[usable], responses[usable]
-    if y.ndim > 1:
-        return partial(_outputs, [fitted(model, x, output) for output in y.T])
-    if coarse is None:
-        return fitted(model, x, y)
-    coarse_values = _coarse_at("surrogate", coarse, domain, points)[usable]
-    return fit_multifidelity(MultifidelityModel(model, model, joined), x, y, coarse_values)
-
-
-def _probes(surrogate: Surrogate) -> Floats:
-    """Return values of the surface at 64 fixed points, which identify it."""
-    unit = sobol(64, surrogate.domain.dimensions, 0)
-    return surrogate._surface_at(surrogate.domain.at(unit), unit)
 
 
 def _usable(responses: Floats) -> NDArray[np.bool_]:

@@ -14,7 +14,8 @@ from prbayes.inference.refits import (
     is_stored,
     minimise_sets,
 )
-from prbayes.inference.resampling import DataSets, observed_set
+from prbayes.inference.resampling import observed_set
+from prbayes.model.random_variable import Node
 from prbayes.numerics.batched_minimisers import Descent
 from prbayes.propagation.base import N_BLOCKS
 
@@ -80,43 +81,35 @@ def _error_of_points(sampling: SamplingDistribution) -> Floats:
 
     The spread of the minima of blocks of the design, as if they were independent, bounds it.
     """
-    evaluator, scales = sampling.evaluator, sampling.scales
-    bounds = evaluator.reweighted
+    evaluator = sampling.evaluator
     observed = observed_set(evaluator)
-    if all(
-        node.name in bounds and bounds[node.name].design.is_emulated for node in evaluator.nodes
-    ):
-        minima = []
-        descent = None
-        for b in range(N_BLOCKS):
-            parts = {
-                k: bound.copied(bound.design.rows(bound.blocks == b)) for k, bound in bounds.items()
-            }
-            nodes = tuple(replace(node, bound=parts[node.name]) for node in evaluator.nodes)
-            part = replace(evaluator, nodes=nodes, has_graph=False)
-            objective = BatchObjective.of(part, scales, observed)
-            descent = descent or descent_of(sampling, objective, is_rough=True)
-            minima.append(_minimum(sampling, objective, descent))
-        x = np.array(minima)
-        is_usable = np.isfinite(x).all(axis=1)
-        # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
-        # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
-        rate = 0.5 + 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)
-    else:
-        # The observed responses against each block.
-        on_line = {name for name, bound in bounds.items() if bound.design.on_line}
-        blocks = [
-            0 * node.bound.blocks if node.name in on_line else node.bound.blocks
-            for node in evaluator.nodes
-        ]
-        first = np.zeros(N_BLOCKS, dtype=int)
-        sets = DataSets(observed.values, [w[first] for w in observed.weights])
-        objective = BatchObjective.of(evaluator, scales, sets, blocks=blocks)
-        x, is_usable = minimise_sets(sampling, objective, descent_of(sampling, objective))
-        rate = 0.5
+    minima = []
+    descent = None
+    for b in range(N_BLOCKS):
+        nodes = tuple(_on_block(node, b) for node in evaluator.nodes)
+        part = replace(evaluator, nodes=nodes, has_graph=False)
+        objective = BatchObjective.of(part, sampling.scales, observed)
+        if descent is None:
+            descent = descent_of(sampling, objective, is_rough=True)
+        minima.append(_minimum(sampling, objective, descent))
+    x = np.array(minima)
+    is_usable = np.isfinite(x).all(axis=1)
     if is_usable.sum() < N_BLOCKS / 2:
         return np.full(sampling.stderr.size, np.inf)
+    rate = 0.5
+    if all(bound.design.is_emulated for bound in evaluator.reweighted.values()):
+        # Points that fill d dimensions evenly, for functions with a jump along a surface; smooth
+        # ones have up to 1/2 + 1/d (He and Owen 2016, doi:10.1111/rssb.12132).
+        rate += 0.5 / max(node.bound.inputs.dimensions for node in evaluator.nodes)
     return np.asarray(x[is_usable].std(axis=0, ddof=1) / N_BLOCKS**rate)
+
+
+def _on_block(node: Node, block: int) -> Node:
+    """Return a simulator on one block of its design; points on a line remain together."""
+    bound = node.reweighted
+    if bound is None or bound.design.on_line:
+        return node
+    return replace(node, bound=bound.copied(bound.design.rows(bound.blocks == block)))
 
 
 def _minimum(sampling: SamplingDistribution, objective: BatchObjective, descent: Descent) -> Floats:

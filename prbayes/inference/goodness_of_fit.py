@@ -71,19 +71,8 @@ class FittedSets:
             simulated, weights = evaluator.populations(thetas, k)
             for part in single_output_parts(node.target):
                 values, rows = part.observed_of(sets.values[k])
-                order = np.argsort(values, kind="stable")
-                samples = np.broadcast_to(part.of(simulated), weights.shape)
-                expected = []
-                for sample, w in zip(samples, weights, strict=True):
-                    # Through the middles of steps; only finite values can be observed.
-                    is_finite = np.isfinite(sample)
-                    sorted_ = np.argsort(sample[is_finite], kind="stable")
-                    mass = w[is_finite][sorted_]
-                    mass = mass / mass.sum()
-                    middles = np.cumsum(mass) - mass / 2
-                    expected.append(np.interp(values[order], sample[is_finite][sorted_], middles))
-                observed = sets.weights[k][:, rows][:, order]
-                columns.append(log_distances(np.array(expected), observed))
+                observed = sets.weights[k][:, rows]
+                columns.append(_fit_distances(part.of(simulated), weights, values, observed))
         return np.concatenate(columns, axis=1)
 
 
@@ -101,12 +90,21 @@ def worst_p_value(observed: Floats, drawn: Floats, *, two_sided: bool = False) -
     return float(np.mean(worst >= worst[0]))
 
 
-def log_distances(expected: Floats, weights: Floats) -> Floats:
-    """Return logarithms of the Cramer-von Mises and Anderson-Darling distances, (S, 2).
+def _fit_distances(simulated: Floats, masses: Floats, values: Floats, weights: Floats) -> Floats:
+    """Return logarithms of two distances of data sets from populations, (S, 2).
 
-    Of distribution functions at the values in order, and the weights of these, (S, n) both.
+    Those of Cramer-von Mises and Anderson-Darling, between the weighted values (n,), (S, n) of data
+    sets and populations (N,) or (S, N), (S, N). Only finite responses can be observed.
     """
+    masses = np.where(np.isfinite(simulated), masses, 0.0)
+    masses = masses / masses.sum(axis=1, keepdims=True)
     weights = weights / weights.sum(axis=1, keepdims=True)
+    order = np.argsort(values, kind="stable")
+    points, weights = values[order], weights[:, order]
+    # In the middles of the steps of both.
+    at_most = distribution_function(simulated, masses, points)
+    less = distribution_function(simulated, masses, np.nextafter(points, -np.inf))
+    expected = (at_most + less) / 2
     below = np.cumsum(weights, axis=1) - weights / 2
     squares = weights * (below - expected) ** 2
     # A mass of at least 1e-4 beyond the extremes bounds the weight of single observations there.
@@ -212,13 +210,8 @@ class _Outputs:
     def distances(self, j: int) -> Floats:
         """Return logarithms of two distances of data sets from their fits in an output, (S, 2)."""
         is_measured = ~np.isnan(self.values[:, j])
-        values = self.values[is_measured, j]
-        order = np.argsort(values, kind="stable")
-        points, column = values[order], self.simulated[:, j]
-        # In the middle of a step
-        at_most = distribution_function(column, self.masses, points)
-        less = distribution_function(column, self.masses, np.nextafter(points, -np.inf))
-        return log_distances((at_most + less) / 2, self.weights[:, is_measured][:, order])
+        observed = self.values[is_measured, j], self.weights[:, is_measured]
+        return _fit_distances(self.simulated[:, j], self.masses, *observed)
 
     def correlations(self, i: int, j: int) -> tuple[Floats, Floats]:
         """Return the correlations of two outputs in data sets and in populations, (S,) each."""

@@ -143,7 +143,7 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
     An element is bounded if its value is the logistic function of theta between fixed ends.
     """
     d = evaluator.hyperparameters.size
-    lower, upper = _ends(evaluator)
+    lower, upper = _logistic_ends(evaluator.hyperparameters)
     bounded = np.isfinite(upper - lower)
     below, above = bounded.copy(), bounded.copy()
     for side, sign in ((below, -1), (above, 1)):
@@ -161,21 +161,40 @@ def continuation_of(evaluator: Evaluator, thetas: Floats) -> Continuation:
     return Continuation(lower, upper, below, above)
 
 
-def _ends(evaluator: Evaluator) -> tuple[Floats, Floats]:
-    """Return the ends of the values of elements, (d,) each; NaN where there are none."""
-    hyperparameters = evaluator.hyperparameters
-    d = hyperparameters.size
-    base = hyperparameters.prior_thetas(2, 0)
-    far = np.full((2, d), 1e6)
-    rows = np.vstack([base, -far, far])
+def ends_of_prior(hyperparameters: Hyperparameters, theta: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return values of elements in the users' own units, and the ends of their ranges, (d,) each.
+
+    NaN where there is no end, or elements have no values of their own, as those of a simplex.
+    """
+    d = theta.size
+    # A transform is at its end if a point far out has the value of one much farther out.
+    spread = np.diag(hyperparameters.prior_sd)
+    far = [theta + size * spread for size in (-1e6, -1e3, 1e3, 1e6)]
     with np.errstate(over="ignore", invalid="ignore"):
-        variables = hyperparameters.constrained(rows)
-        names = [str(rv.name) for rv in evaluator.model.free_RVs]
-        values = np.column_stack([variables[name].reshape(len(rows), -1) for name in names])
-        if values.shape != rows.shape:  # elements without values of their own, as of a simplex
-            return np.full(d, np.nan), np.full(d, np.nan)
-        lower, upper = values[2], values[4]
-        expected = lower + (upper - lower) * expit(base)
-        is_logistic = np.isclose(values[:2], expected, rtol=1e-9).all(axis=0)
-        is_logistic &= np.isfinite(upper - lower)
+        values = _free_values(hyperparameters, np.vstack([theta, *far]))
+    if values.shape[1] != d:
+        unknown = np.full(d, np.nan)
+        return unknown, unknown, unknown
+    outermost, low, high, uppermost = np.diagonal(values[1:].reshape(4, d, d), axis1=1, axis2=2)
+    lower = np.where((low == outermost) & np.isfinite(low), low, np.nan)
+    upper = np.where((high == uppermost) & np.isfinite(high), high, np.nan)
+    return values[0], lower, upper
+
+
+def _logistic_ends(hyperparameters: Hyperparameters) -> tuple[Floats, Floats]:
+    """Return the ends, (d,) each, of elements that are logistic functions of theta, else NaN."""
+    base = hyperparameters.prior_thetas(2, 0)
+    _, lower, upper = ends_of_prior(hyperparameters, base[0])
+    expected = lower + (upper - lower) * expit(base)
+    is_logistic = np.zeros(lower.size, dtype=bool)
+    if np.isfinite(expected).any():
+        values = _free_values(hyperparameters, base)
+        is_logistic = np.isclose(values, expected, rtol=1e-9).all(axis=0)
     return np.where(is_logistic, lower, np.nan), np.where(is_logistic, upper, np.nan)
+
+
+def _free_values(hyperparameters: Hyperparameters, thetas: Floats) -> Floats:
+    """Return the values of the free variables, (S, d), or (S, k) with a simplex among them."""
+    variables = hyperparameters.constrained(thetas)
+    names = [str(rv.name) for rv in hyperparameters.model.free_RVs]
+    return np.column_stack([variables[name].reshape(len(thetas), -1) for name in names])

@@ -406,9 +406,6 @@ class BatchObjective:
     targets: list[Discrepancy]  # by simulator in the sum, each against all B data sets
     values: list[Floats]  # (n_k,) or (n_k, m): the stored responses
     bases: list[Basis]  # from weights of stored responses to features
-    # (n_k,): the block of each point of the design. If there are several, the b-th data set is
-    # compared with the b-th block alone.
-    blocks: Sequence[NDArray[np.intp]] = ()
 
     @classmethod
     def of(
@@ -418,7 +415,6 @@ class BatchObjective:
         sets: DataSets,
         *,
         simulators: Sequence[int] | None = None,
-        blocks: Sequence[NDArray[np.intp]] = (),
         stored: Sequence[Floats | None] = (),
     ) -> BatchObjective:
         """Prepare the observed sides of all data sets; of all simulators by default.
@@ -441,7 +437,7 @@ class BatchObjective:
             targets.append(target)
             values.append(responses)
             bases.append(target.basis(responses))
-        return cls(evaluator, scales, tuple(simulators), targets, values, bases, blocks)
+        return cls(evaluator, scales, tuple(simulators), targets, values, bases)
 
     @property
     def n_sets(self) -> int:
@@ -465,17 +461,12 @@ class BatchObjective:
         return np.concatenate([self._values(thetas[p], numbers[p]) for p in portions])
 
     def _values(self, thetas: Floats, rows: Any) -> Floats:
-        """Return the values for some data sets, on the whole design or on blocks."""
+        """Return the values for some data sets."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
         total: Any = 0.0
         for i, k in enumerate(self.simulators):
             _, weights = self.evaluator.populations(stacked, k)
             weights = weights.reshape(*thetas.shape[:-1], -1)
-            if self.blocks and self.blocks[i].any():
-                block_of_set = np.arange(self.n_sets)[rows, None, None]
-                weights = weights * (self.blocks[i] == block_of_set)
-                with np.errstate(invalid="ignore"):
-                    weights = weights / weights.sum(axis=-1, keepdims=True)
             features = self.bases[i].rows(rows).features(weights)
             total = total + self.targets[i].rows(rows).outer(*features, xp=np) / self.scales[k]
         return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))

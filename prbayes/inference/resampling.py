@@ -27,9 +27,6 @@ _MAX_POINTS = 1 << 15
 # Data sets for a sampling distribution: standard errors then have an error of 5 %.
 SETS = 200
 
-# Responses and weights of a simulator's population, (1, n) each.
-type _Population = tuple[Floats, Floats]
-
 
 @dataclass(frozen=True, eq=False)
 class DataSets:
@@ -69,18 +66,14 @@ def dependent(nodes: Sequence[Node]) -> bool:
 
 def groups(nodes: Sequence[Node]) -> list[list[int]]:
     """Return indices of simulators, in groups that share specimens, even through a third one."""
-    joined: list[tuple[list[int], set[int]]] = []
-    for k, number in enumerate(specimens(nodes)[0]):
-        labels = frozenset(number.tolist())
-        members, shared = [k], set(labels)
-        separate = []
-        for group, group_labels in joined:
-            if group_labels.isdisjoint(labels):
-                separate.append((group, group_labels))
-            else:
-                members, shared = members + group, shared | group_labels
-        joined = [*separate, (sorted(members), shared)]
-    return sorted([members for members, _ in joined])
+    from scipy.sparse.csgraph import connected_components
+
+    if not nodes:
+        return []
+    numbers, total = specimens(nodes)
+    measures = np.array([np.isin(np.arange(total), number) for number in numbers])
+    _, group = connected_components(measures @ measures.T)
+    return [np.flatnonzero(group == g).tolist() for g in np.unique(group)]
 
 
 def siblings(nodes: Sequence[Node], names: set[str]) -> set[str]:
@@ -142,71 +135,82 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
         thinned(*evaluator.populations(theta[None], k), node)
         for k, node in enumerate(evaluator.nodes)
     ]
-    return sets_at(evaluator, populations, simulated_points(evaluator, populations, n_sets, seed))
+    points = simulated_points(evaluator, populations, n_sets, seed)
+    return sets_at(evaluator, [values[0] for values, _ in populations], points)
 
 
-def stored_populations(evaluator: Evaluator, thetas: Floats) -> list[_Population]:
-    """Return stored responses by simulator, (1, n), as `sets_at` takes them."""
-    nodes = range(len(evaluator.nodes))
-    return [(evaluator.populations(thetas[:1], k)[0], np.empty(0)) for k in nodes]
-
-
-def points_along(
+def sets_along(
     evaluator: Evaluator, thetas: Floats, rng: np.random.Generator
-) -> list[NDArray[np.intp]]:
-    """Draw the specimens of one data set at each theta: points by simulator, (n, specimens)."""
+) -> tuple[DataSets, list[NDArray[np.intp]]]:
+    """Draw one data set at each theta, and return the points of its specimens by simulator too.
+
+    Points are those of stored responses, (n, specimens).
+    """
     nodes = evaluator.nodes
     size = (len(thetas), specimens(nodes)[1])
-    populations = stored_populations(evaluator, thetas)
+    responses = [evaluator.populations(thetas[:1], k)[0][0] for k in range(len(nodes))]
     points: dict[int, NDArray[np.intp]] = {}
     for group in _aligned_groups(nodes):
-        columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
-        is_observable = np.asarray(np.all(columns, axis=0))
+        is_observable = _observable_by_all(evaluator, responses, group)
         uniform = rng.random(size)
         drawn = np.empty(size, dtype=np.intp)
         at_once = max(1, AT_ONCE // is_observable.size)
         for first in range(0, len(thetas), at_once):
             _, weights = evaluator.populations(thetas[first : first + at_once], group[0])
-            below = np.cumsum(weights * is_observable, axis=1)
-            for i, sums in enumerate(below, start=first):
-                # On the right of equal sums, so that no point without weight is drawn.
-                drawn[i] = np.searchsorted(sums, uniform[i] * sums[-1], side="right")
-        # A product may be rounded up to the whole.
-        points |= dict.fromkeys(group, np.minimum(drawn, is_observable.size - 1))
-    return [points[k] for k in range(len(nodes))]
+            for i, mass in enumerate(weights * is_observable, start=first):
+                drawn[i] = _points_of(mass, uniform[i])
+        points |= dict.fromkeys(group, drawn)
+    by_simulator = [points[k] for k in range(len(nodes))]
+    return sets_at(evaluator, responses, by_simulator), by_simulator
 
 
 def simulated_points(
     evaluator: Evaluator,
-    populations: list[_Population],
+    populations: list[tuple[Floats, Floats]],
     n_sets: int,
     seed: int = 0,
     *,
     more: int = 0,
 ) -> list[NDArray[np.intp]]:
-    """Draw the specimens of data sets: points of populations, (n_sets, specimens + more) each."""
+    """Draw the specimens of data sets: points of populations, (n_sets, specimens + more) each.
+
+    Populations are responses and weights by simulator, (1, n) each.
+    """
     nodes = evaluator.nodes
     rng = np.random.default_rng([seed, 1])
     size = (n_sets, specimens(nodes)[1] + more)
+    responses = [values[0] for values, _ in populations]
     points: dict[int, NDArray[np.intp]] = {}
     for group in _aligned_groups(nodes):
-        columns = [observable(populations[k][0][0], nodes[k].target) for k in group]
-        is_observable = np.asarray(np.all(columns, axis=0))
         # Simulators that share specimens have the same points, with the same weights.
-        mass = np.where(is_observable, populations[group[0]][1][0], 0.0)
-        probability = mass / mass.sum()
-        points |= dict.fromkeys(group, rng.choice(probability.size, size=size, p=probability))
+        mass = populations[group[0]][1][0] * _observable_by_all(evaluator, responses, group)
+        points |= dict.fromkeys(group, _points_of(mass, rng.random(size)))
     return [points[k] for k in range(len(nodes))]
 
 
+def _observable_by_all(
+    evaluator: Evaluator, responses: list[Floats], group: list[int]
+) -> NDArray[np.bool_]:
+    """Return which points all simulators of a group can observe, (n,)."""
+    columns = [observable(responses[k], evaluator.nodes[k].target) for k in group]
+    return np.asarray(np.all(columns, axis=0))
+
+
+def _points_of(mass: Floats, uniform: Floats) -> NDArray[np.intp]:
+    """Return points of a population at levels of its cumulated weights, (n,), (...) -> (...)."""
+    below = np.cumsum(mass / mass.sum())
+    # On the right of equal sums, so that no point without weight is drawn.
+    points = np.searchsorted(below / below[-1], uniform, side="right")
+    return np.minimum(points, mass.size - 1)  # a product may be rounded up to the whole
+
+
 def sets_at(
-    evaluator: Evaluator, populations: list[_Population], points: list[NDArray[np.intp]]
+    evaluator: Evaluator, populations: list[Floats], points: list[NDArray[np.intp]]
 ) -> DataSets:
-    """Return the data sets that are measured on specimens, given by `simulated_points`."""
+    """Return the data sets that are measured on specimens, given as points of responses (n,)."""
     numbers, _ = specimens(evaluator.nodes)
     values, weights = [], []
-    for k, node in enumerate(evaluator.nodes):
-        responses = populations[k][0][0]
+    for k, (node, responses) in enumerate(zip(evaluator.nodes, populations, strict=True)):
         is_observable = observable(responses, node.target)
         # The index of each point among those that can be observed.
         index = np.cumsum(is_observable) - 1

@@ -87,10 +87,13 @@ class AreaDiscrepancy(Discrepancy):
         """Return the ranks of the values among all finite values, the knots."""
         pooled = np.concatenate([simulated, self.observed])
         knots = np.unique(pooled[np.isfinite(pooled)])
-        order, below = ranked(simulated, knots[:-1], kind="quicksort")
-        observed_order, observed_below = ranked(self.observed, knots[:-1], kind="quicksort")
-        arrays = [order, below, observed_order, observed_below, np.diff(knots)]
-        return RankedBasis(tuple(array[None] for array in arrays), (self.weights,))
+        starts = knots[:-1]
+        order, below = ranked(simulated, starts, kind="quicksort")
+        observed_order, observed_below = ranked(self.observed, starts, kind="quicksort")
+        lengths = np.diff(knots)
+        arrays = (order, below, observed_order, observed_below, lengths)
+        rows = tuple(array[None] for array in arrays)
+        return RankedBasis(rows, (self.weights,))
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the area."""
@@ -114,7 +117,8 @@ class AreaSum(PartSum):
         bases = [target.basis(values) for target, values in projected(self.parts, simulated)]
         columns = zip(*[basis.arrays for basis in bases], strict=True)
         arrays = [_padded([row for (row,) in column]) for column in columns]
-        return RankedBasis(tuple(arrays), tuple(part.target.weights for part in self.parts))
+        observed_weights = tuple(part.target.weights for part in self.parts)
+        return RankedBasis(tuple(arrays), observed_weights)
 
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the areas times their shares."""

@@ -182,13 +182,16 @@ def _correlations(moments: Any, m: int, xp: Any) -> Any:
     place = np.zeros((m, m), dtype=int)
     place[rows, columns] = np.arange(rows.size)
     i, j = np.tril_indices(m, -1)
-    unit = xp.maximum(moments[..., 0], 1e-300)[..., None]
-    mean = moments[..., 1 : m + 1] / unit
-    second = moments[..., m + 1 :] / unit
-    variance = second[..., np.diag(place)] - mean**2
-    sd = xp.sqrt(xp.maximum(variance, _LEAST_VARIANCE))
-    covariance = second[..., place[i, j]] - mean[..., i] * mean[..., j]
-    return xp.clip(covariance / (sd[..., i] * sd[..., j]), -1.0, 1.0)
+    total = xp.maximum(moments[..., 0], 1e-300)[..., None]
+    mean = moments[..., 1 : m + 1] / total
+    second = moments[..., m + 1 :] / total
+    squares = second[..., np.diag(place)]
+    variance = xp.maximum(squares - mean**2, _LEAST_VARIANCE)
+    sd = xp.sqrt(variance)
+    products = second[..., place[i, j]]
+    covariance = products - mean[..., i] * mean[..., j]
+    correlation = covariance / (sd[..., i] * sd[..., j])
+    return xp.clip(correlation, -1.0, 1.0)
 
 
 def _observed_correlations(values: Floats, weights: Floats) -> Floats:

@@ -50,8 +50,10 @@ def spread(sample: Floats, weights: Floats) -> float:
     1.34 is the interquartile range of the standard normal distribution.
     """
     sample = sample - sample.min()  # equal values give exactly zero
-    sd = float(np.sqrt(weights @ (sample - weights @ sample) ** 2))
-    iqr = float(quantile(sample, weights, 0.75) - quantile(sample, weights, 0.25))
+    mean = weights @ sample
+    sd = float(np.sqrt(weights @ (sample - mean) ** 2))
+    low, high = quantile(sample, weights, [0.25, 0.75])
+    iqr = float(high - low)
     return min(sd, iqr / 1.34) if iqr > 0 else sd
 
 
@@ -69,7 +71,7 @@ def silverman(sample: Floats, weights: Floats) -> float:
 
 def twice_silverman(sample: Floats, weights: Floats) -> float:
     """Return two Silverman bandwidths: the default of the metrics that smooth both sides alike."""
-    return float(1.8 * spread(sample, weights) * (weights**2).sum() ** 0.2)
+    return 2 * silverman(sample, weights)
 
 
 def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:
@@ -464,7 +466,10 @@ def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
         p = inner.cells.density(values, weights)[..., :-2]
         q = inner.density[..., :-2]
         dz = inner.cells.widths[:-2]
-        size = np.sqrt(((p**2) * dz).sum(axis=-1) * ((q**2) * dz).sum(axis=-1))
-        cosine = (p * q * dz).sum(axis=-1) / np.where(size > 0, size, 1.0)
+        p_squared = (p**2 * dz).sum(axis=-1)
+        q_squared = (q**2 * dz).sum(axis=-1)
+        size = np.sqrt(p_squared * q_squared)
+        product_sum = (p * q * dz).sum(axis=-1)
+        cosine = product_sum / np.where(size > 0, size, 1.0)
         cosines.append(np.nan_to_num(cosine))
     return np.asarray(np.min(cosines, axis=0))

@@ -89,18 +89,13 @@ class KernelCells(Cells):
         *batch, n = sample.shape
         rows = int(np.prod(batch, dtype=int))
         nodes = self.centers.size
-        # Equal weights, the usual case, are passed as a single number.
-        equal = weights.size > 0 and (not any(weights.strides) or weights.min() == weights.max())
-        flat_weights = (weights if equal else np.broadcast_to(weights, sample.shape)).ravel()
-        # Bin the sample on the grid; values that all rows share are passed once.
-        is_shared = not any(sample.strides[:-1])
-        values = sample.reshape(rows, n)[:1] if is_shared else sample.reshape(rows, n)
-        values = np.ascontiguousarray(values, dtype=np.float64)
+        # Bin the sample on the grid.
+        values = np.ascontiguousarray(sample.reshape(rows, n), dtype=np.float64)
+        rows_of_weights = np.broadcast_to(weights, sample.shape).reshape(rows, n)
+        rows_of_weights = np.ascontiguousarray(rows_of_weights, dtype=np.float64)
         counts = np.zeros((rows, nodes + 2 * self.margin))
         outside = np.zeros((rows, 2))
-        count(
-            values, flat_weights, bool(equal), self.low, 1 / self.step, self.margin, counts, outside
-        )
+        count(values, rows_of_weights, self.low, 1 / self.step, self.margin, counts, outside)
         # Smooth the counts, within the grid and beyond its ends.
         inner = np.zeros((rows, nodes))
         smooth(counts, self.kernel, -self.margin, inner)
@@ -118,7 +113,10 @@ class KernelCells(Cells):
         """
         last = self.centers.size - 2
         total: Any = 0.0
-        for block in _blocks(points.size, self.widths.size):
+        # Blocks of points whose matrices fit into memory.
+        size = max(1, AT_ONCE // self.widths.size)
+        for start in range(0, max(1, points.size), size):
+            block = slice(start, start + size)
             # A point is a node and a fraction of a step beyond it.
             t = points[block] / self.step - self.low
             inside = (t >= 1) & (t < last)
@@ -165,19 +163,12 @@ class KernelCells(Cells):
         smoothed = np.broadcast_to(smoothed, (*batch, nodes)).reshape(rows, nodes)
         padded = np.pad(smoothed, [(0, 0), (1, 2)])
         cubics = np.stack([padded[:, k : k + nodes] for k in range(4)], axis=-1) @ spline
-        # Values that all rows share are passed once.
-        values = sample if sample.ndim == 1 else np.broadcast_to(sample, (*batch, n))
-        values = np.ascontiguousarray(values, dtype=np.float64).reshape(-1, n)
+        values = np.broadcast_to(sample, (*batch, n)).reshape(rows, n)
+        values = np.ascontiguousarray(values, dtype=np.float64)
         ends = np.ascontiguousarray(np.broadcast_to(ends, (*batch, 2)).reshape(rows, 2))
         out = np.empty((rows, n))
         read(values, cubics, ends, self.low, 1 / self.step, self.margin, out)
         return out.reshape(*batch, n)
-
-
-def _blocks(n: int, m: int) -> list[slice]:
-    """Return blocks of n points whose matrices with m columns fit into memory."""
-    step = max(1, AT_ONCE // m)
-    return [slice(start, start + step) for start in range(0, max(1, n), step)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,17 +181,16 @@ class BinCells(Cells):
         rows = int(np.prod(batch, dtype=int))
         # The cells of all rows are counted at once: the bins, below, above, and NaN.
         cells = self.centers.size + 3
-        cell = self._cell(sample).reshape(rows, n) + cells * np.arange(rows)[:, None]
+        first = cells * np.arange(rows)
+        cell = self._cell(sample).reshape(rows, n) + first[:, None]
         w = np.broadcast_to(weights, sample.shape)
-        counts = np.bincount(cell.ravel(), w.ravel(), rows * cells).reshape(*batch, cells)
+        counts = np.bincount(cell.ravel(), w.ravel(), rows * cells)
+        counts = counts.reshape(*batch, cells)
         return cast(Floats, counts[..., :-1] / self.widths[0])
 
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return the weight of the points in each bin."""
-        total: Any = 0.0
-        for block in _blocks(points.size, self.widths.size):
-            total = total + weights[..., block] @ self.basis(points[block]) * self.widths
-        return np.asarray(total)
+        return self.density(np.broadcast_to(points, weights.shape), weights) * self.widths
 
     def _cell(self, sample: Floats) -> NDArray[np.intp]:
         """Return cell numbers: bins, then below, above, and NaN."""
@@ -222,8 +212,10 @@ class BinCells(Cells):
         if for_sample:
             batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
             return np.zeros((*batch, sample.shape[-1]))
-        padded = np.concatenate([cotangent, np.zeros_like(cotangent[..., :1])], axis=-1)
-        return np.take_along_axis(padded / self.widths[0], self._cell(sample), axis=-1)
+        of_nan = np.zeros_like(cotangent[..., :1])
+        padded = np.concatenate([cotangent, of_nan], axis=-1)
+        by_weight = padded / self.widths[0]
+        return np.take_along_axis(by_weight, self._cell(sample), axis=-1)
 
 
 def compiled(loop: Callable[..., None]) -> Callable[..., None]:
@@ -248,7 +240,6 @@ def compiled(loop: Callable[..., None]) -> Callable[..., None]:
 def count(
     sample: Floats,
     weights: Floats,
-    equal: bool,
     low: float,
     inverse: float,
     margin: int,
@@ -257,19 +248,17 @@ def count(
 ) -> None:
     """Add weights at the nodes of a grid, spread by cubic B-splines, and those outside it.
 
-    Node k is at ``(low + k - margin) / inverse``. The sample has shape (1 or rows, n), the counts
-    (rows, g), ``outside`` (rows, 2); the weights are flat, and only the first counts if they are
-    equal. NaN counts nowhere.
+    Node k is at ``(low + k - margin) / inverse``. Sample and weights have shape (rows, n), the
+    counts (rows, g), ``outside`` (rows, 2). NaN counts nowhere.
     """
-    n = sample.shape[1]
-    rows, g = counts.shape
+    rows, n = sample.shape
+    g = counts.shape[1]
     moments = np.zeros((g, 4))  # sums of 1, t, t^2, t^3 beyond each node
     for r in range(rows):
-        values = sample[r % len(sample)]
         # Sum the powers of the fractions of all values beyond a node.
         for i in range(n):
-            t = values[i] * inverse - low
-            w = weights[0] if equal else weights[r * n + i]
+            t = sample[r, i] * inverse - low
+            w = weights[r, i]
             if 1 - margin <= t < g - 2 - margin:
                 index = math.floor(t)
                 t -= index
@@ -323,7 +312,7 @@ def read(
     margin: int,
     out: Floats,
 ) -> None:
-    """Evaluate piecewise cubics at a sample, shape (1 or rows, n), into ``out``, shape (rows, n).
+    """Evaluate piecewise cubics at a sample, shape (rows, n), into ``out`` of the same shape.
 
     The coefficients of 1, t, t^2, t^3 beyond each node, which are those of `count`, have shape
     (rows, g, 4); values below and above the grid get those of ``outside``, shape (rows, 2), and NaN
@@ -332,9 +321,8 @@ def read(
     rows, n = out.shape
     g = coefficients.shape[1]
     for r in range(rows):
-        values = sample[r % len(sample)]
         for i in range(n):
-            t = values[i] * inverse - low
+            t = sample[r, i] * inverse - low
             if 1 - margin <= t < g - 2 - margin:
                 index = math.floor(t)
                 t -= index

@@ -97,9 +97,13 @@ class CompositeDiscrepancy(Discrepancy):
     @cached_property
     def _sums(self) -> list[tuple[list[int], PartSum]]:
         """Components that are evaluated together, with their places; the last have one number."""
-        several = [k for k, part in enumerate(self.members) if part.target.event]
-        single = [k for k, part in enumerate(self.members) if not part.target.event]
-        sums = [([k], PartSum((self.members[k],))) for k in several]
+        single = []
+        sums = []
+        for k, part in enumerate(self.members):
+            if part.target.event:
+                sums.append(([k], PartSum((part,))))
+            else:
+                single.append(k)
         if single:
             parts = tuple(self.members[k] for k in single)
             sums.append((single, parts[0].target.together(parts)))

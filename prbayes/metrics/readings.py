@@ -66,9 +66,13 @@ class Readings:
         Specimens near a pole of the response dominate `spread`, which replaces it where the
         quartiles are equal.
         """
-        columns = [v[k] for v, k in zip(self.values.T, self.is_measured.T, strict=True)]
-        widths = [np.subtract(*np.quantile(v, [0.75, 0.25])) if v.size else 0.0 for v in columns]
-        scatter = np.array(widths) / 1.349
+        widths = np.zeros(self.values.shape[1])
+        for j, column in enumerate(self.values.T):
+            measured = column[self.is_measured[:, j]]
+            if measured.size:
+                high, low = np.quantile(measured, [0.75, 0.25])
+                widths[j] = high - low
+        scatter = widths / 1.349
         return np.where(scatter > 0, scatter, self.spread())
 
     def comparison_sd(self, emulator_error: Floats) -> Floats:

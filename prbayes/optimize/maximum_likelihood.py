@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
 from prbayes.inference.checks.population import failing_region_findings
-from prbayes.inference.checks.prior import PriorEnd, end_of_range, prior_end_findings
+from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
     Evaluator,
@@ -32,7 +32,6 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
-from prbayes.model.parameters import THETAS
 from prbayes.model.specimen_likelihood import arrays, draw_readings
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.points import farthest_rows
@@ -351,49 +350,14 @@ def share_mode(
     return True
 
 
-def _prior_ends(
-    evaluator: Evaluator, optimum: LocalOptimum, objective: _Objective
-) -> list[PriorEnd]:
-    """Return the hyperparameters that the data push to a finite end of their prior.
-
-    At the median of the prior the log-likelihood is lower by more than three nats.
-    """
-    from scipy.optimize import minimize as scipy_minimize
-
-    hyperparameters = evaluator.hyperparameters
-    theta, unit = optimum.theta, hyperparameters.prior_sd
-    flat = np.flatnonzero(np.isinf(np.diag(optimum.covariance))).tolist()
-    prior = hyperparameters.prior_thetas(THETAS, 0) if flat else np.empty(0)
-    ends = []
-    for i in flat:
-        below = float((prior[:, i] <= theta[i]).mean())
-        if 0.05 <= below <= 0.95:
-            continue
-        value, bound = end_of_range(evaluator, theta, i, is_upper=below > 0.5)
-        if not np.isfinite(bound):
-            continue
-        start = theta.copy()
-        start[i] = np.median(prior[:, i])
-
-        def along(u: Floats, start: Floats = start, i: int = i) -> float:
-            return objective(start + np.insert(u, i, 0.0) * unit)[0]
-
-        origin = np.zeros(theta.size - 1)
-        lowest = along(origin)
-        if theta.size > 1 and np.isfinite(lowest):
-            options = {"maxfev": 100 * theta.size, "xatol": 1e-2, "fatol": 1e-2}
-            lowest = scipy_minimize(along, origin, method="Nelder-Mead", options=options).fun
-        if lowest > optimum.value + 3.0:
-            ends.append(PriorEnd(hyperparameters.readable_names[i], value, bound))
-    return ends
-
-
 def _findings(
     evaluator: Evaluator, objective: _Objective, modes: list[LocalOptimum], weights: Floats
 ) -> list[Finding]:
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
-    ends = _prior_ends(evaluator, best, objective)
+    is_flat = np.isinf(np.diag(best.covariance))
+    # Three nats: a likelihood ratio of twenty.
+    ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
     findings = list(failing_region_findings(evaluator, best.theta))
     findings += prior_end_findings(ends)
     if np.isnan(best.covariance).any():

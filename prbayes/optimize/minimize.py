@@ -37,7 +37,7 @@ from prbayes.inference.checks.metric_suitability import (
     heavy_tails,
     smoothing_bias,
 )
-from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
+from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import SamplingDistribution, jumping_simulators
 from prbayes.inference.resampling import SETS
@@ -544,7 +544,7 @@ def optimum_findings(
     findings += design_error_findings(evaluator, design_error)
     findings += [mode.finding(evaluator) for mode in optima if mode.comparable]
     if sampling is not None:
-        ends = elements_at_prior_ends(sampling)
+        ends = ends_by_metric(sampling)
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
         findings += prior_end_findings(ends, page)
         names = {end.name for end in ends}

@@ -31,10 +31,8 @@ from prbayes.inference.resampling import (
     groups,
     observable,
     observed_set,
-    points_along,
-    sets_at,
+    sets_along,
     specimens,
-    stored_populations,
 )
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
@@ -388,8 +386,7 @@ def _draw(
         )
     x, thetas = x[is_supported], thetas[is_supported]
     rng = np.random.default_rng([options.seed, seed])
-    points = points_along(evaluator, thetas, rng)
-    data = sets_at(evaluator, stored_populations(evaluator, thetas), points)
+    data, points = sets_along(evaluator, thetas, rng)
     # Populations at another optimum have their estimates near the first one.
     starts = x if len(centers) == 1 else np.zeros_like(x)
     estimates, converged = refit(sampling, data, starts, is_rough=True)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.emulators.selection import (
+    CANDIDATES,
     Runs,
-    candidate_surfaces,
     predict_outputs,
     predict_without_blocks,
     select_surfaces,
@@ -341,7 +341,7 @@ def fit_emulator(
     y = runs.values.reshape(len(runs), -1)
     fitted = Runs(x, y, weights.mean(axis=0), runs.blocks, coarse)
     try:
-        surfaces = candidate_surfaces(*x.shape) if isinstance(emulator, str) else [emulator]
+        surfaces = CANDIDATES if isinstance(emulator, str) else [emulator]
         best, left_out = select_surfaces(surfaces, fitted)
     except np.linalg.LinAlgError:
         return None

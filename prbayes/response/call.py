@@ -555,20 +555,24 @@ def chunks(
     work = partial(compute, function, **options)
     workers, most_chunks = capacity(settings.executor)
     pool = Pool(settings.name, settings.executor)
-    suspects: list[Rows] = []  # chunks at work when a worker was lost
+    suspects: list[Rows] = []  # chunks at work when a worker was lost, computed one at a time
+    suspect: Rows | None = None  # at work
     loss: BaseException | None = None
     begun: dict[Future[Chunk], Rows] = {}
     waiting = rows
     error: BaseException | None = None
     with progress(f"responses of {settings.name}", rows.size) as report:
         while waiting.size or begun or suspects:
-            if suspects and not begun:
-                for chunk_rows, chunk in _one_at_a_time(pool, work, points, suspects, loss):
-                    tally.count(chunk_rows.size, chunk.seconds)
-                    report(chunk_rows.size, "")
-                    yield [(chunk_rows, chunk)]
-                suspects = []
-            while waiting.size and not suspects and len(begun) < most_chunks:
+            if loss is not None and not begun:
+                pool.renew(loss)
+                loss = None
+                if suspects:
+                    pool.refuse_dead()
+            if not begun:
+                suspect = suspects.pop() if suspects else None
+                if suspect is not None:
+                    begun[pool.submitted(work, points.at(suspect), tolerant)] = suspect
+            while waiting.size and suspect is None and loss is None and len(begun) < most_chunks:
                 size = chunk_size(settings, tally, waiting.size, workers)
                 try:
                     size = budget().grant(size, least=1)
@@ -584,54 +588,31 @@ def chunks(
                 failure = failure_of(future)
                 if has_slipped(failure):
                     waiting = np.concatenate([chunk_rows, waiting])
-                elif tolerant and is_loss(failure):
-                    suspects.append(chunk_rows)
+                    continue
+                if tolerant and is_loss(failure):
                     loss = failure
+                    if chunk_rows is not suspect or chunk_rows.size > 1:
+                        n_parts = 2 if chunk_rows is suspect else 1
+                        suspects += reversed(np.array_split(chunk_rows, n_parts))
+                        continue
+                    reason = f"it ended its worker ({type(loss).__name__}), or took far too long"
+                    chunk = Chunk(np.array([np.nan]), {0: reason}, 0.0)
                 elif failure is not None:
                     error = error or failure
-                    waiting = waiting[:0]
+                    waiting, suspects = waiting[:0], []
+                    continue
                 else:
                     chunk = future.result()
-                    if chunk.raised and not tolerant:
-                        waiting = waiting[:0]
-                    tally.count(chunk_rows.size, chunk.seconds)
-                    report(chunk_rows.size, f"{workers / max(tally.seconds, 1e-9):.3g}/s")
-                    finished.append((chunk_rows, chunk))
+                if chunk.raised and not tolerant:
+                    waiting = waiting[:0]
+                tally.count(chunk_rows.size, chunk.seconds)
+                report(chunk_rows.size, f"{workers / max(tally.seconds, 1e-9):.3g}/s")
+                finished.append((chunk_rows, chunk))
             if finished:
                 yield finished
+    pool.renew(error or loss)  # for the next response that is sent to this executor
     if error is not None:
-        pool.renew(error)  # for the next response that is sent to this executor
         _raise_lost(settings.name, error)
-
-
-def _one_at_a_time(
-    pool: Pool,
-    work: Callable[[Points, bool], Chunk],
-    points: Points,
-    suspects: list[Rows],
-    loss: BaseException | None,
-) -> Iterator[Finished]:
-    """Compute chunks one by one, and bisect those that end their worker, down to a failed point."""
-    pool.renew(loss)
-    pool.refuse_dead()
-    waiting = list(reversed(suspects))
-    while waiting:
-        rows = waiting.pop()
-        future = pool.submitted(work, points.at(rows), True)
-        pool.done([future])
-        failure = failure_of(future)
-        pool.renew(failure)
-        if failure is None:
-            yield rows, future.result()
-        elif has_slipped(failure):
-            waiting.append(rows)
-        elif not is_loss(failure):
-            _raise_lost(pool.name, failure)
-        elif rows.size == 1:
-            reason = f"it ended its worker ({type(failure).__name__}), or took far too long"
-            yield rows, Chunk(np.array([np.nan]), {0: reason}, 0.0)
-        else:
-            waiting += [rows[rows.size // 2 :], rows[: rows.size // 2]]
 
 
 def _raise_lost(name: str, error: BaseException) -> None:

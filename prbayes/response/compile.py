@@ -12,7 +12,7 @@ import numpy as np
 import pytensor
 import pytensor.tensor as pt
 from pytensor.compile.mode import Mode
-from pytensor.graph.basic import Apply, Constant, Variable
+from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
@@ -27,8 +27,6 @@ from pytensor.tensor.variable import TensorVariable
 def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
     """Rewrite what NumPy does faster, or not at all, in the form that PyTensor has."""
     op, terms = node.op, node.inputs
-    if op.scalar_op == pt.switch.scalar_op:
-        return [_where(*terms)]
     if op.scalar_op == pt.softplus.scalar_op:  # PyTensor would loop over numbers
         (x,) = terms
         return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
@@ -56,30 +54,6 @@ def _index_batches(fgraph: Any, node: Any) -> Any:
     if index.type.broadcastable[0]:
         return [x[:, index[0]]]
     return [x[pt.arange(x.shape[0]), index]]
-
-
-class _Where(Op):
-    """Choose between arrays, at no cost if all are the first: most values are in a support."""
-
-    __props__ = ()
-    view_map = {0: [1]}  # noqa: RUF012 - what PyTensor declares
-
-    def make_node(self, condition: Any, first: Any, second: Any) -> Apply:
-        """Take the three as they are."""
-        return Apply(self, [condition, first, second], [pt.switch(condition, first, second).type()])
-
-    def perform(self, node: Apply, inputs: Sequence[Any], output_storage: Any) -> None:
-        """Return the first itself if it is the result."""
-        condition, first, second = inputs
-        dtype = node.outputs[0].dtype
-        shape = np.broadcast_shapes(condition.shape, first.shape, second.shape)
-        if first.shape == shape and first.dtype == dtype and condition.all():
-            output_storage[0][0] = first
-        else:
-            output_storage[0][0] = np.asarray(np.where(condition, first, second), dtype=dtype)
-
-
-_where = _Where()
 
 
 # Batched NumPy calls: a heavy compilation does not pay. Without fusion every elementwise operation

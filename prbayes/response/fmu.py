@@ -360,17 +360,12 @@ class _TimeGrid:
 
     def steps(self) -> Iterator[tuple[float, float, bool]]:
         """Yield the begin and size of each step, and whether outputs are read after it."""
-        begin, n_steps = self.start, 0
+        begin = self.start
         for end in self.times:
             n = max(1, math.ceil((end - begin) / self.step - 1e-6))
+            size = self.step if self.is_even else (end - begin) / n
             for i in range(n):
-                is_last = i == n - 1
-                if self.is_even:
-                    yield self.start + n_steps * self.step, self.step, is_last
-                else:
-                    size = (end - begin) / n
-                    yield begin + i * size, size, is_last
-                n_steps += 1
+                yield begin + i * size, size, i == n - 1
             begin = end
 
 

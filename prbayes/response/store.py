@@ -280,7 +280,6 @@ class Store:
         name = self.name, self.version
         responses = _responses(connection)
         if name not in responses and self.columns is not None:
-            self._refuse_older_files()
             row = (self.name, self.columns, self.version)
             insert = (
                 "INSERT INTO response (name, columns, version, checksum) SELECT ?, ?, ?, ? "
@@ -303,17 +302,6 @@ class Store:
                 "nothing was changed: give the simulator another name, or pass another folder",
             )
         return responses[name]
-
-    def _refuse_older_files(self) -> None:
-        """Raise if the folder has runs of this simulator from before SQLite."""
-        stem = "".join(c if c.isalnum() or c in "-_." else f"%{ord(c):x}" for c in self.name)
-        for file in (f"{stem}.nc", f"{stem}.journal"):
-            if (self.folder / file).exists():
-                raise _FileError(
-                    f"beside {file}, which an older version wrote",
-                    "no such file",
-                    "this version does not read it: move it away, or pass another folder",
-                )
 
     def _read_new_runs(self, session: _Session) -> None:
         """Read the runs that the session has not read; numbers and checksums have to match."""

@@ -27,7 +27,6 @@ from prbayes.model.evaluator import ENOUGH, Evaluator, shortcoming
 from prbayes.model.fingerprint import Level
 from prbayes.model.locking import locked
 from prbayes.model.parameters import (
-    finite_draws,
     single_elements,
     split_elements,
     stacked_draws,
@@ -44,7 +43,15 @@ from prbayes.optimize.optimum import (
     require_of_model,
 )
 from prbayes.response.inputs import model_on_context
-from prbayes.results.likelihood_checks import Checked, check_draws, check_optimum, separate_modes
+from prbayes.results.likelihood_checks import (
+    Checked,
+    check_conflict,
+    check_draws,
+    check_population,
+    emulator_remarks,
+    separate_modes,
+)
+from prbayes.results.predict import populations_of
 
 # R-hat of independent draws exceeds 1 + _NOISE / (chains x draws) about once in a thousand cases:
 # the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, 1500 to 4000 sets of each.
@@ -182,7 +189,9 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     if has_draws and model is not None and (by_specimen or not calibration):
         evaluator = Evaluator.of(model)
         by_specimen = not evaluator.nodes
-        thetas = _thetas(tree["posterior"], evaluator)
+        every_draw = tree["posterior"].sizes["chain"] * tree["posterior"].sizes["draw"]
+        points, _ = populations_of(tree, model, every_draw, "prb.diagnose")
+        thetas = evaluator.hyperparameters.thetas_of(list(points.values()))
     coverage: _Coverage = {}
     if has_draws and calibration:
         coverage = _stored_coverage(calibration)
@@ -199,15 +208,12 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     if not by_specimen:
         checked += _not_tested(reason) if optimum is None else _check_family(optimum)
     elif optimum is not None:
-        checked += check_optimum(optimum)
+        checked += emulator_remarks(optimum.evaluator) + check_population(optimum)
     elif has_draws:
-        maximum = None
-        if evaluator is not None and thetas is not None:
-            sizes = tree["posterior"].sizes
-            thetas = thetas.reshape(sizes["chain"], sizes["draw"], -1)
-            if simulation_obstacle(evaluator) is None:
-                maximum = find_optimum(evaluator, Minimisation())
-        checked += check_draws(evaluator, tree, thetas, maximum)
+        checked += check_draws(evaluator, tree, thetas)
+        if evaluator is not None and thetas is not None and simulation_obstacle(evaluator) is None:
+            maximum = find_optimum(evaluator, Minimisation())
+            checked += check_population(maximum) + check_conflict(maximum, thetas)
     else:
         text = "The family of the population was not tested: that needs the model; pass the "
         checked += Checked(untested=(f"{text}Optimum itself.",))
@@ -464,15 +470,6 @@ def _particles_stuck(result: xr.DataTree) -> list[Finding]:
         f"{cure}."
     )
     return [Finding("particles-stuck", text, "validity.md#diagnostics-of-the-sampler")]
-
-
-def _thetas(posterior: Any, evaluator: Evaluator) -> Floats:
-    """Return the draws as thetas, shape (chains x draws, d)."""
-    names = [rv.name for rv in evaluator.model.free_RVs]
-    missing = [name for name in names if name not in posterior]
-    if missing:
-        raise KeyError(f"posterior: got no {missing}, expected the model's free variables {names}")
-    return evaluator.hyperparameters.thetas_of(list(finite_draws(posterior, names).values()))
 
 
 # -- designs ---------------------------------------------------------------------------------

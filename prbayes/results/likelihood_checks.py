@@ -77,19 +77,11 @@ def _not_tested(subject: str, reason: str) -> Checked:
 _FAMILY = "The family of the population"
 _CONFLICT = "The conflict of prior and data"
 
-# By optimum while it lives: the tests take seconds, and reports repeat them.
+# By optimum while it lives: the test of the population takes seconds, and reports repeat it.
 _CACHE: WeakKeyDictionary[Optimum, Checked] = WeakKeyDictionary()
 
 
-def check_optimum(optimum: Optimum) -> Checked:
-    """Return the reports of the emulator and the test of the population about an optimum."""
-    if optimum not in _CACHE:
-        emulators = Checked(remarks=emulator_remarks(optimum.evaluator))
-        _CACHE[optimum] = emulators + _check_population(optimum)
-    return _CACHE[optimum]
-
-
-def emulator_remarks(evaluator: Evaluator) -> tuple[Finding, ...]:
+def emulator_remarks(evaluator: Evaluator) -> Checked:
     """Report the emulator and the points of each likelihood by specimen."""
     remarks = []
     for likelihood in evaluator.likelihoods:
@@ -105,14 +97,16 @@ def emulator_remarks(evaluator: Evaluator) -> tuple[Finding, ...]:
                 f"{count}, and up to {points.log_a.shape[1]} points.",
             )
         )
-    return tuple(remarks)
+    return Checked(remarks=tuple(remarks))
 
 
 # -- population ------------------------------------------------------------------------------
 
 
-def _check_population(optimum: Optimum) -> Checked:
+def check_population(optimum: Optimum) -> Checked:
     """Test whether the family of the population fits the inputs of the specimens."""
+    if optimum in _CACHE:
+        return _CACHE[optimum]
     evaluator = optimum.evaluator
     likelihoods = evaluator.likelihoods
     reason = _population_obstacle(optimum)
@@ -155,6 +149,7 @@ def _check_population(optimum: Optimum) -> Checked:
         power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
         text = f"{likelihood.name}: the test of the population found no misfit. {power}"
         checked += Checked(misfit, () if misfit else (Finding("population-tested", text),))
+    _CACHE[optimum] = checked
     return checked
 
 
@@ -244,31 +239,32 @@ def _normalised(log_weights: Floats) -> Floats:
     """Return weights of sum one by row, equal ones where all are zero."""
     log_weights = np.where(np.isfinite(log_weights), log_weights, -np.inf)
     largest = log_weights.max(axis=1, keepdims=True)
-    weights = np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
+    largest = np.where(np.isfinite(largest), largest, 0.0)
+    weights = np.exp(log_weights - largest)
     total = weights.sum(axis=1, keepdims=True)
-    return np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1 / weights.shape[1])
+    has_weight = total > 0
+    relative = weights / np.where(has_weight, total, 1.0)
+    return np.where(has_weight, relative, 1 / weights.shape[1])
 
 
 # -- draws -----------------------------------------------------------------------------------
 
 
-def check_draws(
-    evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None, optimum: Optimum | None
-) -> Checked:
-    """Return the reports of the checks of draws.
+def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None) -> Checked:
+    """Return the reports of the checks of draws that need no optimum.
 
-    Without a model, evaluator and thetas are None; without simulated data sets, the optimum is.
+    Without a model, evaluator and thetas are None.
     """
     checked = Checked(findings=influence(result))
     if evaluator is None or thetas is None:
         both = f"{_FAMILY} and the conflict of prior and data were not tested"
         return checked + Checked(untested=(f"{both}: that needs the model; pass model=.",))
-    center = thetas.reshape(-1, evaluator.hyperparameters.size).mean(axis=0)
-    checked += Checked(failing_region_findings(evaluator, center), emulator_remarks(evaluator))
-    if optimum is None:
-        obstacle = simulation_obstacle(evaluator) or ""
-        return checked + _not_tested(_FAMILY, obstacle) + _not_tested(_CONFLICT, obstacle)
-    return checked + _check_population(optimum) + _check_conflict(optimum, thetas)
+    checked += Checked(failing_region_findings(evaluator, thetas.mean(axis=0)))
+    checked += emulator_remarks(evaluator)
+    obstacle = simulation_obstacle(evaluator)
+    if obstacle is None:
+        return checked
+    return checked + _not_tested(_FAMILY, obstacle) + _not_tested(_CONFLICT, obstacle)
 
 
 def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
@@ -326,8 +322,8 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
 # -- prior and data --------------------------------------------------------------------------
 
 
-def _check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
-    """Report hyperparameters whose prior pulls the posterior away from the data."""
+def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
+    """Report hyperparameters whose prior pulls the posterior away from the data; draws (k, d)."""
     evaluator = optimum.evaluator
     if not (optimum.converged and np.isfinite(optimum.covariance).all()):
         reason = "nothing is known of the sampling distribution of the optimum"
@@ -335,7 +331,7 @@ def _check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
     if any(mode["comparable"] for mode in optimum.local_optima):
         return _not_tested(_CONFLICT, "the likelihood has several modes")
     names = evaluator.hyperparameters.names
-    mean = thetas.reshape(-1, evaluator.hyperparameters.size).mean(axis=0)
+    mean = thetas.mean(axis=0)
     errors = np.sqrt(np.diag(optimum.covariance))
     pulls = np.abs(mean - optimum.theta) / errors
     j = int(pulls.argmax())

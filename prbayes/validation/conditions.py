@@ -414,10 +414,13 @@ def area(u: Floats) -> Floats:
     follows from that of :math:`|v|`, which is :math:`v |v| / 2`.
     """
     *leading, n = u.shape
-    zeros, ones = np.zeros((*leading, 1)), np.ones((*leading, 1))
-    ends = np.concatenate([zeros, np.sort(u, axis=-1), ones], axis=-1)
+    zeros = np.zeros((*leading, 1))
+    ones = np.ones((*leading, 1))
+    ascending = np.sort(u, axis=-1)
+    ends = np.concatenate([zeros, ascending, ones], axis=-1)
     ecdf = np.arange(n + 1) / n
     above = ends[..., 1:] - ecdf
     below = ends[..., :-1] - ecdf
     doubled = above * np.abs(above) - below * np.abs(below)
-    return np.asarray(doubled.sum(axis=-1) / 2)
+    total = doubled.sum(axis=-1)
+    return np.asarray(total / 2)

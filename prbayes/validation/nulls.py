@@ -19,14 +19,11 @@ from numpy.typing import NDArray
 from prbayes._progress import progress
 from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, called, positive_integer, positive_number, share
-from prbayes.inference.refits import SamplingDistribution, refit
+from prbayes.inference.refits import refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
-from prbayes.model.evaluator import shortcomings
 from prbayes.model.fingerprint import Level, require_same
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, require_refits
-from prbayes.propagation.base import DesignError
-from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import data_digest, in_order, serving, specimen_names
@@ -194,8 +191,10 @@ def table() -> tuple[Floats, Floats, Floats]:
 def _area_quantiles(n: int) -> tuple[Floats, Floats]:
     """Return minus the logs of tail probabilities and the quantiles of sqrt(n) A, (m,) each."""
     sizes, logs, quantiles = table()
-    at, ends = -1 / np.sqrt(n), -1 / np.sqrt(sizes)
-    return logs, np.array([np.interp(at, ends, column) for column in quantiles.T])
+    place = -1 / np.sqrt(n)
+    places = -1 / np.sqrt(sizes)
+    at_n = [np.interp(place, places, column) for column in quantiles.T]
+    return logs, np.array(at_n)
 
 
 @dataclass(frozen=True)
@@ -350,35 +349,13 @@ class JointNull(Null):
         return judge_by_replicates([self._u_values(case)], case, statistic, alpha)
 
     def _u_values(self, case: Case) -> Floats:
-        """Return u-values of the replicates, (r, n)."""
+        """Draw specimens, recalibrate the model, and return u-values of their responses, (r, n)."""
         require_same(
             case.identity, self.optimum.search.identity, "JointNull: predicted", Level.OPTIMUM
         )
-        evaluator = self.optimum.evaluator
-        sampling = self.optimum.sampling()
-        bounds = evaluator.reweighted.values()
-        with designs_restored(bounds):
-            try:
-                tested = [self._tested(case, condition) for condition in case.conditions]
-            except PoorEmulatorError as error:
-                # All responses at the same points: those of the runs.
-                for bound in bounds:
-                    bound.design = bound.design.runs_alone()
-                short = shortcomings(evaluator, self.optimum.theta[None])
-                if short:
-                    reasons = "; ".join(f"{name}: {reason}" for name, reason in short.items())
-                    raise DesignError(
-                        f"JointNull: {error}; its runs alone do not support the calibrated "
-                        f"population ({reasons})"
-                    ) from error
-                tested = [self._tested(case, condition) for condition in case.conditions]
-            return self._replicates(case, sampling, tested)
-
-    def _replicates(
-        self, case: Case, sampling: SamplingDistribution, tested: list[_Tested]
-    ) -> Floats:
-        """Draw specimens, recalibrate the model, and test their responses, (r, n)."""
         evaluator, theta = self.optimum.evaluator, self.optimum.theta
+        sampling = self.optimum.sampling()
+        tested = [self._tested(case, condition) for condition in case.conditions]
         rng_of_ties = case.rng(1)
         numbers, n_new = _validated_counts(evaluator.nodes, tested)
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
@@ -388,7 +365,8 @@ class JointNull(Null):
         points = simulated_points(
             evaluator, populations, self.replicates, self.random_seed, more=n_new
         )
-        x, converged = refit(sampling, sets_at(evaluator, populations, points))
+        data = sets_at(evaluator, [values[0] for values, _ in populations], points)
+        x, converged = refit(sampling, data)
         # With fewer the replicates would be those of unusual data sets.
         if converged.mean() < 0.5:
             raise ValueError(

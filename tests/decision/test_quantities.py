@@ -35,17 +35,12 @@ def test_numbers_of_a_population_and_of_specimens(
     np.testing.assert_array_equal(quantity.of_specimen(VALUES, 2.25), of_specimens)
 
 
-def test_a_quantile_of_many_is_that_of_the_distribution() -> None:
+def test_a_quantile_of_many_and_a_spread_beside_a_large_mean() -> None:
     z = ndtri((np.arange(2000) + 0.5) / 2000)
-    quantity = prb.decision.Quantile(same, X, probability=0.9)
-    (found,) = quantity.of(z, np.full((1, 2000), 1 / 2000))
-    np.testing.assert_allclose(found, ndtri(0.9), atol=1e-3)
-
-
-def test_a_large_mean_leaves_digits_for_the_spread() -> None:
-    quantity = prb.decision.StandardDeviation(same, X)
-    shifted = quantity.of(VALUES + 1e9, WEIGHTS)
-    np.testing.assert_allclose(shifted, quantity.of(VALUES, WEIGHTS), rtol=1e-6)
+    quantile = prb.decision.Quantile(same, X, probability=0.9)
+    np.testing.assert_allclose(quantile.of(z, np.full((1, 2000), 1 / 2000)), ndtri(0.9), atol=1e-3)
+    sd = prb.decision.StandardDeviation(same, X)
+    np.testing.assert_allclose(sd.of(VALUES + 1e9, WEIGHTS), sd.of(VALUES, WEIGHTS), rtol=1e-6)
 
 
 def test_intervals_have_every_combination_with_the_ends() -> None:

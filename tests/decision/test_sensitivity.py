@@ -68,6 +68,8 @@ def test_an_optimum_in_two_units() -> None:
     assert two.attrs["value"] == pytest.approx(2 * one.attrs["value"])
     np.testing.assert_allclose(one["first"], two["first"], atol=1e-6)
     assert float(one["first"].sel(factor="mu")) == pytest.approx(1, abs=0.01)
+    # The bound of the total by derivatives is reached by a linear response.
+    np.testing.assert_allclose(one.derivative.sel(factor=["mu", "x"]), 1, atol=0.02)
     assert one.attrs["responses"] == 0
     # A new specimen's variance is s^2 (1 + 1 / N).
     assert one.attrs["scatter"] == pytest.approx(50 / 51, abs=0.005)
@@ -78,7 +80,7 @@ def test_errors_fall_with_the_samples_and_seeds_matter() -> None:
     quantity = prb.decision.Exceedance(same, x, limit=2.0)
     few, again, many = [
         prb.sensitivity(posterior(), quantity, model=model, n_samples=n, random_seed=seed)
-        for n, seed in ((64, 1), (64, 1), (1024, 2))
+        for n, seed in ((64, 1), (64, 1), (512, 2))
     ]
     xr.testing.assert_identical(few, again)
     assert float(many.first_error.sel(factor="mu")) < float(few.first_error.sel(factor="mu"))
@@ -88,18 +90,6 @@ def test_errors_fall_with_the_samples_and_seeds_matter() -> None:
         assert (off < 5 * few[f"{key}_error"].sel(factors) + 0.01).all()
     # Whether a specimen is beyond has no derivative.
     assert np.isnan(float(many.derivative.sel(factor="x")))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, x = normal()
-    quantity = prb.decision.Quantile(same, x, probability=0.9)
-    before = prb.sensitivity(posterior(), quantity, model=model, n_samples=256)
-    monkeypatch.setattr(module, "_STEP", factor * module._STEP)
-    after = prb.sensitivity(posterior(), quantity, model=model, n_samples=256)
-    change = (after.derivative - before.derivative).sel(factor=["mu", "sigma"])
-    np.testing.assert_allclose(change, 0, atol=0.01)
 
 
 # -- estimators ----------------------------------------------------------------------------------
@@ -195,10 +185,6 @@ def ishigami_and_linear(a: Any, b: Any, c: Any, d: Any) -> Any:
     return ishigami(np.stack([a, b, c], axis=-1)) + d
 
 
-def bounds(a: Any, b: Any, c: Any, d: Any) -> Any:
-    return a + 2 * d
-
-
 SHARE = VARIANCE / (VARIANCE + 1)
 FIRST_OF_FOUR = np.array([*FIRST * SHARE, 1 - SHARE])
 TOTAL_OF_FOUR = np.array([*TOTAL * SHARE, 1 - SHARE])
@@ -221,36 +207,6 @@ def problem(emulator: str | None = "auto", n: int = 256) -> tuple[prb.Optimum, l
 
 
 @pytest.mark.slow
-def test_two_inputs_that_act_together_emulated_and_called() -> None:
-    def together(a: Any, b: Any) -> Any:
-        return a + b + a * b
-
-    with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
-        b = pm.Normal.dist(0.0, 1.0)
-        z = np.random.default_rng(1).normal(size=(2, 100))
-        prb.Simulator(
-            *("y", together, a, b),
-            metric=prb.ProbabilityResidual(),
-            observed=together(*z),
-            propagation=prb.Reweighted(64),
-        )
-    optimum = prb.minimize(model, starts=0, progressbar=False)
-    # mu + a + (1 + mu) b + a b, with a and b standard normal.
-    slope = 1 + float(optimum.point["mu"])
-    alone = np.array([1.0, slope**2])
-    for computed in (False, True):
-        quantity = prb.decision.Mean(together, a, b)
-        table = prb.sensitivity(optimum, quantity, n_samples=512, computed=computed)
-        own = table.sel(factor=["a", "b"])
-        for key, part in (("first", alone), ("total", alone + 1)):
-            off = np.abs(own[key] - part / (alone.sum() + 1))
-            assert (off < 5 * own[f"{key}_error"]).all()
-            assert (own[f"{key}_error"] < 0.05).all()
-        assert (table.attrs["responses"] > 0) == computed
-
-
-@pytest.mark.slow
 def test_ishigami_emulated_from_few_runs_and_called() -> None:
     optimum, inputs = problem()
     quantity = prb.decision.Mean(ishigami_and_linear, *inputs)
@@ -266,20 +222,6 @@ def test_ishigami_emulated_from_few_runs_and_called() -> None:
 
 
 @pytest.mark.slow
-def test_derivatives_bound_a_linear_response_as_tightly_as_they_can() -> None:
-    optimum, inputs = problem()
-    quantity = prb.decision.Mean(bounds, *inputs)
-    own = prb.sensitivity(optimum, quantity, computed=True).sel(factor=list("abcd"))
-    # a is uniform: 2 pi times the distribution function of z, whose squared derivative has the
-    # mean 1 / (2 pi sqrt(3)).
-    shares = np.array([np.pi**2 / 3, 0, 0, 4.0])
-    np.testing.assert_allclose(own["total"], shares / shares.sum(), atol=0.01)
-    np.testing.assert_allclose(own.derivative[3], own["total"][3], atol=0.01)
-    np.testing.assert_allclose(own.derivative[0], 2 * np.pi / np.sqrt(3) / shares.sum(), atol=0.01)
-    np.testing.assert_allclose(own.derivative[1:3], 0, atol=1e-12)
-
-
-@pytest.mark.slow
 def test_without_an_emulator_nothing_tells_what_is_between_the_runs() -> None:
     optimum, inputs = problem(None, 4096)
     quantity = prb.decision.Mean(ishigami_and_linear, *inputs)
@@ -289,13 +231,8 @@ def test_without_an_emulator_nothing_tells_what_is_between_the_runs() -> None:
 
 
 def test_where_the_nearest_run_failed_a_line_ends() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
-        observed = np.random.default_rng(1).normal(0, 1, 40)
-        prb.Simulator("y", np.sinh, x, metric=prb.AreaMetric(), observed=observed)
-    optimum = prb.minimize(model, progressbar=False)
-    broken = prb.decision.Exceedance(lambda x: np.where(x > 1, np.inf, x), x, limit=1.0)
-    populations = Populations.of(optimum, None, 50, "prb.sensitivity")
+    broken = prb.decision.Exceedance(lambda x: np.where(x > 1, np.inf, x), normal()[1], limit=1.0)
+    populations = Populations.of(optimum(), None, 50, "prb.sensitivity")
     sample = populations.sample(broken.response, broken.inputs, None)
     indices, _ = input_indices(sample, broken, 64, 0, computed=False)
     assert indices.values[1] == pytest.approx(1.0, abs=0.15)
@@ -303,13 +240,22 @@ def test_where_the_nearest_run_failed_a_line_ends() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_the_step_of_inputs_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    optimum, inputs = problem()
-    quantity = prb.decision.Mean(ishigami_and_linear, *inputs)
-    before = prb.sensitivity(optimum, quantity, n_samples=64, computed=True)
+def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, x = normal()
+    of_inputs, inputs = problem()
+    first = prb.decision.Quantile(same, x, probability=0.9)
+    second = prb.decision.Mean(ishigami_and_linear, *inputs)
+
+    def derivatives() -> tuple[Any, Any]:
+        one = prb.sensitivity(posterior(), first, model=model, n_samples=256)
+        two = prb.sensitivity(of_inputs, second, n_samples=64, computed=True)
+        return one.derivative.sel(factor=["mu", "sigma"]), two.derivative[1:]
+
+    before = derivatives()
     monkeypatch.setattr(module, "_STEP", factor * module._STEP)
-    after = prb.sensitivity(optimum, quantity, n_samples=64, computed=True)
-    np.testing.assert_allclose(after.derivative[1:], before.derivative[1:], rtol=0.01)
+    after = derivatives()
+    np.testing.assert_allclose(after[0], before[0], atol=0.01)
+    np.testing.assert_allclose(after[1], before[1], rtol=0.01)
 
 
 # -- the copula ------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Files of surrogates: the same surface comes back, and other files are refused."""
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,9 @@ def test_a_file_keeps_the_surface_and_its_settings(tmp_path: Path, model: Any) -
     back = prb.Surrogate.load(tmp_path / "s.nc")
     np.testing.assert_array_equal(back(X, Y), found(X, Y))
     assert back(99.0, 1.0) == 7.0
+    again = pickle.loads(pickle.dumps(found))
+    np.testing.assert_array_equal(again(X, Y), found(X, Y))
+    np.testing.assert_array_equal(again.local_error(X, Y), found.local_error(X, Y))
     assert (back.model, back.n_runs, back.ranges) == (model, 48, found.ranges)
     assert (back.error.rms, back.error.population_sd) == (
         found.error.rms,
@@ -51,6 +55,12 @@ def test_multivariate_constant_and_abort_survive_a_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back(v, 2.0), found(v, 2.0))
     with pytest.raises(ValueError, match="outside its design"):
         back(v, 1.0)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "s.nc").write_bytes(b"not a file of this kind")
+    with pytest.raises(StoreError, match=r"path: got .*expected a file of Surrogate.save"):
+        prb.Surrogate.load(tmp_path / "s.nc")
 
 
 def test_a_regressor_is_passed_again_at_load(tmp_path: Path) -> None:
@@ -82,12 +92,6 @@ def test_a_coarse_response_is_passed_again_at_load(tmp_path: Path, joined: bool)
     np.testing.assert_array_equal(back(X, Y), found(X, Y))
     prb.Surrogate.fit(bent, BOX, 48).save(tmp_path / "alone.nc")
     assert prb.Surrogate.load(tmp_path / "alone.nc", coarse=coarse).coarse is None
-
-
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "s.nc").write_bytes(b"not a file of this kind")
-    with pytest.raises(StoreError, match=r"path: got .*expected a file of Surrogate.save"):
-        prb.Surrogate.load(tmp_path / "s.nc")
 
 
 def test_several_outputs_survive_a_file(tmp_path: Path) -> None:

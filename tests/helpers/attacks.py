@@ -66,17 +66,26 @@ def found_in(store: Store) -> str:
     return EARLIER if whole and not known[np.argmin(known) :].any() else "holes"
 
 
-def opened(folder: Path) -> str:
-    """Return what becomes of a store that is opened."""
+def outcome_of(read: Callable[[], str]) -> str:
+    """Return what becomes of reading or writing a file."""
     try:
-        store = Store(folder, "y", columns=3)
-        outcome = found_in(store)
-        store.close()
+        return read()
     except StoreError as error:
         return sentence(str(error))
     except Exception as error:
         return f"{type(error).__name__}: {error}"
-    return outcome
+
+
+def opened(folder: Path) -> str:
+    """Return what becomes of a store that is opened."""
+
+    def read() -> str:
+        store = Store(folder, "y", columns=3)
+        outcome = found_in(store)
+        store.close()
+        return outcome
+
+    return outcome_of(read)
 
 
 def sentence(text: str) -> str:
@@ -256,7 +265,8 @@ def killed_writers(folder: Path, rng: np.random.Generator, n: int) -> Iterator[s
 
 def committed(folder: Path, said: list[list[int]]) -> str:
     """Return whether all is there that processes said they had written, and nothing else."""
-    try:
+
+    def read() -> str:
         store = Store(folder, "y", columns=2)
         for number, chunks in enumerate(said):
             points = 5.0 * np.array(chunks)[:, None] + np.arange(5) if chunks else np.empty((0, 5))
@@ -273,9 +283,9 @@ def committed(folder: Path, said: list[list[int]]) -> str:
             return f"{unsaid} responses that nobody wrote"
         store.add(np.array([[7.0, 7.0]]), np.array([7_000_007.0]))
         store.close()
-    except Exception as error:
-        return f"{type(error).__name__}: {error}"
-    return SAME
+        return SAME
+
+    return outcome_of(read)
 
 
 def threads_that_write(folder: Path, rng: np.random.Generator, n: int) -> Iterator[str]:
@@ -360,15 +370,14 @@ def sound_checkpoint(path: Path) -> None:
 
 def read_checkpoint(folder: Path) -> str:
     """Return what becomes of a checkpoint that is gone on with."""
-    try:
+
+    def read() -> str:
         found = Checkpoint(folder / "run.nc", PROBLEM, SETTINGS)
-    except StoreError as error:
-        return sentence(str(error))
-    except Exception as error:
-        return f"{type(error).__name__}: {error}"
-    same = found.note == {"stage": 1} and set(found.arrays) == set(STATE)
-    same = same and all(np.array_equal(found.arrays[k], STATE[k], equal_nan=True) for k in STATE)
-    return SAME if same else "wrong numbers"
+        same = found.note == {"stage": 1} and set(found.arrays) == set(STATE)
+        same = same and all(np.array_equal(found.arrays[k], STATE[k], True) for k in STATE)
+        return SAME if same else "wrong numbers"
+
+    return outcome_of(read)
 
 
 def checkpoint_attack(damage: Callable[..., Any]) -> Attack:
@@ -389,15 +398,13 @@ def checkpoint_on_a_full_disk(folder: Path, rng: np.random.Generator, n: int) ->
     path = folder / "run.nc"
     for size in places(rng, 40_000, n):
         sound_checkpoint(path)
-        try:
+
+        def write(size: int = size) -> str:
             with room_for(size):
                 Checkpoint(path, PROBLEM, SETTINGS).save({"t": np.arange(5_000.0)}, {"stage": 2})
-        except StoreError as error:
-            outcome = sentence(str(error))
-        except Exception as error:
-            outcome = f"{type(error).__name__}: {error}"
-        else:
-            outcome = "not refused"
+            return "not refused"
+
+        outcome = outcome_of(write)
         kept = read_checkpoint(folder)
         alone = [p.name for p in folder.iterdir()] == [path.name]
         yield outcome if kept == SAME and alone else f"{outcome}, and then {kept}"

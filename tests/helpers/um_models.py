@@ -1,17 +1,12 @@
-"""A server of UM-Bridge models: `python um_models.py PORT FILE` serves until it is killed."""
+"""A server of UM-Bridge models: `python um_models.py PORT` serves until it is killed."""
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import umbridge
-
-# Of one that dies: the evaluations before it does, once.
-LIFETIME = 10
 
 
 class Beam(umbridge.Model):
@@ -30,21 +25,6 @@ class Beam(umbridge.Model):
 
     def supports_evaluate(self) -> bool:
         return True
-
-
-class Mortal(Beam):
-    """Ends the server after some evaluations, unless that has happened before."""
-
-    def __init__(self, name: str, flag: Path) -> None:
-        super().__init__(name)
-        self.flag, self.count = flag, 0
-
-    def __call__(self, parameters: Any, config: Any) -> list[list[float]]:
-        self.count += 1
-        if self.count == LIFETIME and not self.flag.exists():
-            self.flag.touch()
-            os._exit(1)
-        return super().__call__(parameters, config)
 
 
 class Vectors(Beam):
@@ -86,12 +66,5 @@ class Mute(Beam):
 
 
 if __name__ == "__main__":
-    port, flag = int(sys.argv[1]), Path(sys.argv[2])
-    models = [
-        Beam("beam"),
-        Mortal("mortal", flag),
-        Vectors("vectors"),
-        Moody("moody"),
-        Mute("mute"),
-    ]
-    umbridge.serve_models(models, port, max_workers=4)
+    models = [Beam("beam"), Vectors("vectors"), Moody("moody"), Mute("mute")]
+    umbridge.serve_models(models, int(sys.argv[1]), max_workers=4)

@@ -7,33 +7,21 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import um_models
 
 
 class Real:
-    """A server of UM-Bridge in a process of its own, which may be killed and started again."""
+    """A server of UM-Bridge in a process of its own."""
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}"
-        self.folder = folder
-        self.process: Any = None
-        self.start()
-        self.wait()
-
-    def start(self) -> None:
-        if self.process is not None:
-            self.process.wait()
-        program = [sys.executable, um_models.__file__, str(self.port), str(self.folder / "died")]
-        with (self.folder / "log.txt").open("ab") as log:
+        with (folder / "log.txt").open("ab") as log:
+            program = [sys.executable, um_models.__file__, str(self.port)]
             self.process = subprocess.Popen(program, stdout=log, stderr=log)
-
-    def wait(self) -> None:
-        """Wait until it is there."""
         until = time.monotonic() + 60
         while True:
             try:

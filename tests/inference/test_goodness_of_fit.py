@@ -1,4 +1,4 @@
-"""Goodness of fit: how often right families are called wrong, and wrong ones are seen."""
+"""Goodness of fit: size and power for families, and which outputs and correlations misfit."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,16 +6,19 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-from four_metrics import METRICS, R256, same
+from four_metrics import METRICS, R256, same, slow
 
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.goodness_of_fit import (
     UNLIKELY,
     FittedSets,
+    output_misfits,
     population_misfit,
+    worst_p_value,
 )
 from prbayes.inference.refits import SamplingDistribution
+from prbayes.model.evaluator import Evaluator
 
 Draw = Callable[[np.random.Generator, int], Floats]
 FAMILIES: dict[str, Draw] = {
@@ -26,9 +29,8 @@ FAMILIES: dict[str, Draw] = {
 }
 
 
-def optimum(name: str, family: str, seed: int, n: int = 50, **keywords: Any) -> prb.Optimum:
-    """Fit a normal population to data of a family."""
-    observed = FAMILIES[family](np.random.default_rng([7, seed, n]), n)
+def optimum(name: str, observed: Any, **keywords: Any) -> prb.Optimum:
+    """Fit a normal population."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         keywords = {"propagation": R256} | keywords
@@ -36,23 +38,24 @@ def optimum(name: str, family: str, seed: int, n: int = 50, **keywords: Any) -> 
     return prb.minimize(model, starts=0)
 
 
-def fit_probability(sampling: SamplingDistribution, n_sets: int = 200) -> float:
-    fitted = FittedSets.of(sampling, n_sets, 0)
+def of_family(name: str, family: str, seed: int, **keywords: Any) -> prb.Optimum:
+    observed = FAMILIES[family](np.random.default_rng([7, seed, 50]), 50)
+    return optimum(name, observed, **keywords)
+
+
+def p_value(found: prb.Optimum, n_sets: int = 200) -> float:
+    fitted = FittedSets.of(found.sampling(), n_sets, 0)
     assert fitted is not None
     return fitted.p_value
 
 
-def probabilities(name: str, family: str, sets: int) -> Floats:
-    found = []
-    for seed in range(sets):
-        sampling = optimum(name, family, seed).sampling()
-        found.append(fit_probability(sampling))
-    return np.array(found)
+def p_values(name: str, family: str, sets: int) -> Floats:
+    return np.array([p_value(of_family(name, family, seed)) for seed in range(sets)])
 
 
 @pytest.mark.slow
 def test_a_right_family_is_called_wrong_as_rarely_as_said() -> None:
-    p = probabilities("pr", "normal", 60)
+    p = p_values("pr", "normal", 60)
     # A binomial number of 60 with probability .05: 3, and eight or more once in 150 cases.
     assert (p < 0.05).sum() < 8
     assert (p < UNLIKELY).sum() < 4
@@ -61,59 +64,53 @@ def test_a_right_family_is_called_wrong_as_rarely_as_said() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [pytest.param("area", marks=pytest.mark.slow), "kl"])
+@pytest.mark.parametrize("name", [slow("area"), "kl"])
 def test_a_population_with_two_modes_is_no_normal_one(name: str) -> None:
-    assert (probabilities(name, "bimodal", 3) < UNLIKELY).all()
+    assert (p_values(name, "bimodal", 3) < UNLIKELY).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(METRICS))
 @pytest.mark.parametrize(
     ("family", "low", "high"),
-    [
-        ("normal", 0.0, 0.06),
-        ("t3", 0.3, 1.0),
-        ("bimodal", 0.95, 1.0),
-        ("exponential", 0.8, 1.0),
-    ],
+    [("normal", 0.0, 0.06), ("t3", 0.3, 1.0), ("bimodal", 0.95, 1.0), ("exponential", 0.8, 1.0)],
 )
 def test_how_often_families_are_called_wrong(
     name: str, family: str, low: float, high: float
 ) -> None:
-    share = (probabilities(name, family, 60) < UNLIKELY).mean()
+    share = (p_values(name, family, 60) < UNLIKELY).mean()
     assert low <= share <= high
 
 
 @pytest.mark.long
 def test_diagnose_says_so_of_optima() -> None:
-    wrong = optimum("pr", "bimodal", 0)
-    said = "the inputs probably have another family"
-    assert said in str(prb.diagnose(wrong))
-    assert prb.diagnose(optimum("pr", "normal", 0)).ok
-
-
-def test_it_costs_no_response() -> None:
-    found = optimum("pr", "t3", 0)
-    before = found.evaluator.n_responses
-    fit_probability(found.sampling(), 50)
-    assert found.evaluator.n_responses == before
+    diagnosis = prb.diagnose(of_family("pr", "bimodal", 0))
+    assert "the inputs probably have another family" in str(diagnosis)
+    assert prb.diagnose(of_family("pr", "normal", 0)).ok
 
 
 def test_repeated_measurements_of_a_specimen_are_drawn_together() -> None:
     """Each of ten values twice is no normal sample of twenty, but is one of ten specimens."""
     values = np.repeat(np.random.default_rng(5).normal(1, 0.5, 10), 2)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=values, propagation=R256,
-            specimens=np.repeat(np.arange(10), 2),
-        )  # fmt: skip
-    p = fit_probability(prb.minimize(model).sampling())
-    assert p > 0.05
+    fitted = optimum("area", values, specimens=np.repeat(np.arange(10), 2))
+    before = fitted.evaluator.n_responses
+    assert p_value(fitted) > 0.05
+    assert fitted.evaluator.n_responses == before
+
+
+def test_the_largest_of_standardised_statistics_is_compared() -> None:
+    drawn = np.random.default_rng(0).standard_normal((999, 2)) * [1.0, 100.0]
+    assert worst_p_value(np.array([5.0, 0.0]), drawn) == pytest.approx(0.001)
+    assert worst_p_value(np.array([0.0, 5.0]), drawn) > 0.3
+    assert worst_p_value(np.array([-5.0, 0.0]), drawn) > 0.3
+    assert worst_p_value(np.array([-5.0, 0.0]), drawn, two_sided=True) == pytest.approx(0.001)
+    unknown = np.where(np.arange(999)[:, None] < 998, np.nan, drawn)
+    assert worst_p_value(np.array([5.0, 0.0]), unknown) == 1.0
+    assert worst_p_value(np.array([np.nan, 0.0]), drawn) == 1.0
 
 
 def test_where_it_is_not_looked_at_a_line_says_why() -> None:
-    found = optimum("kl", "normal", 0, propagation=prb.Resimulated(256))
+    found = of_family("kl", "normal", 0, propagation=prb.Resimulated(256))
     before = found.evaluator.n_responses
     diagnosis = prb.diagnose(found)
     assert found.evaluator.n_responses == before
@@ -127,38 +124,34 @@ def test_where_it_is_not_looked_at_a_line_says_why() -> None:
     assert "refits need an optimum; look at prb.diagnose of prb.minimize" in note
     (note,) = prb.diagnose(found.to_datatree()).notes
     assert "refits need the model; pass the Optimum itself" in note
-    assert prb.diagnose(optimum("pr", "normal", 0)).notes == ()
+    assert prb.diagnose(of_family("pr", "normal", 0)).notes == ()
 
 
 def test_why_it_is_not_looked_at_with_other_terms() -> None:
     with pm.Model() as model:
         mu = pm.Normal("mu", 0, 2)
-        prb.Simulator(
-            "y", same, pm.Normal.dist(mu, 1.0), metric=METRICS["kl"],
-            observed=FAMILIES["normal"](np.random.default_rng(1), 30), propagation=R256,
-        )  # fmt: skip
+        x, observed = pm.Normal.dist(mu, 1.0), FAMILIES["normal"](np.random.default_rng(1), 30)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=observed, propagation=R256)
         pm.Normal("other", mu, 1.0, observed=1.0)
     (note,) = prb.diagnose(prb.minimize(model, starts=0)).notes
     assert "the model has likelihood terms or potentials besides its simulators" in note
 
 
 @pytest.mark.long
-def test_an_optimum_that_the_prior_holds_away_from_the_data_is_told() -> None:
+def test_an_optimum_that_the_prior_holds_away_from_the_data_is_reported() -> None:
     """The residual is flat there: from the draws around it nothing could be seen."""
 
-    def held(away: float) -> prb.Optimum:
+    def with_prior(away: float) -> prb.Optimum:
         data = np.random.default_rng(1).normal(2.0, 1.0, 20)
         with pm.Model() as model:
             x = pm.Normal.dist(pm.Normal("mu", 2.0 - away, 0.2), pm.HalfNormal("sigma", 1))
-            prb.Simulator(
-                "y", same, x, metric=METRICS["pr"], observed=data, epsilon=1.0, propagation=R256
-            )
+            keywords: dict[str, Any] = {"observed": data, "epsilon": 1.0, "propagation": R256}
+            prb.Simulator("y", same, x, metric=METRICS["pr"], **keywords)
         return prb.minimize(model, prior=True)
 
-    assert "the prior, which is part of its objective, and the data contr" in str(
-        prb.diagnose(held(3.0))
-    )
-    agreeing = prb.diagnose(held(0.0))
+    text = "the prior, which is part of its objective, and the data contr"
+    assert text in str(prb.diagnose(with_prior(3.0)))
+    agreeing = prb.diagnose(with_prior(0.0))
     assert agreeing.ok
     assert agreeing.notes == ()
 
@@ -166,3 +159,70 @@ def test_an_optimum_that_the_prior_holds_away_from_the_data_is_told() -> None:
 def test_where_nothing_is_known_nothing_is_said() -> None:
     for with_prior in (False, True):
         assert population_misfit(np.nan, with_prior=with_prior) == []
+
+
+# -- by output -------------------------------------------------------------------------------------
+
+
+def three(a: Any, b: Any, c: Any) -> Any:
+    return np.stack([a, 0.8 * a + 0.6 * b, c], axis=-1)
+
+
+DATA = three(*np.random.default_rng(1).standard_normal((3, 60)))
+WRONG_OUTPUT = DATA * [1.0, 1.0, 2.0]
+WRONG_CORRELATION = np.column_stack([DATA[:, 0], DATA[::-1, 1], DATA[:, 2]])
+WITH_FAILURES = np.where((np.arange(60) < 6)[:, None] & [True, False, False], np.inf, DATA)
+
+
+def model_of(data: Any) -> pm.Model:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 0.3)
+        inputs = [pm.Normal.dist(mu, 1.0), pm.Normal.dist(0.0, 1.0), pm.Normal.dist(0.0, 1.0)]
+        metric = prb.Joint(prb.ProbabilityResidual(), directions=6)
+        few = prb.Reweighted(128, max_points=768)
+        prb.Simulator("y", three, *inputs, metric=metric, observed=data, propagation=few)
+    return model
+
+
+def misfit(data: Any) -> str:
+    """Return the finding of data against the population at zero."""
+    evaluator = Evaluator.of(model_of(data))
+    sampling = SamplingDistribution.of(evaluator, np.zeros(1), np.ones(1))
+    (finding,) = output_misfits(FittedSets.at_theta(sampling, 200, 0))
+    return finding.text
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("gaps", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_outputs_and_pairs_that_misfit_are_named(gaps: bool) -> None:
+    # Without the last output of some specimens.
+    lost = gaps & (np.arange(60) < 10)[:, None] & [False, False, True]
+    text = misfit(np.where(lost, np.nan, WRONG_OUTPUT))
+    assert text.startswith("y: what disagrees with the best population are outputs 2 (p = 0.0")
+    assert "correlations" not in text
+    text = misfit(np.where(lost, np.nan, WRONG_CORRELATION))
+    assert "outputs" not in text
+    assert "correlations 0 with 1 (measured " in text
+    assert ", calibrated 0.8" in text
+    assert " with 2" not in text
+
+
+def test_failures_that_the_model_does_not_predict_are_named() -> None:
+    assert "outputs 0 (p" in misfit(WITH_FAILURES)
+
+
+@pytest.mark.long
+def test_of_right_data_nothing_is_named() -> None:
+    assert misfit(DATA).startswith("y: no output by itself, and no correlation of two, disagrees")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("is_wrong", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_diagnosis_names_what_disagrees_and_is_quiet_otherwise(is_wrong: bool) -> None:
+    found = prb.minimize(model_of(WRONG_CORRELATION if is_wrong else DATA))
+    before = found.evaluator.n_responses
+    diagnosis = prb.diagnose(found)
+    assert found.evaluator.n_responses == before
+    expected = any("farther from the best population" in text for text in diagnosis.messages)
+    assert is_wrong == expected
+    assert is_wrong == ("y: what disagrees with the best population are" in str(diagnosis))

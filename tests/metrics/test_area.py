@@ -1,4 +1,4 @@
-"""The area metric is the first Wasserstein distance, of failed and of stored values too."""
+"""The area metric of failed, stored and symbolic values (the distance: test_properties.py)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytensor
 import pytensor.tensor as pt
 import pytest
-from scipy.stats import wasserstein_distance
 
 from prbayes._validate import Floats
 from prbayes.metrics.area import AreaMetric
@@ -17,16 +16,6 @@ from prbayes.metrics.base import Minimum
 INF, NAN = np.inf, np.nan
 PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
 Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
-
-
-def test_area_is_the_first_wasserstein_distance(draw: Draw) -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        x, w, z, u = draw(int(rng.integers(1 << 30)), *rng.integers(1, 40, 2))
-        x[: x.size // 2] = np.round(x[: x.size // 2])  # ties
-        z[: z.size // 2] = np.round(z[: z.size // 2])
-        area = AreaMetric()(x, z, weights=5 * w, observed_weights=9 * u)
-        np.testing.assert_allclose(area, wasserstein_distance(x, z, w, u), rtol=1e-11)
 
 
 def test_stored_values_with_ties_infinities_and_nan_give_the_same_area(draw: Draw) -> None:

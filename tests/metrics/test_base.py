@@ -1,9 +1,8 @@
-"""Identities that hold for every metric, and the contract of a user's own metric."""
+"""Identities that hold for every metric, and the floor of logarithms."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from scipy.stats import norm
 from prbayes._validate import Floats
 from prbayes.metrics import density
 from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import Discrepancy, Metric, Minimum
-from prbayes.metrics.density import DensityDiscrepancy, DensityEstimator, GaussianKDE, overlap
+from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.density import GaussianKDE, overlap
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 
@@ -186,34 +185,3 @@ def test_the_floor_keeps_an_outlier_in_the_forward_divergence(
     sd = np.exp(fits(KullbackLeibler(), observed, (1e-12, 1e-9, 1e-7), monkeypatch)[:, 1])
     assert sd[0] == pytest.approx(sd[1], rel=0.02)
     assert sd[2] < 0.6 * sd[1]
-
-
-# -- a user's own metric ---------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Hellinger(Metric):
-    density: DensityEstimator = field(default_factory=GaussianKDE)
-
-    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
-        cells = self.density.cells(observed, weights)
-        return HellingerDiscrepancy.on_cells(self, observed, weights, cells)
-
-
-class HellingerDiscrepancy(DensityDiscrepancy):
-    def outer(self, *features: Any, xp: Any) -> Any:
-        return 1 - (xp.sqrt(features[0] * self.density) * self.cells.widths).sum(axis=-1)
-
-
-def test_a_metric_on_densities_needs_its_outer_function_only(normal: Callable[..., Floats]) -> None:
-    z = normal(0, 1)
-    d = Hellinger(GaussianKDE(0.1)).against(z)
-    # The closed form for normal densities of equal spread, here widened by the kernel; the sample
-    # has hardly any tails.
-    expected = 1 - np.exp(-1 / (8 * (1 + 0.1**2)))
-    assert d(z + 1) == pytest.approx(expected, rel=5e-3)
-    assert d.with_observed(z + 1)(z) == pytest.approx(expected, rel=5e-3)
-    assert d.scale == 1.0
-    # Nothing is assumed that it does not declare.
-    assert (d.metric.minimum, d.metric.tail_responses) == (Minimum.UNKNOWN, 0)
-    assert (d.metric.additive, d.metric.likelihood, d.metric.takes_weights) == (False, False, True)

@@ -40,10 +40,9 @@ def test_kernel_grid_covers_six_bandwidths_or_half_the_range_at_either_side(
     assert 7 * narrowed <= cells.kernel.size // 2 * cells.step < 7 * narrowed + cells.step
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_no_observed_value_falls_outside_its_histogram(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    for _ in range(25):
+def test_no_observed_value_falls_outside_its_histogram() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(100):
         x = rng.normal(10 ** rng.uniform(-3, 3), 10 ** rng.uniform(-3, 3), rng.integers(2, 40))
         w = np.full(x.size, 1 / x.size)
         q = Histogram(int(rng.integers(1, 60))).cells(x, w).density(x, w)
@@ -103,15 +102,12 @@ def test_bandwidths_that_are_not_positive(bandwidth: float) -> None:
         GaussianKDE(lambda x, w: bandwidth).cells(OBSERVED, EQUAL)
 
 
-@pytest.mark.parametrize("value", [0.0, 1 / 3, 1e6 + 0.1, -7e10 - 0.3])
-@pytest.mark.parametrize("n", [1, 3, 7, 49])
-@pytest.mark.parametrize("rule", [twice_silverman, likelihood_bandwidth])
-def test_equal_observed_values_have_no_bandwidth_and_no_bins(
-    value: float, n: int, rule: Any
-) -> None:
+@pytest.mark.parametrize(("value", "n"), [(0.0, 1), (1 / 3, 7), (1e6 + 0.1, 3), (-7e10 - 0.3, 49)])
+def test_equal_observed_values_have_no_bandwidth_and_no_bins(value: float, n: int) -> None:
     x, w = np.full(n, value), np.full(n, 1 / n)
-    with pytest.raises(ValueError, match=f"bandwidth: got 0 from {n} observed.*use AreaMetric"):
-        GaussianKDE(rule).cells(x, w)
+    for rule in (twice_silverman, likelihood_bandwidth):
+        with pytest.raises(ValueError, match=f"bandwidth: got 0 from {n} observed.*use AreaMetric"):
+            GaussianKDE(rule).cells(x, w)
     with pytest.raises(ValueError, match=f"histogram: got {n} observed values, all"):
         Histogram().cells(x, w)
 
@@ -121,7 +117,6 @@ def test_equal_observed_values_have_no_bandwidth_and_no_bins(
     [
         (lambda: Histogram(0), ValueError),
         (lambda: Histogram(2.5), TypeError),  # type: ignore[arg-type]
-        (lambda: Histogram(True), TypeError),
         (lambda: GaussianKDE("silverman"), TypeError),  # type: ignore[arg-type]
         (lambda: density_estimator(Histogram), TypeError),
         (lambda: density_estimator(7), TypeError),

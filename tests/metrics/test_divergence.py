@@ -27,7 +27,7 @@ def prepared(metric: Metric, observed: Floats, weights: Floats | None = None) ->
 @pytest.mark.parametrize(
     ("m", "s", "mu", "sd"), [(0, 1, 0, 1.3), (0.5, 1, 0, 1), (-0.8, 0.8, 0.2, 1)]
 )
-@pytest.mark.parametrize(("a", "h"), [(1e-3, 0.4), (1.0, 0.6), (70.0, 0.4)])
+@pytest.mark.parametrize(("a", "h"), [(1e-3, 0.4), (70.0, 0.6)])
 def test_normal_densities(
     normal: Normal, m: float, s: float, mu: float, sd: float, a: float, h: float
 ) -> None:
@@ -103,10 +103,9 @@ def test_other_observed_values_keep_the_scale_factor_and_the_cells() -> None:
 
 
 @pytest.mark.parametrize("metric", [KullbackLeibler, ProbabilityResidual])
-@pytest.mark.parametrize("density", [GaussianKDE, "kde", 0.3])
-def test_wrong_settings(metric: Any, density: Any) -> None:
+def test_wrong_settings(metric: Any) -> None:
     with pytest.raises(TypeError, match=r"density: got .*, expected prb.GaussianKDE\(\)"):
-        metric(density)
+        metric(GaussianKDE)
     with pytest.raises(ValueError, match="scale_base: got 0, expected a positive finite number"):
         ProbabilityResidual(scale_base=0)
     with pytest.raises(ValueError, match=r"bandwidth: got 0 .*GaussianKDE\(bandwidth=.*AreaMetric"):

@@ -74,7 +74,7 @@ def test_an_outlier_counts_alike_whether_it_was_there_at_first_or_in_a_refit(far
     np.testing.assert_allclose(refitted.outer(*features, xp=np), refitted(simulated), rtol=1e-9)
 
 
-@pytest.mark.parametrize("spread", [0.7, 1.0, 2.0])
+@pytest.mark.parametrize("spread", [0.7, 2.0])
 def test_no_value_beyond_the_grid_improves_the_likelihood(spread: float) -> None:
     simulated = spread * norm.ppf((np.arange(2000) + 0.5) / 2000)
     observed = norm.ppf((np.arange(20) + 0.5) / 20)

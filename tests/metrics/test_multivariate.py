@@ -46,19 +46,15 @@ def largest_cosine(u: Floats) -> float:
     return float(cosine.max())
 
 
-def test_two_outputs_have_equal_angles() -> None:
-    u = directions(2, 5, 0)
-    angles = np.sort(np.arctan2(u[:, 1], u[:, 0]) % np.pi)
-    np.testing.assert_allclose(np.diff(angles), np.pi / 5)
-    np.testing.assert_array_equal(u, directions(2, 5, 7))
-    assert directions(3, 1, 0).shape == (1, 3)
-
-
-# The best arrangements of lines: of an icosahedron, of the 24-cell, and of the roots of E6.
-@pytest.mark.parametrize(("m", "number", "best"), [(3, 6, 5**-0.5), (4, 12, 0.5), (6, 36, 0.5)])
+# In the plane the best are at equal angles; then those of an icosahedron, of the 24-cell and of E6.
+@pytest.mark.parametrize(
+    ("m", "number", "best"),
+    [(2, 5, np.cos(np.pi / 5)), (3, 6, 5**-0.5), (4, 12, 0.5), (6, 36, 0.5)],
+)
 def test_known_best_arrangements_are_found(m: int, number: int, best: float) -> None:
     assert largest_cosine(directions(m, number, 0)) == pytest.approx(best, abs=2e-3)
-    assert not np.allclose(directions(m, number, 0), directions(m, number, 1))
+    assert np.allclose(directions(m, number, 0), directions(m, number, 1)) == (m == 2)
+    assert directions(m, 1, 0).shape == (1, m)
 
 
 @pytest.mark.parametrize("m", [3, 5, 8])
@@ -72,7 +68,7 @@ def test_directions_are_of_unit_length_and_cover_all_directions_alike(m: int) ->
     assert np.linalg.matrix_rank(u[:, i] * u[:, j], tol=0.3) == i.size
 
 
-@pytest.mark.parametrize(("m", "number"), [(3, 10), (4, 18), (8, 70)])
+@pytest.mark.parametrize(("m", "number"), [(3, 10), (8, 70)])
 def test_neither_rounding_nor_more_steps_decide_the_directions(m: int, number: int) -> None:
     start = np.random.default_rng(0).standard_normal((number, m))
     noise = 1e-14 * np.random.default_rng(1).standard_normal((number, m))
@@ -131,12 +127,9 @@ def test_a_joint_metric_declares_what_its_inner_one_does(metric: Metric) -> None
     assert joint.like(KullbackLeibler()) == Joint(KullbackLeibler(), directions=5)
     assert metric.like(AreaMetric()) == AreaMetric()
     assert pickle.loads(pickle.dumps(joint)).additive == metric.additive
-
-
-@pytest.mark.parametrize("metric", [3, AreaMetric, Joint(AreaMetric())])
-def test_only_a_metric_of_one_output_is_lifted(metric: Any) -> None:
-    with pytest.raises(TypeError, match="expected a metric of one output"):
-        Joint(metric)
+    for other in (3, AreaMetric, joint):
+        with pytest.raises(TypeError, match="expected a metric of one output"):
+            Joint(other)  # type: ignore[arg-type]
 
 
 @by_metric
@@ -168,7 +161,7 @@ def test_a_wrong_correlation_counts_where_marginals_are_right(metric: Metric) ->
 
 
 def test_gross_outliers_move_the_minimiser_under_the_residual_and_more_under_the_area() -> None:
-    points = norm.ppf(qmc.Sobol(2, seed=0).random_base2(9))
+    points = norm.ppf(qmc.Sobol(2, seed=0).random_base2(7))
     y = sample(200, rho=0.6)
     spoiled = y.copy()
     spoiled[:10] = 40.0
@@ -322,15 +315,13 @@ def test_a_surface_is_compared_on_itself() -> None:
     scale = np.array([1e3, 1.0, 1e-6])
     scaled = metric.with_design(metric.against(y * scale), other * scale, 2)
     assert scaled(other * scale) == pytest.approx(beside(other), rel=1e-6)
-
-
-@pytest.mark.parametrize(("bend", "inputs"), [(0.05, 3), (0.5, 2)])
-def test_other_outputs_are_compared_as_they_are(bend: float, inputs: int) -> None:
-    y, other = bent(60, bend), bent(40, bend, 1)
-    target = Joint(ProbabilityResidual()).against(y)
-    beside = target.metric.with_design(target, other, inputs)
-    assert len(beside.parts) == len(target.parts) == 10
-    assert beside(other) == target(other)
+    # Other outputs are compared as they are.
+    for bend, inputs in ((0.05, 3), (0.5, 2)):
+        y, other = bent(60, bend), bent(40, bend, 1)
+        target = metric.against(y)
+        beside = metric.with_design(target, other, inputs)
+        assert len(beside.parts) == len(target.parts) == 10
+        assert beside(other) == target(other)
 
 
 def test_the_adjoint_of_binned_densities_is_their_transpose() -> None:

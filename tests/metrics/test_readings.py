@@ -6,6 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytensor
+import pytensor.tensor as pt
 import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
@@ -13,6 +15,7 @@ from scipy.stats import norm
 from prbayes.metrics.readings import Readings, averaged, log_interval_probability
 
 NAN, INF = np.nan, np.inf
+PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
 
 
 def readings(values: Any, **given: Any) -> Readings:
@@ -64,15 +67,17 @@ def test_variances_of_reading_emulator_and_rounding_add() -> None:
     assert rounded.comparison_sd(error) == pytest.approx(np.sqrt(0.25 + 0.36 / 12))
 
 
-@pytest.mark.parametrize("output", [0.0, 0.7, 3.0])
+@pytest.mark.parametrize("unit", [1.0, 1e4])
 @pytest.mark.parametrize("step", [1e-5, 0.5, 5.0])
-def test_a_rounded_reading_has_the_mean_density_over_its_step(output: float, step: float) -> None:
-    density = readings([[1.0]], step=[[step]]).log_density(np.array([[[output]]]), np.array([0.2]))
-    ends = 1 - step / 2, 1 + step / 2
-    is_inside = ends[0] < output < ends[1]
-    options: dict[str, Any] = {"points": [output]} if is_inside else {"epsabs": 0}
-    mean, _ = quad(lambda x: norm.pdf(x, output, 0.2) / step, *ends, **options)
-    assert density[0, 0] == pytest.approx(np.log(mean), rel=1e-6, abs=1e-8)
+def test_a_rounded_reading_has_the_mean_density_over_its_step(step: float, unit: float) -> None:
+    for output in (0.0, 0.7, 3.0):
+        y = readings([[unit]], step=[[step * unit]])
+        density = y.log_density(np.array([[[output * unit]]]), np.array([0.2 * unit]))
+        ends = 1 - step / 2, 1 + step / 2
+        is_inside = ends[0] < output < ends[1]
+        options: dict[str, Any] = {"points": [output]} if is_inside else {"epsabs": 0}
+        mean, _ = quad(lambda x, at=output: norm.pdf(x, at, 0.2) / step, *ends, **options)
+        assert density[0, 0] == pytest.approx(np.log(mean / unit), rel=1e-6, abs=1e-8)
 
 
 @pytest.mark.parametrize(("lower", "upper"), [(1.0, INF), (-INF, 0.5), (-1.0, 0.5), (3.0, 3.1)])
@@ -112,19 +117,10 @@ def test_intervals_and_their_mirror_images() -> None:
     near = np.abs(low) < 4
     exact = np.log(norm.cdf(high[near]) - norm.cdf(low[near]))
     np.testing.assert_allclose(value[near], exact, rtol=1e-8)
+    graph = log_interval_probability(pt.as_tensor(low), pt.as_tensor(high), pt)
+    np.testing.assert_allclose(graph.eval(mode=PYTHON), value, rtol=1e-9)
     narrow = log_interval_probability(low[near], low[near] + 1e-9)
     np.testing.assert_allclose(narrow, norm.logpdf(low[near]) + np.log(1e-9), rtol=1e-5)
-
-
-def test_units_shift_the_density_by_their_logarithm() -> None:
-    points, unit = np.array([[[0.8], [1.1]]]), 1e4
-    first, second = (
-        readings([[u]], error=[[0.2 * u]], step=[[0.1 * u]]).log_density(
-            u * points, np.array([0.05 * u])
-        )
-        for u in (1.0, unit)
-    )
-    np.testing.assert_allclose(second, first - np.log(unit), rtol=1e-9)
 
 
 def test_the_spread_is_that_of_measured_values_and_never_zero() -> None:

@@ -23,23 +23,23 @@ def curves(n: int, seed: int = 1, noise: float = 0.0) -> Floats:
     return np.asarray(a * T + b * T**3 + noise * rng.standard_normal((n, 40)))
 
 
-def test_two_inputs_make_two_components() -> None:
+def test_two_inputs_make_two_components_and_a_remainder_is_noise_or_structure() -> None:
     found = principal_components(curves(30), EQUAL, 2)
     np.testing.assert_allclose(found.axes.T @ found.axes, np.eye(2), atol=1e-12)
     scores = (curves(30) - found.center) @ found.axes
     np.testing.assert_allclose(found.center + scores @ found.axes.T, curves(30), atol=1e-10)
     assert "40 outputs are compared by 2 principal component(s)" in found.summary
-    assert not found.missed
-
-
-def test_a_remainder_is_noise_or_structure() -> None:
     noisy = principal_components(curves(30, noise=0.2), EQUAL, 2)
+    shifted = principal_components(curves(30, noise=0.2) - 70, EQUAL, 2)
+    np.testing.assert_allclose(shifted.axes, noisy.axes, atol=1e-9)
+    np.testing.assert_allclose(shifted.center, noisy.center - 70, rtol=1e-9)
     assert noisy.left_out > 0.01
     assert abs(noisy.rest_correlation) < 0.2
-    assert not noisy.missed
     too_few = principal_components(curves(30), EQUAL, 1)
     assert too_few.rest_correlation > 0.5
     assert "it is no noise" in too_few.missed
+    assert not found.missed
+    assert not noisy.missed
 
 
 def test_the_fewest_that_leave_out_a_hundredth_of_data_and_design() -> None:
@@ -158,8 +158,11 @@ def test_signs_are_those_of_the_data_in_any_order() -> None:
     for seed in range(8):
         order = np.random.default_rng(seed).permutation(50)
         np.testing.assert_allclose(coordinates(y[order]), z[order], atol=1e-8)
-    # The longer tail of each coordinate is on its positive side.
+    # The longer tail of each coordinate is on its positive side, whatever a gross outlier does.
     assert (z.max(axis=0) > -z.min(axis=0)).all()
+    for far in (-1e3, 1e3):
+        y[0] = far
+        assert ((coordinates(y) * z)[1:].sum(axis=0) > 0).all()
 
 
 FEW = np.r_[np.ones(3), np.zeros(47)] / 3

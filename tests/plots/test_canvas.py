@@ -50,8 +50,6 @@ def test_settings_of_the_collection_are_passed_on(posterior: xr.DataTree) -> Non
     assert pc.viz["row_index"]["sigma"].item() == 1
     figure = prb.plot_posterior(posterior, figsize=(9, 3)).viz["figure"]
     assert tuple(figure.item().get_size_inches()) == (9, 3)
-    with pytest.raises(ValueError, match=r"figsize: got 'wide', expected width and height"):
-        prb.plot_posterior(posterior, figsize="wide")
     with pytest.raises(TypeError, match=r"backend: got str 'plotly', expected none"):
         prb.plot_posterior(posterior, backend="plotly")
 

@@ -34,9 +34,7 @@ def test_stages_by_chain(read: SimpleNamespace, drawn: Any) -> None:
     assert read.texts(pc) == ["chain 0", "chain 1"]
 
 
-def test_wrong_arguments_are_refused(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
-    with pytest.raises(TypeError, match="got Optimum, expected the DataTree"):
-        prb.plot_stages(optimum)  # type: ignore[arg-type]
+def test_statistics_that_are_not_by_stage_are_refused(posterior: xr.DataTree) -> None:
     without = posterior.copy()
     without["sample_stats"] = xr.DataTree(xr.Dataset({"beta": ("chain", np.ones(2))}))
     with pytest.raises(ValueError, match="got sample_stats without dims"):

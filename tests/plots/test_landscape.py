@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-import xarray as xr
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
@@ -150,12 +149,9 @@ def test_the_landscape_is_blank_where_the_design_does_not_reach(optimum: prb.Opt
     assert np.isfinite(found.heights[ess > 40]).all()
 
 
-def test_what_has_no_trace_is_refused(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
+def test_what_has_no_trace_is_refused(optimum: prb.Optimum) -> None:
     with pytest.raises(ValueError, match="test: got an optimum without a trace"):
         check_optimum(replace(optimum, search=replace(optimum.search, trace={})), "test")
-    for plot in (prb.plot_optimizer, prb.plot_landscape):
-        with pytest.raises(TypeError, match=f"{plot.__name__}: got DataTree"):
-            plot(posterior)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

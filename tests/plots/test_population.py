@@ -30,10 +30,6 @@ def test_the_population_is_the_closed_form(
     np.testing.assert_allclose(
         y, stats.norm.pdf(x, optimum.point["mu"], optimum.point["sigma"]), atol=1e-9
     )
-    with pytest.raises(TypeError, match="got int, expected an Optimum"):
-        prb.plot_population(3, model=optimum.model)  # type: ignore[arg-type]
-    with pytest.raises(KeyError, match="got z, expected some of"):
-        prb.plot_population(optimum, inputs=["z"])
 
 
 def correlated() -> pm.Model:

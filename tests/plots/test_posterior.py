@@ -80,13 +80,7 @@ def test_a_packed_factor_is_drawn_where_it_is_asked_for() -> None:
     assert drawn == ["chol[0]", "chol[1]", "chol[2]"]
 
 
-def test_wrong_arguments_are_refused(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
-    with pytest.raises(TypeError, match="got Optimum, expected a DataTree"):
-        prb.plot_posterior(optimum)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="optimum: got int, expected an Optimum"):
-        prb.plot_posterior(posterior, optimum=3)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"prob: got 2\.0"):
-        prb.plot_posterior(posterior, prob=2.0)
+def test_a_constant_posterior_is_refused(posterior: xr.DataTree) -> None:
     constant = xr.DataTree.from_dict({"posterior": posterior["posterior"].to_dataset() * 0})
     with pytest.raises(ValueError, match=r"got a posterior of \['mu', 'sigma'\]"):
         prb.plot_posterior(constant)

@@ -67,5 +67,3 @@ def test_what_does_not_belong_together_is_refused() -> None:
         prb.plots.plot_prediction(np.ones((4, 2)), PREDICTED)
     with pytest.raises(ValueError, match="expected values under the names of the predictions"):
         prb.plots.plot_prediction({"hot": MEASURED}, {"cold": PREDICTED})
-    with pytest.raises(TypeError, match=r"expected the DataArray of prb\.predict"):
-        prb.plots.plot_prediction(MEASURED, np.ones((3, 4)))

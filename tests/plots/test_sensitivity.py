@@ -30,8 +30,3 @@ def test_a_factor_has_a_row_with_two_errors(table: xr.Dataset, read: SimpleNames
     np.testing.assert_allclose(read.xy(pc, "total_1", "hyperparameter")[0], [0.28, 0.32])
     axis = pc.viz["plot"]["hyperparameter"].item()
     assert [t.get_text() for t in axis.get_yticklabels()] == ["mean", "sigma"]
-
-
-def test_no_table_is_refused() -> None:
-    with pytest.raises(TypeError, match=r"expected the Dataset of prb\.sensitivity"):
-        prb.plots.plot_sensitivity(xr.Dataset())

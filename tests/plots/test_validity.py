@@ -81,12 +81,6 @@ def test_several_tests_of_different_sizes_get_a_panel_each() -> None:
     ]
 
 
-def test_refusals() -> None:
-    for bad in (3, {}, {"a": 3}):
-        with pytest.raises(TypeError, match=r"expected a ValidityTest from prb\.area_test"):
-            prb.plot_validity(bad)  # type: ignore[arg-type]
-
-
 # -- several outputs -------------------------------------------------------------------------------
 
 

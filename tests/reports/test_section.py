@@ -47,25 +47,6 @@ def test_a_section_is_immutable_and_replaced_as_a_whole(picture_bytes: bytes) ->
         dataclasses.replace(made, level=4)
 
 
-@pytest.mark.parametrize(
-    ("keywords", "words"),
-    [
-        ({"table": [1, 2]}, r"expected a pandas\.DataFrame"),
-        ({"picture": b"GIF89a", "alt": "x"}, "expected SVG, PNG or JPEG"),
-        ({"picture": 3, "alt": "x"}, "savefig"),
-        ({"picture": b"\x89PNG\r\n"}, "alt: got nothing"),
-        ({"picture": b"\x89PNG\r\n", "alt": " "}, "alt: got nothing"),
-        ({"text": (3,)}, "expected a text"),
-        ({"level": 1}, "expected 2, or 3"),
-        ({"title": " "}, "title: got"),
-        ({"title": None}, "title: got"),
-    ],
-)
-def test_refusals(keywords: dict[str, Any], words: str) -> None:
-    with pytest.raises((TypeError, ValueError), match=words):
-        prb.reports.Section(**({"title": "x"} | keywords))
-
-
 class Drawing:
     """Saves so many bytes as SVG."""
 

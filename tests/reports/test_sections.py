@@ -289,16 +289,6 @@ def test_sections_depend_on_the_results_and_come_in_order(
     assert {"Posterior", "Comparison", "Validity"}.isdisjoint(chapters(optimum))
 
 
-def test_hostile_names_of_a_model_are_text(row: Any, parse: Any) -> None:
-    with pm.Model() as model:
-        mu = pm.Normal("<b>x<b>", 0, 2) + pm.Normal("a|b", 0, 1) + pm.Normal("p & q", 0, 1)
-        x = pm.Normal.dist(mu, 1.0)
-        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
-    text = prb.Report("<b>x<b>", model=model)._html()
-    assert row("<b>x<b>", "distribution", parse(text))["distribution"] == "Normal(0, 2)"
-    assert "<b>" not in text
-
-
 @pytest.mark.long
 def test_several_simulators_and_vectors(tmp_path: Path, section: Any, parse: Any) -> None:
     with pm.Model(coords={"part": ["shaft", "disk"]}) as model:

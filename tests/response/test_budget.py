@@ -16,7 +16,7 @@ from line_problem import build, line
 
 import prbayes as prb
 from prbayes.response import BudgetError
-from prbayes.response.budget import budget, limited, unlimited
+from prbayes.response.budget import budget, duration, limited, unlimited
 
 QUIET: dict[str, Any] = {"progressbar": False}
 
@@ -56,18 +56,21 @@ def test_responses_are_granted_as_long_as_there_are_some() -> None:
     assert budget().grant(1, least=1) == 1
     with limited(None, 10), pytest.raises(BudgetError):
         budget().grant(11, least=11)
-
-
-def test_time_runs_out() -> None:
     with limited(0.001, None):
         time.sleep(0.002)
         with pytest.raises(BudgetError, match=r"max_seconds = 0\.001 was reached"):
             budget().check()
-
-
-def test_a_budget_holds_in_its_own_thread() -> None:
+    # A budget holds in its own thread.
     with limited(None, 1), ThreadPoolExecutor(1) as other:
         assert other.submit(lambda: budget().grant(5, least=5)).result() == 5
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(1.25, "1.2 s"), (75.0, "75 s"), (150.0, "2.5 min"), (9000.0, "2.5 h"), (2e5, "2.3 days")],
+)
+def test_a_time_is_written_in_the_unit_in_which_it_reads_best(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
 
 
 # -- minimize --------------------------------------------------------------------------------------
@@ -79,16 +82,12 @@ def found(store: Path, response: Any = None, **limits: Any) -> prb.Optimum:
     return prb.minimize(model, tolerance=1e-2, max_evaluations=25, **limits, **QUIET)
 
 
-@pytest.fixture(scope="module")
-def at_once(tmp_path_factory: pytest.TempPathFactory) -> prb.Optimum:
-    return found(tmp_path_factory.mktemp("at_once"))
-
-
-def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum) -> None:
+def test_minimize_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    at_once = found(tmp_path / "at_once")
     response = Counted()
     total = 0
     for most in (100, 150):
-        optimum = found(tmp_path, prb.scalar(response), max_runs=most)
+        optimum = found(tmp_path / "parts", prb.scalar(response), max_runs=most)
         assert optimum.search.stopped == f"max_runs = {most} was reached"
         assert not optimum.converged
         assert np.isfinite(optimum.discrepancy)
@@ -101,7 +100,7 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum)
         assert str(tmp_path) in message
         assert optimum.to_datatree()["optimum"].attrs["stopped"] == optimum.search.stopped
     # A budget that is large enough changes nothing.
-    optimum = found(tmp_path, max_seconds=1000, max_runs=at_once.n_responses)
+    optimum = found(tmp_path / "parts", max_seconds=1000, max_runs=at_once.n_responses)
     assert not optimum.search.stopped
     assert np.array_equal(optimum.theta, at_once.theta)
     assert np.array_equal(optimum.covariance, at_once.covariance)
@@ -146,14 +145,10 @@ def test_refine_goes_on_with_the_design_that_has_grown() -> None:
     with pytest.raises(BudgetError, match=expected):
         prb.refine(parts, thetas=FAR, max_runs=20, **QUIET)
     assert other.bound.n_points == 32 < node.bound.n_points
+    with pytest.raises(BudgetError, match="max_runs = 1 was reached"):
+        prb.refine(parts, max_runs=1, **QUIET)  # around an optimum
     prb.refine(parts, thetas=FAR, **QUIET)
     assert np.array_equal(other.bound.design.runs.values, node.bound.design.runs.values)
-
-
-def test_refinement_around_the_optimum_has_a_budget_too() -> None:
-    model, _ = build(prb.Reweighted(16))
-    with pytest.raises(BudgetError, match="max_runs = 10 was reached"):
-        prb.refine(model, max_runs=10, **QUIET)
 
 
 # -- sample_smc ------------------------------------------------------------------------------------
@@ -265,12 +260,9 @@ def test_chains_that_finish_on_a_design_that_grew_are_returned_and_the_rest_goes
     np.testing.assert_array_equal(part["posterior"]["mu"], rest["posterior"]["mu"][:1])
 
 
-def test_the_optimum_within_is_not_taken_for_an_answer() -> None:
+def test_no_answer_of_the_sampler_is_an_error() -> None:
     model, _ = build(prb.Resimulated(16), black_box, epsilon=None)
-    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_runs = 50 was reached"):
-        prb.sample_smc(30, model=model, adjustment=None, max_runs=50, **QUIET)
-
-
-def test_time_is_a_budget_of_the_sampler() -> None:
-    with pytest.raises(BudgetError, match="max_seconds = 1e-06 was reached"):
-        sampled("Fresh", max_seconds=1e-6)
+    for limits, spent in (({"max_runs": 50}, "max_runs = 50"), ({"max_seconds": 1e-6}, "max_sec")):
+        # The optimum within is not taken for an answer.
+        with pytest.raises(BudgetError, match=rf"prb\.sample_smc: {spent}.* was reached"):
+            prb.sample_smc(30, model=model, adjustment=None, **limits, **QUIET)

@@ -8,16 +8,14 @@ import re
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import (
     BrokenExecutor,
     Executor,
     Future,
-    ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
 from contextlib import nullcontext
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +33,6 @@ from prbayes.response.call import (
     Tally,
     checked,
     chunk_size,
-    chunks,
     compute,
     respond,
 )
@@ -71,14 +68,15 @@ def times(x: Any, a: Any) -> Any:
     return a * x
 
 
-def slow_times(x: Any, a: Any) -> Any:
-    time.sleep(0.002 * np.size(x))
-    return a * x
-
-
 def fails_above_two(x: float, a: float) -> float:
     if x > 2:
         raise ArithmeticError("too steep")
+    return a * x
+
+
+def leaves_above_two(x: float, a: float) -> float:
+    if x > 2:
+        raise SystemExit("bye")
     return a * x
 
 
@@ -113,24 +111,6 @@ def run(
 # -- the same numbers, wherever they are computed --------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def processes() -> Iterator[Executor]:
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        yield pool
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("response", [times, slow_times, prb.scalar(times), lambda x, a: a * x])
-def test_executors_give_the_same_responses(response: Any, processes: Executor) -> None:
-    expected = stored(model(times))
-    np.testing.assert_array_equal(stored(model(response)), expected)
-    with ThreadPoolExecutor(3) as threads:
-        for executor in (threads, processes):
-            found = model(response, executor=executor)
-            np.testing.assert_array_equal(stored(found), expected)
-            assert responses(found).computed == N
-
-
 def test_resimulated_and_fresh_use_the_executor_too() -> None:
     seen = set()
 
@@ -145,30 +125,6 @@ def test_resimulated_and_fresh_use_the_executor_too() -> None:
             evaluator(np.zeros((2, 1)))
             assert seen
             assert all(name.startswith("far") for name in seen)
-
-
-def test_chunks_follow_the_measured_cost() -> None:
-    sizes: list[int] = []
-
-    def response(x: Any, a: Any) -> Any:
-        sizes.append(len(x))
-        time.sleep(0.01 * len(x))
-        return a * x
-
-    tally = Tally()
-    found = respond(CallSettings("y", response), line(100), tally)
-    np.testing.assert_array_equal(found, 2 * np.arange(100.0))
-    assert sizes[0] == 16
-    # 10 ms each: at most 20 of them make up the 200 ms of a chunk; a slow machine makes them fewer.
-    assert all(5 <= s <= 20 for s in sizes[1:-1])
-    assert tally.computed == 100
-
-
-def test_a_scalar_function_that_is_slow_is_a_task_of_its_own() -> None:
-    calling = CallSettings("y", prb.scalar(lambda x, a: time.sleep(0.02) or x))
-    found = chunks(calling, line(5), np.arange(5), False, Tally())
-    taken = [rows.size for done in found for rows, _ in done]
-    assert taken == [1] * 5
 
 
 def test_responses_that_are_done_while_the_disk_is_busy_are_stored_together(
@@ -230,42 +186,36 @@ def test_a_tally_forgets_old_chunks_slowly() -> None:
 
 
 @KINDS
-def test_an_exception_aborts_by_default(kind: str) -> None:
-    with pytest.raises(ResponseError, match=r"y: .*raised ArithmeticError: too steep"):
-        run(fails_above_two, kind)
-
-
-@KINDS
-@pytest.mark.parametrize("function", [fails_above_two, nan_above_two])
-def test_replaced(kind: str, function: Any, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(
+    ("function", "reason", "strict"),
+    [
+        (fails_above_two, "it raised ArithmeticError: too steep", Abort()),
+        (leaves_above_two, "it raised SystemExit: bye", Abort()),
+        (nan_above_two, "it is NaN", Abort(on_nan=True)),
+    ],
+)
+def test_a_failure_is_replaced_or_ends_the_run(
+    kind: str, function: Any, reason: str, strict: Abort, caplog: pytest.LogCaptureFixture
+) -> None:
     with caplog.at_level(logging.WARNING, "prbayes"):
         values, tally = run(function, kind, on_failure=Replace(np.inf))
     np.testing.assert_array_equal(values, np.where(STEEP, np.inf, 2 * X))
     assert tally.failures == STEEP.sum()
     assert f"y: {STEEP.sum()} of {N} responses failed, replaced by inf" in caplog.text
     assert sorted(f.inputs[0] for f in tally.failed.values()) == sorted(X[STEEP])
-    if function is fails_above_two:
-        assert {f.reason for f in tally.failed.values()} == {"it raised ArithmeticError: too steep"}
+    assert {f.reason for f in tally.failed.values()} == {reason}
+    with pytest.raises(ResponseError, match=f"y: .*{reason}"):
+        run(function, kind, on_failure=strict)
+    if function is nan_above_two:
+        np.testing.assert_array_equal(np.isnan(run(function, kind)[0]), STEEP)
 
 
-@KINDS
-def test_nan_is_a_result_by_default_and_a_failure_if_asked_for(kind: str) -> None:
-    np.testing.assert_array_equal(np.isnan(run(nan_above_two, kind)[0]), STEEP)
-    with pytest.raises(ResponseError, match="it is NaN"):
-        run(nan_above_two, kind, on_failure=Abort(on_nan=True))
-
-
-@KINDS
-def test_a_response_that_leaves_python_is_a_failure_like_another(kind: str) -> None:
-    def leaves(x: float, a: float) -> float:
-        if x > 2:
-            raise SystemExit("bye")
-        return a * x
-
-    values, _ = run(leaves, kind, on_failure=Replace(np.inf))
-    np.testing.assert_array_equal(values, np.where(STEEP, np.inf, 2 * X))
-    with pytest.raises(ResponseError, match="raised SystemExit: bye"):
-        run(leaves, kind)
+def test_policies_and_their_defaults() -> None:
+    assert [policy.tries for policy in (Abort(), Replace(), Retry(), Retry(2))] == [1, 1, 2, 3]
+    last = Replace(np.inf)
+    assert (last.final, Retry(2, then=last).final) == (last, last)
+    assert Abort() == Abort(on_nan=False) == Retry(then=Abort()).final
+    assert repr(Retry().then) == "Replace(value=nan)"
 
 
 def test_retried_once_and_then_it_works() -> None:
@@ -298,11 +248,6 @@ def test_retried_in_vain(kind: str, tmp_path: Path) -> None:
     assert failed == dict.fromkeys(keys, "it raised ArithmeticError: too steep")
     with pytest.raises(ResponseError, match="too steep"):
         run(fails_above_two, kind, on_failure=Retry(2, then=Abort()))
-
-
-def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
-    with pytest.raises(ResponseError, match=r"the response returned shape \(2,\)"):
-        respond(CallSettings("y", lambda x, a: (a * x)[:2], on_failure=Replace()), line(9), Tally())
 
 
 def test_a_failure_says_where() -> None:
@@ -354,21 +299,15 @@ def test_nothing_is_computed_twice_but_one_response_without_a_version(
     first, second = (model(prb.scalar(times), **kept) for _ in range(2))
     np.testing.assert_array_equal(stored(second), stored(first))
     assert (responses(first).computed, responses(second).computed) == (N, again)
-    prb.minimize(pm.do(second, {}), progressbar=False)
-    assert responses(second).computed == again  # nor by a clone
+    optimum = prb.minimize(pm.do(second, {}), progressbar=False)  # nor by a clone
+    assert optimum.search.n_computed == responses(second).computed == again
+    assert optimum.n_responses >= N
     more = model(prb.scalar(times), prb.Reweighted(N, random_seed=1, **kept))
     assert responses(more).computed == N + again  # other points
     data = Store(tmp_path, "y", version=version).to_dataset()
     assert data["response"].size == 2 * N
     np.testing.assert_allclose(data["response"], 2 * data["inputs"][:, 0])
     np.testing.assert_array_equal(data["inputs"][:, 1], 2.0)  # the constant
-
-
-def test_an_optimum_tells_what_was_computed_and_what_it_rests_on(tmp_path: Path) -> None:
-    first = prb.minimize(model(prb.scalar(times), store=tmp_path))
-    again = prb.minimize(model(prb.scalar(times), store=tmp_path))
-    assert first.search.n_computed == first.n_responses == again.n_responses >= N
-    assert (again.search.n_computed, again.point) == (1, first.point)
 
 
 def by_factor(factor: float, calls: list[Any] | None = None) -> Any:
@@ -423,53 +362,23 @@ def test_responses_of_each_version_and_constant_are_kept_apart(tmp_path: Path) -
     assert tally.computed == N
 
 
-def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
-    store = Store(tmp_path, "y", columns=2, version="1")
-    with pytest.raises(ResponseError, match=r"\d+ responses are kept in"):
-        run(fails_above_two, store=store)
-    assert len(store) == int(np.argmax(STEEP))  # all that came before the first steep point
-    n_kept = len(store)
-    values, tally = run(times, store=store)
-    np.testing.assert_array_equal(values, 2 * X)
-    assert tally.computed == N - n_kept
-
-
 def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
-    class Cluster:
-        """Begins once all has come, or a second later."""
+    class Cluster(Executor):
+        """Begins when all chunks were submitted."""
 
-        most = 0
+        def __init__(self) -> None:
+            self.waiting: list[tuple[Future[Any], Callable[..., Any], Any]] = []
 
-        def __init__(self, pool: ThreadPoolExecutor) -> None:
-            self.pool, self.under_way, self.lock, self.full = (
-                pool,
-                0,
-                threading.Lock(),
-                threading.Event(),
-            )
+        def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Future[Any]:
+            self.waiting.append((Future(), work, job))
+            if len(self.waiting) == N:
+                for future, begun, given in self.waiting:
+                    future.set_result(begun(*given))
+            return self.waiting[-1][0]
 
-        def submit(self, function: Any, *arguments: Any) -> Any:
-            with self.lock:
-                self.under_way += 1
-                self.most = max(self.most, self.under_way)
-                if self.under_way == N:
-                    self.full.set()
-            return self.pool.submit(self.work, function, *arguments)
-
-        def work(self, function: Any, *arguments: Any) -> Any:
-            self.full.wait(1.0)
-            with self.lock:
-                self.under_way -= 1
-            return function(*arguments)
-
-        map = None
-
-    with ThreadPoolExecutor(N) as pool:
-        cluster = Cluster(pool)
-        calling = CallSettings("y", prb.scalar(lambda x: 2 * x), cluster)  # type: ignore[arg-type]
-        found = respond(calling, Points([X], [True]), Tally())
+    calling = CallSettings("y", prb.scalar(lambda x: 2 * x), Cluster())
+    found = respond(calling, Points([X], [True]), Tally())
     np.testing.assert_array_equal(found, 2 * X)
-    assert cluster.most == N
 
 
 @pytest.mark.parametrize("error", [ArithmeticError, BrokenExecutor])
@@ -494,7 +403,8 @@ def test_what_is_being_computed_when_one_fails_is_kept(
 
     points = Points([np.arange(12.0)], [True])
     store = Store(tmp_path, "y", columns=1)
-    with Pool(2) as pool, pytest.raises(ResponseError, match="too steep"):
+    kept = r"too steep.*; 3 responses are kept in" if error is ArithmeticError else "too steep"
+    with Pool(2) as pool, pytest.raises(ResponseError, match=kept):
         respond(CallSettings("y", prb.scalar(function), pool, store), points, Tally())
     values, known = store.find(points.keys())
     np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
@@ -609,6 +519,20 @@ def test_what_is_no_response_is_refused(result: Any, message: str) -> None:
     with pytest.raises(ResponseError, match=f"the response returned {message}"):
         checked(result, (3,), [np.zeros(3), 1.0])
     np.testing.assert_array_equal(checked([1, True, np.nan], (3,), [])[0], [1.0, 1.0, np.nan])
+
+
+def test_a_batch_has_the_time_of_all_of_its_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[float | None] = []
+
+    def time_limit(seconds: float | None) -> Any:
+        limits.append(seconds)
+        return nullcontext()
+
+    monkeypatch.setattr("prbayes.response.call.time_limit", time_limit)
+    for function in (times, prb.scalar(times)):
+        compute(function, line(3), False, 2.0)
+    compute(times, line(3), False)
+    assert limits == [6.0, 2.0, 2.0, 2.0, None]
 
 
 def test_points_that_fail_are_found_by_halving() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -76,39 +74,6 @@ def test_a_sum_may_have_more_terms_than_an_operation_of_numpy_has_operands() -> 
     expected = [values.sum(axis=0), values.prod(axis=0), slopes]
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)
-
-
-@pytest.mark.parametrize("choice", [[1, 1, 1], [1, 0, 1], [0, 0, 0]])
-def test_a_choice_that_is_the_same_throughout_has_the_shape_and_type_of_others(
-    choice: list[int],
-) -> None:
-    chosen, row, column, whole = pt.lvector(), pt.dvector(), pt.dcol(), pt.lvector()
-    held = pytensor.shared(np.arange(3.0))
-    first = pt.gt(chosen, 0)
-    graphs = [
-        pt.switch(first, held, -np.inf),
-        pt.switch(first, column, row),
-        pt.switch(first, row, column),
-        pt.switch(first, whole, 0.5),
-    ]
-    function = compiled([chosen, row, column, whole], graphs)
-    names = [str(node.op) for node in function.maker.fgraph.apply_nodes]
-    assert not any("Switch" in name for name in names)
-    x, c, n = np.array([0.1, np.nan, 0.3]), np.array([[1.0], [2.0]]), np.array([4, 5, 6])
-    where = np.array(choice) > 0
-    expected = [
-        np.where(where, np.arange(3.0), -np.inf),
-        np.where(where, c, x),
-        np.where(where, x, c),
-        np.where(where, n, 0.5),
-    ]
-    found = function(choice, x, c, n)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one, other)
-        assert one.dtype == other.dtype
-    found[0][:] = 7.0  # of the caller alone
-    np.testing.assert_array_equal(held.get_value(), np.arange(3.0))
-    np.testing.assert_array_equal(function(choice, x, c, n)[0], expected[0])
 
 
 # -- once ------------------------------------------------------------------------------------------
@@ -203,18 +168,6 @@ def test_shared_variables_are_those_of_the_one_who_asks(
     assert total(mine, mine)(1.0)[0].shape == (3,)
     total(pytensor.shared(np.zeros((3, 1))), double)
     assert len(compilations) == 3
-
-
-@pytest.mark.long
-def test_values_that_are_shared_go_with_the_last_function(compilations: list[Any]) -> None:
-    values = pytensor.shared(np.zeros(5))
-    x = pt.dscalar()
-    function = compiled([x], [x + values])
-    gone = weakref.ref(values)
-    del values, function
-    gc.collect()
-    assert gone() is None
-    assert len(compilation._cache) == len(compilations) == 1
 
 
 @pytest.mark.parametrize("what", ["generator", "operation", "inside", "large"])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 
 import prbayes as prb
 from prbayes._finding import from_json
@@ -65,19 +66,6 @@ def test_several_coefficients_are_the_last_axis(batch: tuple[int, ...]) -> None:
         np.testing.assert_allclose(bent.of(line, time)(x, b), 2 * x + expected)
 
 
-@pytest.mark.parametrize("kind", [prb.response.Additive, prb.response.Multiplicative])
-def test_an_output_without_discrepancy_is_as_it_was(kind: Any) -> None:
-    found = kind(TIMES, np.sqrt).of(curve, [1.0, np.nan, 4.0])(np.ones(2), np.full(2, 7.0))
-    np.testing.assert_array_equal(found[:, 1], curve(np.ones(2))[:, 1])
-    assert (found[:, [0, 2]] > 7).all()
-
-
-@pytest.mark.parametrize("kind", [prb.response.Additive, prb.response.Multiplicative])
-def test_what_failed_stays_failed(kind: Any) -> None:
-    found = kind([0.0, 1.0]).of(lambda x: x, 1.0)(np.array([np.inf, np.nan]), np.full(2, -1.0))
-    np.testing.assert_array_equal(found, [np.inf, np.nan])
-
-
 def test_a_function_of_one_specimen_stays_one() -> None:
     one = prb.scalar(lambda x: x**2 if x > 0 else 0.0)
     both = prb.response.Additive([0.0, 1.0]).of(one, 1.0)
@@ -85,6 +73,15 @@ def test_a_function_of_one_specimen_stays_one() -> None:
     assert has_discrepancy(both)
     assert not has_discrepancy(one)
     np.testing.assert_allclose(both([3.0, -1.0], [0.5, 0.5]), [9.5, 0.5])
+
+
+@pytest.mark.parametrize("kind", [prb.response.Additive, prb.response.Multiplicative])
+def test_a_failure_and_an_output_without_discrepancy_are_as_they_were(kind: Any) -> None:
+    found = kind(TIMES, np.sqrt).of(curve, [1.0, np.nan, 4.0])(np.ones(2), np.full(2, 7.0))
+    np.testing.assert_array_equal(found[:, 1], curve(np.ones(2))[:, 1])
+    assert (found[:, [0, 2]] > 7).all()
+    failed = kind([0.0, 1.0]).of(lambda x: x, 1.0)(np.array([np.inf, np.nan]), np.full(2, -1.0))
+    np.testing.assert_array_equal(failed, [np.inf, np.nan])
 
 
 def test_a_mapping_is_refused() -> None:
@@ -104,22 +101,17 @@ def test_it_says_where_it_extrapolates(condition: Any, outside: bool) -> None:
 
 
 def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture) -> None:
-    data = np.random.default_rng(4).normal(1.0, 0.3, 30)
     drift = prb.response.Additive([0.0, 2.0])
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.3)
         b = pm.Normal.dist(0.0, 0.1)
-        prb.Simulator(
-            *("y", drift.of(line, 1.0), x, b),
-            metric=prb.KullbackLeibler(), observed=data, propagation=prb.Resimulated(64),
-        )  # fmt: skip
-        optimum = prb.minimize(progressbar=False)
-    assert not caplog.records
-    inside = prb.predict(optimum, drift.of(line, 2.0), x, b, model=model, n_samples=50)
+    result = xr.DataTree.from_dict({"posterior": xr.Dataset({"mu": (("chain", "draw"), [[1.0]])})})
+    settings: dict[str, Any] = {"model": model, "n_samples": 50, "progressbar": False}
+    inside = prb.predict(result, drift.of(line, 2.0), x, b, **settings)
     assert from_json(inside.attrs["findings"]) == ()
     assert not caplog.records
     with caplog.at_level(logging.WARNING, "prbayes"):
-        beyond = prb.predict(optimum, drift.of(line, 3.0), x, b, model=model, n_samples=50)
+        beyond = prb.predict(result, drift.of(line, 3.0), x, b, **settings)
     said = "line at 3: extrapolates its model discrepancy, seen from 0 to 2."
     (finding,) = from_json(beyond.attrs["findings"])
     assert (finding.code, str(finding)) == ("extrapolated-discrepancy", said)

@@ -18,10 +18,10 @@ import units
 from hostile import processes
 
 import prbayes as prb
-from prbayes.model.random_variable import nodes
 from prbayes.response import fmu
 from prbayes.response.call import CallSettings, Points, Tally, respond
 from prbayes.response.executors import Pool
+from prbayes.response.outputs import read_observed
 from prbayes.response.store import Store
 
 
@@ -134,36 +134,17 @@ def test_what_takes_too_long_is_ended_between_steps(unit: Path) -> None:
     np.testing.assert_array_equal(joined(response(2.0, 3.0)), [4.5, 18.0])
 
 
-def model_of(response: Any, executor: Any = None, **settings: Any) -> Any:
-    """Return the node of a simulator of which everything is computed."""
-    force = np.random.default_rng(1).normal(3.0, 0.5, 12)
-    with pm.Model() as model:
-        prb.Simulator(
-            "y",
-            response,
-            2.0,
-            pm.Normal.dist(pm.Normal("mu", 3.0, 0.3), 0.5),
-            metric=prb.Joint(prb.AreaMetric()),
-            observed={"work": 2 * force**2, "position": 1.5 * force},
-            propagation=prb.Reweighted(16, max_points=16, executor=executor, **settings),
-        )
-    (node,) = nodes(model).values()
-    return node
-
-
-@pytest.mark.exact
-def test_a_study_takes_outputs_by_name_and_finds_them_in_its_store(
-    unit: Path, tmp_path: Path
-) -> None:
-    with ThreadPoolExecutor(2) as pool:
-        node = model_of(spring(unit), pool, store=tmp_path, version="1")
-    force = node.reweighted.design.runs.points[0]
-    # In the order of what was observed.
+def test_outputs_are_stored_in_the_order_of_what_was_observed(unit: Path, tmp_path: Path) -> None:
+    force = np.linspace(2.0, 4.0, 16)
+    points = Points([2.0, force], [False, True])
+    _, outputs = read_observed("y", {"work": force, "position": force})
     expected = np.stack([2 * force**2, force / 2 * 3.0], axis=1)
-    np.testing.assert_allclose(node.bound.design.sample.values, expected, rtol=1e-14)
-    again = model_of(spring(unit), store=tmp_path, version="1")
-    np.testing.assert_array_equal(again.bound.design.sample.values, node.bound.design.sample.values)
-    assert (node.bound.responses.computed, again.bound.responses.computed) == (16, 0)
+    for n_computed in (16, 0):
+        store, tally = Store(tmp_path, "y", columns=2, version="1", outputs=2), Tally()
+        with ThreadPoolExecutor(2) as pool:
+            calling = CallSettings("y", spring(unit), pool, store, outputs=outputs)
+            np.testing.assert_allclose(respond(calling, points, tally), expected, rtol=1e-14)
+        assert tally.computed == n_computed
 
 
 def test_a_simulator_that_does_not_fit_is_refused_before_anything_is_simulated(

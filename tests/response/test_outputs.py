@@ -16,23 +16,16 @@ from prbayes.response.outputs import (
 TABLE = np.arange(6.0).reshape(3, 2)
 
 
-def test_one_dimension_is_one_output():
+def test_outputs_without_names_are_one_or_numbered():
     values, outputs = read_observed("y", [1.0, 2.0])
     assert values.tolist() == [1.0, 2.0]
     assert outputs == SINGLE_OUTPUT
     assert outputs.event == ()
-
-
-def test_columns_without_names_are_numbered():
-    _, outputs = read_observed("y", TABLE)
+    values, outputs = read_observed("y", np.ma.masked_array(TABLE, TABLE == 3.0))
+    np.testing.assert_array_equal(np.isnan(values), TABLE == 3.0)
     assert outputs.names == ("0", "1")
     assert outputs.event == (2,)
     assert not outputs.keys
-
-
-def test_a_mask_is_a_missing_output():
-    values, _ = read_observed("y", np.ma.masked_array(TABLE, TABLE == 3.0))
-    np.testing.assert_array_equal(np.isnan(values), TABLE == 3.0)
 
 
 @pytest.mark.parametrize(

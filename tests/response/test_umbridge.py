@@ -14,17 +14,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytest
-import um_models
 from um_server import Real
 
 import prbayes as prb
-from prbayes.model.random_variable import nodes
 from prbayes.response import umbridge as um_bridge
 
 # -- a server that is told what to do --------------------------------------------------------------
@@ -80,8 +77,8 @@ class Telling(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, evaluate: Callable[..., None] = give, **known: Any) -> None:
-        super().__init__(("127.0.0.1", 0), Told)
+    def __init__(self, evaluate: Callable[..., None] = give, port: int = 0, **known: Any) -> None:
+        super().__init__(("127.0.0.1", port), Told)
         self.evaluate, self.asked, self.connections = evaluate, list[Any](), 0
         self.known = KNOWN | {f"/{path}": answer for path, answer in known.items()}
         self.url = f"http://127.0.0.1:{self.server_port}"
@@ -91,8 +88,8 @@ class Telling(ThreadingHTTPServer):
 
 
 @contextmanager
-def telling(evaluate: Callable[..., None] = give, **known: Any) -> Iterator[Telling]:
-    with Telling(evaluate, **known) as server:
+def telling(evaluate: Callable[..., None] = give, **settings: Any) -> Iterator[Telling]:
+    with Telling(evaluate, **settings) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         try:
@@ -181,84 +178,22 @@ if child > 1:
     subprocess.run(program, input=pickle.dumps(beam), check=True, timeout=60)
 
 
-def model_of(response: Any, **settings: Any) -> pm.Model:
-    """A model whose two outputs come from a server."""
-    x = np.random.default_rng(1).normal(1.0, 0.5, 12)
-    with pm.Model() as model:
-        prb.Simulator(
-            "y",
-            response,
-            pm.Normal.dist(pm.Normal("mu", 1.0, 0.3), 0.5),
-            2.0,
-            metric=prb.Joint(prb.AreaMetric()),
-            observed=np.stack([x - 4.0, 2 * x * x], axis=1),
-            propagation=prb.Reweighted(16, max_points=16, **settings),
-        )
-    return model
-
-
-def responses(response: Any, **settings: Any) -> tuple[np.ndarray[Any, Any], Any]:
-    (node,) = nodes(model_of(response, **settings)).values()
-    return node.bound.design.sample.values, node
-
-
-@pytest.mark.long
-@pytest.mark.exact
-def test_a_server_that_dies_and_comes_back_in_mid_study_loses_nothing(tmp_path: Path) -> None:
-    server = Real(tmp_path)
-
-    def again() -> None:
-        server.start()
-
-    try:
-        reference, _ = responses(prb.umbridge(server.url, "beam"))
-        mortal = prb.umbridge(server.url, "mortal", patience=60)
-        nurse = threading.Thread(target=again)
-        nurse.start()
-        with ThreadPoolExecutor(3) as pool:
-            values, node = responses(mortal, executor=pool, store=tmp_path / "store")
-        nurse.join()
-        assert (tmp_path / "died").exists()
-        np.testing.assert_array_equal(values, reference)
-        assert node.bound.responses.computed == 16
-
-        # It dies, and nobody starts it: what was computed is kept for the next morning.
-        (tmp_path / "died").unlink()
-        server.kill()
-        server.start()
-        server.wait()
-        settings = {"store": tmp_path / "next", "version": "1"}
-        hasty = prb.umbridge(server.url, "mortal", patience=0.2)
-        with pytest.raises(
-            prb.response.ResponseError, match=r"is away for more than patience = 0.2 s"
-        ):
-            responses(hasty, **settings)
-        server.start()
-        server.wait()
-        values, node = responses(hasty, **settings)
-        np.testing.assert_array_equal(values, reference)
-        assert node.bound.responses.computed == 16 - (um_models.LIFETIME - 1)
-    finally:
-        server.kill()
-
-
-@pytest.mark.exact
-def test_a_specimen_that_fails_now_and_then_is_tried_again_by_policy() -> None:
-    seen: set[float] = set()
-
+def test_a_server_that_goes_away_is_waited_for() -> None:
     def evaluate(handler: Told, x: float, y: float) -> None:
-        if x in seen:
-            give(handler, x, y)
-        else:
-            seen.add(x)
-            handler.say("500 Internal Server Error", 500)
+        handler.close_connection = True
+        give(handler, x, y)
 
     with telling(evaluate) as server:
-        retry = prb.response.Retry(1, then=prb.response.Abort())
-        values, node = responses(prb.umbridge(server.url), on_failure=retry)
-    x = node.reweighted.design.runs.points[0]
-    np.testing.assert_array_equal(values, np.stack([x - 4.0, x * x * 2.0], axis=1))
-    assert node.bound.responses.computed == 32
+        url = server.url
+        patient, hasty = prb.umbridge(url), prb.umbridge(url, patience=0.2)
+        assert hasty(7.0, 1.0)[1] == 49
+    with pytest.raises(ConnectionError, match=r"is away for more than patience = 0.2 s"):
+        hasty(7.0, 1.0)
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(patient, 7.0, 1.0)
+        time.sleep(0.1)
+        with telling(evaluate, port=server.server_port):
+            assert waiting.result()[1] == 49
 
 
 # -- what goes wrong -------------------------------------------------------------------------------
@@ -282,7 +217,7 @@ def test_what_is_no_server_is_refused_at_once(real: Real) -> None:
 
 
 def test_models_that_are_not_there_are_refused(real: Real) -> None:
-    with pytest.raises(ValueError, match=r"got 'forward', expected one of .* 'beam', 'mortal', 'v"):
+    with pytest.raises(ValueError, match=r"got 'forward', expected one of .* 'beam', 'vectors"):
         prb.umbridge(real.url)
     with pytest.raises(ValueError, match=r"got 'mute', which the server at .* cannot evaluate"):
         prb.umbridge(real.url, "mute")

@@ -69,11 +69,6 @@ def predict(response: Any, posterior: Any = POSTERIOR, **keywords: Any) -> xr.Da
     return prb.predict(posterior, response, x, model=model, **{"random_seed": 1, **keywords})
 
 
-@cache
-def optimum() -> prb.Optimum:
-    return prb.minimize(plain()[0])
-
-
 # -- one population per draw
 
 
@@ -94,12 +89,6 @@ def test_each_draw_is_a_population(stored: bool) -> None:
     assert np.abs(correlation).max() < 0.2
 
 
-def test_an_optimum_is_one_population() -> None:
-    y = prb.predict(optimum(), identity, plain()[1], random_seed=1)
-    assert y.shape == (1, 1, 500)
-    assert y.mean() == pytest.approx(optimum().point["mu"], abs=0.02)
-
-
 def test_draws_are_thinned_evenly_and_keep_their_coordinates() -> None:
     many = tree(mu=np.tile(np.linspace(0.5, 1.5, 101), (2, 1)), sigma=np.full((2, 101), 0.5))
     many["posterior"] = many["posterior"].to_dataset().assign_coords(draw=np.arange(101) * 10)
@@ -107,6 +96,11 @@ def test_draws_are_thinned_evenly_and_keep_their_coordinates() -> None:
     assert y.draw.values.tolist() == [0, 250, 500, 750, 1000]
     np.testing.assert_allclose(y.mean("sample")[0], [0.5, 0.75, 1.0, 1.25, 1.5], atol=0.05)
     assert predict(identity, many, n_draws=1, n_samples=9).shape == (2, 1, 9)
+    # An optimum is one population.
+    best = prb.minimize(plain()[0], starts=0)
+    y = prb.predict(best, identity, plain()[1], random_seed=1)
+    assert y.shape == (1, 1, 500)
+    assert y.mean() == pytest.approx(best.point["mu"], abs=0.02)
 
 
 @pytest.mark.slow
@@ -127,20 +121,14 @@ def test_a_posterior_of_stock_pymc() -> None:
 # -- what is computed
 
 
-def test_the_simulators_own_response_is_not_computed_again() -> None:
-    response = Counted()
-    model, x = build(response)
-    first_use(model)
-    count = response.count
-    y = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
-    assert response.count == count
-    assert y.attrs["responses"] == 0
-    assert y.attrs["source"] == "stored responses of y"
-    assert y.name == "Counted"
-
-
 def test_another_response_is_computed_once_for_each_design_point() -> None:
-    model, x = build()
+    own = Counted()
+    model, x = build(own)
+    first_use(model)
+    count = own.count
+    y = prb.predict(POSTERIOR, own, x, model=model, random_seed=1)
+    assert (own.count, y.attrs["responses"], y.name) == (count, 0, "Counted")
+    assert y.attrs["source"] == "stored responses of y"
     response = Counted()
     first = prb.predict(POSTERIOR, response, x, model=model, n_samples=2000, random_seed=1)
     assert first.attrs["responses"] == 512
@@ -173,20 +161,18 @@ def test_another_constant_is_another_response() -> None:
     np.testing.assert_allclose(three, two + 1)
 
 
-def test_without_stored_points_every_specimen_is_computed() -> None:
-    response = Counted()
-    with ThreadPoolExecutor(2) as pool:
-        y = predict(response, n_samples=100, stored=False, executor=pool)
-    assert response.count == y.attrs["responses"] == 600
-    assert y.attrs["source"] == "new specimens"
-
-
 def test_a_store_keeps_the_responses(tmp_path: Path) -> None:
     response = Counted()
     for _ in range(2):
         model, x = build()
         prb.predict(POSTERIOR, response, x, model=model, store=tmp_path, name="later")
     assert response.count == 512 + 1  # one again, to find out whether it is the same response
+    # Without stored points every specimen is computed.
+    response = Counted()
+    with ThreadPoolExecutor(2) as pool:
+        y = predict(response, n_samples=100, stored=False, executor=pool)
+    assert response.count == y.attrs["responses"] == 600
+    assert y.attrs["source"] == "new specimens"
     with pytest.raises(ValueError, match="a function called <lambda>, expected a name"):
         prb.predict(POSTERIOR, lambda x: x, x, model=model, store=tmp_path)
 
@@ -336,12 +322,10 @@ def test_names_of_a_function_of_one_specimen_are_kept(workers: int) -> None:
         return outputs if x > 0 else dict(reversed(outputs.items()))
 
     with ThreadPoolExecutor(2) as pool:
-        y = predict(prb.scalar(named), stored=False, executor=pool if workers else None)
+        executor = pool if workers else None
+        y = predict(prb.scalar(named), stored=False, n_samples=50, executor=executor)
     assert sorted(y["output"].values) == ["high", "low"]
     np.testing.assert_allclose(y.sel(output="high") - y.sel(output="low"), 5)
-
-
-def test_other_keys_for_other_specimens_are_refused() -> None:
-    response = prb.scalar(lambda x: {"a": x, "b": x} if x > 1 else {"a": x, "c": x})
+    other_keys = prb.scalar(lambda x: {"a": x, "b": x} if x > 1 else {"a": x, "c": x})
     with pytest.raises(ResponseError, match=r"keys \['a', '[bc]'\]"):
-        predict(response)
+        predict(other_keys)

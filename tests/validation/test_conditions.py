@@ -62,6 +62,15 @@ def test_specimens_are_counted_over_all_conditions() -> None:
         ({"a": [1.0]}, {"a": DRAWS}, [[1]], "specimens: got list, expected a mapping"),
         ([[1.0]], [DRAWS], [[1], [2]], "specimens: got 2 conditions, expected a list with the"),
         ([], [], None, "observed: got 0 conditions"),
+        ([[[1.0]]], DRAWS, None, r"observed: got shape \(1, 1, 1\), expected \(n,\)"),
+        ([], DRAWS, None, "observed: got shape"),
+        ([1.0], np.full(20, np.nan), None, "nothing but NaN"),
+        ([1.0], np.array(1.0), None, r"predicted: got shape \(\)"),
+        ([1.0], xr.DataArray(DRAWS[0], dims="x"), None, r"got a DataArray with dims \('x',\)"),
+        ({"a": [1.0]}, {"b": DRAWS}, None, r"got \['a'\], expected a mapping .* \['b'\]"),
+        ({"a": [1.0]}, DRAWS, None, "predicted: got ndarray, expected a mapping"),
+        ([1.0], {"a": DRAWS}, None, "observed: got list, expected a mapping"),
+        ([[1.0]], [DRAWS, DRAWS], None, "observed: got 1 conditions, expected a list"),
         ([1.0, 2.0], DRAWS, [[1, 2]], r"specimens: got shape \(1, 2\), expected \(2,\)"),
         ([1.0, -np.inf], DRAWS, None, "got 1 NaN or -inf among 2 values"),
         ([1.0], np.array([-np.inf, 1.0]), None, "predicted: got -inf"),
@@ -130,11 +139,10 @@ def test_steps_of_a_predictive_distribution() -> None:
     twice = Predictive(np.array([1.0, 2.0, 2.0])).transform(y, None)
     weighted = Predictive(np.array([2.0, 1.0]), np.array([4.0, 2.0]))
     np.testing.assert_allclose(weighted.transform(y, None), twice)
-
-
-def test_nan_is_left_out_of_the_pool_and_stays_nan_among_measured_values() -> None:
-    pool = Predictive(np.array([[1.0, np.nan], [3.0, np.inf]]))
-    u = pool.transform(np.array([np.nan, 2.0, np.inf]), None)
+    # NaN is left out of the pool, and stays NaN among measured values.
+    u = Predictive(np.array([[1.0, np.nan], [3.0, np.inf]])).transform(
+        np.array([np.nan, 2.0, np.inf]), None
+    )
     np.testing.assert_allclose(u, [np.nan, 1 / 3, 5 / 6])
     weighted = Predictive(np.array([np.nan, 1.0, 3.0]), np.array([9.0, 1.0, 3.0]))
     assert weighted.transform(np.array([2.0]), None) == pytest.approx(0.25)
@@ -159,7 +167,11 @@ def test_between_is_the_middle_or_uniform() -> None:
     ],
 )
 def test_u_values_are_the_middle_of_the_steps(observed: Any, predicted: Any, expected: Any) -> None:
-    np.testing.assert_allclose(u_values(observed, np.array(predicted)), expected)
+    u = u_values(observed, np.array(predicted))
+    np.testing.assert_allclose(u, expected)
+    # Folded values are the distance from the middle.
+    folded = read_case(observed, np.array(predicted), folded=True)
+    np.testing.assert_allclose(folded.tested(u), np.abs(2 * u - 1))
 
 
 def test_u_values_of_transformations_and_conditions(posterior: Posterior) -> None:
@@ -189,9 +201,3 @@ def test_randomised_u_values_of_ties_are_uniform() -> None:
     normal = xr.DataArray(rng.normal(0, 1, (1, 1, 50_000)), dims=DIMS)
     u = u_values(rng.normal(0, 1, 2000).round(0), normal.round(0), randomize=True)
     assert EXACT.p_value(float(area(u)), 2000) > 0.01
-
-
-def test_folded_values_are_the_distance_from_the_middle() -> None:
-    u = np.array([0.0, 0.25, 0.5, 1.0])
-    np.testing.assert_array_equal(read_case([1.0], DRAWS, folded=True).tested(u), [1, 0.5, 0, 1])
-    np.testing.assert_array_equal(read_case([1.0], DRAWS).tested(u), u)

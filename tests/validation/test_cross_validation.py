@@ -84,21 +84,18 @@ def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
 
 
 def test_few_specimens_have_fewer_folds() -> None:
-    few = minimized(data=DATA[:9], metric=METRIC)
+    few = minimized(data=DATA[:9], propagation=prb.Reweighted(128))
     assert most_folds(few, 5) == most_folds(few, 10) == 4
     assert most_folds(skewed()["normal"], 10) == 10
     # Cross-validations among the candidates have a number of folds.
     table = prb.rank({"a": prb.cross_validate(few, folds=3), "b": few})
     assert table.attrs["folds"] == 3
-
-
-def test_refusals_of_cross_validation() -> None:
     with pytest.raises(TypeError, match="got dict, expected an Optimum"):
         prb.cross_validate({})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="folds: got 1"):
-        prb.cross_validate(skewed()["normal"], folds=1)
-    with pytest.raises(ValueError, match="folds: got 40 for 60 specimens, expected at most 30"):
-        prb.cross_validate(skewed()["normal"], folds=40)
+        prb.cross_validate(few, folds=1)
+    with pytest.raises(ValueError, match="folds: got 8 for 9 specimens, expected at most 4"):
+        prb.cross_validate(few, folds=8)
     simplex = {"method": "Nelder-Mead", "max_evaluations": 10}
     fresh = minimized(metric=METRIC, propagation=prb.Fresh(60), **simplex)
     for function, argument in ((prb.cross_validate, fresh), (prb.rank, {"a": fresh, "b": fresh})):
@@ -124,7 +121,10 @@ def scored(scores: Any, weights: Any = None) -> xr.Dataset:
 
 @pytest.mark.long
 def test_the_right_family_is_identified_and_families_alike_are_not() -> None:
-    table = prb.rank(skewed(), **QUIET)
+    table = prb.rank(skewed(), folds=5, random_seed=0, **QUIET)
+    xr.testing.assert_identical(table, prb.rank({label: validated(label) for label in skewed()}))
+    other = prb.rank(skewed(), folds=5, random_seed=1, **QUIET)
+    assert float(other.difference[1]) != float(table.difference[1])
     assert table.candidate.values.tolist() == ["lognormal", "normal"]
     assert table.significant.values.tolist() == [False, True]
     by = f"{float(table.difference[1]):.1f} nats (standard error {float(table.stderr[1]):.1f})"
@@ -135,15 +135,6 @@ def test_the_right_family_is_identified_and_families_alike_are_not() -> None:
     assert not alike.significant.any()
     best, second = alike.candidate.values
     assert alike.attrs["verdict"].startswith(f"the data do not separate {best} from {second}: ")
-
-
-@pytest.mark.long
-def test_optima_are_cross_validated_alike() -> None:
-    by_optima = prb.rank(skewed(), folds=5, random_seed=0, **QUIET)
-    by_folds = prb.rank({label: validated(label) for label in skewed()})
-    xr.testing.assert_identical(by_optima, by_folds)
-    other = prb.rank(skewed(), folds=5, random_seed=1, **QUIET)
-    assert float(other.difference[1]) != float(by_folds.difference[1])
 
 
 @pytest.mark.long
@@ -176,33 +167,27 @@ def test_a_score_is_that_of_a_population_that_was_calibrated_without_the_specime
     np.testing.assert_allclose(validated("lognormal").score.values[out], expected, atol=0.1)
 
 
-def test_the_error_of_equal_weights_is_the_usual_one_and_ties_are_no_preference() -> None:
+def test_errors_of_differences() -> None:
     a, b = np.random.default_rng(3).normal(size=(2, 25))
     table = prb.rank({"a": scored(a), "b": scored(b)})
+    # The error of equal weights is the usual one, and ties are no preference.
     expected = np.std(a - b, ddof=1) * 5
     assert table["stderr"].values.max() == pytest.approx(expected)
     same = prb.rank({"a": scored(a), "b": scored(a)})
     assert same.difference.values.tolist() == [0, 0]
     assert not same.significant.any()
-
-
-def test_the_difference_of_specimens_with_weights() -> None:
-    weights = np.repeat([1.0, 3.0], 20)
     # A constant advantage for each observation has no error, however they are weighted.
+    weights = np.repeat([1.0, 3.0], 20)
     table = prb.rank({"a": scored(0.2 * weights, weights), "b": scored(np.zeros(40), weights)})
     assert table["stderr"].values.max() == pytest.approx(0, abs=1e-12)
     assert table.significant.values.tolist() == [False, True]
-
-
-def test_more_candidates_ask_for_more() -> None:
-    rng = np.random.default_rng(8)
-    noise = rng.normal(size=400)
+    # Two candidates 2.2 standard errors apart; more of them need more.
+    noise = np.random.default_rng(8).normal(size=400)
     noise = (noise - noise.mean()) / noise.std(ddof=1)
-    # Ahead by 2.2 standard errors.
     ahead = noise + 2.2 / np.sqrt(400)
-    two = prb.rank({"a": scored(ahead), "b": scored(0 * noise)})
-    assert two.significant.any()
-    three = prb.rank({"a": scored(ahead), "b": scored(0 * noise), "c": scored(0 * noise)})
+    candidates = {"a": scored(ahead), "b": scored(0 * noise)}
+    assert prb.rank(candidates).significant.any()
+    three = prb.rank(candidates | {"c": scored(0 * noise)})
     assert not three.significant.any()
     assert three.attrs["verdict"].count("do not separate") == 2
 
@@ -288,7 +273,8 @@ def test_refusals_of_a_ranking() -> None:
 
 
 def test_equal_observations_have_no_score() -> None:
-    found = prb.cross_validate(minimized(normal, np.ones(12), metric=METRIC), **QUIET)
+    equal = minimized(normal, np.ones(12), metric=METRIC, propagation=prb.Reweighted(64))
+    found = prb.cross_validate(equal, folds=2, **QUIET)
     assert found.score.isnull().all()
     assert found.discrepancy.notnull().all()
     with pytest.raises(ValueError, match="a without a score of 12 of 12 specimens"):
@@ -307,18 +293,20 @@ EVERY = np.arange(40)
 
 def test_a_score_is_the_log_density_of_a_normal_population() -> None:
     found = log_scores(scoring_target(READINGS, EQUAL), POPULATION, ALIKE, EVERY)
-    # A kernel of 0.14 standard deviations, and a hundredth of the population, are elsewhere.
+    # A kernel of 0.14 standard deviations, and a tenth of the population, are elsewhere.
     np.testing.assert_allclose(found, norm.logpdf(READINGS, 3.0, 2.0), atol=0.15)
     assert found.mean() == pytest.approx(norm.logpdf(READINGS, 3.0, 2.0).mean(), abs=0.02)
-
-
-def test_differences_of_scores_do_not_depend_on_the_unit() -> None:
+    # Differences of scores do not depend on the unit.
     differences = []
     for unit in (1, 1000):
         target = scoring_target(unit * READINGS, EQUAL)
         a, b = (log_scores(target, unit * f * POPULATION, ALIKE, EVERY) for f in (1.0, 1.3))
         differences.append(a - b)
     np.testing.assert_allclose(*differences, atol=1e-9)
+    # One specimen far out costs a tenth of a Student's t density with three degrees of freedom.
+    far = np.append(READINGS, 60.0)
+    found = log_scores(scoring_target(far, np.full(41, 1 / 41)), POPULATION, ALIKE, np.arange(41))
+    assert -22 < found[-1] < -10
 
 
 @pytest.mark.parametrize("outputs", [1, 3])
@@ -353,13 +341,6 @@ def test_a_specimen_keeps_its_score_in_any_order_and_by_itself() -> None:
     # Products of matrices of other shapes round differently.
     rows = np.array([7, 2, 30])
     np.testing.assert_allclose(log_scores(target, simulated, ALIKE, rows), found[rows], rtol=1e-12)
-
-
-def test_one_specimen_far_out_costs_a_bounded_amount() -> None:
-    far = np.append(READINGS, 60.0)
-    found = log_scores(scoring_target(far, np.full(41, 1 / 41)), POPULATION, ALIKE, np.arange(41))
-    # A hundredth of a Student's t density with three degrees of freedom, 29 units out.
-    assert -22 < found[-1] < -10
 
 
 def test_points_without_response_are_left_out_and_failures_are_not() -> None:

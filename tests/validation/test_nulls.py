@@ -132,9 +132,6 @@ def test_a_seed_gives_the_same_replicates() -> None:
     one, same, other = (replicates(case, replicates=50, random_seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     assert (one != other).mean() > 0.5
-
-
-def test_refusals() -> None:
     with pytest.raises(ValueError, match="PosteriorNull: replicates: got 5"):
         prb.validation.PosteriorNull(5)
     with pytest.raises(ValueError, match="PosteriorNull: random_seed: got -1"):
@@ -146,13 +143,17 @@ def test_published_critical_values_and_closed_forms() -> None:
         assert EXACT.critical_value(n) == pytest.approx(published, abs=4e-4)
     scaled = [np.sqrt(n) * EXACT.critical_value(n) for n in (500, 1000, 10_000)]
     np.testing.assert_allclose(scaled, 0.5821, atol=2e-4)
+    # Sizes between those of the table have quantiles between theirs.
+    for alpha in (0.5, 0.05, 1e-3):
+        falls = np.diff([np.sqrt(n) * EXACT.critical_value(n, alpha) for n in (22, 23, 24, 25)])
+        assert (falls > 0).all() or (falls < 0).all()
     for alpha in (0.5, 0.1, 0.05, 0.01):  # A = 1/4 + (u - 1/2)^2
         expected = 0.25 + ((1 - alpha) / 2) ** 2
         assert EXACT.critical_value(1, alpha) == pytest.approx(expected, abs=1e-4)
     assert EXACT.p_value(0.25 + 0.3**2, 1) == pytest.approx(0.4, abs=2e-3)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 7, 23, 60, pytest.param(170, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [2, 7, 23, pytest.param(170, marks=pytest.mark.slow)])
 def test_the_table_against_simulation(n: int) -> None:
     size = 100_000
     found = area(np.random.default_rng(n).random((size, n)))
@@ -169,19 +170,7 @@ def test_the_table_is_what_its_script_makes() -> None:
     np.testing.assert_allclose(area_null.areas(np.array([0.2, 0.5])), area(np.array([0.2, 0.5])))
 
 
-def test_the_table_is_monotone() -> None:
-    sizes, logs, rows = table()
-    assert (np.diff(sizes) > 0).all()
-    assert (np.diff(logs) > 0).all()
-    assert (np.diff(rows, axis=1) >= 0).all()
-    assert (sizes[0], sizes[-1]) == (1, 1000)
-    # Sizes between those of the table have quantiles between theirs.
-    for alpha in (0.5, 0.05, 1e-3):
-        falls = np.diff([np.sqrt(n) * EXACT.critical_value(n, alpha) for n in (22, 23, 24, 25)])
-        assert (falls > 0).all() or (falls < 0).all()
-
-
-@pytest.mark.parametrize("n", [1, 2, 8, 20, 77, 1000, 5000])
+@pytest.mark.parametrize("n", [1, 8, 77, 5000])
 def test_p_values_and_critical_values_belong_together(n: int) -> None:
     for alpha in (0.2, 0.05, 0.01, 1e-4):
         assert EXACT.p_value(EXACT.critical_value(n, alpha), n) == pytest.approx(alpha, rel=1e-6)
@@ -228,8 +217,8 @@ def model_of(
 
 
 @cache
-def calibrated(labelled: bool = False) -> tuple[prb.Optimum, Any]:
-    model, x = model_of(labels=np.arange(20) if labelled else None)
+def calibrated() -> tuple[prb.Optimum, Any]:
+    model, x = model_of(labels=np.arange(20))
     return prb.minimize(model), x
 
 
@@ -254,7 +243,7 @@ def test_own_data_take_the_joint_null() -> None:
 
 @pytest.mark.long
 def test_own_specimens_under_another_condition_are_as_close_as_under_their_own() -> None:
-    optimum, x = calibrated(labelled=True)
+    optimum, x = calibrated()
     null = joint(optimum, responses=(double, x))
     own = prb.area_test(DATA, prb.predict(optimum, same, x), null=joint(optimum))
     predicted = prb.predict(optimum, double, x)
@@ -267,18 +256,9 @@ def test_own_specimens_under_another_condition_are_as_close_as_under_their_own()
         prb.area_test(2 * DATA, predicted, specimens=np.arange(20))
 
 
-def test_the_joint_null_rejects_data_that_the_family_cannot_follow() -> None:
-    noise = np.random.default_rng(2).normal(0, 0.05, 30)
-    model, x = model_of(10 + np.repeat([-1.0, 1.0], 15) + noise)
-    optimum = prb.minimize(model)
-    predicted = prb.predict(optimum, same, x, random_seed=1)
-    data = optimum.evaluator.nodes[0].observed
-    assert prb.area_test(data, predicted, null=joint(optimum)).rejected
-
-
 def test_a_resimulated_model_has_a_joint_null_too() -> None:
     model, x = model_of(propagation=prb.Resimulated(256))
-    optimum = prb.minimize(model)
+    optimum = prb.minimize(model, starts=0)
     predicted = prb.predict(optimum, same, x, random_seed=1)
     test = prb.area_test(DATA, predicted, null=joint(optimum))
     assert test.critical_value == pytest.approx(0.0571, abs=0.012)  # to first order
@@ -303,21 +283,27 @@ def test_refusals_of_the_joint_null(posterior: Posterior) -> None:
     with pytest.raises(TypeError, match=r"responses: got .*, expected a tuple \(response"):
         joint(optimum, responses=same)
     metric = prb.FunctionMetric(lambda s, o: np.abs(s.mean(-1) - o.mean()))
-    model, _ = model_of(propagation=prb.Resimulated(64), metric=metric)
+    model, _ = model_of(propagation=prb.Resimulated(16), metric=metric)
     with pytest.raises(ValueError, match=r"a FunctionMetric, .*the model cannot be recalibrated"):
-        joint(prb.minimize(model, method="Nelder-Mead", starts=0, max_evaluations=20))
+        joint(prb.minimize(model, method="Nelder-Mead", starts=0, max_evaluations=5))
 
 
 def test_the_calibrations_data_in_any_order_and_some_of_its_specimens() -> None:
-    optimum, x = calibrated(labelled=True)
+    optimum, x = calibrated()
     predicted = prb.predict(optimum, same, x, random_seed=1)
-    tests = [
-        prb.area_test(data, predicted, null=joint(optimum, 99))
-        for data in (DATA, DATA[::-1], np.sort(DATA))
-    ]
+    null = joint(optimum, 99)
+    tests = [prb.area_test(data, predicted, null=null) for data in (DATA, DATA[::-1])]
     assert len({(t.p_value, t.critical_value) for t in tests}) == 1
     # Fewer of the calibration's specimens are followed less closely.
-    null = joint(optimum)
     part = prb.area_test(DATA[:8], predicted, null=null, specimens=np.arange(8))
     fresh = prb.area_test(DATA[:8] + 0.01, predicted, null=null, specimens=np.arange(50, 58))
     assert part.critical_value < fresh.critical_value
+
+
+def test_the_joint_null_rejects_data_that_the_family_cannot_follow() -> None:
+    noise = np.random.default_rng(2).normal(0, 0.05, 30)
+    data = 10 + np.repeat([-1.0, 1.0], 15) + noise
+    model, x = model_of(data, prb.Reweighted(256))
+    optimum = prb.minimize(model, starts=0)
+    predicted = prb.predict(optimum, same, x, random_seed=1)
+    assert prb.area_test(data, predicted, null=joint(optimum, 99)).rejected

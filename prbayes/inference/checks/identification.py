@@ -202,19 +202,12 @@ def elements_at_edge(
     unchanged = max(1e-5, tolerance) * size
     at_edge = []
     for i in np.flatnonzero((changes_further < unchanged) & (changes_back > unchanged)):
-        differs = _populations_differ(evaluator, theta, further[i])
-        if not differs:
-            # So far out the population is one number, to the last digit: it counts from the last
-            # point on the way back with the same discrepancy, to a tenth of a spread.
-            low, high = 0.0, 1.0
-            for _ in range(10):
-                half = (low + high) / 2
-                point = theta + half * (back[i] - theta)
-                (value,) = evaluator.total(point[None], scales)
-                low, high = (half, high) if abs(value - center) < unchanged else (low, half)
-            last = theta + low * (back[i] - theta)
-            differs = _populations_differ(evaluator, last, last + further[i] - theta)
-        if differs:
+        # Far out the population is one number, to the last digit: what counts is the last point on
+        # the way back with the same discrepancy.
+        way = theta + np.linspace(0, 1, 101)[:, None] * (back[i] - theta)
+        is_same = np.abs(evaluator.total(way, scales) - center) < unchanged
+        last = way[np.logical_and.accumulate(is_same)][-1]
+        if _populations_differ(evaluator, last, last + further[i] - theta):
             at_edge.append(hyperparameters.readable_names[far[i]])
     return tuple(at_edge)
 

@@ -1,7 +1,7 @@
 """Checks of the prior: hyperparameters pushed to an end of it, and its conflict with the data.
 
 At an end nothing changes in unconstrained space, as for unidentified hyperparameters. But back at
-the middle of the prior the discrepancy is larger by more than sampling noise.
+the middle of the prior the objective is larger by more than sampling noise.
 
 An estimate far out in its prior predictive distribution conflicts with the prior (Evans and
 Moshonov 2006, doi:10.1214/06-BA129). A conflict costs something only where the prior pulls the
@@ -10,13 +10,15 @@ posterior away from the estimate. The study is likelihood_guards, section 2.11.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
+from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored
 from prbayes.model.evaluator import Evaluator, only_through_prior
 from prbayes.model.parameters import THETAS
@@ -34,86 +36,73 @@ class PriorEnd:
         return f"{self.name} to {self.value:.4g}, next to the end of its prior at {self.bound:.4g}"
 
 
-def elements_at_prior_ends(sampling: SamplingDistribution, seed: int = 0) -> list[PriorEnd]:
-    """Return the elements that the data push to an end of their prior; computes no response.
+def elements_at_prior_ends(
+    evaluator: Evaluator,
+    theta: Floats,
+    flat: NDArray[np.bool_],
+    objective: Callable[[Floats], float],
+    rise: float,
+) -> list[PriorEnd]:
+    """Return the ``flat`` elements, (d,), that the data push to an end of their prior.
 
-    A lower end at zero without an upper end is not one: that is a population without scatter.
+    With the element at the median of its prior, the objective is higher than at theta by more than
+    ``rise``, whatever the other elements. A lower end at zero without an upper end is not one: that
+    is a population without scatter.
     """
-    evaluator, local, theta = sampling.evaluator, sampling.local, sampling.theta
-    if not local.unidentified.size or not is_stored(evaluator):
+    from scipy.optimize import minimize as scipy_minimize
+
+    if not flat.any():
         return []
-    # Two elements that only replace each other have a squared loading of a half each.
-    is_alone = (local.unidentified**2).sum(axis=1) > 0.9
-    is_alone &= ~only_through_prior(evaluator)
-    prior = evaluator.hyperparameters.prior_thetas(THETAS, seed)
+    hyperparameters = evaluator.hyperparameters
+    prior = hyperparameters.prior_thetas(THETAS, 0)
     below = (prior <= theta).mean(axis=0)
     is_outermost = (below < 0.05) | (below > 0.95)
+    values, lower, upper = ends_of_prior(hyperparameters, theta)
+    lower = np.where((lower == 0) & np.isnan(upper), np.nan, lower)
     ends = []
-    for i in np.flatnonzero(is_alone & is_outermost).tolist():
-        value, bound = end_of_range(evaluator, theta, i, is_upper=bool(below[i] > 0.5))
-        if np.isfinite(bound) and _is_pushed(sampling, i, float(np.median(prior[:, i]))):
-            ends.append(PriorEnd(evaluator.hyperparameters.readable_names[i], value, bound))
+    for i in np.flatnonzero(flat & is_outermost).tolist():
+        bound = upper[i] if below[i] > 0.5 else lower[i]
+        if np.isnan(bound):
+            continue
+        start = theta.copy()
+        start[i] = np.median(prior[:, i])
+
+        def along(x: Floats, start: Floats = start, i: int = i) -> float:
+            return objective(start + np.insert(x, i, 0.0) * hyperparameters.prior_sd)
+
+        # A coarse search suffices.
+        origin = np.zeros(theta.size - 1)
+        options = {
+            "maxfev": 100 * theta.size,
+            "initial_simplex": np.vstack([origin, np.eye(origin.size)]),
+            "fatol": 0.01 * rise,
+            "xatol": 1e-2,
+        }
+        limit, lowest = objective(theta) + rise, along(origin)
+        # Infinite where no design reaches.
+        if origin.size and limit < lowest < np.inf:
+            lowest = scipy_minimize(along, origin, method="Nelder-Mead", options=options).fun
+        if lowest > limit:
+            name = hyperparameters.readable_names[i]
+            ends.append(PriorEnd(name, float(values[i]), float(bound)))
     return ends
 
 
-def end_of_range(
-    evaluator: Evaluator, theta: Floats, i: int, *, is_upper: bool
-) -> tuple[float, float]:
-    """Return an element in the users' own units, and the end of its range on one side, or NaN."""
-    # A transform is at its end if a point far out has the value of one much farther out.
-    steps = np.outer([0.0, 1e3, 1e6, -1e3, -1e6], np.eye(theta.size)[i])
-    thetas = theta + steps * evaluator.hyperparameters.prior_sd
-    with np.errstate(over="ignore"):
-        variables = evaluator.hyperparameters.constrained(thetas).values()
-    values = np.column_stack([np.reshape(value, (len(thetas), -1)) for value in variables])
-    if values.shape != thetas.shape:  # elements without values of their own, as of a simplex
-        return np.nan, np.nan
-    value, *far = values[:, i]
-    above, below = (a if a == b and np.isfinite(a) else np.nan for a, b in (far[:2], far[2:]))
-    if is_upper:
-        return float(value), float(above)
-    without_scatter = below == 0 and np.isnan(above)
-    return float(value), np.nan if without_scatter else float(below)
+def ends_by_metric(sampling: SamplingDistribution) -> list[PriorEnd]:
+    """Return the elements that are pushed to an end of their prior; computes no response."""
+    evaluator, scales = sampling.evaluator, sampling.scales
+    # Two elements that only replace each other have a squared loading of a half each.
+    is_alone = (sampling.local.unidentified**2).sum(axis=1) > 0.9
+    is_alone &= ~only_through_prior(evaluator)
+    if not is_alone.any() or not is_stored(evaluator):
+        return []
 
+    def total(theta: Floats) -> float:
+        return float(evaluator.total(theta[None], scales)[0])
 
-def _is_pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
-    """Return whether the middle of an element's prior is worse, whatever the other elements."""
-    from scipy.optimize import minimize as scipy_minimize
-
-    evaluator, theta = sampling.evaluator, sampling.theta
     noise = np.array([information.noise_floor for information in sampling.information])
-
-    def is_worse(point: Floats) -> bool:
-        at_theta, at_point = evaluator(np.stack([theta, point])).discrepancies
-        with np.errstate(invalid="ignore"):
-            # NaN, as where no design reaches, is worse.
-            return not bool((at_point - at_theta <= noise).all())
-
-    back = theta.copy()
-    back[i] = middle
-    if not is_worse(back):
-        return False
-    rest = np.delete(np.arange(theta.size), i)
-    if not rest.size:
-        return True
-    unit = evaluator.hyperparameters.prior_sd[rest]
-
-    def along(x: Floats) -> float:
-        point = back.copy()
-        point[rest] += x * unit
-        (value,) = evaluator.total(point[None], sampling.scales)
-        return float(value)
-
-    # A coarse search suffices.
-    start = np.zeros(rest.size)
-    options = {
-        "maxfev": 100 * theta.size,
-        "initial_simplex": np.vstack([start, np.eye(rest.size)]),
-        "fatol": 1e-4,
-        "xatol": 1e-2,
-    }
-    back[rest] += scipy_minimize(along, start, method="Nelder-Mead", options=options).x * unit
-    return is_worse(back)
+    rise = float((noise / scales).sum())
+    return elements_at_prior_ends(evaluator, sampling.theta, is_alone, total, rise)
 
 
 def prior_end_findings(

@@ -9,60 +9,100 @@ from four_metrics import same
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.inference.checks.metric_suitability import data_between_runs
+from prbayes.inference.checks.metric_suitability import (
+    data_between_runs,
+    heavy_tails,
+    small_simulators,
+    smoothing_bias,
+)
+from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 
-
-@pytest.mark.long
-def test_an_area_of_a_population_without_a_mean_is_warned_of() -> None:
-    def minimum(metric: prb.Metric, make: Any, observed: Any) -> prb.Optimum:
-        with pm.Model() as model:
-            x = make(pm.HalfNormal("scale", 2))
-            prb.Simulator(
-                "y", lambda x: x, x, metric=metric, observed=observed,
-                propagation=prb.Reweighted(256),
-            )  # fmt: skip
-        return prb.minimize(model)
-
-    observed = np.abs(np.random.default_rng(1).standard_cauchy(30))
-    said = "one or less has no mean"
-    area = minimum(prb.AreaMetric(), pm.HalfCauchy.dist, observed)
-    assert said in "".join(map(str, area.findings))
-    assert said in str(prb.diagnose(area))
-    other = minimum(prb.KullbackLeibler(), pm.HalfCauchy.dist, observed)
-    assert said not in "".join(map(str, other.findings))
-    observed = np.random.default_rng(1).exponential(1.0, 30)
-    short = minimum(prb.AreaMetric(), lambda s: pm.Exponential.dist(scale=s), observed)
-    assert said not in "".join(map(str, short.findings))
-
-
-@pytest.mark.parametrize(("largest", "said"), [(2.2, False), (9.0, True)])
-def test_a_value_between_responses_far_apart_is_told_of(largest: float, said: bool) -> None:
-    """A kernel as narrow as the data want sees none of the few responses in a long tail."""
-    observed = np.append(np.exp(norm.ppf((np.arange(59) + 0.5) / 59, 0, 0.2)), largest)
-    with pm.Model() as model:
-        x = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator(
-            "y",
-            np.positive,
-            x,
-            metric=prb.LogLikelihood(density=prb.GaussianKDE()),
-            observed=observed,
-        )
-    evaluator = Evaluator.of(model)
-    found = data_between_runs(evaluator, np.array([0.0, np.log(0.3)]))
-    assert len(found) == said
-    if said:
-        assert "1 of 60 observed values (9) lie between responses" in found[0].text
-    # A metric that smooths both sides takes no value by itself.
-    with pm.Model() as model:
-        x = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), observed=observed)
-    assert data_between_runs(Evaluator.of(model), np.array([0.0, np.log(0.3)])) == []
-
-
+LOG_LIKELIHOOD = prb.LogLikelihood(density=prb.GaussianKDE())
 N = 40
 INPUTS = 0.3 + norm.ppf((np.arange(N) + 0.5) / N)
+
+
+def evaluator_of(x: Any, metric: prb.Metric, observed: Any, response: Any = same) -> Evaluator:
+    """Return the evaluator of a model of one input, ``x()``."""
+    with pm.Model() as model:
+        data = {"observed": observed, "propagation": prb.Reweighted(512)}
+        prb.Simulator("y", response, x(), metric=metric, **data)
+    return Evaluator.of(model)
+
+
+def half_cauchy() -> Any:
+    return pm.HalfCauchy.dist(pm.HalfNormal("scale", 2))
+
+
+def exponential() -> Any:
+    return pm.Exponential.dist(scale=pm.HalfNormal("scale", 2))
+
+
+@pytest.mark.parametrize(
+    ("x", "metric", "is_reported"),
+    [
+        (half_cauchy, prb.AreaMetric(), True),
+        (half_cauchy, prb.KullbackLeibler(), False),
+        (exponential, prb.AreaMetric(), False),
+    ],
+)
+def test_an_area_of_a_population_without_a_mean_is_reported(
+    x: Any, metric: prb.Metric, is_reported: bool
+) -> None:
+    observed = np.abs(np.random.default_rng(1).standard_cauchy(30))
+    findings = heavy_tails(evaluator_of(x, metric, observed), np.zeros(1))
+    assert [finding.code for finding in findings] == ["heavy-tail"] * is_reported
+    assert all("one or less has no mean" in finding.text for finding in findings)
+
+
+def lognormal() -> Any:
+    return pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
+
+
+@pytest.mark.parametrize(
+    ("largest", "metric", "is_reported"),
+    [
+        (2.2, LOG_LIKELIHOOD, False),
+        (9.0, LOG_LIKELIHOOD, True),
+        # A metric that smooths both sides takes no value by itself.
+        (9.0, prb.KullbackLeibler(), False),
+    ],
+)
+def test_a_value_between_responses_far_apart_is_reported(
+    largest: float, metric: prb.Metric, is_reported: bool
+) -> None:
+    """A kernel as narrow as the data want sees none of the few responses in a long tail."""
+    observed = np.append(np.exp(norm.ppf((np.arange(59) + 0.5) / 59, 0, 0.2)), largest)
+    evaluator = evaluator_of(lognormal, metric, observed)
+    findings = data_between_runs(evaluator, np.array([0.0, np.log(0.3)]))
+    assert len(findings) == is_reported
+    for finding in findings:
+        assert "1 of 60 observed values (9) lie between responses" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("metric", "shared", "n", "is_reported"),
+    [
+        (prb.AreaMetric(), True, 12, True),
+        (LOG_LIKELIHOOD, True, 12, True),
+        (prb.ProbabilityResidual(), True, 12, False),
+        (prb.AreaMetric(), False, 12, False),
+        (prb.AreaMetric(), True, 30, False),
+    ],
+)
+def test_few_specimens_underestimate_a_spread_in_common(
+    metric: prb.Metric, shared: bool, n: int, is_reported: bool
+) -> None:
+    with pm.Model() as model:
+        spread = pm.HalfNormal("s", 1)
+        for k in range(2):
+            x = pm.Normal.dist(0, spread if shared else pm.HalfNormal(f"s{k}", 1))
+            prb.Simulator(f"y{k}", same, x, metric=metric, observed=INPUTS[:n])
+    findings = small_simulators(Evaluator.of(model))
+    assert len(findings) == is_reported
+    for finding in findings:
+        assert f"they have {n} specimens or more, expected at least 30" in finding.text
 
 
 def branches(x: Any) -> Any:
@@ -70,44 +110,53 @@ def branches(x: Any) -> Any:
     return np.where(x > 0, 10 + x, x)
 
 
-def optimum(response: Any, metric: prb.Metric) -> prb.Optimum:
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
-        propagation = prb.Reweighted(512)
-        observed = response(INPUTS)
-        prb.Simulator("y", response, x, metric=metric, observed=observed, propagation=propagation)
-        return prb.minimize(progressbar=False)
+def normal() -> Any:
+    return pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
 
 
-def told(result: prb.Optimum) -> list[str]:
-    return [finding.text for finding in result.findings if finding.code == "smoothing-bias"]
+def biases(response: Any, metric: prb.Metric, sigma: float) -> tuple[list[str], float]:
+    """Return the findings at the mean of the inputs, and the standard error of sigma."""
+    evaluator = evaluator_of(normal, metric, response(INPUTS), response)
+    theta, scales = np.array([0.3, np.log(sigma)]), np.ones(1)
+    local = SamplingDistribution.of(evaluator, theta, scales).local
+    findings = smoothing_bias(evaluator, theta, scales, local)
+    assert smoothing_bias(evaluator, theta, scales, None) == []
+    stderr = sigma * float(np.sqrt(local.in_theta[1, 1]))
+    return [finding.text for finding in findings], stderr
 
 
-def test_a_kernel_that_is_wide_beside_a_branch_is_told_of() -> None:
-    found = optimum(branches, prb.LogLikelihood(density=prb.GaussianKDE()))
-    assert found.point["sigma"] < INPUTS.std() - found.stderr["sigma"]
-    (line,) = told(found)
+@pytest.mark.long
+def test_a_kernel_that_is_wide_beside_a_branch_is_reported() -> None:
+    def optimum(metric: prb.Metric) -> prb.Optimum:
+        observed = branches(INPUTS)
+        evaluator = evaluator_of(normal, metric, observed, branches)
+        return prb.minimize(evaluator.model, progressbar=False)
+
+    biased = optimum(LOG_LIKELIHOOD)
+    assert biased.point["sigma"] < INPUTS.std() - biased.stderr["sigma"]
+    (line,) = [f.text for f in biased.findings if f.code == "smoothing-bias"]
     assert "y: the kernel of the log-likelihood is wide" in line
     assert "sigma is off by more than a standard error" in line
-    # What is proposed mends it.
+    # The proposed kernel has no bias.
     width = float(line.split("GaussianKDE(")[1].split(")")[0])
-    mended = optimum(branches, prb.LogLikelihood(density=prb.GaussianKDE(width)))
-    assert not told(mended)
+    mended = optimum(prb.LogLikelihood(density=prb.GaussianKDE(width)))
+    assert "smoothing-bias" not in {finding.code for finding in mended.findings}
     assert mended.point["sigma"] == pytest.approx(INPUTS.std(), rel=0.02)
 
 
 @pytest.mark.parametrize("width", [0.2, 0.4])
 def test_the_bias_is_that_of_the_kernel_s_variance(width: float) -> None:
-    found = optimum(same, prb.LogLikelihood(density=prb.GaussianKDE(width)))
     # The smoothed population has the data's variance.
-    sigma = np.sqrt(INPUTS.var() - width**2)
-    assert found.point["sigma"] == pytest.approx(sigma, rel=2e-3)
-    bias = (INPUTS.std() - sigma) / found.stderr["sigma"]
-    lines = told(found)
+    sigma = float(np.sqrt(INPUTS.var() - width**2))
+    metric = prb.LogLikelihood(density=prb.GaussianKDE(width))
+    lines, stderr = biases(same, metric, sigma)
+    bias = (INPUTS.std() - sigma) / stderr
     assert bool(lines) == (bias > 0.5)
-    if lines:
-        number = float(lines[0].split("off by about ")[1].split()[0])
+    for line in lines:
+        number = float(line.split("off by about ")[1].split()[0])
         assert number == pytest.approx(bias, abs=0.1)
+        proposed = float(line.split("GaussianKDE(")[1].split(")")[0])
+        assert proposed == pytest.approx(width * np.sqrt(0.1 / number), rel=0.03)
 
 
 @pytest.mark.parametrize(
@@ -115,8 +164,8 @@ def test_the_bias_is_that_of_the_kernel_s_variance(width: float) -> None:
     [
         prb.LogLikelihood(density=prb.Histogram(9)),
         prb.KullbackLeibler(prb.GaussianKDE(0.9)),
-        prb.LogLikelihood(density=prb.GaussianKDE()),
+        LOG_LIKELIHOOD,
     ],
 )
-def test_others_are_not(metric: prb.Metric) -> None:
-    assert not told(optimum(same, metric))
+def test_other_metrics_have_no_bias(metric: prb.Metric) -> None:
+    assert biases(same, metric, float(INPUTS.std()))[0] == []

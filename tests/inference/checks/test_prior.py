@@ -15,8 +15,9 @@ from prbayes._validate import Floats
 from prbayes.inference.checks.prior import (
     PriorEnd,
     conflict_findings,
-    elements_at_prior_ends,
+    ends_by_metric,
     prior_conflict,
+    prior_end_findings,
 )
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -24,77 +25,66 @@ from prbayes.model.evaluator import Evaluator
 LEVELS = norm.ppf((np.arange(30) + 0.5) / 30)
 
 
-def added(x: Any, z: Any) -> Any:
-    return x + z
+def model(observed: Any, name: str = "kl") -> pm.Model:
+    with pm.Model() as result:
+        mu = pm.Uniform("mu", 0, 1)
+        x = pm.Normal.dist(mu, pm.HalfNormal("sd", 0.3))
+        pm.Deterministic("twice", 2 * mu)
+        data = {"observed": observed, "propagation": R256}
+        prb.Simulator("y", same, x, metric=METRICS[name], **data)
+    return result
 
 
-def model(
-    observed: Any,
-    mu: Any,
-    sd: Any,
-    metric: prb.Metric = METRICS["kl"],
-    propagation: prb.Reweighted = R256,
-) -> pm.Model:
-    with pm.Model() as found:
-        x = pm.Normal.dist(mu("mu"), sd("sd"))
-        prb.Simulator("y", same, x, metric=metric, observed=observed, propagation=propagation)
-    return found
-
-
-def unit(name: str) -> Any:
-    return pm.Uniform(name, 0, 1)
-
-
-def narrow(name: str) -> Any:
-    return pm.HalfNormal(name, 0.3)
-
-
-def ends(found: pm.Model, theta: Any) -> list[PriorEnd]:
-    evaluator = Evaluator.of(found)
-    sampling = SamplingDistribution.of(evaluator, np.array(theta), np.ones(1))
-    return elements_at_prior_ends(sampling)
+def ends(problem: pm.Model, *theta: float) -> list[PriorEnd]:
+    evaluator = Evaluator.of(problem)
+    return ends_by_metric(SamplingDistribution.of(evaluator, np.array(theta), np.ones(1)))
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))
-@pytest.mark.parametrize(("place", "bound"), [(2.85, 1.0), (-1.85, 0.0)])
-def test_data_beyond_a_prior_push_to_its_end_and_draws_stay_there(
+@pytest.mark.parametrize(("place", "bound"), [(1.6, 1.0), (-0.6, 0.0)])
+def test_data_beyond_a_prior_push_to_its_end(name: str, place: float, bound: float) -> None:
+    problem = model(place + 0.3 * LEVELS, name)
+    (end,) = ends(problem, np.copysign(9.0, place), np.log(0.65))
+    assert (end.name, end.bound) == ("mu", bound)
+    assert end.value == pytest.approx(bound, abs=1e-3)
+    (finding,) = prior_end_findings([end])
+    expected = f"The data push mu to {end.value:.4g}, next to the end of its prior at {bound:.4g}, "
+    assert finding.text.startswith(expected)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "place", "bound"), [("kl", 2.85, 1.0), ("area", -1.85, 0.0)])
+def test_an_optimum_at_an_end_says_so_and_draws_stay_there(
     name: str, place: float, bound: float
 ) -> None:
-    problem = model(place + 0.3 * LEVELS, unit, narrow, METRICS[name], prb.Reweighted(1024))
+    problem = model(place + 0.3 * LEVELS, name)
     optimum = prb.minimize(problem, progressbar=False)
     (finding,) = optimum.findings
     assert finding.code == "prior-end"
-    assert "The data push mu to" in finding.text
-    assert f"next to the end of its prior at {bound:.4g}" in finding.text
-    if (name, bound) in {("kl", 1.0), ("area", 0.0)}:
-        # Refits of the area metric are at an edge, where its estimate has no density.
-        adjustment: Any = None if name == "area" else "estimate"
-        sampler: dict[str, Any] = {"draws": 300, "chains": 2, "random_seed": 1}
-        tree = prb.sample_smc(
-            model=problem, optimum=optimum, adjustment=adjustment, progressbar=False, **sampler
-        )
-        # They went back to the prior, whose mean is a half, where estimates have no density.
-        assert abs(float(tree.posterior["mu"].mean()) - bound) < 0.15
+    # Refits of the area metric are at an edge, where its estimate has no density.
+    given: dict[str, Any] = {"adjustment": None} if name == "area" else {}
+    given |= {"draws": 300, "chains": 2, "random_seed": 1, "progressbar": False}
+    tree = prb.sample_smc(model=problem, optimum=optimum, **given)
+    # Back at the prior, the mean would be a half.
+    assert abs(float(tree.posterior["mu"].mean()) - bound) < 0.15
 
 
 def test_the_middle_of_a_prior_is_no_end_and_nor_is_a_population_without_scatter() -> None:
-    assert not ends(model(0.5 + 0.3 * LEVELS, unit, narrow), [0.0, np.log(0.3)])
+    assert not ends(model(0.5 + 0.3 * LEVELS), 0.0, np.log(0.3))
     # A standard deviation that is small beside the kernel, whose prior ends at zero.
-    assert not ends(model(0.5 + 0.01 * LEVELS, unit, narrow), [0.0, np.log(1e-5)])
+    assert not ends(model(0.5 + 0.01 * LEVELS), 0.0, np.log(1e-5))
     # At the other end than the data's the middle is better, so that these do not push there.
-    assert not ends(model(2.85 + 0.3 * LEVELS, unit, narrow), [-6.0, np.log(1.8)])
+    assert not ends(model(2.85 + 0.3 * LEVELS), -6.0, np.log(1.8))
 
 
 def test_two_that_only_stand_for_each_other_are_not_pushed() -> None:
-    with pm.Model() as found:
-        x = pm.Normal.dist(pm.Uniform("a", 0, 1), 0.3)
-        z = pm.Normal.dist(pm.Uniform("b", 0, 1), 0.3)
-        prb.Simulator(
-            "y", added, x, z, metric=METRICS["kl"], observed=1.2 + 0.42 * LEVELS, propagation=R256
-        )
+    with pm.Model() as problem:
+        x, z = (pm.Normal.dist(pm.Uniform(name, 0, 1), 0.3) for name in "ab")
+        data = {"observed": 1.2 + 0.42 * LEVELS, "propagation": R256}
+        prb.Simulator("y", lambda x, z: x + z, x, z, metric=METRICS["kl"], **data)
     # One at its upper end, the other at its lower one, or elsewhere.
-    assert not ends(found, [4.0, -4.0])
-    assert not ends(found, [4.0, 0.0])
+    assert not ends(problem, 4.0, -4.0)
+    assert not ends(problem, 4.0, 0.0)
 
 
 def estimates(mu: Floats, sd: Floats, n: int, rng: np.random.Generator) -> Floats:
@@ -107,15 +97,12 @@ def sharp_prior(size: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
     return 10 + 0.3 * rng.standard_normal(size), np.exp(0.2 * rng.standard_normal(size))
 
 
-@pytest.mark.parametrize(
-    ("n", "mu_off", "column", "power"),
-    [(10, 4, 0, 0.86), (20, 4, 0, 0.98), (10, 2, 0, 0.21), (20, 3, 0, 0.83)],
-)
-def test_power_for_a_mean_off_the_prior(n: int, mu_off: int, column: int, power: float) -> None:
+@pytest.mark.parametrize(("n", "mu_off", "power"), [(10, 2, 0.21), (20, 3, 0.83)])
+def test_power_for_a_mean_off_the_prior(n: int, mu_off: int, power: float) -> None:
     rng = np.random.default_rng(n)
     predictive = estimates(*sharp_prior(1000, rng), n, rng)
     observed = estimates(np.full(300, 10 + 0.3 * mu_off), np.ones(300), n, rng)
-    p = [prior_conflict(t, np.ones(2), t, predictive).p_values[column] for t in observed]
+    p = [prior_conflict(t, np.ones(2), t, predictive).p_values[0] for t in observed]
     # standard error .029 at most, and .03 of the 1000 simulated estimates
     assert np.mean(np.array(p) <= 0.05) == pytest.approx(power, abs=0.16)
 
@@ -132,48 +119,37 @@ def test_size_of_single_and_of_adjusted_p_values() -> None:
     assert np.mean(family <= 0.05) == pytest.approx(0.05, abs=0.035)
 
 
-def test_holm() -> None:
+def test_p_values_of_finite_estimates_are_adjusted_by_holm() -> None:
     predictive = np.tile(np.arange(999.0)[:, None], (1, 4))
+    failed = np.concatenate([predictive, np.full((50, 4), np.nan), np.full((9, 4), -np.inf)])
     # p = 2 (k + 1) / 1000 for k simulated estimates as far out
-    test = prior_conflict(np.array([4.5, 994.5, 9.5, 499.0]), np.ones(4), np.zeros(4), predictive)
-    assert test.p_values == pytest.approx([0.012, 0.01, 0.022, 1.0])
-    assert test.adjusted == pytest.approx([0.04, 0.04, 0.044, 1.0])  # never decreasing
-    assert test.pulls == pytest.approx([4.5, 994.5, 9.5, 499.0])  # in standard errors
+    estimate = np.array([4.5, 994.5, 9.5, 499.0])
+    for estimated in (predictive, failed):
+        test = prior_conflict(estimate, np.ones(4), np.zeros(4), estimated)
+        assert test.p_values == pytest.approx([0.012, 0.01, 0.022, 1.0])
+        assert test.adjusted == pytest.approx([0.04, 0.04, 0.044, 1.0])  # never decreasing
+        assert test.pulls == pytest.approx(estimate)  # in standard errors
+    unknown = np.full((3, 4), np.nan)
+    assert (prior_conflict(estimate, np.ones(4), np.zeros(4), unknown).p_values == 1).all()
 
 
-def test_a_conflict_needs_both_p_value_and_pull() -> None:
-    rng = np.random.default_rng(2)
-    prior = rng.normal(10, 0.3, (1000, 1))
-    predictive = prior + rng.normal(0, 0.2, prior.shape)
-
-    def codes(estimate: float, posterior: float) -> list[str]:
-        values = (np.array([v]) for v in (estimate, 0.2, posterior))
-        findings = conflict_findings(["mu"], prior, *values, predictive)
-        return [finding.code for finding in findings]
-
-    assert codes(11.6, 11.2) == ["prior-conflict"]
-    assert codes(11.6, 11.55) == []
-    assert codes(10.1, 10.4) == []
-    assert codes(8.4, 8.8) == ["prior-conflict"]
-
-
-def test_the_text_has_both_sides_and_the_unit_is_the_users() -> None:
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_a_conflict_needs_both_p_value_and_pull(unit: float) -> None:
     rng = np.random.default_rng(3)
     prior = rng.normal(10, 0.3, (1000, 1))
     predictive = prior + rng.normal(0, 0.2, prior.shape)
-    arguments = [np.array([11.8]), np.array([0.2]), np.array([11.2])]
-    (finding,) = conflict_findings(["mu"], prior, *arguments, predictive)
-    assert finding.text.startswith("mu: got prior 10 +- 0.3, data 11.8 +- 0.2 (p = 0.002); ")
-    assert "the prior pulls the posterior mean to 11.2, 3.0 standard errors" in finding.text
-    scaled = [1000 * v for v in arguments]
-    (other,) = conflict_findings(["mu"], 1000 * prior, *scaled, 1000 * predictive)
-    assert "3.0 standard errors" in other.text
-    assert "(p = 0.002)" in other.text
 
+    def texts(estimate: float, posterior: float) -> list[str]:
+        values = (np.array([unit * v]) for v in (estimate, 0.2, posterior))
+        findings = conflict_findings(["mu"], unit * prior, *values, unit * predictive)
+        return [finding.text for finding in findings]
 
-def test_failed_estimates_are_left_out() -> None:
-    at = np.array([4.5]), np.ones(1), np.zeros(1)
-    predictive = np.arange(999.0)[:, None]
-    failed = np.concatenate([predictive, np.full((50, 1), np.nan), np.full((9, 1), -np.inf)])
-    assert prior_conflict(*at, failed).p_values == prior_conflict(*at, predictive).p_values
-    assert prior_conflict(*at, np.full((3, 1), np.nan)).p_values == 1
+    (text,) = texts(11.8, 11.2)
+    assert "(p = 0.002); " in text
+    assert ", 3.0 standard errors from the data" in text
+    if unit == 1.0:
+        assert text.startswith("mu: got prior 10 +- 0.3, data 11.8 +- 0.2 (p = 0.002); ")
+        assert "the prior pulls the posterior mean to 11.2, 3.0 standard errors" in text
+    assert texts(11.6, 11.55) == []
+    assert texts(10.1, 10.4) == []
+    assert len(texts(8.4, 8.8)) == 1
