@@ -538,12 +538,10 @@ INNER = {
     "model.specimen_likelihood": {
         "pymc.logprob.abstract.ValuedRV",
         "pymc.logprob.abstract._logprob",
-        "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Constant",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.replace.vectorize_graph",
         "pytensor.graph.traversal.ancestors",
-        "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",
     },
     "plots.population": {"pytensor.tensor.variable.TensorVariable"},

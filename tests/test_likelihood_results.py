@@ -16,7 +16,7 @@ import xarray as xr
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.model.evaluator import specimen_log_likelihoods, specimen_params
+from prbayes.model.evaluator import specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.optimize.maximum_likelihood import other_specimens, specimen_pool, specimen_refits
 from prbayes.response.distributions import compiled_log_density
@@ -232,7 +232,7 @@ def test_refits_of_simulated_data_are_maximum_likelihood_estimates(optimum: prb.
     """Of a normal population in x they are mean and standard deviation of the inputs."""
     evaluator = optimum.evaluator
     (likelihood,) = evaluator.likelihoods
-    params = specimen_params(evaluator, optimum.theta[None], 0)
+    params = evaluator.hyperparameters.constrained(optimum.theta[None])
     pool = specimen_pool(likelihood, params, np.random.default_rng(3), size=1)
     (points,), log_a = data = pool(np.random.default_rng(4))
     before = specimen_log_likelihoods(evaluator, optimum.theta[None])["y"]

@@ -11,16 +11,14 @@ import pymc as pm
 from prbayes._validate import called
 from prbayes.model.description import without_addresses
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.model.random_variable import computed_node, simulators
 from prbayes.model.specimen_likelihood import (
     measurements_of,
     require_simulator,
     specimen_likelihoods,
 )
-from prbayes.model.specimen_preparation import first_run_count, is_prepared, prepared
-from prbayes.propagation.specimen_emulation import first_runs
-from prbayes.response.budget import BudgetError, Cost, RunCost, SimulatorCost
+from prbayes.model.specimen_preparation import emulator_cost, is_prepared, prepared
+from prbayes.response.budget import BudgetError, Cost, SimulatorCost
 from prbayes.response.inputs import model_on_context
 
 
@@ -99,27 +97,12 @@ def cost(model: pm.Model | Callable[[], pm.Model] | None = None) -> Cost:
         )
     likelihoods = specimen_likelihoods(model)
     for rv, measurement in measurements_of(model).items():
-        costs.append(_emulator_cost(likelihoods[rv], measurement))
+        likelihood, responses = likelihoods[rv], measurement.responses
+        computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
+        emulator = f"{measurement.metric!r} by an emulator"
+        needed = emulator_cost(likelihood)
+        costs.append(SimulatorCost(responses.name, emulator, needed, computed, responses.workers))
     return Cost(tuple(costs))
-
-
-def _emulator_cost(likelihood: SpecimenLikelihood, measurement: Measurement) -> SimulatorCost:
-    """Return the runs for the emulator of a log-likelihood by specimen."""
-    first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
-    batch = max(first // 2, likelihood.options.fresh)
-    computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
-    most = first + 5 * batch
-    growth = (
-        f"up to {most} in all, {batch} at a time at the roots of the specimens, until the emulator "
-        f"shifts no estimate by more than {likelihood.options.bias} standard deviations"
-    )
-    return SimulatorCost(
-        measurement.responses.name,
-        f"{measurement.metric!r} by an emulator",
-        RunCost(max(first + 2 * batch, computed), 0, most, growth),
-        computed,
-        measurement.responses.workers,
-    )
 
 
 @contextmanager

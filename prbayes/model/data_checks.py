@@ -81,14 +81,11 @@ def warn_duplicates(name: str, observed: Floats) -> None:
 
 
 def _has_few_steps(column: Floats) -> bool:
-    """Return whether n values, (n,), are on a decimal scale of less than n steps."""
+    """Return whether n values, (n,), are rounded to less than n steps."""
     values = column[np.isfinite(column)]
-    for unit in 10.0 ** np.arange(-3, 7):
-        scaled = values * unit
-        is_whole = np.abs(scaled - np.round(scaled)).max(initial=0.0) < 1e-6
-        if is_whole and np.ptp(values) * unit < len(column):
-            return True
-    return False
+    step = resolution(values)
+    has_few = step > 0 and np.ptp(values) / step < len(column)
+    return bool(has_few) or len(np.unique(values)) < 3
 
 
 # Rounding, censoring and repeats.
@@ -159,14 +156,14 @@ def count_at_ends(
         _, repeats = np.unique(y[(y > low) & (y < high)], return_counts=True)
         p_values = np.where(at_end > repeats.max(initial=1), 1 / (draws + 1), 1.0)
     else:
-        at_end = np.array([np.sum(y > high - step / 2), np.sum(y < low + step / 2)])
-        rng = np.random.default_rng(seed)
-        null = np.empty((draws, 2))
-        for draw in null:
-            values = np.round((rng.normal(y.mean(), y.std(), n) - low) / step)
-            draw[0] = np.sum(values == values.max())
-            draw[1] = np.sum(values == values.min())
-        bootstrap = adjusted_p_values(at_end.astype(np.float64), null)
+        is_high, is_low = y > high - step / 2, y < low + step / 2
+        at_end = np.array([is_high.sum(), is_low.sum()])
+        samples = np.random.default_rng(seed).normal(y.mean(), y.std(), (draws, n))
+        cells_of = np.round((samples - low) / step)
+        largest = cells_of == cells_of.max(axis=1, keepdims=True)
+        smallest = cells_of == cells_of.min(axis=1, keepdims=True)
+        null = np.stack([largest.sum(axis=1), smallest.sum(axis=1)], axis=1)
+        bootstrap = adjusted_p_values(at_end.astype(np.float64), null.astype(np.float64))
         cells = max(1, int(0.5 * y.std() / step))
         width = (cells + 0.5) * step
         near = np.array([np.sum(y > high - width), np.sum(y < low + width)])
@@ -205,16 +202,22 @@ def chance_of_repeats(y: Floats, steps: Floats, draws: int = 399, seed: int = 0)
     repeats = count_repeats(y)
     if not repeats:
         return 1.0
-    measured = np.isfinite(y)
-    sd = np.array([y[rows, j].std() if rows.any() else 0.0 for j, rows in enumerate(measured.T)])
+    sd = np.zeros(len(steps))
+    for j, column in enumerate(y.T):
+        measured = column[np.isfinite(column)]
+        if measured.size:
+            sd[j] = measured.std()
     fine = steps <= 0.25 * sd
     if not fine.any():
         return 1.0
-    cells = np.where(steps > 0, np.round(y / np.where(steps > 0, steps, 1.0)), y)
+    is_rounded = steps > 0
+    unit = np.where(is_rounded, steps, 1.0)
+    cells = np.where(is_rounded, np.round(y / unit), y)
     rng = np.random.default_rng(seed)
     null = []
     for _ in range(draws):
-        move = np.where(steps > 0, fine * rng.integers(-1, 2, y.shape), rng.random(y.shape))
+        whole_steps = fine * rng.integers(-1, 2, y.shape)
+        move = np.where(is_rounded, whole_steps, rng.random(y.shape))
         null.append(count_repeats(cells + move))
     return (np.sum(np.array(null) >= repeats) + 1) / (draws + 1)
 
@@ -319,13 +322,16 @@ def refuse_scatter(
         return
     row = int(np.flatnonzero(finite)[-1])
     last, again = outputs[row], alone(row)
+    change = np.abs(again - last)
     accuracy = rounding * np.abs(outputs[finite]).max(axis=0)
-    if not (np.abs(again - last) > accuracy).any():
+    if not (change > accuracy).any():
         return
-    differs = (np.abs(alone(row) - again) > accuracy).any()
-    if not differs and not (np.abs(again - last) > one_system * outputs[finite].std(axis=0)).any():
+    change_alone = np.abs(alone(row) - again)
+    tolerance = one_system * outputs[finite].std(axis=0)
+    if not (change_alone > accuracy).any() and not (change > tolerance).any():
         return
-    j = int(np.nanargmax(np.abs(again - last) / np.where(accuracy > 0, accuracy, 1.0)))
+    unit = np.where(accuracy > 0, accuracy, 1.0)
+    j = int(np.nanargmax(change / unit))
     raise ResponseError(
         f"{name}: got outputs {last[j]:.6g} and {again[j]:.6g} of the same inputs, expected the "
         "same for prb.LogLikelihood(): the response has scatter of its own, or a state from one "

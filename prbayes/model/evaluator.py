@@ -22,6 +22,7 @@ from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.model.parameters import Hyperparameters, parent_values
 from prbayes.model.random_variable import (
     Node,
+    ObservedRV,
     SimulatorRV,
     building,
     log_kernel,
@@ -33,7 +34,6 @@ from prbayes.model.specimen_likelihood import (
     require_simulator,
     specimen_likelihoods,
 )
-from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import Bound
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
@@ -134,19 +134,18 @@ class Evaluator:
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
         total = np.zeros(len(thetas))
-        evaluated = set()
-        for k, likelihood in enumerate(self.likelihoods):
-            if not likelihood.needs_graph:
-                values = log_likelihoods(likelihood, specimen_params(self, thetas, k))
-                total += values.sum(axis=1)
-                evaluated |= {m.name for m in likelihood.measurements}
-        variables = [rv for rv in _ordinary(self.model) if rv.name not in evaluated]
+        if self.likelihoods:
+            values = self.hyperparameters.constrained(thetas)
+            for likelihood in self.likelihoods:
+                total += log_likelihoods(likelihood, values).sum(axis=1)
+        observed = self.model.observed_RVs
+        variables = [rv for rv in observed if not isinstance(rv.owner.op, ObservedRV)]
         if variables or self.model.potentials:
             if "log_other" not in self.functions:
                 graph = _log_other(self.model, variables)
                 self.functions["log_other"] = self.hyperparameters.compile([graph])
-            (values,) = self.functions["log_other"](np.ascontiguousarray(thetas))
-            total = total + values
+            (terms,) = self.functions["log_other"](np.ascontiguousarray(thetas))
+            total = total + terms
         return total
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
@@ -159,11 +158,6 @@ class Evaluator:
         """Evaluate a batch, shape (P, d); an invalid theta does not affect the rest."""
         size = len(thetas)
         rows_at_once = [AT_ONCE // max(1, node.bound.n_points) for node in self.nodes]
-        rows_at_once += [
-            IN_CACHE // prepared(likelihood).points.log_a.size
-            for likelihood in self.likelihoods
-            if likelihood.needs_graph
-        ]
         step = max(1, min(rows_at_once, default=size))
         log_prior = np.empty(size)
         log_other = np.empty(size)
@@ -270,7 +264,8 @@ class Evaluator:
         """Return the values of the parents of the k-th of `simulators`, shapes (P, *shape)."""
         if k >= len(self.nodes):
             simulator = self.emulated[k - len(self.nodes)]
-            return parent_values(self.hyperparameters, thetas, simulator.inputs, simulator.place)
+            values = self.hyperparameters.constrained(thetas)
+            return parent_values(values, simulator.inputs, simulator.place)
         key = ("parents", *(node.name for node in self.nodes))
         if key not in self.functions:
             params = _simulator_params(self)
@@ -278,8 +273,8 @@ class Evaluator:
             ends = np.cumsum([0, *map(len, params)])
             self.functions[key] = self.hyperparameters.compile(graphs), ends
         function, ends = self.functions[key]
-        values = function(np.ascontiguousarray(thetas))[ends[k] : ends[k + 1]]
-        return [np.broadcast_to(value, (len(thetas), *np.shape(value)[1:])) for value in values]
+        parents = function(np.ascontiguousarray(thetas))[ends[k] : ends[k + 1]]
+        return [np.broadcast_to(p, (len(thetas), *np.shape(p)[1:])) for p in parents]
 
     def populations(self, thetas: Floats, k: int) -> tuple[Floats, Floats]:
         """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`."""
@@ -367,13 +362,6 @@ def likelihood_of(evaluator: Evaluator, measurement: Measurement) -> SpecimenLik
     return next(e.likelihood for e in evaluator.emulated if e.measurement is measurement)
 
 
-def specimen_params(evaluator: Evaluator, thetas: Floats, k: int) -> dict[Any, Floats]:
-    """Return the variables of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
-    values = evaluator.hyperparameters.constrained(thetas)
-    variables = evaluator.likelihoods[k].variables()
-    return {v: values[str(v.name)] for v in variables if not is_group(v)}
-
-
 def specimen_graphs(evaluator: Evaluator) -> list[Any]:
     """Return the graphs of the log-likelihoods of the specimens, by likelihood, (S,)."""
     names = [likelihood.measurements[-1].name for likelihood in evaluator.likelihoods]
@@ -387,19 +375,9 @@ def specimen_log_likelihoods(evaluator: Evaluator, thetas: Floats) -> dict[str, 
     Of simulators with common specimens the last has those of all, and the first ones have none.
     """
     result = {m.name: np.empty((len(thetas), 0)) for m in evaluator.measurements}
-    for k, likelihood in enumerate(evaluator.likelihoods):
-        if likelihood.needs_graph:
-            if "specimens" not in evaluator.functions:
-                graphs = specimen_graphs(evaluator)
-                compiled_graphs = [evaluator.hyperparameters.compile([g]) for g in graphs]
-                evaluator.functions["specimens"] = compiled_graphs
-            rows = max(1, IN_CACHE // prepared(likelihood).points.log_a.size)
-            blocks = np.split(np.ascontiguousarray(thetas), range(rows, len(thetas), rows))
-            function = evaluator.functions["specimens"][k]
-            values = np.concatenate([function(block)[0] for block in blocks])
-        else:
-            values = log_likelihoods(likelihood, specimen_params(evaluator, thetas, k))
-        result[likelihood.measurements[-1].name] = values
+    values = evaluator.hyperparameters.constrained(thetas)
+    for likelihood in evaluator.likelihoods:
+        result[likelihood.measurements[-1].name] = log_likelihoods(likelihood, values)
     return result
 
 
@@ -412,7 +390,7 @@ def is_current(evaluator: Evaluator) -> bool:
     likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
     now: list[object] = [*nodes(model).values(), *likelihoods]
     previous: list[object] = [*evaluator.nodes, *evaluator.likelihoods]
-    return len(now) == len(previous) and all(a is b for a, b in zip(now, previous, strict=True))
+    return now == previous
 
 
 def n_design_runs(evaluator: Evaluator) -> int:

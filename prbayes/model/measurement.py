@@ -254,11 +254,6 @@ class SpecimenLikelihood:
         return not any("error" in m.extras for m in self.measurements)
 
     @property
-    def needs_graph(self) -> bool:
-        """Whether only a graph computes the log-likelihood: with an unknown error, or repeats."""
-        return not self.error_is_known or self.stacked.repeats is not None
-
-    @property
     def calls_response(self) -> bool:
         """Whether the response itself takes the place of an emulator."""
         return self.measurements[0].propagation.calls_response

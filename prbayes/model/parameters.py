@@ -141,7 +141,8 @@ class Hyperparameters:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
         if not size:  # PyTensor transforms no empty matrices
-            return {name: v[:0] for name, v in self.constrained(self.initial[None]).items()}
+            single = self.constrained(self.initial[None])
+            return {name: value[:0] for name, value in single.items()}
         variables = self.model.unobserved_RVs
         values = self._constrain(np.ascontiguousarray(thetas))
         # Values that do not depend on theta have no leading axis, or one of length one.
@@ -203,16 +204,13 @@ class Hyperparameters:
         return np.asarray(thetas)
 
     @cached_property
-    def _prior_draws(self) -> tuple[PriorSampler, dict[tuple[int, int], Floats]]:
-        """The sampler of the prior, and its draws of theta by size and seed."""
-        return PriorSampler(self.model.free_RVs), {}
+    def _prior_sampler(self) -> PriorSampler:
+        """Draws of the free variables from the prior."""
+        return PriorSampler(self.model.free_RVs)
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        sampler, draws = self._prior_draws
-        if (size, seed) not in draws:
-            draws[size, seed] = self.thetas_of(sampler(size, seed))
-        return draws[size, seed].copy()
+        return self.thetas_of(self._prior_sampler(size, seed))
 
     @cached_property
     def prior_sd(self) -> Floats:
@@ -284,13 +282,14 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, N
     return np.where(np.isfinite(thetas), thetas, hyperparameters.initial), order
 
 
-def parent_values(
-    hyperparameters: Hyperparameters, thetas: Floats, inputs: Inputs, group: int | None
-) -> list[Floats]:
-    """Return the parents of inputs at thetas, in the group with this index, shapes (P, *shape)."""
-    values = hyperparameters.constrained(thetas)
+def parent_values(values: Mapping[str, Floats], inputs: Inputs, group: int | None) -> list[Floats]:
+    """Return the parents of inputs, in the group with this index, shapes (P, *shape).
+
+    Values are those of the model's variables by name, (P, *shape).
+    """
+    size = len(next(iter(values.values())))
     return [
-        np.full(len(thetas), group) if is_group(parent) else values[str(parent.name)]
+        np.full(size, group) if is_group(parent) else values[str(parent.name)]
         for parent in inputs.parents
     ]
 

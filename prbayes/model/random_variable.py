@@ -44,7 +44,7 @@ from prbayes.model.data_checks import warn_out_of_range
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
-from prbayes.response.budget import duration
+from prbayes.response.budget import RunCost, duration
 from prbayes.response.compile import PLAIN
 from prbayes.response.inputs import Inputs, broadcast_batch
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
@@ -166,6 +166,11 @@ class Specification:
     original: Specification | None = None  # of a clone, which takes the runs of the original
     node: Node | None = field(default=None, init=False)  # set at the first use
 
+    @property
+    def metric(self) -> Metric:
+        """The metric of the target."""
+        return self.target.metric
+
     def copied(self) -> Specification:
         """Return the same simulator with its own epsilon, for a clone of the model."""
         epsilon = shared_epsilon(self.name, float(self.epsilon.get_value()))
@@ -192,7 +197,10 @@ def computed(simulator: AnySimulator) -> Node:
             # Counts and notes of an attempt that fails are dropped with the copy.
             responses = simulator.responses.copied()
             responses.runs = simulator.responses.runs
-            responses.on_start = partial(_log_first_runs, propagation, responses)
+            setting = type(propagation).__name__
+            if hasattr(propagation, "n"):
+                setting += f"(n={propagation.n})"
+            responses.on_start = partial(log_first_runs, propagation.cost, setting, responses)
             with shown(simulator.progressbar):
                 bound = propagation.bind(simulator.name, responses.inputs, target, responses)
                 dimensions = bound.inputs.dimensions
@@ -222,11 +230,10 @@ def computed_node(simulator: AnySimulator) -> Node | None:
     return computed(simulator)
 
 
-def _log_first_runs(
-    propagation: Propagation, responses: Responses, runs: int, seconds: float
+def log_first_runs(
+    cost: RunCost, setting: str, responses: Responses, runs: int, seconds: float
 ) -> None:
     """Log how many runs there are, and how long they take, from the time of one run, or NaN."""
-    cost = propagation.cost
     if cost.per_theta and np.isnan(seconds):
         return  # known after the first call
     responses.on_start = None
@@ -236,9 +243,6 @@ def _log_first_runs(
         total = ceil(number / responses.workers) * seconds
         time = f", about {duration(total)}" if total >= 1 else ", less than 1 s"
         counts.append(f"{number}{time}" if number and not np.isnan(total) else str(number))
-    setting = type(propagation).__name__
-    if hasattr(propagation, "n"):
-        setting += f"(n={propagation.n})"
     _log.info(
         "%s: runs at first: %s; for each value of the hyperparameters: %s; to change this, pass "
         "another number in propagation=%s; more: %s",
@@ -286,17 +290,17 @@ def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
 # The operation.
 
 
-class SimulatorRV(RandomVariable):
-    """The operation of an observed variable: draws data sets, and carries its simulator.
+class ObservedRV(RandomVariable):
+    """The operation of a simulator's observed variable: draws data sets, and refers to a record.
 
-    Two operations are equal if they carry the same simulator: no rewrite of a graph merges others.
+    Two operations are equal if they refer to the same record: no rewrite of a graph merges others.
 
-    PyTensor's rewriters keep every operation that they have met. The simulator with all stored
-    responses is therefore referenced by applications of the operation, which live as long as a
+    PyTensor's rewriters keep every operation that they have met. The record, with all stored
+    responses, is therefore referenced by applications of the operation, which live as long as a
     model or a compiled function, and weakly by the operation itself.
     """
 
-    __props__ = ("name", "signature", "dtype", "inplace", "simulator")
+    __props__ = ("name", "signature", "dtype", "inplace", "reference")
 
     def __init__(
         self,
@@ -305,64 +309,84 @@ class SimulatorRV(RandomVariable):
         dtype: str = "floatX",
         inplace: bool = False,
         *,
-        simulator: AnySimulator,
+        reference: weakref.ref[Any],
     ) -> None:
-        response = response_name(simulator.responses.function)
-        label = f"Simulator of {response} by {type(simulator.target.metric).__name__}"
+        self.reference = reference
+        label = "Simulator of {} by {}".format(*self._response_and_metric)
         super().__init__(name=name or label, signature=signature, dtype=dtype, inplace=inplace)
-        self._simulator = weakref.ref(simulator)
-        self.owner: weakref.ref[Any] | None = None
-        self._warned = False
 
     @property
-    def simulator(self) -> AnySimulator:
-        """The simulator: a specification until `nodes` computes its first responses."""
-        simulator = self._simulator()
-        if simulator is None:
+    def record(self) -> Any:
+        """The record that applications of the operation reference."""
+        record = self.reference()
+        if record is None:
             raise RuntimeError(f"{self}: got an operation of a model that is gone")
-        return simulator
+        return record
 
-    def __eq__(self, other: object) -> bool:
-        """Return whether it is of the same simulator, and applied alike."""
-        keys = ("name", "signature", "dtype", "inplace", "_simulator")
-        return type(self) is type(other) and all(
-            getattr(self, key) == getattr(other, key) for key in keys
-        )
+    @property
+    def simulator(self) -> Any:
+        """The simulator of the observed variable."""
+        return self.record
 
-    def __hash__(self) -> int:
-        """Return a number that stays when the simulator is gone."""
-        return hash((type(self), self.name, self.signature, self.dtype, self.inplace))
-
-    def make_node(self, *inputs: Any, **keywords: Any) -> Apply[Any, Any]:
-        """Apply the operation; the application, and its copies, reference the simulator."""
-        apply = super().make_node(*inputs, **keywords)
-        apply.tag.simulator = self.simulator
-        return apply
-
-    def __str__(self) -> str:
-        """Show the name and the signature, without the simulator."""
-        return f'prbayes_Simulator_rv{{"{self.signature}"}}'
+    @property
+    def _response_and_metric(self) -> tuple[str, str]:
+        """Names of the response and of the metric's class."""
+        simulator = self.simulator
+        return response_name(simulator.responses.function), type(simulator.metric).__name__
 
     @property
     def _print_name(self) -> tuple[str, str]:
-        simulator = self.simulator
-        return printed_names(simulator.responses.function, type(simulator.target.metric).__name__)
+        """The name that PyMC prints for a distribution, as text and as LaTeX."""
+        text = ", ".join(self._response_and_metric)
+        latex = text.replace("_", "\\_")
+        return f"Simulator[{text}]", f"\\operatorname{{Simulator}}[\\text{{{latex}}}]"
+
+    def make_node(self, *inputs: Any, **keywords: Any) -> Apply[Any, Any]:
+        """Apply the operation; the application, and its copies, reference the record."""
+        apply = super().make_node(*inputs, **keywords)
+        apply.tag.record = self.record
+        return apply
+
+    def assign(self, apply: Apply[Any, Any], record: Any) -> None:
+        """Give an application in a model an operation of its own, which refers to a record."""
+        apply.op = type(self)(**{**self._props_dict(), "reference": weakref.ref(record)})
+        apply.tag.record = record
+
+    def __str__(self) -> str:
+        """Show the name and the signature, without the record."""
+        return f'prbayes_Simulator_rv{{"{self.signature}"}}'
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Replace the weak reference, which has no pickle, by the record."""
+        return {**self.__dict__, "reference": self.record}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the weak reference; the application references the record."""
+        self.__dict__.update(state)
+        self.reference = weakref.ref(state["reference"])
+
+    def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
+        """Return the number of outputs of a specimen."""
+        return [pt.constant(n, dtype="int64") for n in self.simulator.outputs.event]
+
+
+class SimulatorRV(ObservedRV):
+    """The operation of a simulator with a metric of distributions; its record is the simulator.
+
+    The simulator is a `Specification` until `nodes` computes its first responses.
+    """
+
+    owner: weakref.ref[Any] | None = None  # the application in the model
+    _warned = False
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the owner: a copy that is unpickled belongs to a model of its own."""
-        return {**self.__dict__, "owner": None, "_simulator": self.simulator}
+        return {**super().__getstate__(), "owner": None}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the weak reference; the application references the simulator."""
-        self.__dict__.update(state)
-        self._simulator = weakref.ref(state["_simulator"])
-
-    def assign(self, apply: Apply[Any, Any], simulator: AnySimulator) -> None:
-        """Give an application in a model an operation of its own, which carries a simulator."""
-        operation = SimulatorRV(**{**self._props_dict(), "simulator": simulator})
-        operation.owner = weakref.ref(apply)
-        apply.op = operation
-        apply.tag.simulator = simulator
+    def assign(self, apply: Apply[Any, Any], record: Any) -> None:
+        """Give an application in a model an operation of its own, which refers to a record."""
+        super().assign(apply, record)
+        apply.op.owner = weakref.ref(apply)
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
         """Draw responses of specimens; their shape is the last of the arguments."""
@@ -393,10 +417,6 @@ class SimulatorRV(RandomVariable):
             values[places] = bound.draw(rng, n_specimens, parents).reshape(shape)
         return values
 
-    def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
-        """Return the number of outputs of a specimen."""
-        return [pt.constant(n, dtype="int64") for n in self.simulator.target.event]
-
 
 def response_name(function: Any) -> str:
     """Return the name of a response, or the arguments of a lambda function."""
@@ -405,13 +425,6 @@ def response_name(function: Any) -> str:
     if name != "<lambda>":
         return name
     return f"lambda({', '.join(signature(inner).parameters)})"
-
-
-def printed_names(function: Any, metric: str) -> tuple[str, str]:
-    """Return the name that PyMC prints for a distribution, as text and as LaTeX."""
-    text = f"{response_name(function)}, {metric}"
-    latex = text.replace("_", "\\_")
-    return f"Simulator[{text}]", f"\\operatorname{{Simulator}}[\\text{{{latex}}}]"
 
 
 # The log-density.
@@ -516,17 +529,15 @@ optdb.register("prbayes_shape", out2in(shape_without_draw), "minimum_compile", p
 class SimulatorDistribution(pm.Distribution):
     """The distribution that PyMC makes the observed variable from."""
 
-    rv_type = SimulatorRV
+    rv_type = ObservedRV
 
     @classmethod
     def rv_op(
-        cls, *params: Any, simulator: Specification, size: Any = None, rng: Any = None
+        cls, *params: Any, operation: ObservedRV, size: Any = None, rng: Any = None
     ) -> TensorVariable:
-        """Return a random variable that carries a simulator."""
-        signature = rv_signature([p.type.ndim for p in params], len(simulator.target.event))
-        op = SimulatorRV(signature=signature, simulator=simulator)
+        """Return a random variable of an operation."""
         generator = pt.random.shared_rng(seed=None) if rng is None else rng
-        _, rv = op(*params, size=size, rng=generator, return_next_rng=True)
+        _, rv = operation(*params, size=size, rng=generator, return_next_rng=True)
         return rv
 
     @classmethod

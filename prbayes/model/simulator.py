@@ -34,17 +34,18 @@ from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_
 from prbayes.model.random_variable import (
     AnySimulator,
     SimulatorDistribution,
+    SimulatorRV,
     Specification,
     effective_specimens,
     has_default_epsilon,
     known_value,
+    rv_signature,
     shared_epsilon,
     simulators,
 )
 from prbayes.model.specimen_likelihood import (
-    SpecimenDistribution,
+    SpecimenRV,
     measurements_of,
-    set_likelihood,
     specimen_likelihoods,
 )
 from prbayes.propagation.base import Propagation, refuse_nested
@@ -275,17 +276,13 @@ def _add_measurement(
         dims = _checked_dims(name, dims, measurement.observed.shape, model)
     groups = measurement.groups
     params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables(names)]
-    rv = SpecimenDistribution(
-        name,
-        *params,
-        *joined,
-        likelihood=likelihood,
-        simulators=names,
-        observed=_pymc_data(observed, measurement.observed),
-        dims=dims,
-    )
+    params += joined
+    signature = rv_signature([p.type.ndim for p in params], len(measurement.event))
+    operation = SpecimenRV(signature=signature, reference=weakref.ref(likelihood), simulators=names)
+    data = _pymc_data(observed, measurement.observed)
+    rv = SimulatorDistribution(name, *params, operation=operation, observed=data, dims=dims)
     for partner in joined:
-        set_likelihood(partner, likelihood)
+        partner.owner.op.assign(partner.owner, likelihood)
     return rv
 
 
@@ -486,13 +483,12 @@ def _add_simulator(
         and not aleatory.isdisjoint(simulator.responses.inputs.aleatory)
     ]
     group = pt.constant(place, dtype="int64")
-    rv = SimulatorDistribution(
-        name,
-        *(group if is_group(v) else v for v in inputs.parents),
-        simulator=replace(specification, same_inputs=tuple(same_inputs)),
-        observed=_pymc_data(observed, target.observed),
-        dims=dims,
-    )
+    params = [group if is_group(v) else v for v in inputs.parents]
+    signature = rv_signature([p.type.ndim for p in params], len(target.event))
+    simulator = replace(specification, same_inputs=tuple(same_inputs))
+    operation = SimulatorRV(signature=signature, reference=weakref.ref(simulator))
+    data = _pymc_data(observed, target.observed)
+    rv = SimulatorDistribution(name, *params, operation=operation, observed=data, dims=dims)
     rv.owner.op.owner = weakref.ref(rv.owner)  # before a clone of the model claims it
     return rv
 

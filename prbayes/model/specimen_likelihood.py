@@ -10,19 +10,19 @@ those of the first ones have none; their observed variables are parameters of th
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytensor
 import pytensor.tensor as pt
+from numpy.typing import NDArray
 from pymc.logprob.abstract import ValuedRV, _logprob
-from pytensor.graph.basic import Apply, Constant
+from pytensor.graph.basic import Constant
 from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.traversal import ancestors
-from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats, called
@@ -33,14 +33,13 @@ from prbayes.model.measurement import (
     output_columns,
     specimen_numbers,
 )
+from prbayes.model.parameters import parent_values
 from prbayes.model.random_variable import (
     TERMS,
+    ObservedRV,
     equal_data,
     known_value,
-    printed_names,
     require_data,
-    response_name,
-    rv_signature,
     simulators,
 )
 from prbayes.model.specimen_preparation import prepared
@@ -82,38 +81,68 @@ def _points_by_group(likelihood: SpecimenLikelihood) -> list[WeightedPoints]:
     return last[1]
 
 
-def _parent_values(
-    likelihood: SpecimenLikelihood, params: Mapping[Any, Floats], group: Any
-) -> list[Any]:
-    """Return the values of the parents of the inputs, (P, *shape), in a group's populations."""
-    size = len(next(iter(params.values())))
-    return [
-        np.full(size, group) if is_group(parent) else params[parent]
-        for parent in likelihood.inputs.parents
-    ]
-
-
-def log_likelihoods(likelihood: SpecimenLikelihood, params: Mapping[Any, Floats]) -> Floats:
+def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
     """Return the log-likelihoods of the specimens in populations, (P, S), without a graph.
 
-    Values are by the likelihood's variables, shapes (P, *shape), without the group of a specimen.
+    Values are those of the model's variables by name, (P, *shape).
     """
-    share = prepared(likelihood).share
-    result = np.empty((len(next(iter(params.values()))), len(likelihood.readings)))
+    share, repeats = prepared(likelihood).share, likelihood.stacked.repeats
+    errors = _errors(likelihood, values)
+    result = np.empty((len(errors), len(likelihood.readings)))
     groups = zip(likelihood.by_group, _points_by_group(likelihood), strict=True)
     for (group, rows), points in groups:
-        parents = _parent_values(likelihood, params, group)
-        result[:, rows] = likelihood.density.log_likelihoods(parents, points)
+        parents = parent_values(values, likelihood.inputs, group)
+        if likelihood.error_is_known:
+            result[:, rows] = likelihood.density.log_likelihoods(parents, points)
+        else:
+            result[:, rows] = _with_unknown_error(likelihood, errors, parents, points, rows)
         if share is not None:
             log_share = share.of_populations(likelihood.density, parents, likelihood.coordinates)
             result[:, rows] -= log_share[:, None]
-    gross_share = likelihood.measurements[0].gross_errors
+    if repeats is not None:
+        result += [repeats.log_density(error, np) for error in errors]
+    gross_share = _gross_share(likelihood.measurements[0], values)
     if gross_share is not False:
-        gross_share = np.reshape(params.get(gross_share, gross_share), (-1, 1))
+        gross_share = np.reshape(gross_share, (-1, 1))
         gross = np.log(gross_share) + likelihood.stacked.log_gross
         result = np.logaddexp(np.log1p(-gross_share) + result, gross)
     weights = likelihood.measurements[0].weights
     return result if weights is None else result * weights
+
+
+def _errors(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
+    """Return the unknown error of each output, (P, M), one where it is known."""
+    size = len(next(iter(values.values())))
+    columns = []
+    for m in likelihood.measurements:
+        error = np.ones((size, m.rows.shape[1]))
+        if "error" in m.extras:
+            error *= values[str(m.extras["error"].name)].reshape(size, -1)
+        columns.append(error)
+    return np.concatenate(columns, axis=1)
+
+
+def _gross_share(measurement: Measurement, values: Mapping[str, Floats]) -> Any:
+    """Return the share of specimens with a gross error, a number or (P,), or False."""
+    share = measurement.gross_errors
+    return values[str(share.name)] if isinstance(share, TensorVariable) else share
+
+
+def _with_unknown_error(
+    likelihood: SpecimenLikelihood,
+    errors: Floats,
+    parents: Sequence[Floats],
+    points: WeightedPoints,
+    rows: NDArray[np.intp],
+) -> Floats:
+    """Return log-likelihoods of the specimens of a group, (P, n), for errors (P, M)."""
+    result = np.empty((len(errors), len(rows)))
+    for k, error in enumerate(errors):
+        log_a = points.log_a + _readings_log_density(likelihood, error, np)[rows]
+        population = [parent[k : k + 1] for parent in parents]
+        at_error = replace(points, log_a=log_a)
+        (result[k],) = likelihood.density.log_likelihoods(population, at_error)
+    return result
 
 
 def log_likelihood_graph(
@@ -136,7 +165,7 @@ def log_likelihood_graph(
         errors.append(error + pt.zeros(m.rows.shape[1]))
     error = pt.concatenate(errors)
     if not likelihood.error_is_known:
-        terms = terms + _readings_log_density(likelihood, error)
+        terms = terms + _readings_log_density(likelihood, error, pt)
     result = logsumexp_finite(terms)
     if share is not None:
         result = result - _log_share(likelihood, values, share)[groups]
@@ -188,15 +217,18 @@ def _log_share(likelihood: SpecimenLikelihood, values: dict[Any, Any], share: Re
     return pt.switch(is_unknown, 0.0, -pt.softplus(log_ratio))
 
 
-def _readings_log_density(likelihood: SpecimenLikelihood, error: Any) -> Any:
-    """Return the log-density of the readings at the points, (S, K), for an unknown error, (M,)."""
+def _readings_log_density(likelihood: SpecimenLikelihood, error: Any, xp: Any) -> Any:
+    """Return the log-density of the readings at the points, (S, K), for an unknown error, (M,).
+
+    As an array or a graph.
+    """
     readings, preparation = likelihood.readings, prepared(likelihood)
     outputs = preparation.points.outputs
     # Points that fill up the array have any output.
     outputs = np.where(np.isfinite(outputs), outputs, 1e30)
     unit = np.where(readings.is_relative[:, None], np.abs(outputs), 1.0)
     sd = error * likelihood.stacked.scale[:, None] * unit
-    return readings.symbolic_log_density(outputs, preparation.emulation.error**2 + sd**2, pt)
+    return readings.symbolic_log_density(outputs, preparation.emulation.error**2 + sd**2, xp)
 
 
 def logsumexp_finite(terms: Any) -> TensorVariable:
@@ -218,18 +250,18 @@ def logsumexp_finite(terms: Any) -> TensorVariable:
 def draw_readings(
     likelihood: SpecimenLikelihood,
     rng: np.random.Generator,
-    params: Mapping[Any, Floats],
+    values: Mapping[str, Floats],
     n: int,
     measurement: Measurement | None = None,
 ) -> Floats:
     """Draw the emulated readings of n specimens of each population, (P, n), (P, n, m) or (P, n, M).
 
-    Values are by the likelihood's variables, shapes (P, *shape), without the group of a specimen:
-    specimens are of the groups of the observed ones. Readings are those of one simulator, or the
-    outputs of all. If n is the number of a simulator's rows, repeated readings have common inputs.
-    NaN in a population of which next to nothing has a response.
+    Values are those of the model's variables by name, (P, *shape). Specimens are of the groups of
+    the observed ones. Readings are those of one simulator, or the outputs of all. If n is the
+    number of a simulator's rows, repeated readings have common inputs. NaN in a population of which
+    next to nothing has a response.
     """
-    emulation, size = prepared(likelihood).emulation, len(next(iter(params.values())))
+    emulation, size = prepared(likelihood).emulation, len(next(iter(values.values())))
     groups = likelihood.stacked.groups if measurement is None else measurement.groups
     by_group: list[tuple[Any, Any]] = [(None, np.arange(n))]
     if groups is not None:
@@ -244,7 +276,7 @@ def draw_readings(
     def draw_outputs() -> Floats:
         inputs: list[Floats] = []
         for group, columns in by_group:
-            parents = _parent_values(likelihood, params, group)
+            parents = parent_values(values, likelihood.inputs, group)
             drawn, _ = likelihood.density.sampler(parents, len(columns), rng)
             inputs = inputs or [np.empty((size, n, *x.shape[2:])) for x in drawn]
             for whole, part in zip(inputs, drawn, strict=True):
@@ -262,10 +294,10 @@ def draw_readings(
             break
         outputs[is_missing] = draw_outputs()[is_missing]
     if measurement is None:
-        return _with_errors(rng, outputs, likelihood.readings, likelihood.measurements, params)
+        return _with_errors(rng, outputs, likelihood.readings, likelihood.measurements, values)
     outputs = outputs[..., output_columns(likelihood, measurement)]
-    values = _with_errors(rng, outputs, measurement.readings, [measurement], params)
-    return values.reshape(size, n, *measurement.event)
+    readings = _with_errors(rng, outputs, measurement.readings, [measurement], values)
+    return readings.reshape(size, n, *measurement.event)
 
 
 def _with_errors(
@@ -273,108 +305,62 @@ def _with_errors(
     outputs: Floats,
     readings: Readings,
     measurements: Sequence[Measurement],
-    params: Mapping[Any, Floats],
+    values: Mapping[str, Floats],
 ) -> Floats:
     """Return readings of outputs, (P, n, m): with error, rounding and gross errors."""
     size, n, count = outputs.shape
     sd: Any = np.resize(readings.error, (n, count))
     if len(measurements) == 1 and "error" in measurements[0].extras:
-        sd = params[measurements[0].extras["error"]].reshape(size, 1, -1)
+        sd = values[str(measurements[0].extras["error"].name)].reshape(size, 1, -1)
     is_relative = np.resize(readings.is_relative, (n, count))
     sd = sd * np.where(is_relative, np.abs(outputs), 1.0)
-    values = outputs + sd * rng.standard_normal(outputs.shape)
+    result = outputs + sd * rng.standard_normal(outputs.shape)
     step = np.resize(readings.step, (n, count))
     unit = np.where(step > 0, step, 1.0)
-    values = np.where(step > 0, np.round(values / unit) * unit, values)
-    share = measurements[0].gross_errors
+    result = np.where(step > 0, np.round(result / unit) * unit, result)
+    share = _gross_share(measurements[0], values)
     if share is not False:
         low, high = np.concatenate([m.range for m in measurements], axis=1)
         middle, width = (low + high) / 2, high - low
         gross_errors = middle + width * (2 * rng.random(outputs.shape) - 1)
-        probability = np.reshape(params.get(share, share), (-1, 1))
+        probability = np.reshape(share, (-1, 1))
         is_gross = rng.random((size, n)) < probability
-        values = np.where(is_gross[..., None], gross_errors, values)
-    return np.asarray(values)
+        result = np.where(is_gross[..., None], gross_errors, result)
+    return np.asarray(result)
 
 
-class SpecimenRV(RandomVariable):  # type: ignore[misc]
-    """The operation of the observed variable: draws data sets, and carries the likelihood.
+class SpecimenRV(ObservedRV):
+    """The operation of a simulator with a log-likelihood by specimen; its record is that."""
 
-    PyTensor's rewriters keep every operation that they have met: the operation refers weakly to the
-    likelihood, its applications refer to it.
-    """
+    __props__ = (*ObservedRV.__props__, "simulators")  # type: ignore[assignment]
+    __str__ = ObservedRV.__str__  # PyTensor makes one of its own from the properties
 
-    __props__ = ("name", "signature", "dtype", "inplace", "reference", "simulators")
-
-    def __init__(
-        self,
-        name: str | None = None,
-        signature: str | None = None,
-        dtype: str = "floatX",
-        inplace: bool = False,
-        *,
-        likelihood: SpecimenLikelihood | None = None,
-        reference: Any = None,
-        simulators: tuple[str, ...] = (),
-    ) -> None:
-        self.reference = reference if likelihood is None else weakref.ref(likelihood)
+    def __init__(self, *arguments: Any, simulators: tuple[str, ...], **keywords: Any) -> None:
         # This one, after those with the same specimens, whose observed variables are parameters.
         self.simulators = simulators
-        function = response_name(self.measurement.responses.function)
-        label = f"Simulator of {function} by LogLikelihood"
-        super().__init__(name=name or label, signature=signature, dtype=dtype, inplace=inplace)
-
-    @property
-    def likelihood(self) -> SpecimenLikelihood:
-        """The log-likelihood by specimen."""
-        likelihood = self.reference()
-        if likelihood is None:
-            raise RuntimeError("got an operation of a model that is gone")
-        return likelihood
+        super().__init__(*arguments, **keywords)
 
     @property
     def measurements(self) -> list[Measurement]:
         """The measurements of `simulators`; the last is that of this simulator."""
-        by_name = {m.name: m for m in self.likelihood.measurements}
+        by_name = {m.name: m for m in self.record.measurements}
         return [by_name[name] for name in self.simulators]
 
     @property
-    def measurement(self) -> Measurement:
+    def simulator(self) -> Measurement:
         """The measurement of this simulator."""
         return self.measurements[-1]
 
     @property
     def variables(self) -> tuple[TensorVariable, ...]:
         """The variables that are its first parameters."""
-        return self.likelihood.variables(self.simulators)
-
-    def __str__(self) -> str:
-        """Show the name and the signature, without the likelihood."""
-        return f'prbayes_Simulator_rv{{"{self.signature}"}}'
-
-    @property
-    def _print_name(self) -> tuple[str, str]:
-        return printed_names(self.measurement.responses.function, "LogLikelihood")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Replace the weak reference, which has no pickle, by the likelihood."""
-        return {**self.__dict__, "reference": self.likelihood}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the weak reference; the application references the likelihood."""
-        self.__dict__.update(state)
-        self.reference = weakref.ref(state["reference"])
-
-    def make_node(self, *inputs: Any, **keywords: Any) -> Apply[Any, Any]:
-        """Apply the operation; the application references the likelihood."""
-        apply = super().make_node(*inputs, **keywords)
-        apply.tag.likelihood = self.likelihood
-        return apply
+        likelihood: SpecimenLikelihood = self.record
+        return likelihood.variables(self.simulators)
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
         """Draw responses of specimens; their shape is the last of the arguments."""
         *params, size = arguments
-        measurement = self.measurement
+        measurement = self.simulator
         # Readings of other simulators, the last parameters, are not part of the population.
         pairs = zip(self.variables, params, strict=False)
         parents = {parent: param for parent, param in pairs if not is_group(parent)}
@@ -390,48 +376,10 @@ class SpecimenRV(RandomVariable):  # type: ignore[misc]
             ndim = parent.type.ndim
             first = param if param.ndim == ndim else param[..., 0, *(slice(None),) * ndim]
             tail = first.shape[first.ndim - ndim :]
-            flat[parent] = np.broadcast_to(first, (*batch[:-1], *tail)).reshape(-1, *tail)
-        values = draw_readings(self.likelihood, rng, flat, n, measurement)
+            whole = np.broadcast_to(first, (*batch[:-1], *tail))
+            flat[str(parent.name)] = whole.reshape(-1, *tail)
+        values = draw_readings(self.record, rng, flat, n, measurement)
         return values.reshape(*shape, *measurement.event)
-
-    def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
-        """Return the number of outputs of a specimen."""
-        return [pt.constant(n, dtype="int64") for n in self.measurement.event]
-
-
-class SpecimenDistribution(pm.Distribution):  # type: ignore[misc]
-    """The distribution that PyMC makes the observed variable from."""
-
-    rv_type = SpecimenRV
-
-    @classmethod
-    def rv_op(
-        cls,
-        *params: Any,
-        likelihood: SpecimenLikelihood,
-        simulators: tuple[str, ...],
-        size: Any = None,
-        rng: Any = None,
-    ) -> TensorVariable:
-        """Return a random variable that carries a likelihood."""
-        *earlier, last = (m for m in likelihood.measurements if m.name in simulators)
-        ndims = [v.type.ndim for v in likelihood.variables(simulators)]
-        ndims += [m.observed.ndim for m in earlier]
-        signature = rv_signature(ndims, len(last.event))
-        op = SpecimenRV(signature=signature, likelihood=likelihood, simulators=simulators)
-        generator = pt.random.shared_rng(seed=None) if rng is None else rng
-        _, rv = op(*params, size=size, rng=generator, return_next_rng=True)
-        return rv
-
-    @classmethod
-    def dist(cls, *params: Any, **kwargs: Any) -> TensorVariable:
-        """Return a random variable outside a model."""
-        return super().dist(params, **kwargs)
-
-    @staticmethod
-    def support_point(rv: TensorVariable, size: Any, *params: Any) -> TensorVariable:
-        """Return where a sampler would start, were the variable not observed."""
-        return pt.zeros_like(rv)
 
 
 @_logprob.register(SpecimenRV)  # type: ignore[untyped-decorator]
@@ -440,7 +388,7 @@ def _log_density_of_vector(
 ) -> TensorVariable:
     """Return the log-likelihoods of the specimens, (S,); none where a later simulator has them."""
     (value,) = values
-    if TERMS.get() == "priors" or op.measurement is not op.likelihood.measurements[-1]:
+    if TERMS.get() == "priors" or op.simulator is not op.record.measurements[-1]:
         return pt.zeros(0)
     variables = op.variables
     parents = {
@@ -448,10 +396,13 @@ def _log_density_of_vector(
         for v, p in zip(variables, params, strict=False)
     }
     measurements: Sequence[Measurement] = op.measurements
-    earlier = zip(params[len(variables) :], measurements[:-1], strict=True)
-    data = [_without_marks(p[(0,) * (p.ndim - m.observed.ndim)]) for p, m in earlier] + [value]
+    data = []
+    for param, m in zip(params[len(variables) :], measurements[:-1], strict=True):
+        first = param[(0,) * (param.ndim - m.observed.ndim)]
+        data.append(_without_marks(first))
+    data.append(value)
     numbers = {m.name: known_value(v) for m, v in zip(measurements, data, strict=True)}
-    likelihood = op.likelihood.observing(numbers)
+    likelihood = op.record.observing(numbers)
     result = log_likelihood_graph(likelihood, parents)
     conditions = [
         equal_data(v, m.observed)
@@ -461,7 +412,7 @@ def _log_density_of_vector(
     if not conditions:
         return result
     is_same = pt.all(pt.stack(conditions))
-    return require_data(op.measurement.name, "whose points are part of it", result, is_same)
+    return require_data(op.simulator.name, "whose points are part of it", result, is_same)
 
 
 def _without_marks(variable: Any) -> Any:
@@ -483,24 +434,17 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
         raise TypeError(f"model: got {called(model)}, expected a pm.Model")
     rvs = [rv for rv in model.observed_RVs if isinstance(rv.owner.op, SpecimenRV)]
     data = {rv.owner.op.simulators[-1]: known_value(model.rvs_to_values[rv]) for rv in rvs}
-    result = {rv: rv.owner.op.likelihood for rv in rvs}
+    result = {rv: rv.owner.op.record for rv in rvs}
     current = {old: old.observing(data) for old in result.values()}
     for rv, old in result.items():
         if current[old] is not old:
-            set_likelihood(rv, current[old])
+            rv.owner.op.assign(rv.owner, current[old])
     return {rv: current[old] for rv, old in result.items()}
-
-
-def set_likelihood(rv: Any, likelihood: SpecimenLikelihood) -> None:
-    """Give an observed variable another likelihood."""
-    properties = {**rv.owner.op._props_dict(), "reference": weakref.ref(likelihood)}
-    rv.owner.op = SpecimenRV(**properties)
-    rv.owner.tag.likelihood = likelihood
 
 
 def measurements_of(model: pm.Model) -> dict[Any, Measurement]:
     """Return the simulators with a log-likelihood by specimen, by their observed variables."""
-    return {rv: rv.owner.op.measurement for rv in specimen_likelihoods(model)}
+    return {rv: rv.owner.op.simulator for rv in specimen_likelihoods(model)}
 
 
 def require_simulator(model: pm.Model) -> None:

@@ -6,7 +6,6 @@ covered, and the unit of Monte Carlo errors.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -30,18 +29,16 @@ from prbayes.model.data_checks import (
 )
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import Hyperparameters, log_posterior, parent_values
+from prbayes.model.random_variable import log_first_runs
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare, response_share
-from prbayes.propagation.specimen_emulation import Emulation, emulate
+from prbayes.propagation.specimen_emulation import Emulation, emulate, first_runs
 from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
-from prbayes.response.budget import duration
+from prbayes.response.budget import RunCost
 from prbayes.response.inputs import aleatory_names
-from prbayes.response.response import Responses
-
-_log = logging.getLogger("prbayes")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +73,26 @@ def first_run_count(likelihood: SpecimenLikelihood) -> int | None:
     return max((n for n in numbers if n is not None), default=None)
 
 
+def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
+    """Return the runs for the emulator of a log-likelihood by specimen."""
+    first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
+    batch = max(first // 2, likelihood.options.fresh)
+    computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
+    most = first + 5 * batch
+    growth = (
+        f"up to {most} in all, {batch} at a time at the roots of the specimens, until the emulator "
+        f"shifts no estimate by more than {likelihood.options.bias} standard deviations"
+    )
+    return RunCost(max(first + 2 * batch, computed), 0, most, growth)
+
+
 def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     """Compute runs, emulator and points; log how many runs there are."""
     responses = [m.responses for m in likelihood.measurements]
+    cost = emulator_cost(likelihood)
+    n = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     for response in responses:
-        response.on_start = partial(_log_first_runs, likelihood, response)
+        response.on_start = partial(log_first_runs, cost, f"Reweighted(n={n})", response)
     populations = Populations(likelihood)
     runs = Runs(likelihood)
     try:
@@ -104,24 +116,6 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     finally:
         for response in responses:
             response.on_start = None
-
-
-def _log_first_runs(
-    likelihood: SpecimenLikelihood, responses: Responses, runs: int, seconds: float
-) -> None:
-    """Log how many runs there are, how long they take, and which number changes them."""
-    responses.on_start = None
-    total = np.ceil(runs / responses.workers) * seconds
-    time = f", about {duration(float(total))}" if total >= 1 else ""
-    _log.info(
-        "%s: runs at first: %d%s; then %d at a time at the roots of the specimens; to change "
-        "this, pass another number in propagation=prb.Reweighted(n=%d)",
-        responses.name,
-        runs,
-        time,
-        max(runs // 2, likelihood.options.fresh),
-        runs,
-    )
 
 
 @dataclass(eq=False)
@@ -247,19 +241,18 @@ class Populations:
         result = np.empty((len(thetas), n))
         x = likelihood.coordinates.inputs(z)
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
+        values = self.hyperparameters.constrained(thetas)
         for group, rows in likelihood.by_group:
+            parents = parent_values(values, likelihood.inputs, group)
             if smoothing is None:
-                parents = parent_values(self.hyperparameters, thetas, likelihood.inputs, group)
                 points = WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], weights[rows])
                 result[:, rows] = likelihood.density.log_likelihoods(parents, points)
                 continue
             step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):
                 block = slice(first, first + step)
-                parents = parent_values(
-                    self.hyperparameters, thetas[block], likelihood.inputs, group
-                )
-                logs = self._normal_log_density(parents, z[rows].reshape(-1, d), smoothing)
+                at_block = [parent[block] for parent in parents]
+                logs = self._normal_log_density(at_block, z[rows].reshape(-1, d), smoothing)
                 logs = np.where(np.isnan(logs), -np.inf, logs)
                 logs = logs.reshape(-1, len(rows), count)
                 result[block, rows] = log_sum_exp(logs + weights[rows])
@@ -273,8 +266,9 @@ class Populations:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
         likelihood = self.likelihood
         result = np.zeros(len(thetas))
+        values = self.hyperparameters.constrained(thetas)
         for group, rows in likelihood.by_group:
-            parents = parent_values(self.hyperparameters, thetas, likelihood.inputs, group)
+            parents = parent_values(values, likelihood.inputs, group)
             result += len(rows) * share.of_populations(
                 likelihood.density, parents, likelihood.coordinates
             )
@@ -379,10 +373,9 @@ class PopulationDraws:
         populations, likelihood = self.populations, self.populations.likelihood
         rng = np.random.default_rng([0, 3])
         parts = []
+        values = populations.hyperparameters.constrained(self.thetas)
         for group, _ in likelihood.by_group:
-            parents = parent_values(
-                populations.hyperparameters, self.thetas, likelihood.inputs, group
-            )
+            parents = parent_values(values, likelihood.inputs, group)
             inputs, _ = likelihood.density.sampler(parents, n_of_each, rng)
             z = likelihood.coordinates.of(inputs, 2)
             parts.append(z.reshape(-1, z.shape[-1]))

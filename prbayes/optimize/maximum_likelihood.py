@@ -28,7 +28,6 @@ from prbayes.model.evaluator import (
     only_through_prior,
     specimen_graphs,
     specimen_log_likelihoods,
-    specimen_params,
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
@@ -434,22 +433,22 @@ type SpecimenData = tuple[list[Floats], Floats]
 
 def specimen_pool(
     likelihood: SpecimenLikelihood,
-    params: Mapping[Any, Floats],
+    values: Mapping[str, Floats],
     rng: np.random.Generator,
     size: int = 2000,
 ) -> Callable[[np.random.Generator], SpecimenData]:
     """Simulate at least ``size`` specimens of one population, with their points.
 
-    ``params`` has the values of the variables without the group, (1, *shape). Return a function
+    ``values`` are those of the model's variables by name, (1, *shape). Return a function
     that draws a data set: for each observed specimen one with its group and missing outputs.
     """
     n = len(likelihood.readings)
     copies = max(1, -(-size // n))
-    values = draw_readings(likelihood, rng, params, copies * n)[0].reshape(copies * n, -1)
-    observed, shape = likelihood.readings, values.shape
+    drawn = draw_readings(likelihood, rng, values, copies * n)[0].reshape(copies * n, -1)
+    observed, shape = likelihood.readings, drawn.shape
     missing = np.full(shape, np.nan)
     readings = Readings(
-        np.where(np.resize(observed.is_measured, shape), values, np.nan),
+        np.where(np.resize(observed.is_measured, shape), drawn, np.nan),
         np.resize(observed.error, shape),
         np.resize(observed.step, shape),
         missing,
@@ -560,10 +559,8 @@ class SpecimenRefits:
         """Yield estimates of simulated data sets, whether they converged, and the data."""
         evaluator = self.evaluator
         rng = np.random.default_rng([seed, 21])
-        pools = [
-            specimen_pool(likelihood, specimen_params(evaluator, self.theta[None], k), rng)
-            for k, likelihood in enumerate(evaluator.likelihoods)
-        ]
+        values = evaluator.hyperparameters.constrained(self.theta[None])
+        pools = [specimen_pool(likelihood, values, rng) for likelihood in evaluator.likelihoods]
         rng = np.random.default_rng([seed, 22])
         for _ in range(draws):
             data = [pool(rng) for pool in pools]

@@ -27,7 +27,6 @@ from prbayes.model.evaluator import (
     Evaluator,
     likelihood_of,
     specimen_log_likelihoods,
-    specimen_params,
 )
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.model.measurement import specimen_labels
@@ -281,11 +280,12 @@ def _emulated_responses(
     """Return emulated responses of new specimens at thetas, (chains, draws, d)."""
     chains, draws, d = thetas.shape
     responses = {}
-    for k, likelihood in enumerate(evaluator.likelihoods):
-        params = specimen_params(evaluator, thetas.reshape(-1, d), k)
+    values = evaluator.hyperparameters.constrained(thetas.reshape(-1, d))
+    for likelihood in evaluator.likelihoods:
         for measurement in likelihood.measurements:
-            values = draw_readings(likelihood, rng, params, len(measurement.observed), measurement)
-            responses[measurement.name] = values.reshape(chains, draws, *values.shape[1:])
+            n = len(measurement.observed)
+            readings = draw_readings(likelihood, rng, values, n, measurement)
+            responses[measurement.name] = readings.reshape(chains, draws, *readings.shape[1:])
     return labelled_responses(evaluator, responses, (chains, draws))
 
 

@@ -17,7 +17,7 @@ from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
-from prbayes.model.evaluator import Evaluator, specimen_params
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
 from prbayes.optimize.maximum_likelihood import (
@@ -226,12 +226,11 @@ def _ranks(evaluator: Evaluator, settings: SamplingSettings, number: int) -> dic
     hyperparameters = evaluator.hyperparameters
     theta = hyperparameters.prior_thetas(1, int(rng.integers(2**31)))
     data = fresh_data(evaluator, theta[0], rng) if evaluator.nodes else {}
+    values = hyperparameters.constrained(theta)
     # With a likelihood by specimen the emulator is the response.
     pools = [
-        specimen_pool(
-            likelihood, specimen_params(evaluator, theta, k), rng, size=len(likelihood.readings)
-        )
-        for k, likelihood in enumerate(evaluator.likelihoods)
+        specimen_pool(likelihood, values, rng, size=len(likelihood.readings))
+        for likelihood in evaluator.likelihoods
     ]
     settings = replace(settings, random_seed=int(rng.integers(2**31)))
     draw = sample if settings.adjustment is None else draw_posterior

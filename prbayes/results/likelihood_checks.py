@@ -210,6 +210,7 @@ def scored_specimens(
     ``data`` points (N, K, *event) and numbers A (N, K).
     """
     result = []
+    at_theta = evaluator.hyperparameters.constrained(theta[None])
     for likelihood, functions, (points, log_a) in zip(
         evaluator.likelihoods, scores, data, strict=True
     ):
@@ -217,7 +218,7 @@ def scored_specimens(
         z = np.empty((*log_a.shape, likelihood.coordinates.size))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
-            parents = parent_values(evaluator.hyperparameters, theta[None], inputs, place)
+            parents = parent_values(at_theta, inputs, place)
             size = log_a[rows].size
             flat = [x[rows].reshape(size, *x.shape[2:]) for x in points]
             values, (log_p,) = (function(*parents, *flat) for function in functions)
@@ -391,11 +392,12 @@ def _complete_covariance(
     """Return the inverse information of the inputs of all specimens, (d, d); NaN if singular."""
     step = 1e-3 * evaluator.hyperparameters.prior_sd
     around = cross(theta, step)
+    values = evaluator.hyperparameters.constrained(around)
     information = np.zeros((theta.size, theta.size))
     n = _OPTIONS.specimens
     for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
         for place, rows in likelihood.by_group:
-            parents = parent_values(evaluator.hyperparameters, around, likelihood.inputs, place)
+            parents = parent_values(values, likelihood.inputs, place)
             specimens, _ = sampler([parent[:1] for parent in parents], n, rng)
             (log_p,) = log_density(*parents, *[x[0] for x in specimens])
             with np.errstate(invalid="ignore"):

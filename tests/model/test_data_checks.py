@@ -46,10 +46,10 @@ def codes(y: Floats, **arguments: object) -> list[str]:
 # Resolution: size 0 of 8000, power 1.00.
 
 
-@pytest.mark.parametrize("n", [3, 20, 200])
-def test_continuous_values_have_no_step(n: int) -> None:
-    rng = np.random.default_rng(n)
-    assert not any(resolution(rng.normal(10, 1, n)) for _ in range(500))
+def test_continuous_values_have_no_step() -> None:
+    for n in (3, 20, 200):
+        rng = np.random.default_rng(n)
+        assert not any(resolution(rng.normal(10, 1, n)) for _ in range(300))
 
 
 @pytest.mark.parametrize("step", [0.1, 0.25, 0.5, 1.0])
@@ -130,13 +130,12 @@ def test_a_tie_at_a_fine_step_may_be_chance() -> None:
     assert p_values[0] > 0.005
 
 
-@pytest.mark.parametrize("step", [0.1, 0.5])
-def test_rounded_values_of_skewed_populations_rarely_have_a_pile(step: float) -> None:
+def test_rounded_values_of_skewed_populations_rarely_have_a_pile() -> None:
     rng = np.random.default_rng(12)
     folded = (rng.normal(2, 0.5, (60, 50)) - 1) ** 2
     for y in (folded, np.exp(rng.standard_normal((60, 50)))):
-        sd = y.std()
-        p = [min(count_at_ends(rounded(v, step * sd), step * sd, 199)[1]) for v in y]
+        step = 0.1 * y.std()
+        p = [min(count_at_ends(rounded(v, step), step, 99)[1]) for v in y]
         # at most .04 in the table; standard error .025. The bootstrap alone flags .5 to .95.
         assert np.mean(np.array(p) <= 0.05) <= 0.15
 
@@ -182,16 +181,15 @@ def test_identical_specimens_are_groups_of_indices() -> None:
     assert identical_specimens(np.full((4, 2), np.nan)) == ()
 
 
-@pytest.mark.parametrize("m", [1, 2, 3])
-@pytest.mark.parametrize("step", [0.0, 0.01, 0.1, 0.5])
+@pytest.mark.parametrize(("m", "step"), [(1, 0.0), (1, 0.1), (2, 0.01), (3, 0.5)])
 def test_size_of_repeats(m: int, step: float) -> None:
     rng = np.random.default_rng([m, int(100 * step)])
-    p = [chance_of_repeats(correlated(rng, 50, m, step), np.full(m, step), 199) for _ in range(30)]
+    p = [chance_of_repeats(correlated(rng, 50, m, step), np.full(m, step), 99) for _ in range(30)]
     # size 0 to .03; standard error .03
     assert np.mean(np.array(p) <= 0.01) <= 0.14
 
 
-@pytest.mark.parametrize(("m", "step"), [(1, 0.0), (2, 0.0), (2, 0.01), (2, 0.1), (3, 0.1)])
+@pytest.mark.parametrize(("m", "step"), [(1, 0.0), (2, 0.01), (2, 0.1)])
 def test_copies_are_identified(m: int, step: float) -> None:
     rng = np.random.default_rng(14)
     found = [
@@ -226,7 +224,7 @@ def test_copies_are_no_pile(draw: Callable[[np.random.Generator], Floats]) -> No
 
 def test_size_of_all_checks() -> None:
     rng = np.random.default_rng(17)
-    assert not any(codes(correlated(rng, 20, 2)) for _ in range(60))
+    assert not any(codes(correlated(rng, 20, 2)) for _ in range(30))
     counts = Counter(code for _ in range(30) for code in set(codes(correlated(rng, 50, 2, 0.1))))
     # about .04; standard error .04
     assert counts.total() / 30 <= 0.2

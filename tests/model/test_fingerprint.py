@@ -203,7 +203,7 @@ def test_the_function_of_a_metric_is_compared_by_its_values() -> None:
     assert "discrepancy of y has other values" in text
 
 
-@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64)])
+@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Fresh(64)])
 def test_an_identity_computes_no_response_and_compares_them(
     propagation: Propagation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -402,13 +402,6 @@ def test_predict_compares_responses_also_with_another_prior(propagation: Any) ->
         x = pm.Normal.dist(wrong["mu"], 1.0)
         with pytest.raises(ValueError, match="the response of y has other values at the same poi"):
             prb.predict(result, np.positive, x, model=wrong, stored=False)
-
-
-def test_a_clone_has_its_own_epsilon() -> None:
-    clone = clone_model(base())
-    prb.set_epsilon(clone, {"y": 0.3})
-    tree = prb.sample_smc(20, model=clone, optimum=optimum(), **SMC)
-    assert float(tree["calibration"]["epsilon"][0]) == 0.3
 
 
 @pytest.mark.long

@@ -89,26 +89,9 @@ def test_these_are_no_uses(propagation: Any, runs: int) -> None:
     assert response.runs == runs
 
 
-def test_a_later_simulator_of_the_model_is_no_use() -> None:
-    response = prb.scalar(Counted())
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        given = {"observed": 2 * OBSERVED, "propagation": prb.Reweighted(16)}
-        for name, metric in (("y", AREA), ("z", prb.KullbackLeibler())):
-            prb.Simulator(name, response, x, metric=metric, specimens=range(20), **given)
-    assert response.function.runs == 0
-    first, second = first_use(model).values()
-    assert response.function.runs == 16, "they share their runs"
-    assert second.same_inputs == ("y",)
-    np.testing.assert_array_equal(first.bound.design.runs.values, second.bound.design.runs.values)
-
-
 def test_arguments_are_checked_when_the_model_is_written() -> None:
-    metric = prb.FunctionMetric(lambda a, b: abs(a.mean(-1) - b.mean()))
     with pytest.raises(TypeError, match="progressbar"):
         build(Counted(), progressbar="no")
-    with pytest.raises(TypeError, match="a metric that takes no weights"):
-        build(Counted(), metric=metric)
     with pytest.raises(TypeError, match="emulator: got RadialBasis for aleatory inputs"):
         build(Counted(), prb.Reweighted(32, emulator=prb.surrogate.RadialBasis()))
 
@@ -142,7 +125,11 @@ USES: dict[str, Callable[[pm.Model], object]] = {
     "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
 )
 @pytest.mark.parametrize(
-    "name", [n if n != "nutpie" else pytest.param(n, marks=pytest.mark.long) for n in USES]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.long] if name in ("NUTS", "nutpie") else [])
+        for name in USES
+    ],
 )
 def test_the_first_use_computes_the_runs_once(name: str, caplog: pytest.LogCaptureFixture) -> None:
     response = Counted()

@@ -68,17 +68,14 @@ def by_cloudpickle(model: pm.Model) -> pm.Model:
 
 COPIES: dict[str, Callable[[pm.Model], pm.Model]] = {
     "clone": clone_model,
-    "copy": copy.copy,
     "deepcopy": copy.deepcopy,
     "freeze": freeze_dims_and_data,
     "cloudpickle": by_cloudpickle,
-    "clone of a clone": lambda model: clone_model(clone_model(model)),
     "clone of an unpickled model": lambda model: clone_model(by_cloudpickle(model)),
-    "unpickled clone": lambda model: by_cloudpickle(clone_model(model)),
 }
 
 
-@pytest.mark.parametrize("propagation", [DESIGN, prb.Resimulated(64), prb.Fresh(20_000)])
+@pytest.mark.parametrize("propagation", [DESIGN, prb.Resimulated(64)])
 def test_conditioned_models_have_the_same_discrepancy(propagation: Propagation) -> None:
     model = build(propagation)
     conditioned = {
@@ -87,30 +84,14 @@ def test_conditioned_models_have_the_same_discrepancy(propagation: Propagation) 
         "clone": (clone_model(model), list(AT)),
     }
     expected = Evaluator.of(model)(THETA).discrepancies[0, 0]
-    tolerance = {"rtol": 0.1 if propagation.is_random else 1e-9}
     for clone, names in conditioned.values():
         evaluator = Evaluator.of(clone)
         assert sorted(evaluator.hyperparameters.names) == sorted(names)
         theta = np.array([[AT[n] for n in evaluator.hyperparameters.names]])
         found = evaluator(theta).discrepancies[0, 0]
-        np.testing.assert_allclose(found, expected, **tolerance)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
         density = log_density(clone)({name: AT[name] for name in names})
-        np.testing.assert_allclose(density, -expected / 0.1, **tolerance)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "way", [way if " " not in way else pytest.param(way, marks=pytest.mark.slow) for way in COPIES]
-)
-def test_a_copy_has_the_same_optimum(way: str) -> None:
-    model = build()
-    first, second = (prb.minimize(m, starts=0, **QUIET) for m in (model, COPIES[way](model)))
-    # PyMC's clones may order variables, and so the points of a larger design, in another way: a
-    # design is good to a tenth of a standard error.
-    for name in ("mu", "sigma"):
-        assert abs(first.point[name] - second.point[name]) < 0.1 * first.stderr[name]
-        assert first.stderr[name] == pytest.approx(second.stderr[name], rel=0.05)
-    assert first.n_responses == second.n_responses
+        np.testing.assert_allclose(density, -expected / 0.1, rtol=1e-9)
 
 
 @pytest.mark.parametrize("way", COPIES)
@@ -138,17 +119,6 @@ def test_a_copy_shares_nothing_that_changes(way: str) -> None:
     assert ratios()[0] == pytest.approx(2, rel=1e-12)
     assert (node.bound.n_points, copied.bound.n_points) == (64, 128)
     assert node.responses.count == 64
-
-
-def test_minimize_on_a_conditioned_model_does_not_change_the_original() -> None:
-    model = build(prior=(0, 30))
-    compiled = log_density(model)
-    before = compiled(AT)
-    conditioned = pm.do(model, {"sigma": 0.7})
-    prb.minimize(conditioned, starts=0, **QUIET)
-    assert node_of(conditioned).bound.n_points > 64, "the design was refined"
-    assert compiled(AT) == before
-    assert node_of(model).bound.n_points == 64
 
 
 def test_counts_of_resimulated_responses_are_separate() -> None:
@@ -250,7 +220,7 @@ def test_a_batch_of_parameters_is_a_batch_of_populations() -> None:
     y, mu = model["y"], model["mu"]
     means = np.array([-0.5, 1.0, 2.5])
     many = vectorize_graph(y, {mu: pytensor.tensor.as_tensor(means), model["sigma"]: 0.5 + 0 * mu})
-    drawn: Floats = pm.draw(many, random_seed=1)
+    drawn: Floats = pm.draw(many, random_seed=1, mode=PLAIN)
     assert drawn.shape == (3, OBSERVED.size)
     # Twenty values of standard deviation .5 each: a standard error of .11
     np.testing.assert_allclose(drawn.mean(axis=1), means, atol=0.5)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -154,14 +155,6 @@ def test_find_map_agrees_with_minimize(name: str) -> None:
         np.testing.assert_allclose(found[key].item(), optimum[key], atol=0.1 * sd)
 
 
-@pytest.mark.slow
-def test_pymc_gives_a_black_box_slice_steps() -> None:
-    idata = nuts(model_of("black box")[0], 60, 20, 1)
-    assert "diverging" not in idata.sample_stats
-    for key, (mean, sd) in reference("black box").items():
-        assert abs(float(idata.posterior[key].mean()) - mean) < 0.6 * sd, key
-
-
 @pytest.mark.parametrize("sampler", [nuts, find_map, prb.minimize])
 def test_fresh_is_refused_by_methods_with_gradients(sampler: Callable[[pm.Model], Any]) -> None:
     with pytest.raises(TypeError, match=r"y: prb.Fresh draws new .*use .*prb.Re"):
@@ -183,14 +176,16 @@ def test_fresh_with_an_epsilon_for_the_run() -> None:
 
 
 @cache
-def predictive(name: str, kind: str, seed: int = 1) -> Floats:
+def predictive(name: str, kind: str) -> Floats:
     """Return data sets, shape (draws, N)."""
-    model = model_of(name)[0]
+    quick = {"model": model_of(name)[0], "random_seed": 1, "compile_kwargs": {"mode": PLAIN}}
     if kind == "prior":
-        group = pm.sample_prior_predictive(40, model=model, random_seed=seed).prior_predictive
+        drawn = pm.sample_prior_predictive(40, **quick)
+        group = drawn.prior_predictive
     else:
-        few = draws_of(name, "prbayes SMC").isel(draw=slice(0, 40))
-        drawn = pm.sample_posterior_predictive(few, model=model, random_seed=seed, **QUIET)
+        posterior = az.from_dict({"posterior": {"mu": np.full((2, 40), MU),
+                                                "sigma": np.full((2, 40), SIGMA)}})  # fmt: skip
+        drawn = pm.sample_posterior_predictive(posterior, **quick, **QUIET)
         group = drawn.posterior_predictive
     assert group["y"].dims[:2] == ("chain", "draw")
     return np.asarray(group["y"].values.reshape(-1, N))
@@ -210,7 +205,8 @@ def test_predictive_draws_are_different_specimens(name: str, kind: str) -> None:
         error = 0.75 * SIGMA / np.sqrt(N)
         np.testing.assert_allclose(within.mean(), 0.75 * SIGMA, rtol=0.08)
         np.testing.assert_allclose(sets.mean(), 0.75 * MU, atol=0.06)
-        assert 0.7 * error < between < 2 * error
+        # Standard error of a standard deviation of 80 data sets: 8 %
+        assert between == pytest.approx(error, rel=0.4)
     # No data set is repeated, and specimens are in no order.
     assert len(np.unique(sets[:, 0])) > 1
     assert len(np.unique(sets.mean(axis=1))) == len(sets)
@@ -220,30 +216,6 @@ def test_predictive_draws_are_different_specimens(name: str, kind: str) -> None:
         bound = model_of(name)[1].bound
         assert MODELS[name][1].count == bound.n_points == POINTS
         assert np.isin(sets, bound.design.sample.values).all()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["Reweighted", "Resimulated"])
-def test_the_same_seed_gives_the_same_prediction(name: str) -> None:
-    first = predictive(name, "prior")
-    predictive.cache_clear()
-    np.testing.assert_array_equal(predictive(name, "prior"), first)
-    assert not np.array_equal(predictive(name, "prior", seed=2), first)
-
-
-@pytest.mark.long
-def test_reweighted_calls_the_response_n_times_in_all() -> None:
-    for sampler in ("NUTS", "batched kernel, two cores", "prbayes SMC"):
-        draws_of("Reweighted", sampler)
-    model, node = model_of("Reweighted")
-    counts = {
-        MODELS["Reweighted"][1].count,
-        node.responses.count,
-        node.bound.n_points,
-        prb.minimize(model).n_responses,
-        draws_of("Reweighted", "prbayes SMC").posterior.attrs["n_responses"],
-    }
-    assert counts == {POINTS}
 
 
 @pytest.mark.parametrize("response", [line, BlackBox()])
@@ -364,14 +336,6 @@ def test_single_precision_is_refused_before_any_response() -> None:
         prb.minimize(model)
 
 
-def _labelled(*labels: Any) -> None:
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        for name, specimens in zip("yz", labels, strict=False):
-            given = {"metric": AREA, "observed": np.arange(3.0), "specimens": specimens}
-            prb.Simulator(name, line, x, propagation=prb.Reweighted(64), **given)
-
-
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
@@ -379,16 +343,17 @@ def _labelled(*labels: Any) -> None:
         ([np.array([0, 1, "1"], dtype=object)], r"y: specimens: got the label '1' and, in y, 1"),
         ((list("abc"), [b"a", b"b", b"c"]), r"z: specimens: got bytes b'a' as a label, expected"),
         ([[0.0, np.nan, 2.0]], "y: specimens: got float nan as a label"),
+        (([0, 1, 2], [0.0, 1.0, 3.0]), None),
+        ((["a", "b", "c"], np.array(["c", "d", "e"], dtype=object)), None),
     ],
 )
-def test_labels_that_only_look_the_same_are_refused(labels: Any, message: str) -> None:
-    with pytest.raises((TypeError, ValueError), match=message):
-        _labelled(*labels)
-
-
-def test_labels_of_equal_numbers_are_the_same() -> None:
-    _labelled([0, 1, 2], [0.0, 1.0, 3.0])
-    _labelled(["a", "b", "c"], np.array(["c", "d", "e"], dtype=object))
+def test_labels_that_only_look_the_same_are_refused(labels: Any, message: str | None) -> None:
+    refusal = pytest.raises((TypeError, ValueError), match=message) if message else nullcontext()
+    with pm.Model(), refusal:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        for name, specimens in zip("yz", labels, strict=False):
+            given = {"metric": AREA, "observed": np.arange(3.0), "specimens": specimens}
+            prb.Simulator(name, line, x, propagation=prb.Reweighted(64), **given)
 
 
 # Simulators of one response.
@@ -422,7 +387,7 @@ def test_simulators_of_one_response_share_the_runs_of_their_design() -> None:
     prb.refine(model, thetas=np.array([[2.0, np.log(0.05)]]))
     assert first.bound.n_points == second.bound.n_points > 128
     assert sum(sizes) == first.bound.n_points
-    assert prb.minimize(model, progressbar=False).search.n_computed == sum(sizes)
+    assert Evaluator.of(model).n_responses == sum(sizes)
 
 
 @pytest.mark.parametrize("propagation", [prb.Resimulated(128), prb.Fresh(128)])
@@ -443,9 +408,8 @@ def test_simulators_of_one_response_share_the_runs_of_a_population(
         np.testing.assert_allclose(separate.discrepancies(thetas, k), together[:, k], rtol=1e-12)
 
 
-@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64)])
-def test_another_constant_is_another_run(propagation: Propagation) -> None:
-    evaluator = Evaluator.of(two_of_one(propagation, second=3.0)[0])
+def test_another_constant_is_another_run() -> None:
+    evaluator = Evaluator.of(two_of_one(prb.Resimulated(64), second=3.0)[0])
     theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.5})[None]
     populations = [evaluator.populations(theta, k) for k in range(2)]
     means = [(values * weights).sum() for values, weights in populations]
