@@ -35,7 +35,7 @@ from pytensor import shared
 from pytensor.compile import function
 from pytensor.compile.mode import Mode, optdb
 from pytensor.compile.sharedvalue import SharedVariable
-from pytensor.gradient import NullTypeGradError, disconnected_grad, grad_undefined
+from pytensor.gradient import NullTypeGradError, disconnected_grad, grad_not_implemented
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node, graph_replace, vectorize_graph
@@ -177,7 +177,7 @@ class Batched(Op):
         outputs[0][0] = 2 * inputs[0]
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        return [grad_undefined(self, 0, inputs[0])]
+        return [grad_not_implemented(self, 0, inputs[0], "none")]
 
 
 _vectorize_node.register(Batched, lambda op, node, *batched: op.make_node(*batched))

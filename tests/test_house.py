@@ -560,7 +560,7 @@ INNER = {
         "pytensor.tensor.variable.TensorVariable",
     },
     "propagation.ops": {
-        "pytensor.gradient.grad_undefined",
+        "pytensor.gradient.grad_not_implemented",
         "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.op.Op",

@@ -405,16 +405,6 @@ class DensitySum(PartSum):
         ]
         return np.concatenate(densities, axis=-1)
 
-    def adjoint(self, projections: Floats, cotangent: Floats) -> Floats:
-        """Return the derivatives for the weights of the sum of `binned` times the cotangent.
-
-        Shapes (n, K), (..., cells) -> (..., n).
-        """
-        total: Any = 0.0
-        for values, cells, place in zip(projections.T, self.cells, self._slices, strict=True):
-            total = total + cells.adjoint(values, cotangent[..., place])
-        return np.asarray(total)
-
     def outer(self, features: Features, shares: Floats, xp: Any) -> Any:
         """Return the sum of the components, in one pass over all cells where possible."""
         (densities,) = features

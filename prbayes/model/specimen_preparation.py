@@ -35,7 +35,12 @@ from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare, response_share
-from prbayes.propagation.specimen_emulation import Emulation, emulate, first_runs
+from prbayes.propagation.specimen_emulation import (
+    Emulation,
+    EmulationProblem,
+    emulate,
+    first_runs,
+)
 from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
 from prbayes.response.budget import RunCost
 from prbayes.response.inputs import aleatory_names
@@ -98,12 +103,10 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     try:
         emulation, points, findings = _emulate(runs, populations, likelihood.shared_emulation)
         refined, share = response_share(
-            runs,
+            _problem(runs),
             emulation,
             populations.prior_specimens,
             lambda share: populations.posterior(points.z, points.log_a, share=share),
-            likelihood.options,
-            name=likelihood.name,
         )
         if refined is not emulation and not _is_partial(likelihood):
             # Specimens beside the failing region have points on its right side now.
@@ -162,6 +165,13 @@ def _is_partial(likelihood: SpecimenLikelihood) -> bool:
     return bool((present.sum(axis=1) < likelihood.coordinates.size).any())
 
 
+def _problem(runs: Runs) -> EmulationProblem:
+    """Return the response and the readings of all simulators of the specimens."""
+    likelihood = runs.likelihood
+    n, options = first_run_count(likelihood), likelihood.options
+    return EmulationProblem(runs, likelihood.readings, options, n=n, name=likelihood.name)
+
+
 def _emulate(
     runs: Runs, populations: Populations, emulation: Emulation | None
 ) -> tuple[Emulation, SpecimenPoints, Sequence[Finding]]:
@@ -169,7 +179,7 @@ def _emulate(
     likelihood = runs.likelihood
     name, options, readings = likelihood.name, likelihood.options, likelihood.readings
     bounds, d = likelihood.coordinates.bounds, likelihood.coordinates.size
-    n = first_run_count(likelihood)
+    problem = _problem(runs)
     if _is_partial(likelihood):
         if likelihood.calls_response:
             raise TypeError(
@@ -177,22 +187,16 @@ def _emulate(
                 "specimens have fewer readings than inputs; leave propagation= out"
             )
         specimens, posterior = populations.prior_specimens(), populations.posterior
-        emulation, points = fibre_points(
-            runs, readings, bounds, specimens, posterior, options, n=n, name=name
-        )
+        emulation, points = fibre_points(problem, bounds, specimens, posterior)
         return emulation, points, _data_findings(likelihood, several_roots=True)
     box = np.stack([-np.ones(d), np.ones(d)])
     if likelihood.calls_response:
-        emulation = Emulation.of_function(runs, box, bounds, readings, options)
-    emulation, roots = emulate(
-        runs, readings, box, bounds, options, n=n, previous=emulation, name=name
-    )
+        emulation = Emulation.of_function(problem, box, bounds)
+    emulation, roots = emulate(problem, box, bounds, emulation)
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
     error, is_known = emulation.error, likelihood.error_is_known
-    points = draw_points(
-        emulation.values, error, readings, roots, emulation.box, options, error_is_known=is_known
-    )
+    points = draw_points(emulation, readings, roots, options, error_is_known=is_known)
     findings: list[Finding] = [
         *_data_findings(likelihood, several_roots=bool((points.n_roots > 1).any())),
         *misfit_findings(name, readings, roots, error),

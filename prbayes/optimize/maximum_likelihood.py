@@ -460,9 +460,7 @@ def specimen_pool(
     options = replace(options, half_difference=options.half_difference * np.sqrt(copies))
     emulation = prepared(likelihood).emulation
     roots = specimen_roots(emulation, readings, options)
-    points = draw_points(
-        emulation.values, emulation.error, readings, roots, emulation.box, options, seed=1
-    )
+    points = draw_points(emulation, readings, roots, options, seed=1)
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
     inputs = likelihood.coordinates.inputs(points.z)
 

@@ -15,7 +15,7 @@ from scipy.special import gammaln, logsumexp, ndtri
 
 from prbayes._validate import Floats
 from prbayes.numerics.points import sobol
-from prbayes.propagation.roots import Response
+from prbayes.propagation.roots import Response, find_roots
 
 Indices = NDArray[np.intp]
 
@@ -152,7 +152,7 @@ class Charts:
     inflation: ClassVar[float] = 1.3
 
     centre: Floats  # (N, C, d)
-    # Orthonormal columns, at first the null space and the row space of the Jacobian at the centre.
+    # Orthonormal columns: the null space and the row space of the Jacobian at the centre.
     free: Floats  # (N, C, d, d - m)
     solved: Floats  # (N, C, d, m)
     location: Floats  # (N, C, d - m): of the t distribution
@@ -258,67 +258,31 @@ def solve_each(matrices: Floats, right: Floats) -> Floats:
 def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
     """Return charts at the modes of the reference population on the fibres.
 
-    At most four for a specimen: modes within 8 nats of the best, and .7 apart from better ones.
+    At most four for a specimen: modes within 8 nats of the best. They minimise |z|^2 / 2 + |(g(z) -
+    y) / .05|^2 / 2, in which the population is the weak term.
     """
     n, m = fibres.y.shape
     d = len(fibres.population.mean)
+
+    def with_inputs(z: Floats) -> tuple[Floats, Floats]:
+        values, jacobian = fibres.outputs(z)
+        identity = np.broadcast_to(np.eye(d), (len(z), d, d))
+        return np.concatenate([values, z], axis=1), np.concatenate([jacobian, identity], axis=1)
+
     first = np.concatenate([np.zeros((1, d)), ndtri(sobol(starts, d, 0))])[:starts]
-    specimen = np.repeat(np.arange(n), starts)
-    z = _levenberg_marquardt(fibres, specimen, np.tile(first, (n, 1)))
-    z, jacobian, converged = fibres.solve(specimen, z)
-    log_normal = -(z**2).sum(axis=1) / 2
-    log_density = np.where(converged, log_normal, -np.inf).reshape(n, starts)
-    best = log_density.max(axis=1)
-
-    order = np.argsort(-log_density, axis=1, kind="stable")
-    modes = np.full((n, min(4, charts), d), np.inf)
-    source = np.full(modes.shape[:2], -1)
-    count = np.zeros(n, dtype=int)
-    for rank in range(starts):
-        row = np.arange(n) * starts + order[:, rank]
-        value = log_density.ravel()[row]
-        distance = np.sqrt(((z[row, None] - modes) ** 2).sum(axis=2)).min(axis=1)
-        accepted = np.isfinite(value) & (value > best - 8) & (distance > 0.7)
-        i = np.flatnonzero(accepted & (count < modes.shape[1]))
-        modes[i, count[i]] = z[row[i]]
-        source[i, count[i]] = row[i]
-        count[i] += 1
-
-    i, slot = np.nonzero(source >= 0)
-    row = source[i, slot]
-    new = _charts_at(fibres, z[row], jacobian[row])
-    return Charts.empty(n, charts, d, m).including(i, slot, new)
-
-
-def _levenberg_marquardt(fibres: Fibres, specimen: Indices, z: Floats) -> Floats:
-    """Minimise |z|^2 + |(g(z) - y) / .05|^2, in which the population is the weak term."""
-    weight = 1 / 0.05
-    y = fibres.y[specimen] * weight
-    z = z.copy()
-    values, jacobian = fibres.outputs(z)
-    residual, slopes = y - values * weight, jacobian * weight
-    cost = (residual**2).sum(axis=1) + (z**2).sum(axis=1)
-    damping = np.full(len(z), 1e-2)
-    active = np.flatnonzero(np.isfinite(cost))
-    for _ in range(25):
-        if not active.size:
-            break
-        transposed = slopes[active].transpose(0, 2, 1)
-        gradient = (transposed @ residual[active][..., None])[..., 0] - z[active]
-        hessian = transposed @ slopes[active]
-        hessian += (1 + damping[active])[:, None, None] * np.eye(z.shape[1])
-        trial = z[active] + solve_each(hessian, gradient)
-        values, jacobian = fibres.outputs(trial)
-        trial_residual = y[active] - values * weight
-        trial_cost = (trial_residual**2).sum(axis=1) + (trial**2).sum(axis=1)
-        better = trial_cost < cost[active]  # False for NaN
-        gain = cost[active] - trial_cost
-        rows = active[better]
-        z[rows], cost[rows] = trial[better], trial_cost[better]
-        residual[rows], slopes[rows] = trial_residual[better], jacobian[better] * weight
-        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10), 1e-6, 1e8)
-        active = active[~(better & (gain < 1e-6))]
-    return z
+    target = np.concatenate([fibres.y, np.zeros((n, d))], axis=1)
+    sd = np.repeat([0.05, 1.0], [m, d])
+    box = np.stack([np.full(d, -12.0), np.full(d, 12.0)])
+    modes = find_roots(with_inputs, target, sd, np.tile(first, (n, 1, 1)), box, gap=8.0)
+    z, jacobian, converged = fibres.solve(modes.specimen, modes.z)
+    log_density = -(z**2).sum(axis=1) / 2
+    rows = np.flatnonzero(converged)
+    rows = rows[np.lexsort((-log_density[rows], modes.specimen[rows]))]
+    specimen = modes.specimen[rows]
+    slot = np.arange(len(rows)) - np.searchsorted(specimen, specimen)
+    rows, specimen, slot = (values[slot < min(4, charts)] for values in (rows, specimen, slot))
+    new = _charts_at(fibres, z[rows], jacobian[rows])
+    return Charts.empty(n, charts, d, m).including(specimen, slot, new)
 
 
 def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:

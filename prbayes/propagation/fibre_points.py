@@ -63,9 +63,8 @@ from prbayes.propagation.charts import (
 from prbayes.propagation.roots import Response
 from prbayes.propagation.specimen_emulation import (
     Emulation,
-    PointOptions,
+    EmulationProblem,
     extended,
-    first_runs,
     half_difference,
     require_accurate,
     spread_out,
@@ -92,44 +91,34 @@ type Posterior = Callable[[Floats, Floats, Floats | None], Draws]
 
 
 def fibre_points(
-    run: Callable[[Floats], Floats],
-    readings: Readings,
-    bounds: Floats,
-    prior_specimens: Floats,
-    posterior: Posterior,
-    options: PointOptions,
-    *,
-    n: int | None = None,
-    seed: int = 0,
-    name: str = "response",
+    problem: EmulationProblem, bounds: Floats, prior_specimens: Floats, posterior: Posterior
 ) -> tuple[Emulation, SpecimenPoints]:
-    """Emulate a response with n first runs, and draw points on the fibres of all specimens.
+    """Emulate a response, and draw points on the fibres of all specimens.
 
-    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response; the middle
-    99 % of the prior predictive population lies within [-1, 1]. ``posterior`` maps points
-    (N, K, d), their numbers (N, K), and None or a covariance by which populations are smoothed, to
-    draws. Raise DesignError if the emulator is too inaccurate, or `most_points` are not enough.
+    The middle 99 % of the prior predictive population lies within [-1, 1] in each coordinate.
+    ``posterior`` maps points (N, K, d), their numbers (N, K), and None or a covariance by which
+    populations are smoothed, to draws. Raise DesignError if the emulator is too inaccurate, or
+    `most_points` are not enough.
     """
+    readings, options, seed = problem.readings, problem.options, problem.seed
     d = bounds.shape[1]
-    n = first_runs(d) if n is None else n
+    n = problem.n_first(d)
     population = ReferencePopulation.from_sample(prior_specimens)
     # Wider than the population by half; even points of a box would be in its corners.
     first = np.clip(population.inputs(1.5 * ndtri(sobol(n, d, seed))), *bounds)
-    emulation = Emulation.first(run, first, bounds, readings, options, name)
+    emulation = Emulation.first(problem, first, bounds)
     rng = np.random.default_rng([seed, 1])
     count, batch_size = 256, max(n // 2, options.fresh)
     for batch in range(6):
-        points, draws = _reliable_draws(
-            emulation, readings, population, posterior, count, options, seed + batch, name
-        )
+        numbered = replace(problem, seed=seed + batch)
+        points, draws = _reliable_draws(emulation, numbered, population, posterior, count)
         count = points.z.shape[1]
         population = ReferencePopulation.from_sample(draws.specimens())
         if batch >= 2 and emulation.bias <= options.bias:
             break
         fresh = _fresh(points, draws, batch_size, bounds, rng)
-        half = batch_size // 2
-        emulation = extended(emulation, run, fresh, readings, options, name, half)
-    require_accurate(emulation, readings, options, name)
+        emulation = extended(emulation, problem, fresh, batch_size // 2)
+    require_accurate(emulation, problem)
     # Points on fibres cost more than those around roots, and their error falls more slowly.
     unit = options.half_difference * _per_hyperparameter(draws)
     count = 128
@@ -144,7 +133,7 @@ def fibre_points(
         if difference <= largest:
             return emulation, replace(joined(*halves), difference=difference)
         if is_last:
-            raise _monte_carlo_error(name, 2 * count, difference, largest)
+            raise _monte_carlo_error(problem.name, 2 * count, difference, largest)
         halves = [
             joined(half, proposal.draw(count, after=count))
             for half, proposal in zip(halves, proposals, strict=True)
@@ -154,13 +143,10 @@ def fibre_points(
 
 def _reliable_draws(
     emulation: Emulation,
-    readings: Readings,
+    problem: EmulationProblem,
     population: ReferencePopulation,
     posterior: Posterior,
     count: int,
-    options: PointOptions,
-    seed: int,
-    name: str,
 ) -> tuple[SpecimenPoints, Draws]:
     """Return points, at first ``count``, and draws at which both halves of the points agree.
 
@@ -168,10 +154,11 @@ def _reliable_draws(
     where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
     narrow the reference population, until it narrows no more; then points are doubled.
     """
+    readings = problem.readings
     free = population.root.shape[0] - int(readings.is_measured.sum(axis=1).min())
     narrows = False
     while True:
-        points = FibreProposals.fitted(emulation, readings, population, seed).draw(count)
+        points = FibreProposals.fitted(emulation, readings, population, problem.seed).draw(count)
         if not narrows:
             draws = posterior(points.z, points.log_a, None)
             halves = slice(count // 2), slice(count // 2, None)
@@ -181,8 +168,8 @@ def _reliable_draws(
             limit = _per_hyperparameter(draws)
             if difference <= limit:
                 return points, draws
-            if 2 * count > options.most_points:
-                raise _monte_carlo_error(name, count, difference, limit)
+            if 2 * count > problem.options.most_points:
+                raise _monte_carlo_error(problem.name, count, difference, limit)
         smoothing = count ** (-2 / (free + 4)) * population.root @ population.root.T
         specimens = posterior(points.z, points.log_a, smoothing).specimens()
         narrow = ReferencePopulation.from_sample(specimens)
@@ -368,7 +355,7 @@ class FibreProposal:
         for block in _blocks(n, points):
             fibres = replace(self.fibres, y=self.fibres.y[block])
             charts = Charts(*(array[block] for array in vars(self.charts).values()))
-            z, log_a[block], *_ = _draw(
+            z, log_a[block], _ = _draw(
                 fibres, charts, points, (1, seed), self.numbers[block], after
             )
             x[block] = fibres.population.inputs(z)
@@ -389,10 +376,8 @@ def fit_fibres(
     """Fit proposals to the fibres of measured outputs y, (N, m) with m < d.
 
     Charts at the modes, more charts until ``tries`` random points of the fibres are covered, then
-    rounds of adaptation to 256 weighted points each. Charts turn in all rounds but the last, before
-    which the cover is repeated: without that, single specimens lacked up to .35 in log L.
-    ``population`` should cover the plausible populations. A specimen has the same points alone as
-    in a batch if its number is the same.
+    rounds of adaptation to 256 weighted points each. ``population`` should cover the plausible
+    populations. A specimen has the same points alone as in a batch if its number is the same.
 
     Examples
     --------
@@ -416,16 +401,10 @@ def fit_fibres(
     parts = [Charts.empty(0, most_charts, d, y.shape[1])]
     for block in _blocks(len(y), 256):
         part, label = replace(fibres, y=fibres.y[block]), numbers[block]
-        charts = charts_at_modes(part, 8, most_charts)
         normal = ndtri(_shifted_sobol(tries, d, (0, seed), label))
-        charts = cover(part, charts, normal)
+        charts = cover(part, charts_at_modes(part, 8, most_charts), normal)
         for r in range(rounds):
-            last = r == rounds - 1
-            if last and r > 0:
-                # Charts that turned end elsewhere; those of the last round keep their directions.
-                charts = cover(part, charts, normal)
-            sample = _draw(part, charts, 256, (2 + r, seed), label)
-            charts = _adapted(charts, sample, turn=not last)
+            charts = _adapted(charts, _draw(part, charts, 256, (2 + r, seed), label))
         parts.append(charts)
     arrays = zip(*(vars(part).values() for part in parts), strict=True)
     return FibreProposal(fibres, Charts(*map(np.concatenate, arrays)), numbers)
@@ -459,9 +438,8 @@ def without_errors(x: Floats, log_a: Floats, m: int) -> tuple[Floats, Floats]:
     return x[..., :-m], log_a + log_normal
 
 
-# Points of n specimens: whitened inputs z, (n, K, d), numbers A, (n, K), charts, (n, K), and
-# Jacobians with respect to z, (n, K, m, d).
-type _Sample = tuple[Floats, Floats, Indices, Floats]
+# Points of n specimens: whitened inputs z, (n, K, d), numbers A, (n, K), and charts, (n, K).
+type _Sample = tuple[Floats, Floats, Indices]
 
 
 def _draw(
@@ -497,28 +475,20 @@ def _draw(
     log_units = log_units - np.log(fibres.unit).sum()
     log_a[rows] = log_units - np.log(points) - log_density
     z = np.where(converged[:, None], z, 0.0)
-    return (
-        z.reshape(n, points, -1),
-        log_a.reshape(n, points),
-        slot.reshape(n, points),
-        np.where(converged[:, None, None], jacobian, 0.0).reshape(n, points, *jacobian.shape[1:]),
-    )
+    return z.reshape(n, points, -1), log_a.reshape(n, points), slot.reshape(n, points)
 
 
-def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
+def _adapted(charts: Charts, sample: _Sample) -> Charts:
     """Return charts with location, scale and share of their weighted points.
 
-    With `turn` the solved directions become the row space of the mean Jacobian, which keeps
-    det(J solved) off zero over more of the fibre. The present values count as 4 (d - m) points.
+    The present values count as 4 (d - m) points.
     """
-    z, log_a, chart, jacobian = sample
-    d, k = charts.free.shape[2:]
-    m = d - k
+    z, log_a, chart = sample
+    k = charts.free.shape[3]
     log_weight = log_a - (z**2).sum(axis=2) / 2
     largest = log_weight.max(axis=1, keepdims=True)
     weight = np.exp(log_weight - np.where(np.isfinite(largest), largest, 0))
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
-    free, solved = charts.free.copy(), charts.solved.copy()
     location, scale = charts.location.copy(), charts.scale.copy()
     share = np.zeros_like(charts.share)
     for c in range(share.shape[1]):
@@ -526,31 +496,14 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
         share[:, c] = w.sum(axis=1)
         i = np.flatnonzero(share[:, c] > 1e-6)
         w = w[i] / share[i, c][:, None]
-        squares = weight[i] ** 2 * (chart[i] == c)
-        size = share[i, c] ** 2 / squares.sum(axis=1)
-
-        turns = (size > d) & turn
-        turned = i[turns]
-        mean_jacobian = np.einsum("nk,nkmd->nmd", w[turns], jacobian[turned])
-        right = np.linalg.svd(mean_jacobian)[2].transpose(0, 2, 1)
-        solved[turned, c] = right[..., :m]
-        free[turned, c] = right[..., m:]
-
-        # Present location and scale in the new directions
-        rotation = free[i, c].transpose(0, 2, 1) @ charts.free[i, c]
-        transposed = rotation.transpose(0, 2, 1)
-        present_location = (rotation @ charts.location[i, c][..., None])[..., 0]
-        root = rotation @ charts.scale[i, c]
-        present = (
-            root @ root.transpose(0, 2, 1) / Charts.inflation + np.eye(k) - rotation @ transposed
-        )
-
-        u = (z[i] - charts.centre[i, None, c]) @ free[i, c]
+        size = 1 / (w**2).sum(axis=1)
         old = (4.0 * k / (size + 4 * k))[:, None]
         new = (size / (size + 4 * k))[:, None]
-        mean = new * (w[:, None, :] @ u)[:, 0] + old * present_location
+        u = (z[i] - charts.centre[i, None, c]) @ charts.free[i, c]
+        mean = new * (w[:, None, :] @ u)[:, 0] + old * charts.location[i, c]
         centred = u - mean[:, None]
         covariance = (centred * w[..., None]).transpose(0, 2, 1) @ centred
+        present = scale[i, c] @ scale[i, c].transpose(0, 2, 1) / Charts.inflation
         covariance = new[..., None] * covariance + old[..., None] * present
         location[i, c] = mean
         scale[i, c] = np.linalg.cholesky(Charts.inflation * covariance)
@@ -558,7 +511,7 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
     share = 0.9 * share + 0.1 * has_chart / np.maximum(has_chart.sum(axis=1, keepdims=True), 1)
     share = np.where(has_chart, share, 0)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-300)
-    return replace(charts, free=free, solved=solved, location=location, scale=scale, share=share)
+    return replace(charts, location=location, scale=scale, share=share)
 
 
 def _shifted_sobol(points: int, dimensions: int, key: tuple[int, int], numbers: Indices) -> Floats:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from pytensor.gradient import grad_undefined
+from pytensor.gradient import grad_not_implemented
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
 
 from prbayes.metrics.base import Basis, Discrepancy
-from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy, DensitySum
+from prbayes.metrics.density import BinnedBasis, DensityDiscrepancy
 from prbayes.metrics.grid import Cells
 from prbayes.response.inputs import broadcast_batch
 from prbayes.response.response import Responses
@@ -24,7 +24,7 @@ from prbayes.response.response import Responses
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
-    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|Binned|OpaqueOp|abc_d)",
+    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|OpaqueOp|abc_d)",
 )
 
 
@@ -34,7 +34,6 @@ class OwnOp(Op):
     __props__: tuple[str, ...] = ()
     event_ndims: Sequence[int] = (1, 1)  # of the inputs: a sample and its weights
     event_shape: tuple[int | None, ...] = ()  # of the result
-    supported: ClassVar[str] = "prb.Reweighted alone; use that,"  # by JAX
     no_gradient: str = ""  # why there is none, and what to do
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -45,7 +44,8 @@ class OwnOp(Op):
         """Return the name, and what to do where a backend has no form of it."""
         return (
             f"{type(self).__name__}, which is computed by NumPy: PyTensor's JAX mode and NumPyro "
-            f"take {self.supported} or nuts_sampler='nutpie' or 'pymc'"
+            "take prb.Reweighted alone, with a smaller max_points for several outputs; use that, "
+            "or nuts_sampler='nutpie' or 'pymc'"
         )
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
@@ -122,15 +122,16 @@ class DensityOp(OwnOp):
         outputs[0][0] = self.cells.density(sample, weights)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Return the derivatives by another operation."""
-        if not self.cells.smooth:
-            raise NotImplementedError(
-                "a Histogram has no gradient under prb.Resimulated: "
-                "use GaussianKDE, or prb.Reweighted"
-            )
+        """Return the derivatives by another operation; a histogram has none for its sample."""
         sample, weights = inputs
-        slope = CotangentOp(self.cells, for_sample=True)(sample, *cotangents)
         value = CotangentOp(self.cells, for_sample=False)(sample, *cotangents)
+        if not self.cells.smooth:
+            reason = (
+                "a Histogram has no gradient under prb.Resimulated: use GaussianKDE, or "
+                "prb.Reweighted"
+            )
+            return [grad_not_implemented(self, 0, sample, reason), value]
+        slope = CotangentOp(self.cells, for_sample=True)(sample, *cotangents)
         return [weights * slope, value]
 
 
@@ -148,45 +149,6 @@ class CotangentOp(OwnOp):
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
         outputs[0][0] = self.cells.adjoint(*inputs, for_sample=self.for_sample)
-
-
-class BinnedOp(OwnOp):
-    """Densities of stored projections, side by side, (n, K), (..., n) -> (..., cells)."""
-
-    __props__ = ("densities",)
-    event_ndims = (2, 1)
-    supported = "several outputs of smaller designs alone; pass prb.Reweighted(max_points=...),"
-
-    def __init__(self, densities: DensitySum) -> None:
-        self.densities = densities
-        self.event_shape = (densities.n_cells,)
-
-    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
-        """Bin and smooth."""
-        outputs[0][0] = self.densities.binned(*inputs)
-
-    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Return the derivatives for the weights by another operation; values are stored."""
-        projections, _ = inputs
-        constant = grad_undefined(self, 0, projections, "stored values do not change")
-        return [constant, BinnedAdjointOp(self.densities)(projections, *cotangents)]
-
-
-class BinnedAdjointOp(OwnOp):
-    """The adjoint of such densities, (n, K), (..., cells) -> (..., n)."""
-
-    __props__ = ("densities",)
-    event_ndims = (2, 1)
-    event_shape = (None,)
-    supported = BinnedOp.supported
-    no_gradient = CotangentOp.no_gradient
-
-    def __init__(self, densities: DensitySum) -> None:
-        self.densities = densities
-
-    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
-        """Gather."""
-        outputs[0][0] = self.densities.adjoint(*inputs)
 
 
 class OpaqueOp(OwnOp):
@@ -216,7 +178,12 @@ def stored_discrepancy(target: Discrepancy, basis: Basis, weights: Any) -> Any:
     if not target.metric.symbolic:
         return OpaqueOp(target)(*basis.arrays, weights)
     if isinstance(basis, BinnedBasis):
-        return target.outer(BinnedOp(basis.densities)(*basis.arrays, weights), xp=pt)
+        (projections,) = basis.arrays
+        densities = [
+            DensityOp(cells)(projections[:, k], weights)
+            for k, cells in enumerate(basis.densities.cells)
+        ]
+        return target.outer(pt.concatenate(densities, axis=-1), xp=pt)
     return target.outer(*basis.features(weights, pt), xp=pt)
 
 

@@ -20,12 +20,16 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp, stdtrit
 
-from prbayes._stats import log_sum_exp
 from prbayes._validate import Floats
 from prbayes.numerics.points import farthest_rows, sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
-from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions, first_runs
+from prbayes.propagation.specimen_emulation import (
+    Coordinates,
+    Emulation,
+    EmulationProblem,
+    first_runs,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,16 +40,13 @@ class ResponseShare:
     log_b: Floats  # (M,): minus the log of the proposal density of z, up to a constant
     with_response: int  # number of points with a response
 
-    def log_share(self, log_p: Floats) -> Floats:
-        """Return log S of log-densities of points, (..., M) -> (...); zero without response."""
-        terms = log_p + self.log_b
-        inside = log_sum_exp(terms[..., : self.with_response])
-        return _log_share(inside, log_sum_exp(terms[..., self.with_response :]))
-
     def of_populations(
         self, density: PopulationDensity, parents: Sequence[Floats], coordinates: Coordinates
     ) -> Floats:
-        """Return log S of the populations at parents, shapes (S, *shape) -> (S,)."""
+        """Return log S of the populations at parents, shapes (S, *shape) -> (S,).
+
+        Zero where the populations have no point with a response.
+        """
         log_b = self.log_b + coordinates.log_jacobian(self.z)
         x = coordinates.inputs(self.z)
         integrals = []
@@ -53,39 +54,33 @@ class ResponseShare:
             of_rows = [v[None, rows] for v in x]
             points = WeightedPoints.of(density.inputs, of_rows, log_b[None, rows])
             integrals.append(density.log_likelihoods(parents, points)[:, 0])
-        return _log_share(*integrals)
-
-
-def _log_share(inside: Floats, outside: Floats) -> Floats:
-    """Return log S of the logs of both integrals, zero where the first one is zero."""
-    is_finite = np.isfinite(inside)
-    return np.where(is_finite, -np.logaddexp(0.0, outside - np.where(is_finite, inside, 0)), 0.0)
+        inside, outside = integrals
+        is_finite = np.isfinite(inside)
+        log_ratio = outside - np.where(is_finite, inside, 0)
+        return np.where(is_finite, -np.logaddexp(0.0, log_ratio), 0.0)
 
 
 def response_share(
-    run: Callable[[Floats], Floats],
+    problem: EmulationProblem,
     emulation: Emulation,
     prior_specimens: Callable[[], Floats],
     posterior: Callable[[ResponseShare | None], Any],
-    options: PointOptions,
     *,
     count: int = 1024,
     batches: int = 6,
-    seed: int = 0,
-    name: str = "response",
 ) -> tuple[Emulation, ResponseShare | None]:
     """Return the points of the share, and the emulation with runs at the failing region's boundary.
 
     None where the share changes the log-likelihood of no plausible population by more than the
-    error of the points of the specimens. ``run`` maps coordinates (n, d) to outputs (n, m), NaN
-    where there is no response. ``posterior`` maps a share to draws of the hyperparameters, with
-    ``log_share(share)``, (S,), and ``specimens()``, (n, d). Each half has ``count`` points at
-    first, and there are at most ``batches`` batches of runs at the boundary.
+    error of the points of the specimens. ``posterior`` maps a share to draws of the
+    hyperparameters, with ``log_share(share)``, (S,), and ``specimens()``, (n, d). Each half has
+    ``count`` points at first, and there are at most ``batches`` batches of runs at the boundary.
 
     Raise DesignError if boundary or points do not determine the share.
     """
     if not np.isnan(emulation.y).any():
         return emulation, None
+    seed, name, options = problem.seed, problem.name, problem.options
     largest = options.half_difference
     draws = posterior(None)
 
@@ -102,7 +97,7 @@ def response_share(
         previous = draws.log_share(share)
         if len(fresh):
             z = np.concatenate([emulation.z, fresh])
-            y = np.concatenate([emulation.y, run(fresh)])
+            y = np.concatenate([emulation.y, problem.run(fresh)])
             emulation = replace(emulation, z=z, y=y)
         share = draw(count, 0)
         change = float(np.std(draws.log_share(share) - previous))

@@ -63,6 +63,23 @@ def first_runs(dimensions: int) -> int:
     return 64 if dimensions <= 2 else 128 if dimensions <= 4 else 480
 
 
+@dataclass(frozen=True, eq=False)
+class EmulationProblem:
+    """A response to emulate for measured specimens."""
+
+    # Coordinates (n, d) -> outputs (n, m), NaN where there is no response.
+    run: Callable[[Floats], Floats]
+    readings: Readings
+    options: PointOptions = PointOptions()
+    n: int | None = None  # number of first runs
+    seed: int = 0
+    name: str = "response"
+
+    def n_first(self, dimensions: int) -> int:
+        """Return the number of first runs."""
+        return first_runs(dimensions) if self.n is None else self.n
+
+
 class Surface(Protocol):
     """Outputs (k, m) at coordinates (k, d) between runs, with their Jacobian (k, m, d)."""
 
@@ -107,39 +124,25 @@ class Emulation:
     range: Floats  # (2, d): of the roots at which runs were made
 
     @classmethod
-    def first(
-        cls,
-        run: Callable[[Floats], Floats],
-        z: Floats,
-        box: Floats,
-        readings: Readings,
-        options: PointOptions,
-        name: str,
-    ) -> Emulation:
+    def first(cls, problem: EmulationProblem, z: Floats, box: Floats) -> Emulation:
         """Return the emulation of runs at first points."""
-        y = run(z)
-        surface, left_out, is_near = surface_near(z, y, readings, name)
+        y = problem.run(z)
+        surface, left_out, is_near = surface_near(z, y, problem.readings, problem.name)
         rms = np.sqrt((left_out[is_near] ** 2).mean(axis=0))
-        error = np.maximum(2 * rms, options.floor * readings.spread())
+        error = np.maximum(2 * rms, problem.options.floor * problem.readings.spread())
         infinite = np.full(z.shape[1], np.inf)
         return cls(z, y, box, surface, error, np.inf, np.stack([infinite, -infinite]))
 
     @classmethod
-    def of_function(
-        cls,
-        run: Callable[[Floats], Floats],
-        box: Floats,
-        search_box: Floats,
-        readings: Readings,
-        options: PointOptions,
-    ) -> Emulation:
+    def of_function(cls, problem: EmulationProblem, box: Floats, search_box: Floats) -> Emulation:
         """Return the response itself in place of an emulator, with runs as starts of a search."""
         d = box.shape[1]
         z = box[0] + (box[1] - box[0]) * sobol(first_runs(d), d, 0)
-        error = options.floor * readings.spread()
+        error = problem.options.floor * problem.readings.spread()
         infinite = np.full(d, np.inf)
         whole = np.stack([-infinite, infinite])
-        return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
+        surface = DifferencedResponse(problem.run)
+        return cls(z, problem.run(z), search_box, surface, error, 0.0, whole)
 
     def covers(self, z: Floats) -> bool:
         """Return whether points lie in the range of the roots at which runs were made."""
@@ -184,29 +187,23 @@ class Emulation:
 
 
 def emulate(
-    run: Callable[[Floats], Floats],
-    readings: Readings,
+    problem: EmulationProblem,
     box: Floats,
     search_box: Floats,
-    options: PointOptions,
-    *,
-    n: int | None = None,
     previous: Emulation | None = None,
-    seed: int = 0,
-    name: str = "response",
 ) -> tuple[Emulation, Roots]:
     """Fit the emulator: runs over a box, then batches at the roots until the bias is small.
 
-    ``run`` maps coordinates (n, d) to outputs (n, m), NaN where there is no response. The first n
-    runs are in ``box``. ``previous`` is the emulation of the same response for other data. Raise
-    DesignError if the response cannot be emulated well enough.
+    ``previous`` is the emulation of the same response for other data. Raise DesignError if the
+    response cannot be emulated well enough.
     """
+    readings, options, seed = problem.readings, problem.options, problem.seed
     d = box.shape[1]
-    n = first_runs(d) if n is None else n
+    n = problem.n_first(d)
     emulation = previous
     if emulation is None:
         first = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
-        emulation = Emulation.first(run, first, search_box, readings, options, name)
+        emulation = Emulation.first(problem, first, search_box)
     rng = np.random.default_rng([seed, 1])
     for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
@@ -222,23 +219,21 @@ def emulate(
                 break
         count = max(n // 2, options.fresh)
         fresh = spread_out(roots.z, emulation.box, count, options.fresh, rng)
-        emulation = extended(emulation, run, fresh, readings, options, name)
+        emulation = extended(emulation, problem, fresh)
     else:
         roots = specimen_roots(emulation, readings, options)
     roots = _all_roots(emulation, readings, options, roots, seed)
-    require_accurate(emulation, readings, options, name)
+    require_accurate(emulation, problem)
     return emulation, roots
 
 
-def require_accurate(
-    emulation: Emulation, readings: Readings, options: PointOptions, name: str
-) -> None:
+def require_accurate(emulation: Emulation, problem: EmulationProblem) -> None:
     """Raise if the emulator's error is as large as the data's scatter, or shifts populations."""
     rough = (
         "the response is not smooth enough for prb.LogLikelihood(): use "
         "metric=prb.ProbabilityResidual(), or more first runs with propagation=prb.Reweighted(n)"
     )
-    scatter = readings.robust_spread()
+    name, options, scatter = problem.name, problem.options, problem.readings.robust_spread()
     if (emulation.error > scatter).any():
         raise DesignError(
             f"{name}: got an emulator with errors of {emulation.error} at the specimens, expected "
@@ -287,23 +282,18 @@ def _laplace(roots: Roots, box: Floats) -> tuple[NDArray[np.intp], Floats, Float
 
 
 def extended(
-    emulation: Emulation,
-    run: Callable[[Floats], Floats],
-    fresh: Floats,
-    readings: Readings,
-    options: PointOptions,
-    name: str,
-    sampled: int | None = None,
+    emulation: Emulation, problem: EmulationProblem, fresh: Floats, sampled: int | None = None
 ) -> Emulation:
     """Return the emulation with runs at fresh points, whose misfit gives its error and bias.
 
     With `sampled` the misfit is the left-out error of the new emulator at so many first points.
     """
+    readings, options = problem.readings, problem.options
     values, jacobian = emulation.surface(fresh)
-    outputs = run(fresh)
+    outputs = problem.run(fresh)
     z = np.concatenate([emulation.z, fresh])
     y = np.concatenate([emulation.y, outputs])
-    surface, left_out, _ = surface_near(z, y, readings, name)
+    surface, left_out, _ = surface_near(z, y, readings, problem.name)
     misfit = outputs - values if sampled is None else left_out[len(emulation.z) :]
     good = np.isfinite(misfit).all(axis=1)
     error, bias = emulation.error, np.inf

@@ -9,7 +9,7 @@ Papadimas and Dodwell (2021), doi:10.1017/dce.2021.20, integrate over the inputs
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
@@ -31,7 +31,7 @@ from prbayes.propagation.population_density import (
     normal_log_density,
 )
 from prbayes.propagation.roots import Roots, rows_by_specimen
-from prbayes.propagation.specimen_emulation import PointOptions, half_difference
+from prbayes.propagation.specimen_emulation import Emulation, PointOptions, half_difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +84,9 @@ class _Components:
 
 
 def draw_points(
-    emulation: Callable[[Floats], Floats],
-    error: Floats,
+    emulation: Emulation,
     readings: Readings,
     roots: Roots,
-    box: Floats,
     options: PointOptions,
     *,
     error_is_known: bool = True,
@@ -96,13 +94,12 @@ def draw_points(
 ) -> SpecimenPoints:
     """Draw points around all roots until two independent halves of them agree.
 
-    ``emulation`` maps coordinates (k, d) to outputs (k, m), with the standard deviation ``error``.
     If ``error_is_known``, the weights around the root of certain readings are scaled to its mass,
     which 256 points measure; otherwise the error of the readings is approximate. Raise DesignError
     if `most_points` are not enough.
     """
-    sampler = _PointSampler(emulation, error, readings, options.degrees)
-    components = _fit_components(sampler, roots, box, seed)
+    sampler = _PointSampler(emulation, readings, options.degrees)
+    components = _fit_components(sampler, roots, seed)
     is_certain = np.isfinite(components.log_mass).all()
     count = options.points * (1 if is_certain and error_is_known else 16)
     scales = (1.0,) if error_is_known else (0.125, 0.25, 0.5, 1.0, 1.3)
@@ -169,7 +166,7 @@ def _log_likelihoods(sample: SpecimenPoints, populations: Sequence[Normal]) -> F
 
 
 def _fit_components(
-    sampler: _PointSampler, roots: Roots, box: Floats, seed: int, share: float = 0.1
+    sampler: _PointSampler, roots: Roots, seed: int, share: float = 0.1
 ) -> _Components:
     """Return a t component for each root, fitted to the readings' density around it.
 
@@ -178,7 +175,8 @@ def _fit_components(
     specimen given a population twice as wide. A component or a reading that is uncertain by this
     share of the scatter has no mass: see `_normalised`.
     """
-    d = roots.z.shape[1] if len(roots.z) else box.shape[1]
+    box = sampler.emulation.box
+    d = box.shape[1]
     precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
     precision = precision + np.diag(4.0 / (box[1] - box[0]) ** 2)
     scale = np.linalg.cholesky(1.5 * np.linalg.inv(precision))
@@ -198,7 +196,7 @@ def _fit_components(
         if is_pulled:
             ranked = _given_population(ranked, mean, 4 * covariance)
         is_wide = (_sd(ranked) > share * scatter).any(axis=1)
-        sd = subset.readings.comparison_sd(sampler.error)
+        sd = subset.readings.comparison_sd(sampler.emulation.error)
         is_noisy = (sd > share * readings.spread()) & subset.readings.is_measured
         is_uncertain = (is_noisy | subset.readings.is_censored).any(axis=1)
         has_mass = ~(is_wide | is_uncertain[ranked.specimen])
@@ -310,8 +308,7 @@ def _moment_matched(
 class _PointSampler:
     """Points of the readings, weighted by the mixture over the components of a specimen."""
 
-    emulation: Callable[[Floats], Floats]
-    error: Floats  # (m,): standard deviation of the emulator's error
+    emulation: Emulation
     readings: Readings
     degrees: float  # of the t distributions
 
@@ -330,7 +327,8 @@ class _PointSampler:
         z = components.center[:, None] + normal @ components.root.swapaxes(1, 2)
         flat = z.reshape(-1, d)
         starts = range(0, len(flat), IN_CACHE)
-        values = np.concatenate([self.emulation(flat[k : k + IN_CACHE]) for k in starts])
+        blocks = [self.emulation.values(flat[k : k + IN_CACHE]) for k in starts]
+        values = np.concatenate(blocks)
         # By specimen.
         filled = np.maximum(table, 0)
         z_all = z[filled].reshape(n, slots * count, d)
@@ -351,12 +349,13 @@ class _PointSampler:
         log_proposal = log_sum_exp(log_q.swapaxes(1, 2)) + np.log(count)
         exists = np.repeat(table >= 0, count, axis=1)
         log_proposal = np.where(exists, log_proposal, np.inf)
-        log_a = self.readings.log_density(outputs, self.error) - log_proposal
+        log_a = self.readings.log_density(outputs, self.emulation.error) - log_proposal
         return SpecimenPoints(z_all, outputs, log_a, log_proposal, (table >= 0).sum(axis=1))
 
     def with_error(self, points: SpecimenPoints, factor: float) -> SpecimenPoints:
         """Return points with the weights of a reading error that is larger by a factor."""
-        log_density = self.readings.scaled(factor).log_density(points.outputs, self.error)
+        readings, error = self.readings.scaled(factor), self.emulation.error
+        log_density = readings.log_density(points.outputs, error)
         return replace(points, log_a=log_density - points.log_proposal)
 
 

@@ -322,16 +322,3 @@ def test_a_surface_is_compared_on_itself() -> None:
         beside = metric.with_design(target, other, inputs)
         assert len(beside.parts) == len(target.parts) == 10
         assert beside(other) == target(other)
-
-
-def test_the_adjoint_of_binned_densities_is_their_transpose() -> None:
-    """<B w, c> = <w, B' c> for the densities of projections that are computed at each call."""
-    rng = np.random.default_rng(3)
-    target = Joint(KullbackLeibler()).against(rng.normal(size=(30, 2)))
-    basis: Any = target.basis(rng.normal(size=(50, 2)), 0.0)
-    (projections,) = basis.arrays
-    weights = rng.dirichlet(np.ones(50))
-    (densities,) = basis.features(weights)
-    cotangent = rng.normal(size=densities.shape)
-    gradient = basis.densities.adjoint(projections, cotangent)
-    assert densities @ cotangent == pytest.approx(weights @ gradient, rel=1e-10)

@@ -96,15 +96,6 @@ def test_arguments_that_all_propagations_check(kind: Any) -> None:
             kind(**keywords)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_missing_shares_of_a_normal_population(kind: Any) -> None:
-    found = bound(kind(128), response)
-    missing = found.missing(at([1.0], [1.0]))
-    # With five standard errors of 128 random draws.
-    assert abs(missing.lost[0] - 0.159) < 0.16
-    assert abs(missing.failed[0] - 0.159 / 0.841) < 0.18
-
-
 def test_missing_shares_of_weighted_values() -> None:
     values, weights = np.full((1, 10), 1.0), np.full((1, 10), 0.1)
     values[0, :2], values[0, 2:6] = np.nan, np.inf

@@ -207,19 +207,3 @@ def test_another_coarse_response_is_another_problem() -> None:
     assert "coarse=test_another_coarse_response" in first.propagation
     assert first.propagation == changed.propagation
     assert first.discrepancies != changed.discrepancies
-
-
-@pytest.mark.long
-def test_an_optimum_is_that_of_many_runs() -> None:
-    few = prb.minimize(build(), starts=0, progressbar=False)
-    with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), pm.LogNormal("sa", 0, 0.5))
-        b = pm.Normal.dist(1.0, 0.6)
-        prb.Simulator(
-            "y", fine, a, b, metric=prb.KullbackLeibler(), observed=OBSERVED,
-            propagation=prb.Resimulated(2**14),
-        )  # fmt: skip
-    many = prb.minimize(model, start=few.point, starts=0, progressbar=False)
-    assert few.n_responses == 64
-    away = (few.theta - many.theta) / np.sqrt(np.diag(many.covariance))
-    assert np.abs(away).max() < 0.1

@@ -16,7 +16,7 @@ from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.charts import ReferencePopulation
 from prbayes.propagation.fibre_points import fibre_points, fit_fibres, with_errors, without_errors
-from prbayes.propagation.specimen_emulation import Emulation, PointOptions
+from prbayes.propagation.specimen_emulation import Emulation, EmulationProblem, PointOptions
 from prbayes.propagation.specimen_points import SpecimenPoints
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
@@ -36,15 +36,35 @@ def linear(a: Array) -> Any:
     return lambda x: (x @ a.T, np.broadcast_to(a, (len(x), *a.shape)))
 
 
-def log_normal(x: Array, mean: Array, sd: Array) -> Array:
-    z = (x - mean) / sd
-    return -(z**2).sum(axis=-1) / 2 - np.log(sd).sum() - len(mean) / 2 * np.log(2 * np.pi)
+@dataclass(frozen=True)
+class NormalDraws:
+    """Draws of the means and standard deviations of independent normal inputs."""
+
+    means: Floats  # (S, d)
+    sds: Floats  # (S, d)
+
+    @property
+    def thetas(self) -> Floats:
+        return np.concatenate([self.means, self.sds], axis=1)
+
+    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
+        standard = (z - self.means[:, None, None]) / self.sds[:, None, None]
+        log_p = -0.5 * (standard**2).sum(axis=-1) - z.shape[-1] / 2 * np.log(2 * np.pi)
+        log_p -= np.log(self.sds).sum(axis=1)[:, None, None]
+        return np.asarray(logsumexp(log_p + log_a, axis=2))
+
+    def specimens(self) -> Floats:
+        rng = np.random.default_rng(0)
+        z = self.means + self.sds * rng.standard_normal((64, *self.means.shape))
+        return z.reshape(-1, self.means.shape[1])
+
+    def posterior(self, z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
+        return self
 
 
 def log_likelihoods(points: tuple[Array, Array], mean: Array, sd: Array) -> Array:
     """Return log p(y_i | theta) for independent normal inputs, (N,)."""
-    x, log_a = points
-    return np.asarray(logsumexp(log_normal(x, mean, sd) + log_a, axis=1))
+    return NormalDraws(mean[None], sd[None]).log_likelihoods(*points)[0]
 
 
 @dataclass(frozen=True)
@@ -150,7 +170,7 @@ def test_proposals_of_different_seeds_agree_on_fibres_with_turns() -> None:
             population.mean,
             np.diag(population.root),
         )
-        for seed in range(6)
+        for seed in range(3)
     ]
     away = values - np.mean(values, axis=0)
     assert np.abs(away).max() < 5 * 0.0022  # standard error from seeds .0022
@@ -233,18 +253,10 @@ def test_specimens_without_a_root_are_values() -> None:
     assert np.isfinite(x).all()
     others = fit_fibres(p.response, y[::2], p.reference, numbers=np.array([0, 2])).draw(64, seed=1)
     np.testing.assert_allclose(log_a[::2], others[1], atol=1e-7)
-
-
-@pytest.mark.parametrize("response", ["nothing", "constant"])
-def test_responses_without_any_root(response: str) -> None:
-    fill = np.nan if response == "nothing" else 1.0
-    for n in (0, 2):
-        _, log_a = fit_fibres(
-            lambda x: (np.full((len(x), 2), fill), np.zeros((len(x), 2, 3))),
-            np.zeros((n, 2)),
-            ReferencePopulation(np.zeros(3), np.eye(3)),
-        ).draw(8, seed=0)
-        assert log_a.shape == (n, 8)
+    # A response without a value, or without influence
+    for fill in (np.nan, 1.0):
+        constant = lambda x, fill=fill: (np.full((len(x), 1), fill), np.zeros((len(x), 1, 2)))  # noqa: E731
+        _, log_a = fit_fibres(constant, np.zeros((2, 1)), p.reference).draw(8, seed=0)
         assert np.isneginf(log_a).all()
 
 
@@ -280,32 +292,6 @@ def test_a_population_of_a_sample_has_its_moments_in_any_units() -> None:
 N = 8
 
 
-@dataclass(frozen=True)
-class NormalDraws:
-    """Draws of the means and standard deviations of independent normal inputs."""
-
-    means: Floats  # (S, d)
-    sds: Floats  # (S, d)
-
-    @property
-    def thetas(self) -> Floats:
-        return np.concatenate([self.means, self.sds], axis=1)
-
-    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
-        standard = (z - self.means[:, None, None]) / self.sds[:, None, None]
-        log_p = -0.5 * (standard**2).sum(axis=-1) - z.shape[-1] / 2 * np.log(2 * np.pi)
-        log_p -= np.log(self.sds).sum(axis=1)[:, None, None]
-        return np.asarray(logsumexp(log_p + log_a, axis=2))
-
-    def specimens(self) -> Floats:
-        rng = np.random.default_rng(0)
-        z = self.means + self.sds * rng.standard_normal((64, *self.means.shape))
-        return z.reshape(-1, self.means.shape[1])
-
-    def posterior(self, z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
-        return self
-
-
 def draws_of(d: int, mean_sd: float = 0.03, sd: float = 0.15, size: int = 16) -> NormalDraws:
     """Return populations around a mean of .1, by default as 30 specimens determine them."""
     rng = np.random.default_rng(d)
@@ -325,13 +311,10 @@ def points_of(
 ) -> tuple[Emulation, SpecimenPoints]:
     d = draws.means.shape[1]
     prior = 0.4 * np.random.default_rng(1).standard_normal((2048, d))
-    settings = {"n": 16 * d + 32, "seed": 0} | options
-    most = settings.pop("most_points", PointOptions().most_points)
-    options_of_points = PointOptions(most_points=most)
+    settings = {"n": 16 * d + 32} | options
     bounds = np.stack([prior.min(axis=0), prior.max(axis=0)])
-    return fibre_points(
-        response, readings, bounds, prior, draws.posterior, options_of_points, **settings
-    )
+    problem = EmulationProblem(response, readings, **settings)
+    return fibre_points(problem, bounds, prior, draws.posterior)
 
 
 def linear_response(d: int, m: int) -> tuple[Floats, Callable[[Floats], Floats]]:
@@ -358,22 +341,7 @@ def errors(points: SpecimenPoints, exact: Floats, draws: NormalDraws) -> Floats:
 
 
 # Standard errors of log L: largest root mean square error of a specimen and population, six seeds.
-LINEAR = {(2, 1): 2.5e-3, (4, 2): 1.2e-2}
 PATTERNS = {(2, 0.1): 1.1e-2, (3, 0.0): 2.5e-2}
-
-
-@pytest.mark.parametrize(("d", "m"), LINEAR)
-def test_a_linear_response_of_normal_inputs(d: int, m: int) -> None:
-    draws = draws_of(d)
-    a, response = linear_response(d, m)
-    readings = Readings.exact(response(specimens_of(draws)))
-    _, points = points_of(response, readings, draws)
-    assert points.z.shape == (N, 256, d)
-    assert points.outputs.shape == (N, 256, m)
-    assert points.difference <= 0.15
-    assert np.abs(points.outputs - readings.values[:, None]).max() < 1e-3
-    error = errors(points, linear_log_likelihoods(a, readings, draws), draws)
-    assert np.abs(error).max() < 5 * LINEAR[d, m]
 
 
 def patterned(y: Floats) -> Floats:
@@ -393,6 +361,11 @@ def test_patterns_of_missing_outputs(d: int, size: float) -> None:
     y += size * np.random.default_rng(3).standard_normal(y.shape)
     readings = replace(Readings.exact(patterned(y)), error=np.full(y.shape, size))
     _, points = points_of(response, readings, draws)
+    assert points.z.shape == (N, 256, d)
+    assert points.difference <= 0.15
+    if size == 0:
+        away = np.abs(points.outputs - readings.values[:, None])
+        assert np.nanmax(away) < 1e-3
     error = errors(points, linear_log_likelihoods(a, readings, draws), draws)
     assert np.abs(error).max() < 5 * PATTERNS[d, size]
 
@@ -442,7 +415,7 @@ def test_points_are_doubled_until_both_halves_agree() -> None:
     error = errors(points, linear_log_likelihoods(a, readings, draws), draws).sum(axis=1)
     assert error.std() < 0.15
     with pytest.raises(DesignError, match=r"got two halves of 256 points .*ProbabilityResidual"):
-        points_of(lambda z: z @ a.T, readings, draws, most_points=256)
+        points_of(lambda z: z @ a.T, readings, draws, options=PointOptions(most_points=256))
 
 
 @dataclass(frozen=True)

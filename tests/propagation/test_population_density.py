@@ -19,7 +19,6 @@ from prbayes.propagation.population_density import (
     PopulationDensity,
     WeightedPoints,
 )
-from prbayes.response.compile import PLAIN, compile_batched
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs, read_inputs
 
@@ -38,6 +37,14 @@ FAMILIES: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "exponential": (
         lambda a, b: pm.Exponential.dist(a * b),
         lambda a, b: stats.expon(0, 1 / a / b),
+    ),
+    "half-normal": (
+        lambda a, b: pm.HalfNormal.dist(a * b),
+        lambda a, b: stats.halfnorm(scale=a * b),
+    ),
+    "truncated": (
+        lambda a, b: pm.TruncatedNormal.dist(a, b, lower=-1.0),
+        lambda a, b: stats.truncnorm((-1 - a) / b, np.inf, a, b),
     ),
 }
 
@@ -76,7 +83,9 @@ def test_families_are_those_of_scipy(name: str) -> None:
     found = log_likelihoods(inputs, roots, [X], LOG_A)
     assert ExponentialForm.of(inputs.aleatory, [X.ravel()]) is not None
     logs = np.stack([of_scipy(a, b).logpdf(X) for a, b in zip(FIRST, SECOND, strict=True)])
-    assert np.allclose(found, logsumexp(logs + LOG_A, axis=2), rtol=1e-12, atol=1e-12)
+    # The normaliser of a truncated distribution has fewer digits in PyMC.
+    digits = 1e-8 if name == "truncated" else 1e-12
+    np.testing.assert_allclose(found, logsumexp(logs + LOG_A, axis=2), rtol=digits, atol=digits)
     assert np.allclose(found, by_graph(inputs, roots, [X], LOG_A), rtol=1e-12, atol=1e-12)
     # Invalid parameters, and points outside of the support, have no density.
     roots = by_name(inputs, {"a0": np.ones(4), "b0": np.array([-1.0, 0.0, np.nan, 1.0])})
@@ -134,12 +143,11 @@ def test_other_families_have_their_graph() -> None:
     assert np.allclose(log_likelihoods(inputs, roots, [X], LOG_A), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("gross_errors", [False, True])
-def test_an_evaluator_has_the_log_likelihood_of_pymc(gross_errors: bool) -> None:
+def test_an_evaluator_has_the_log_likelihood_of_pymc() -> None:
     observed = [0.0, 1.0, 2.0, 4.0, 5.0, 3.0, 2.5, 9.0]
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        metric = prb.LogLikelihood(gross_errors=gross_errors)
+        metric = prb.LogLikelihood(gross_errors=True)
         prb.Simulator("y", lambda x: 2 * x, x, metric=metric, observed=observed)
     evaluator = Evaluator.of(model)
     thetas = evaluator.hyperparameters.prior_points(16, 0)
@@ -147,50 +155,6 @@ def test_an_evaluator_has_the_log_likelihood_of_pymc(gross_errors: bool) -> None
     expected = graphs(thetas)[0]
     assert np.allclose(specimen_log_likelihoods(evaluator, thetas)["y"], expected, rtol=1e-11)
     assert np.allclose(evaluator.log_other(thetas), expected.sum(axis=1), rtol=1e-11)
-
-
-COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
-# Constructor with two parameters, and ranges of these.
-FORMS = {
-    "normal": (pm.Normal.dist, (-1, 1), (0.5, 2)),
-    "half-normal": (lambda _, s: pm.HalfNormal.dist(s), (0, 1), (0.5, 2)),
-    "truncated": (lambda m, s: pm.TruncatedNormal.dist(m, s, lower=-2), (-1, 1), (0.5, 2)),
-    "lognormal": (pm.LogNormal.dist, (-1, 1), (0.5, 1)),
-    "gamma": (lambda a, b: pm.Gamma.dist(alpha=a, beta=b), (1, 4), (0.5, 2)),
-    "inverse gamma": (lambda a, b: pm.InverseGamma.dist(alpha=a, beta=b), (3, 5), (0.5, 2)),
-    "beta": (lambda a, b: pm.Beta.dist(a, b), (1, 4), (1, 4)),
-    "exponential": (lambda _, b: pm.Exponential.dist(b), (0, 1), (0.5, 2)),
-    "vector": (lambda m, s: pm.Normal.dist(pt.stack([m, -m]), s), (-1, 1), (0.5, 2)),
-    "correlated": (
-        lambda m, s: pm.MvNormal.dist(pt.stack([m, 0.0]), s * COVARIANCE),
-        (-1, 1),
-        (0.5, 2),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", FORMS)
-def test_the_matrix_form_equals_the_density(name: Any) -> None:
-    dist, *ranges = FORMS[name]
-    rng = np.random.default_rng(0)
-    parameters = rng.uniform(*np.transpose(ranges), size=(5, 2))
-    middle = dist(*np.mean(ranges, axis=1))
-    points = pm.draw(middle, 200, random_seed=1, mode=PLAIN)
-    symbols = pt.dscalars("first", "second")
-    given = pt.tensor(dtype="float64", shape=(None,) * points.ndim)
-    logp = pm.logp(dist(*symbols), given, warn_rvs=False)
-    log_density = compile_batched(
-        symbols, [logp.reshape((given.shape[0], -1)).sum(axis=1)], [given]
-    )
-
-    form = ExponentialForm.of([middle], [points])
-
-    assert form is not None
-    (at_anchors,) = log_density(*parameters.T, *form.anchors)
-    (expected,) = log_density(*parameters.T, points)
-    natural, is_rounded = form.natural_parameters(at_anchors)
-    assert not is_rounded.any()
-    np.testing.assert_allclose(natural @ form.statistics, expected, atol=1e-11)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
 from scipy.stats import norm
 
@@ -14,11 +15,12 @@ from prbayes._validate import Floats
 from prbayes.metrics.readings import Readings
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.response_share import ResponseShare, boundary_points, response_share
-from prbayes.propagation.specimen_emulation import Emulation, PointOptions
+from prbayes.propagation.specimen_emulation import Coordinates, Emulation, EmulationProblem
+from prbayes.response.inputs import read_inputs
 
 LIMIT = 0.15
-OPTIONS = PointOptions()
 
 
 def half_space(z: Floats) -> Floats:
@@ -26,10 +28,25 @@ def half_space(z: Floats) -> Floats:
     return np.where(z.mean(axis=1, keepdims=True) > LIMIT, np.nan, z[:, :1])
 
 
-def emulation_of(run: object, d: int, n: int = 64) -> Emulation:
+def problem_of(run: Callable[[Floats], Floats]) -> EmulationProblem:
+    return EmulationProblem(run, Readings.exact(np.linspace(-0.3, 0.1, 20)[:, None]))
+
+
+def emulation_of(run: Callable[[Floats], Floats], d: int) -> Emulation:
     box = np.stack([-np.ones(d), np.ones(d)])
-    y = Readings.exact(np.linspace(-0.3, 0.1, 20)[:, None])
-    return Emulation.first(run, 2 * sobol(n, d, 0) - 1, box, y, OPTIONS, "y")  # type: ignore[arg-type]
+    return Emulation.first(problem_of(run), 2 * sobol(64, d, 0) - 1, box)
+
+
+def log_share(share: ResponseShare, dist: Callable[..., Any], *parents: Floats) -> Floats:
+    """Return log S of populations of one input with the given parents, in coordinates z."""
+    d = share.z.shape[1]
+    with pm.Model() as model:
+        symbols = [pm.Flat(f"p{i}", shape=x.shape[1:]) for i, x in enumerate(parents)]
+        inputs = read_inputs("y", [dist(*symbols, shape=d)], model)
+    ends = np.stack([np.full(d, -np.inf), np.full(d, np.inf)])
+    identity = Coordinates(((d,),), np.zeros(d, dtype=bool), np.zeros(d), np.ones(d), ends)
+    values = [parents[symbols.index(parent)] for parent in inputs.parents]
+    return share.of_populations(PopulationDensity(inputs), values, identity)
 
 
 @dataclass(frozen=True)
@@ -41,8 +58,7 @@ class Populations:
     n: int = 20
 
     def log_share(self, share: ResponseShare) -> Floats:
-        log_p = norm.logpdf(share.z, self.means[:, None], self.sds[:, None, None]).sum(axis=-1)
-        return self.n * share.log_share(log_p)
+        return self.n * log_share(share, pm.Normal.dist, self.means, self.sds)
 
     def specimens(self) -> Floats:
         u = np.random.default_rng(1).standard_normal((64, *self.means.shape))
@@ -67,7 +83,7 @@ def shared(
     emulation = emulation_of(run, d)
     z = 0.5 * np.random.default_rng(3).standard_normal((1000, d))  # specimens of the prior
     after, share = response_share(
-        run, emulation, lambda: z, lambda _: populations, OPTIONS, batches=batches
+        problem_of(run), emulation, lambda: z, lambda _: populations, batches=batches
     )
     return emulation, after, share
 
@@ -117,10 +133,11 @@ def test_a_boundary_that_is_random_is_refused() -> None:
         shared(random, plausible(1, 0.0), 1, batches=2)
 
 
-def test_populations_without_a_point_have_no_share() -> None:
-    share = ResponseShare(np.zeros((2, 1)), np.zeros(2), 1)
-    nothing = np.array([-np.inf, -np.inf])
-    assert share.log_share(nothing) == 0.0
-    assert share.log_share(np.array([0.0, -np.inf])) == 0.0
-    assert share.log_share(np.array([0.0, 0.0])) == pytest.approx(np.log(0.5))
-    assert share.log_share(np.array([-np.inf, 0.0])) == 0.0
+@pytest.mark.parametrize(
+    ("inside", "outside", "expected"),
+    [(1.0, 1.0, np.log(0.5)), (1.0, -1.0, 0.0), (-1.0, 1.0, 0.0), (-1.0, -1.0, 0.0)],
+)
+def test_a_share_of_two_points(inside: float, outside: float, expected: float) -> None:
+    """Points below zero have no density; populations without a point with a response, no share."""
+    share = ResponseShare(np.array([[inside], [outside]]), np.zeros(2), 1)
+    assert log_share(share, pm.HalfNormal.dist, np.ones(1)) == pytest.approx(expected)

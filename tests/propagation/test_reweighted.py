@@ -11,11 +11,10 @@ import pytensor.tensor as pt
 import pytest
 from first_use import first_use
 from scipy.special import logsumexp
-from scipy.stats import norm
+from scipy.stats import norm, poisson
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.metrics.multivariate import CompositeDiscrepancy
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.model.random_variable import nodes
 from prbayes.propagation.reweighted import ReweightedBound, designs_restored
@@ -107,12 +106,11 @@ def test_points_of_one_input_have_equal_mass() -> None:
     assert 0 < mass[0] < 1.5 / 256
 
 
-@pytest.mark.parametrize("n", [256, 1024])
 @pytest.mark.parametrize("kind", sorted(SINGULAR))
 def test_points_have_equal_mass_where_the_density_is_infinite_or_has_narrow_peaks(
-    kind: str, n: int
+    kind: str,
 ) -> None:
-    d = bound_of(model_of(SINGULAR[kind], n))
+    d = bound_of(model_of(SINGULAR[kind]))
     drawn = PopulationSampler(d.inputs)(d.design.mixture.components, 64, np.random.default_rng(0))
     population = drawn[0][0].ravel()
     levels = np.arange(1, 10) / 10
@@ -124,7 +122,8 @@ def test_a_density_that_is_infinite_at_its_edge_leaves_weights_that_are_numbers(
     with pm.Model() as model:
         x = pm.Beta.dist(1.0, pm.HalfNormal("b", 0.3))
         y = pm.Normal.dist(0.0, 1.0)
-        prb.Simulator("y", np.add, x, y, metric=AREA, observed=OBSERVED)
+        propagation = prb.Reweighted(256, emulator=None)
+        prb.Simulator("y", np.add, x, y, metric=AREA, observed=OBSERVED, propagation=propagation)
     evaluator = Evaluator.of(model)
     mass = evaluator.support(evaluator.hyperparameters.prior_thetas(50, 1))["y"]["mean_weight"]
     assert np.isfinite(mass).all()
@@ -143,8 +142,8 @@ def test_weights_are_the_populations_density_over_the_mixture(model: Any) -> Non
     np.testing.assert_array_equal(values[0], points)
     expected = np.exp(logs - logsumexp(logs, axis=1, keepdims=True))
     np.testing.assert_allclose(weights, expected, rtol=1e-9)
-    support = d.support([mu, sigma])
     w = np.exp(logs)
+    support = d.support([mu, sigma])
     ess = w.sum(axis=1) ** 2 / (w**2).sum(axis=1)
     np.testing.assert_allclose(support["weight_ess"], ess, rtol=1e-9)
     np.testing.assert_allclose(support["mean_weight"], w.mean(axis=1), rtol=1e-9)
@@ -215,36 +214,13 @@ def test_blocks_of_populations_change_nothing(monkeypatch: pytest.MonkeyPatch) -
     assert evaluator.discrepancies(thetas[:0], 0).shape == (0,)
 
 
-@pytest.mark.long
 def test_an_input_without_inverse_distribution_function() -> None:
-    rng = np.random.default_rng(2)
-    data = rng.normal(1.0, 0.3, 40) + np.random.default_rng(3).exponential(0.5, 40)
-    model = model_of(lambda: pm.ExGaussian.dist(pm.Normal("mu", 0, 2), 0.3, nu=0.5), observed=data)
+    model = model_of(lambda: pm.ExGaussian.dist(pm.Normal("mu", 0, 2), 0.3, nu=0.5))
     mu = np.array([-1.0, 0.0, 1.0])
     support = bound_of(model).support([mu])
     np.testing.assert_allclose(support["mean_weight"], 1.0, atol=0.02)
     values, weights = bound_of(model).populations([mu])
     np.testing.assert_allclose((values * weights).sum(axis=-1), mu + 0.5, atol=0.02)
-    optimum = prb.minimize(model, method="Nelder-Mead")
-    # The area metric with one location parameter fits medians: sd of the data about 0.58.
-    assert abs(optimum.point["mu"] - 1.0) < 4 * 1.25 * 0.58 / 40**0.5
-
-
-@pytest.mark.slow
-@pytest.mark.exact
-def test_a_discrete_input() -> None:
-    data = np.random.default_rng(4).poisson(4.0, 40)
-    model = model_of(lambda: pm.Poisson.dist(pm.Gamma("rate", 2, 0.5)), 1024, observed=data)
-    rates = np.array([2.0, 4.0, 8.0])
-    values, weights = bound_of(model).populations([rates])
-    ess = bound_of(model).support([rates])["weight_ess"]
-    assert (ess > 200).all()
-    # Drawn at random: importance sampling with its ordinary error.
-    assert (np.abs((values * weights).sum(axis=-1) - rates) < 4 * np.sqrt(rates / ess)).all()
-    np.testing.assert_allclose(bound_of(model).support([rates])["mean_weight"], 1.0, atol=0.2)
-    optimum = prb.minimize(model, method="Nelder-Mead")
-    assert abs(optimum.point["rate"] - data.mean()) < 3 * (4.0 / 40) ** 0.5
-    assert set(np.unique(values)) <= set(range(60))
 
 
 def mixture() -> Any:
@@ -252,28 +228,29 @@ def mixture() -> Any:
     return pm.Mixture.dist(np.array([0.3, 0.7]), components)
 
 
-def censored() -> Any:
-    return pm.Censored.dist(pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0), lower=0.0, upper=None)
+DISTRIBUTIONS = {
+    # A censored input has probability at zero.
+    "censored": (
+        lambda: pm.Censored.dist(pm.Normal.dist(pm.Normal("mu", 1, 1)), lower=0.0, upper=None),
+        lambda x, mu: norm.cdf(x, mu),
+    ),
+    "discrete": (lambda: pm.Poisson.dist(pm.Gamma("rate", 2, 0.5)), poisson.cdf),
+    "mixture": (mixture, lambda x, mu: 0.3 * norm.cdf(x, mu) + 0.7 * norm.cdf(x, 5.0, 0.5)),
+}
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
-    ("distribution", "cdf"),
-    [
-        (censored, lambda x, mu: norm.cdf(x, mu)),
-        pytest.param(
-            mixture,
-            lambda x, mu: 0.3 * norm.cdf(x, mu) + 0.7 * norm.cdf(x, 5.0, 0.5),
-            marks=pytest.mark.slow,
-        ),
-    ],
+    "kind", ["censored", "discrete", pytest.param("mixture", marks=pytest.mark.slow)]
 )
-def test_the_distribution_function_of_a_population(distribution: Any, cdf: Any) -> None:
-    values, weights = Evaluator.of(model_of(distribution, 512)).populations(
-        np.array([[0.5], [1.5]]), 0
-    )
+def test_the_distribution_function_of_a_population(kind: str) -> None:
+    distribution, cdf = DISTRIBUTIONS[kind]
+    values, weights = bound_of(model_of(distribution, 512)).populations([np.array([0.5, 1.5])])
     for mu, row in zip((0.5, 1.5), weights, strict=True):
-        for x in (0.0, 1.0, 3.0, 5.0):  # a censored input has probability at zero
-            assert row[values[0] <= x].sum() == pytest.approx(cdf(x, mu), abs=0.02)
+        for x in (0.0, 1.0, 3.0, 5.0):
+            # Discrete points are drawn at random: four standard errors.
+            tolerance = 0.02 if kind != "discrete" else 2 * np.sqrt((row**2).sum())
+            assert row[values[0] <= x].sum() == pytest.approx(cdf(x, mu), abs=tolerance)
 
 
 def test_lost_mass_is_the_probability_of_failure() -> None:
@@ -286,16 +263,6 @@ def test_lost_mass_is_the_probability_of_failure() -> None:
     short = str(shortcomings(evaluator, np.array([[0.5, 0.0]]))["y"])
     assert "lost mass: 3" in short  # 31%
     assert "at most max_lost = 20.0%" in short
-
-
-def test_too_much_lost_mass_at_the_answer_is_refused() -> None:
-    # 16% of the population is below 0.5, where the response fails. Metrics count NaN responses as
-    # a misfit, so that the answer evades them in part: the limit is set low.
-    model = line(256, metric=KL, response=lambda x: np.where(x < 0.5, np.nan, x), max_lost=0.02)
-    with pytest.raises(prb.propagation.DesignError, match=r"y: lost mass: .*raise max_lost"):
-        prb.minimize(model)
-    with pytest.raises(prb.propagation.DesignError, match=r"y: lost mass: .*raise max_lost"):
-        prb.sample_smc(100, model=model, random_seed=1, progressbar=False)
 
 
 class Sum:
@@ -449,9 +416,8 @@ def test_a_wide_population_is_refused_where_a_narrow_design_may_not_grow() -> No
     model = model_of(narrow, max_points=256, observed=data)
     assert np.abs(bound_of(model).design.runs.points[0]).max() < 3
     words = r"y: the design does not support.* of at most 256\), or use"
-    for find in (prb.minimize, prb.refine):
-        with pytest.raises(prb.propagation.DesignError, match=words):
-            find(model)
+    with pytest.raises(prb.propagation.DesignError, match=words):
+        prb.minimize(model)
 
 
 def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> None:
@@ -460,7 +426,7 @@ def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> N
         first_use(
             model_of(
                 lambda: pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=k), 0.1 * np.eye(k)),  # noqa: B023
-                1024,
+                256,
                 response=lambda x: x.sum(axis=-1),
                 observed=[0.0, 1.0, 2.0],
                 emulator=None,
@@ -607,29 +573,15 @@ def test_data_that_have_changed_are_refused_where_points_are_added() -> None:
     assert bound.n_points == 128
 
 
-def test_a_basis_that_would_be_too_large_changes_nothing_else(
+def test_a_basis_that_would_be_too_large_is_one_of_projections(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     data = np.random.default_rng(1).normal(1.0, 0.5, (30, 2))
-
-    def found() -> tuple[Any, Any, list[int]]:
-        model = model_of(
-            lambda: pm.Normal.dist(pm.Normal("mu", 1, 0.3), 0.5, shape=2),
-            64, metric=prb.Joint(PR), observed=data, emulator=None,
-        )  # fmt: skip
-        bound = bound_of(model)
-        bound.add([np.array([0.9, 1.1])])
-        evaluator = Evaluator.of(model)
-        at = evaluator.objective(prior=False, gradient=True)(np.array([0.9]), np.ones(1))
-        sizes = [s.get_value().size for s in bound._shared]
-        return at, evaluator(np.array([[0.9], [1.2]])).discrepancies, sizes
-
-    at, many, sizes = found()
-    assert max(sizes) > 128 * 100
+    model = model_of(
+        lambda: pm.Normal.dist(pm.Normal("mu", 1, 0.3), 0.5, shape=2),
+        64, metric=prb.Joint(PR), observed=data, emulator=None,
+    )  # fmt: skip
+    bound = bound_of(model)
+    assert bound._graph_basis().arrays[0].size > 64 * 100
     monkeypatch.setattr("prbayes.propagation.reweighted._MAX_BASIS", 100)
-    monkeypatch.setattr(CompositeDiscrepancy.basis, "__defaults__", (100,))
-    compact_at, compact_many, compact_sizes = found()
-    assert max(compact_sizes) == 128 * 4
-    np.testing.assert_allclose(compact_at[0], at[0], rtol=1e-10)
-    np.testing.assert_allclose(compact_at[1], at[1], rtol=1e-9)
-    np.testing.assert_allclose(compact_many, many, rtol=1e-10)
+    assert bound._graph_basis().arrays[0].shape == (64, 4)

@@ -172,27 +172,26 @@ def test_a_coordinate_without_influence_stays_where_it_starts() -> None:
     assert np.allclose(roots.z, [[0.5, 0.7]], atol=1e-6)
 
 
-def test_nearest_starts_are_the_runs_with_the_nearest_outputs() -> None:
-    z = np.arange(6.0)[:, None]
-    run_y = np.array([[0, 0], [1, 0], [2, 0], [0, 100], [1, 100], [2, 100]], dtype=float)
-    everyone = ~np.eye(6, dtype=bool)
-    y = np.array([[0.9, 0.0], [1.9, 100.0]])
-    starts = nearest_starts(z, run_y, y, np.array([1.0, 100.0]), 2, everyone)
-    assert starts[:, 0].ravel().tolist() == [1, 5]
-    assert starts[:, 1].ravel().tolist() == [0, 4]
-    # In units of the spread: a distance of 100 in the second output is as one of 1 in the first.
-    y = np.array([[2.0, 60.0]])
-    starts = nearest_starts(z, run_y, y, np.array([1.0, 100.0]), 2, everyone)
-    assert starts.ravel().tolist() == [5, 2]
+EVERYONE = ~np.eye(6, dtype=bool)
+RUN_Y = np.array([[0, 0], [1, 0], [2, 0], [0, 100], [1, 100], [2, 100]], dtype=float)
 
 
-def test_starts_are_nearest_in_the_outputs_that_were_measured() -> None:
-    run_z = np.arange(4.0)[:, None]
-    run_y = np.array([[1.0, 9.0], [2.0, 5.0], [3.0, 0.0], [4.0, 7.0]])
-    spread = np.array([[1.0, np.inf], [np.inf, 1.0]])
-    y, everyone = np.array([[4.0, 0.0], [0.0, 9.0]]), ~np.eye(4, dtype=bool)
-    starts = nearest_starts(run_z, run_y, y, spread, 2, everyone)
-    assert starts[..., 0].tolist() == [[3.0, 2.0], [0.0, 3.0]]
+@pytest.mark.parametrize(
+    ("y", "spread", "expected"),
+    [
+        ([0.9, 0.0], [1.0, 100.0], [1, 0]),
+        ([1.9, 100.0], [1.0, 100.0], [5, 4]),
+        # In units of the spread: 100 in the second output is as far as 1 in the first.
+        ([2.0, 60.0], [1.0, 100.0], [5, 2]),
+        # Outputs without a reading do not count.
+        ([1.2, 0.0], [1.0, np.inf], [1, 4]),
+        ([0.0, 90.0], [np.inf, 1.0], [3, 4, 5]),  # a tie: all nearest runs
+    ],
+)
+def test_starts_are_the_runs_with_the_nearest_outputs(y: Any, spread: Any, expected: Any) -> None:
+    run_z = np.arange(6.0)[:, None]
+    starts = nearest_starts(run_z, RUN_Y, np.array([y]), np.array([spread]), 2, EVERYONE)
+    assert starts.ravel().tolist() == expected
 
 
 def test_the_nearest_run_of_every_basin_comes_first() -> None:
@@ -207,12 +206,6 @@ def test_the_nearest_run_of_every_basin_comes_first() -> None:
     # All of them, even if one start is asked for.
     again = nearest_starts(z, run_y, np.array([[0.93]]), np.ones(1), 1, neighbours)
     assert np.array_equal(again, starts)
-
-
-def test_neighbours_on_a_line_are_left_and_right() -> None:
-    z = np.random.default_rng(0).normal(size=(50, 1))
-    rank = z[:, 0].argsort().argsort()
-    assert np.array_equal(gabriel_neighbours(z), np.abs(rank[:, None] - rank) == 1)
 
 
 def test_neighbours_in_a_plane_have_an_empty_circle_between_them() -> None:

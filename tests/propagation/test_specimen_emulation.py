@@ -77,28 +77,24 @@ def test_the_bounds_are_those_of_data_sets_of_the_prior() -> None:
     with pm.Model() as model:
         mu = pm.Normal("mu", 0.0, 1.0)
         inputs = read_inputs("y", [pm.Normal.dist(mu, 1.0)], model)
-    few, many = (Coordinates.of_prior(inputs, n) for n in (1, 2000))
+    few, many = (Coordinates.of_prior(inputs, n, populations=512) for n in (1, 500))
     assert np.array_equal(few.center, many.center)
     assert np.array_equal(few.half_width, many.half_width)
-    # The probability that a new data set of 2000 specimens exceeds the upper end: 1 in 4097 on
+    # The probability that a new data set of 500 specimens exceeds the upper end: 1 in 513 on
     # average over the draws, exponentially distributed.
     population = np.random.default_rng(0).normal(size=(1 << 16, 1))
     ends = np.array([few.inputs(few.bounds)[0][1], many.inputs(many.bounds)[0][1]])
-    exceeded = -np.expm1(2000 * norm.logcdf(ends, population, 1)).mean(axis=0)
-    assert exceeded[0] > 50 / 4097
-    assert exceeded[1] < 5 / 4097
+    exceeded = -np.expm1(500 * norm.logcdf(ends, population, 1)).mean(axis=0)
+    assert exceeded[0] > 20 / 513
+    assert exceeded[1] < 5 / 513
 
 
 @pytest.mark.parametrize(
     ("dist", "is_log"),
     [
-        (lambda f: pm.LogNormal.dist(0.0, f), True),  # ratio of the ends exp(5.2) = 170
-        (lambda f: pm.LogNormal.dist(0.0, 0.2 * f), False),  # exp(1.03) = 2.8
+        (lambda f: pm.LogNormal.dist(0.0, 0.2 * f), False),  # ratio of the ends exp(1.03) = 2.8
         (lambda f: pm.LogNormal.dist(0.0, 0.5 * f), True),  # exp(2.6) = 13
         (lambda f: pm.Normal.dist(0.0, 100.0 * f), False),  # has negative values
-        (lambda f: pm.Gamma.dist(0.5, f), True),
-        (lambda f: pm.Uniform.dist(1.0, 5.0 * f), False),
-        (lambda f: pm.Uniform.dist(0.001, 5.0 * f), True),
     ],
 )
 def test_positive_inputs_over_more_than_a_decade_are_logarithms(dist: Any, is_log: bool) -> None:
@@ -138,14 +134,14 @@ def specimens(n: int, seed: int) -> Floats:
 
 
 def test_no_root_is_missing_where_all_are_returned() -> None:
-    shares = [missing_share(both_roots, folded, BOX, specimens(20, s), seed=s) for s in range(10)]
-    assert shares == [0.0] * 10
+    shares = [missing_share(both_roots, folded, BOX, specimens(20, s), seed=s) for s in range(3)]
+    assert shares == [0.0] * 3
 
 
 def test_the_share_is_that_of_the_missing_root() -> None:
-    shares = [missing_share(upper_root, folded, BOX, specimens(20, s), seed=s) for s in range(50)]
+    shares = [missing_share(upper_root, folded, BOX, specimens(20, s), seed=s) for s in range(16)]
     # Responses at inputs of the box near the data: about half of them are at lower roots. Standard
-    # error of one share .044, of the mean .006 and more, as the data differ.
+    # error of one share .044, of the mean .011 and more, as the data differ.
     assert np.mean(shares) == pytest.approx(0.469, abs=0.05)
     assert min(shares) > 0.3
 

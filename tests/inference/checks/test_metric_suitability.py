@@ -81,6 +81,15 @@ def test_a_value_between_responses_far_apart_is_reported(
         assert "1 of 60 observed values (9) lie between responses" in finding.text
 
 
+def test_a_value_beside_a_response_on_either_side_is_not_reported() -> None:
+    bulk, theta = np.exp(norm.ppf((np.arange(59) + 0.5) / 59, 0, 0.2)), np.array([0.0, -1.2])
+    evaluator = evaluator_of(lognormal, LOG_LIKELIHOOD, bulk)
+    low, high = np.sort(evaluator.populations(theta[None], 0)[0][0])[-2:]  # far apart
+    for value, count in ((low + 0.01, 0), ((low + high) / 2, 1), (high - 0.01, 0)):
+        evaluator = evaluator_of(lognormal, LOG_LIKELIHOOD, np.append(bulk, value))
+        assert len(data_between_runs(evaluator, theta)) == count
+
+
 @pytest.mark.parametrize(
     ("metric", "shared", "n", "is_reported"),
     [

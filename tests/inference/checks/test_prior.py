@@ -19,6 +19,7 @@ from prbayes.inference.checks.prior import (
     prior_conflict,
     prior_end_findings,
 )
+from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 
@@ -85,6 +86,21 @@ def test_two_that_only_stand_for_each_other_are_not_pushed() -> None:
     # One at its upper end, the other at its lower one, or elsewhere.
     assert not ends(problem, 4.0, -4.0)
     assert not ends(problem, 4.0, 0.0)
+
+
+def test_ends_of_the_ranges_of_elements() -> None:
+    with pm.Model() as problem:
+        x = pm.Normal.dist(pm.Uniform("u", -1, 3) + pm.Normal("n"), pm.HalfNormal("h"))
+        prb.Simulator("y", same, x, metric=METRICS["area"], observed=LEVELS, propagation=R256)
+    hyperparameters = Evaluator.of(problem).hyperparameters
+    values, lower, upper = ends_of_prior(hyperparameters, np.array([0.0, 0.4, np.log(0.3)]))
+    np.testing.assert_allclose(values, [1.0, 0.4, 0.3])
+    np.testing.assert_array_equal(lower, [-1.0, np.nan, 0.0])
+    np.testing.assert_array_equal(upper, [3.0, np.nan, np.nan])
+    with problem:  # the elements of a simplex have no values of their own
+        pm.Dirichlet("w", np.ones(3))
+    hyperparameters = Evaluator.of(problem).hyperparameters
+    assert np.isnan(ends_of_prior(hyperparameters, np.zeros(5))).all()
 
 
 def estimates(mu: Floats, sd: Floats, n: int, rng: np.random.Generator) -> Floats:
