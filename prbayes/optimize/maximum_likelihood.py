@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
-from prbayes.inference.checks.population import failing_region_findings
+from prbayes.inference.checks.population import failing_region_findings, refuse_lost_specimens
 from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
@@ -354,6 +354,7 @@ def _findings(
 ) -> list[Finding]:
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
+    refuse_lost_specimens(evaluator, best.theta)
     is_flat = np.isinf(np.diag(best.covariance))
     # Three nats: a likelihood ratio of twenty.
     ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from prbayes._finding import Finding, as_json, report
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
+from prbayes.inference.checks.population import refuse_lost_specimens
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import (
     Evaluator,
@@ -331,9 +332,10 @@ def result_of(
         lost = _lost_of_some(evaluator, thetas)
         chains = replace(chains, lost=lost, discrepancies=np.full_like(lost, np.nan))
     findings += _lost_findings(evaluator, chains)
+    rows = thetas.reshape(-1, evaluator.hyperparameters.size)
+    refuse_lost_specimens(evaluator, rows.mean(axis=0))
     with unlimited():
         if not is_pseudo and evaluator.nodes and not evaluator.responses_per_theta:
-            rows = thetas.reshape(-1, evaluator.hyperparameters.size)
             discrepancies = evaluator(rows).discrepancies.reshape(lost.shape)
             chains = replace(chains, discrepancies=discrepancies)
         groups = {}
@@ -369,7 +371,7 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floa
             place = np.unravel_index(row, (chains, draws))
             for k, node in enumerate(evaluator.nodes):
                 if not node.bound.stored:
-                    population = evaluator.populations(thetas[place][None], k)
+                    population = node.bound.populations(evaluator.parents(thetas[place][None], k))
                     lost[(*place, k)] = Missing.of(*population).lost[0]
     except BudgetError:
         pass
