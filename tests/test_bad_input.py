@@ -323,36 +323,38 @@ def test_set_epsilon_is_all_or_nothing(epsilon: dict[str, Any], error: type[Exce
 
 
 def test_a_few_nan_responses_are_fine_and_reported() -> None:
-    model = build(lambda x: np.where(x < 0.8, np.nan, 0.75 * x), propagation=prb.Reweighted(512))
+    model = build(lambda x: np.where(x > 3.8, np.nan, 0.75 * x), propagation=prb.Reweighted(512))
     evaluator = Evaluator.of(model)
     theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
     node = next(iter(nodes(model).values()))
     lost = node.bound.support(evaluator.parents(theta, 0))["lost_mass"]
-    np.testing.assert_allclose(lost, norm.cdf(0.8, 2.0, 0.8), atol=0.01)
+    np.testing.assert_allclose(lost, norm.sf(3.8, 2.0, 0.8), atol=0.004)
     assert np.isfinite(evaluator(theta).discrepancies).all()
-    assert shortcomings(evaluator, theta)["y"].is_lost
-    (bound,) = evaluator.reweighted.values()
-    bound.max_lost = 0.2
     assert not shortcomings(evaluator, theta)
+    (bound,) = evaluator.reweighted.values()
+    bound.max_lost = 0.01
+    assert shortcomings(evaluator, theta)["y"].is_lost
 
 
 def test_much_lost_mass_at_the_optimum_is_an_error() -> None:
     model = build(lambda x: np.where(x > 2, np.nan, 0.75 * x))
     with pytest.raises(
         prb.propagation.DesignError,
-        match=r"y: lost mass: .*NaN.*repair the response.*\+inf .*max_lost",
+        match=r"y: got 1\d of 30 observed responses where no run .* repair the response, or .*max_lost",
     ):
         prb.minimize(model)
 
 
 @pytest.mark.parametrize("propagation", SMALL[:2], ids=lambda p: type(p).__name__)
 def test_specimens_that_fail_are_infinite(propagation: prb.propagation.Propagation) -> None:
-    model = build(lambda x: np.where(np.asarray(x) > 3, np.inf, 0.75 * x), propagation=propagation)
+    model = build(
+        lambda x: np.where(np.asarray(x) > 3.75, np.inf, 0.75 * x), propagation=propagation
+    )
     evaluator = Evaluator.of(model)
     theta = evaluator.hyperparameters.unconstrained({"mu": 2.0, "sigma": 0.8})[None]
     values, weights = evaluator.populations(theta, 0)
     failed = weights[0][np.isinf(values[0])].sum()
-    np.testing.assert_allclose(failed, norm.sf(3, 2.0, 0.8), atol=0.02)
+    np.testing.assert_allclose(failed, norm.sf(3.75, 2.0, 0.8), atol=0.01)
     direct = prb.AreaMetric()(values[0], OBSERVED, weights=weights[0])
     np.testing.assert_allclose(evaluator(theta).discrepancies[0, 0], direct, rtol=1e-12)
     assert np.isfinite(direct)

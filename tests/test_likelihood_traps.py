@@ -33,10 +33,17 @@ SEEDS = range(20)
 BAD = [DesignError, ResponseError]
 
 
-def model_of(response: Any, inputs: Callable[[], list[Any]], y: Any, **given: Any) -> pm.Model:
+def model_of(
+    response: Any,
+    inputs: Callable[[], list[Any]],
+    y: Any,
+    propagation: prb.propagation.Propagation | None = None,
+    **given: Any,
+) -> pm.Model:
     """Return a model with one simulator."""
+    metric = prb.LogLikelihood(**given)
     with pm.Model() as model:
-        prb.Simulator("y", response, *inputs(), observed=y, metric=prb.LogLikelihood(**given))
+        prb.Simulator("y", response, *inputs(), observed=y, metric=metric, propagation=propagation)
     return model
 
 
@@ -197,7 +204,7 @@ def failing(rng: np.random.Generator, above: float) -> pm.Model:
     def response(x: Any) -> Any:
         return np.where(np.asarray(x) > above, np.nan, line(x))
 
-    return model_of(response, normal_input, response(x))
+    return model_of(response, normal_input, response(x), prb.Reweighted(64, max_lost=0.9))
 
 
 def at_end(rng: np.random.Generator, sd: float) -> pm.Model:

@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 from scipy.special import bdtrc
+from scipy.stats import rankdata
 
 from prbayes._finding import Finding, report
 from prbayes._stats import adjusted_p_values
@@ -57,6 +59,59 @@ def warn_out_of_range(
                 )
             )
             return
+
+
+def check_failing_region(
+    name: str,
+    observed: Floats,
+    points: Sequence[Floats],
+    responses: Floats,
+    max_lost: float,
+    apart: float = 6.0,
+) -> None:
+    """Report observed values in gaps of the finite responses beside failing runs.
+
+    A value is in such a gap if it is ``apart`` times the local spacing away from the nearest finite
+    response of the output, and 40 % of the 4 d + 4 runs around that run fail. Specimens were
+    measured there, so that the response should not fail. Raises DesignError if the share of such
+    specimens is above ``max_lost``. Nothing is checked on fewer than 32 finite runs.
+    """
+    values = responses.reshape(len(responses), -1)
+    is_finite = np.isfinite(values).all(axis=1)
+    if is_finite.all() or is_finite.sum() < 32 or not points:
+        return
+    inputs = np.hstack([x.reshape(len(values), -1) for x in points])
+    scores = rankdata(inputs, axis=0)
+    _, neighbours = cKDTree(scores).query(scores, k=4 * inputs.shape[1] + 5)
+    is_beside = (~is_finite[neighbours[:, 1:]]).mean(axis=1)[is_finite] >= 0.4
+    columns = observed.reshape(len(observed), -1)
+    is_apart = np.zeros(columns.shape, dtype=bool)
+    for j, column in enumerate(columns.T):
+        order = np.argsort(values[is_finite, j], kind="stable")
+        outputs, beside = values[is_finite, j][order], is_beside[order]
+        right = np.clip(np.searchsorted(outputs, column), 1, outputs.size - 1)
+        nearest = right - (column - outputs[right - 1] < outputs[right] - column)
+        first = np.clip(nearest - 4, 0, outputs.size - 9)
+        steps = np.diff(outputs)[first[:, None] + np.arange(8)]
+        distance = np.abs(column - outputs[nearest])
+        with np.errstate(invalid="ignore"):  # an output that failed, or was not measured
+            is_apart[:, j] = beside[nearest] & (distance > apart * np.median(steps, axis=1))
+        is_apart[:, j] &= np.isfinite(column)
+    count = int(is_apart.any(axis=1).sum())
+    if not count:
+        return
+    some = np.unique(columns[is_apart])[:3]
+    text = (
+        f"{name}: got {count} of {len(columns)} observed responses where no run has a finite "
+        f"response, such as {', '.join(f'{value:.4g}' for value in some)}: specimens were measured "
+        f"where {(~is_finite).sum()} of {len(values)} runs fail, so that the population cannot be "
+        "estimated there"
+    )
+    if count > max_lost * len(columns):
+        raise DesignError(f"{text}; repair the response, or pass a larger max_lost")
+    report(
+        Finding("failing-data", f"{text}; repair the response.", "expensive.md#when-a-run-fails")
+    )
 
 
 def warn_duplicates(name: str, observed: Floats) -> None:

@@ -148,7 +148,7 @@ class EmulatedSimulator:
     is_emulated: ClassVar[Literal[True]] = True
     # As of a Node: no response is weighted.
     reweighted: ClassVar[None] = None
-    max_lost: ClassVar[float] = MAX_LOST
+    max_lost: float = field(init=False)  # largest share of a population without response
 
     def __post_init__(self) -> None:
         """Set the attributes of the measurement, or of one of its groups."""
@@ -171,6 +171,7 @@ class EmulatedSimulator:
             inputs=m.inputs,
             responses=m.responses,
             outputs=m.outputs,
+            max_lost=getattr(m.propagation, "max_lost", MAX_LOST),
             has_specimens=not self.likelihood.calls_response,
         )
 

@@ -34,7 +34,7 @@ from prbayes.model.specimen_likelihood import (
     require_simulator,
     specimen_likelihoods,
 )
-from prbayes.propagation.base import Bound
+from prbayes.propagation.base import Bound, responding_weights
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
@@ -277,8 +277,12 @@ class Evaluator:
         return [np.broadcast_to(p, (len(thetas), *np.shape(p)[1:])) for p in parents]
 
     def populations(self, thetas: Floats, k: int) -> tuple[Floats, Floats]:
-        """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`."""
-        return self.simulators[k].populations(self.parents(thetas, k))
+        """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`.
+
+        As metrics compare them: points without response have no weight.
+        """
+        values, weights = self.simulators[k].populations(self.parents(thetas, k))
+        return values, responding_weights(values, weights)
 
     def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""

@@ -40,7 +40,7 @@ from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
-from prbayes.model.data_checks import warn_out_of_range
+from prbayes.model.data_checks import check_failing_region, warn_out_of_range
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
@@ -208,6 +208,13 @@ def computed(simulator: AnySimulator) -> Node:
             responses.on_start = None
             outputs = simulator.outputs
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
+            check_failing_region(
+                simulator.name,
+                target.observed,
+                bound.first_points,
+                bound.first_responses,
+                bound.max_lost,
+            )
             node = Node(
                 simulator.name,
                 bound.target,

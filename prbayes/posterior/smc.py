@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from prbayes._finding import Finding, as_json, report
 from prbayes._progress import CONSOLE, lines, live, shown
 from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
+from prbayes.inference.checks.population import refuse_lost_specimens
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import (
     Evaluator,
@@ -339,6 +340,7 @@ def result_of(
             lost = _lost_of_some(evaluator, thetas)
     assert lost is not None
     findings += _lost_findings(evaluator, lost, chains.missing)
+    refuse_lost_specimens(evaluator, rows.mean(axis=0))
     with unlimited():
         if not is_pseudo and evaluator.nodes and not evaluator.responses_per_theta:
             discrepancies = evaluator(rows).discrepancies.reshape(lost.shape)
@@ -373,7 +375,7 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floa
             place = np.unravel_index(row, (chains, draws))
             for k, node in enumerate(evaluator.nodes):
                 if not node.bound.stored:
-                    population = evaluator.populations(thetas[place][None], k)
+                    population = node.bound.populations(evaluator.parents(thetas[place][None], k))
                     lost[(*place, k)] = Missing.of(*population).lost[0]
     except BudgetError:
         pass

@@ -68,6 +68,22 @@ class Missing:
         return cls(lost, failed / rest)
 
 
+def responding_weights(values: Floats, weights: Floats) -> Floats:
+    """Return weights (k, n) that are zero at points without response (NaN) and sum to one.
+
+    Metrics compare the population of the specimens that have a response. Otherwise the lost weight
+    would count as responses that are infinitely far away, and populations would shrink to avoid it.
+    """
+    is_lost = np.isnan(values)
+    if values.ndim > weights.ndim:
+        is_lost = is_lost.any(axis=-1)
+    if not is_lost.any():
+        return weights
+    responding = np.where(is_lost, 0.0, weights)
+    total = responding.sum(axis=-1, keepdims=True)
+    return np.divide(responding, total, out=responding, where=total > 0)
+
+
 class Bound(ABC):
     """A propagation at work for one simulator.
 
@@ -159,7 +175,7 @@ class Bound(ABC):
             missing = Missing.of(values, weights)
             self.last_missing.lost[ok] = missing.lost
             self.last_missing.failed[ok] = missing.failed
-            result[ok] = target.of(values, weights)
+            result[ok] = target.of(values, responding_weights(values, weights))
         return result
 
     def missing(self, params: Sequence[Any]) -> Missing:
@@ -202,6 +218,7 @@ def discrepancy_error(bound: Bound, params: Sequence[Any]) -> float:
         return np.nan
     values, weights = bound.populations(params)
     bound.last_missing = Missing.of(values, weights)
+    weights = responding_weights(values, weights)
     without_block = []
     for block in range(N_BLOCKS):
         is_used = bound.blocks != block

@@ -32,6 +32,7 @@ from prbayes.propagation.population_density import normalise
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import log_density
 from prbayes.response.inputs import Inputs
+from prbayes.response.outputs import is_missing
 from prbayes.response.response import Responses, deduplicated_responses
 
 
@@ -93,6 +94,14 @@ class Design:
         reach = 1 if self.on_line else 8
         cells = [cells_around(self.sample.points[i], reach) for i in self.moving]
         return [*self.sample.points, self.sample.log_density, *chain.from_iterable(cells)]
+
+    @property
+    def graph_arrays(self) -> list[Floats]:
+        """The arrays of weights in a graph: points without response (NaN) have no weight."""
+        arrays = list(self.weight_arrays)
+        place = len(self.sample.points)
+        arrays[place] = np.where(is_missing(self.sample.values), np.inf, arrays[place])
+        return arrays
 
     def summary(self, name: str) -> str:
         """Return the number of runs, and how responses between them are emulated, as a sentence."""

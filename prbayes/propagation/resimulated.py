@@ -171,7 +171,12 @@ class ResimulatedBound(Bound):
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the responses, +inf where parameters are invalid."""
         values, parameters_valid = self._response(params)
+        # As `responding_weights`: points without response have no weight.
+        is_lost = pt.isnan(values)
+        if self.target.event:
+            is_lost = is_lost.any(axis=-1)
         weights = np.full(self.n_per_theta, 1 / self.n_per_theta)
+        weights = pt.switch(is_lost, 0.0, weights) / (1 - is_lost.mean())
         discrepancy = symbolic_discrepancy(self.target, values, weights)
         return pt.switch(parameters_valid, discrepancy, np.inf)
 

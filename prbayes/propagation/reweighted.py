@@ -304,7 +304,7 @@ class ReweightedBound(Bound):
     def design(self, design: Design) -> None:
         self._design = design
         if self._shared:
-            arrays = [*design.weight_arrays, *self._graph_basis().arrays]
+            arrays = [*design.graph_arrays, *self._graph_basis().arrays]
             for shared, array in zip(self._shared, arrays, strict=True):
                 shared.set_value(array, borrow=True)
 
@@ -462,7 +462,7 @@ class ReweightedBound(Bound):
         design, basis = self._design, self._graph_basis()
         n_arrays = len(design.weight_arrays)
         if not self._shared:
-            for i, array in enumerate([*design.weight_arrays, *basis.arrays]):
+            for i, array in enumerate([*design.graph_arrays, *basis.arrays]):
                 # Some samplers know shared variables by their names. Designs may grow.
                 name, shape = f"{self.name}_design_{i}", (None,) * array.ndim
                 self._shared.append(pytensor.shared(array, name=name, borrow=True, shape=shape))
@@ -489,6 +489,7 @@ class ReweightedBound(Bound):
         if self._basis[0] is not target or self._basis[1] is not sample:
             self._basis = (target, sample, target.basis(sample.values))
         basis = self._basis[2]
+        is_lost = is_missing(sample.values)
         size = len(params[0])
         step = max(_MIN_POPULATIONS, _BLOCK // len(sample))
         parts = []
@@ -497,6 +498,7 @@ class ReweightedBound(Bound):
             for first in range(0, max(1, size), step):
                 parents = [p[first : first + step] for p in params]
                 weights = self._sampler.log_weights(parents, self._design)
+                weights[:, is_lost] = -np.inf
                 is_supported = np.isfinite(normalise(weights))
                 weights[~is_supported] = 1 / len(sample)
                 features = basis.features(weights)

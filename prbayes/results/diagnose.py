@@ -15,6 +15,7 @@ from prbayes._display import view
 from prbayes._finding import Finding, from_json
 from prbayes._validate import Floats
 from prbayes.inference.checks.metric_suitability import small_simulators
+from prbayes.inference.checks.population import lost_mass_shift
 from prbayes.inference.goodness_of_fit import (
     UNLIKELY,
     FittedSets,
@@ -223,7 +224,13 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     failures, harmless = _failure_findings(tree, lost, _stored_shares(calibration, "failed_mass"))
     compared = [Finding("outputs-compared", sentence) for sentence in compared_in(calibration)]
     return Diagnosis(
-        (*findings, *checked.findings, *failures, *_unsupported(coverage)),
+        (
+            *findings,
+            *checked.findings,
+            *failures,
+            *_lost_mass(optimum, lost),
+            *_unsupported(coverage),
+        ),
         _as_dataset(coverage),
         (*compared, *_specimens_left_out(lost), *harmless, *checked.remarks),
         checked.untested,
@@ -341,6 +348,28 @@ def _specimens_left_out(lost: Mapping[str, float]) -> list[Finding]:
         for name, share in lost.items()
         if share >= SMALLEST_SHARE
     ]
+
+
+def _lost_mass(optimum: Optimum | None, lost: Mapping[str, float]) -> list[Finding]:
+    """Report an optimum that depends on whether specimens without response count."""
+    is_small = all(share < SMALLEST_SHARE for share in lost.values())
+    if optimum is None or is_small or optimum.evaluator.responses_per_theta:
+        return []
+    evaluator = optimum.evaluator
+    scales = np.array(list(optimum.scales.values()))
+    stderr = np.sqrt(np.diag(optimum.covariance))
+    shift = lost_mass_shift(evaluator, optimum.theta, scales, stderr)
+    far = np.flatnonzero(np.abs(shift) > 0.5)
+    if not far.size:
+        return []
+    names = evaluator.hyperparameters.readable_names
+    shifts = ", ".join(f"{names[i]} by {shift[i]:+.1f}" for i in far)
+    text = (
+        f"Specimens without response (NaN) matter: if they counted as far from the data, the "
+        f"optimum would move {shifts} standard errors. It is right if such specimens cannot be "
+        "measured; otherwise repair the response there, or return +inf for specimens that fail."
+    )
+    return [Finding("lost-mass-matters", text, "distributed.md#when-a-response-fails")]
 
 
 # -- draws -----------------------------------------------------------------------------------

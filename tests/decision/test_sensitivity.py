@@ -38,6 +38,7 @@ def test_a_quantile_of_a_normal_population() -> None:
     np.testing.assert_allclose(own.derivative, expected, atol=0.06)
     x_only = table.sel(factor="x")
     assert [float(x_only[key]) for key in ("first", "total")] == pytest.approx([1, 1], abs=0.02)
+    assert max(float(x_only.first_error), float(x_only.total_error)) < 0.05
     assert table.attrs["sd"] == pytest.approx(2 * np.hypot(mu, 1.6449 * sigma), rel=0.04)
     assert table.kind.values.tolist() == ["hyperparameter", "hyperparameter", "input"]
 

@@ -13,7 +13,7 @@ from first_use import first_use
 import prbayes as prb
 from prbayes.propagation.base import Bound, Missing, Propagation, discrepancy_error
 
-OBSERVED = [0.5, 1.0, 1.5, 2.5]
+OBSERVED = [0.5, 1.0, 1.5, 1.9]
 KINDS = [prb.Reweighted, prb.Resimulated, prb.Fresh]
 
 

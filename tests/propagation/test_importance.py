@@ -35,7 +35,8 @@ def smooth(a: Any, b: Any) -> Any:
 
 # Of specimens whose inputs have means 1.2 and 1, and standard deviations .8 and .6.
 Z = np.random.default_rng(1).normal(size=(2, 40))
-OBSERVED = smooth(1.2 + 0.8 * Z[0], 1.0 + 0.6 * Z[1])
+SPECIMENS = 1.2 + 0.8 * Z[0], 1.0 + 0.6 * Z[1]
+OBSERVED = smooth(*SPECIMENS)
 THETA = np.array([[1.1, -0.2, 0.9, -0.5]])  # ma, log sa, mb, log sb
 
 
@@ -55,8 +56,10 @@ def build(response: Any = smooth, n: int = 64, *, known: bool = False, **keyword
         else:
             b = pm.Normal.dist(pm.Normal("mb", 1, 0.5), pm.LogNormal("sb", -0.5, 0.5))
         stored = prb.Reweighted(n, **{"emulator": "auto", **keywords})
+        # Specimens without a response were not measured.
+        observed = OBSERVED[np.isfinite(response(*SPECIMENS))]
         prb.Simulator(
-            "y", response, a, b, metric=prb.KullbackLeibler(), observed=OBSERVED, propagation=stored
+            "y", response, a, b, metric=prb.KullbackLeibler(), observed=observed, propagation=stored
         )
     return model
 
@@ -80,7 +83,7 @@ def around(theta: Floats, spread: float = 0.1) -> Floats:
 def test_emulated_points_are_far_better_than_weighted_runs(response: Any) -> None:
     ma, la, mb, lb = THETA[0]
     z = np.random.default_rng(7).standard_normal((2, 200_000))
-    truth = np.nan_to_num(response(ma + np.exp(la) * z[0], mb + np.exp(lb) * z[1])).mean()
+    truth = np.nanmean(response(ma + np.exp(la) * z[0], mb + np.exp(lb) * z[1]))
     errors = []
     for keywords in ({}, {"emulator": None}):
         evaluator, _ = design_of(build(response, **keywords))

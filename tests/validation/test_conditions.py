@@ -117,6 +117,19 @@ def test_pairs_of_measured_and_predicted_outputs() -> None:
     np.testing.assert_allclose(pair.weights, [[1 / 3, 0, 1 / 3, 1 / 3], [0.25] * 4])
 
 
+def test_measured_outputs_are_in_the_order_of_the_predicted_ones() -> None:
+    values = np.random.default_rng(0).normal(size=(1, 3, 40, 2))
+    predicted = xr.DataArray(values, dims=(*DIMS, "place"), coords={"place": ["a", "b"]})
+    y = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 7.0]])
+    swapped = xr.DataArray(
+        y[:, ::-1], dims=("specimen", "place"), coords={"place": ["b", "a"]}, name="y"
+    )
+    for observed in (y, swapped):
+        np.testing.assert_array_equal(read_case(observed, predicted).conditions[0].measured, y)
+    with pytest.raises(ValueError, match=r"got the outputs \['b', 'c'\], expected \['a', 'b'\]"):
+        read_case(swapped.assign_coords(place=["b", "c"]), predicted)
+
+
 def test_the_area_is_the_integral_in_any_order() -> None:
     assert area(np.array([0.2])) == pytest.approx((0.2**2 + 0.8**2) / 2)
     for n in (1, 4, 9):

@@ -13,17 +13,20 @@ parametric bootstrap with refit. The study is likelihood_guards, section 2.4.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize as scipy_minimize
 from scipy.special import ndtr, ndtri
 
 from prbayes._finding import Finding
 from prbayes._stats import adjusted_p_values, upper_p_values
 from prbayes._validate import Floats
+from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_preparation import prepared
+from prbayes.propagation.base import DesignError
 from prbayes.response.distributions import PopulationSampler
 
 
@@ -157,17 +160,8 @@ def failing_region_findings(
     fail: as none is among the data, a population moves away from there.
     """
     findings = []
-    rng = np.random.default_rng(23)
-    for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
+    for simulator, share in _failing_shares(evaluator, theta, specimens):
         likelihood = simulator.likelihood
-        emulation = prepared(likelihood).emulation
-        if np.isfinite(emulation.y).all():
-            continue
-        sampler = PopulationSampler(likelihood.inputs)
-        drawn, _ = sampler(evaluator.parents(theta[None], k), specimens, rng)
-        z = likelihood.coordinates.of([x[0] for x in drawn], 1)
-        fails = emulation.fails(np.clip(z, emulation.box[0], emulation.box[1]))
-        share = float(fails.mean())
         n = len(simulator.rows)
         if share * n < lost:
             continue
@@ -187,3 +181,57 @@ def failing_region_findings(
         )
         findings.append(Finding("failing-region", text, "likelihood.md#failing-region"))
     return tuple(findings)
+
+
+def lost_mass_shift(evaluator: Evaluator, theta: Floats, scales: Floats, stderr: Floats) -> Floats:
+    """Return the shift of an optimum, in standard errors (d,), if lost specimens counted.
+
+    The optimum is that of the specimens with a response. Counted, points without one keep their
+    weight and are farther from the data than all responses. No response is computed where they are
+    stored; the minimum is searched by Nelder-Mead.
+    """
+    unit = np.where(np.isfinite(stderr) & (stderr > 0), stderr, 1.0)
+
+    def counted(t: Floats) -> float:
+        at = (theta + t * unit)[None]
+        total = float(-evaluator.log_other(at)[0])
+        for k, node in enumerate(evaluator.nodes):
+            values, weights = node.bound.populations(evaluator.parents(at, k))
+            features = node.target.features(values, weights, np)
+            total += float(node.target.outer(*features, xp=np)[0]) / scales[k]
+        return total if np.isfinite(total) else np.inf
+
+    simplex = np.vstack([np.zeros(theta.size), np.eye(theta.size)])
+    options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-9, "maxfev": 200 * theta.size}
+    minimum = scipy_minimize(counted, np.zeros(theta.size), method="Nelder-Mead", options=options)
+    return np.asarray(minimum.x)
+
+
+def refuse_lost_specimens(evaluator: Evaluator, theta: Floats, specimens: int = 4096) -> None:
+    """Raise if too much of a population has no response (NaN): it is not known from the rest."""
+    for simulator, share in _failing_shares(evaluator, theta, specimens):
+        if prepared(simulator.likelihood).share is not None and share > simulator.max_lost:
+            raise DesignError(
+                f"{simulator.name}: lost mass: got {share:.1%} of the population without a "
+                f"response (NaN) at the answer, expected at most max_lost = "
+                f"{simulator.max_lost:.1%}: it would rest on the specimens that have one; repair "
+                "the response, return +inf for specimens that fail, or pass "
+                "propagation=prb.Reweighted(n, max_lost=...)"
+            )
+
+
+def _failing_shares(
+    evaluator: Evaluator, theta: Floats, specimens: int
+) -> Iterator[tuple[EmulatedSimulator, float]]:
+    """Yield the emulated simulators with failing runs and the failing share of the population."""
+    rng = np.random.default_rng(23)
+    for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
+        likelihood = simulator.likelihood
+        emulation = prepared(likelihood).emulation
+        if np.isfinite(emulation.y).all():
+            continue
+        sampler = PopulationSampler(likelihood.inputs)
+        drawn, _ = sampler(evaluator.parents(theta[None], k), specimens, rng)
+        z = likelihood.coordinates.of([x[0] for x in drawn], 1)
+        fails = emulation.fails(np.clip(z, emulation.box[0], emulation.box[1]))
+        yield simulator, float(fails.mean())
