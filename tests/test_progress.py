@@ -136,9 +136,7 @@ def build(**settings: Any) -> pm.Model:
 
 
 @pytest.mark.long
-def test_a_design_that_grows_tells_its_error_and_the_runs_that_are_left(
-    screen: io.StringIO,
-) -> None:
+def test_a_design_that_grows_shows_its_error(screen: io.StringIO) -> None:
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
         b = pm.Normal.dist(1, pm.HalfNormal("sigma", 0.5))
@@ -147,7 +145,6 @@ def test_a_design_that_grows_tells_its_error_and_the_runs_that_are_left(
         prb.Simulator("y", lambda a, b: a * b, a, b, **data, propagation=propagation)
     assert prb.minimize(model, starts=0).n_responses > 64
     text = " ".join(screen.getvalue().split())
-    assert "runs to go" in text
     assert "0.1 are wanted" in text
 
 

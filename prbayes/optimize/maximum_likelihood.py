@@ -38,10 +38,10 @@ from prbayes.optimize.convergence import Result
 from prbayes.optimize.optimum import (
     Optimum,
     SearchRecord,
+    local_optimum,
     n_computed,
+    place,
     point_and_stderr,
-    point_at,
-    require_minimiser,
     require_sampling,
 )
 from prbayes.propagation.specimen_emulation import specimen_roots
@@ -50,7 +50,7 @@ from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 
 
 @dataclass(frozen=True, eq=False)
-class LocalOptimum:
+class Mode:
     """A local minimum of minus the log-likelihood, or of minus the log-posterior."""
 
     theta: Floats  # (d,)
@@ -94,13 +94,8 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     findings = [finding for preparation in preparations for finding in preparation.findings]
     findings += report(*_findings(evaluator, objective, modes, weights))
     local_optima = tuple(
-        {
-            "point": point_at(evaluator, mode.theta),
-            "discrepancy": mode.value,
-            "theta": mode.theta,
-            "comparable": mode.value - best.value < 6.0,
-            "weight": float(weight),
-        }
+        local_optimum(evaluator, mode.theta, mode.value, comparable=mode.value - best.value < 6.0)
+        | {"weight": float(weight)}
         for mode, weight in zip(modes[1:], weights[1:], strict=True)
     )
     log_likelihoods = specimen_log_likelihoods(evaluator, best.theta[None])
@@ -133,7 +128,7 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
 
 
 def mode_weights(
-    modes: list[LocalOptimum], log_prior: Floats | None = None, prior_sd: Floats | None = None
+    modes: list[Mode], log_prior: Floats | None = None, prior_sd: Floats | None = None
 ) -> Floats:
     """Return the share of each mode in the posterior's mass, by Laplace's approximation.
 
@@ -209,7 +204,7 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
     return list(candidates[rows] * hyperparameters.prior_sd), n_screened
 
 
-def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimum:
+def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:
     """Return the local minimum that BFGS reaches, with its inverse Hessian."""
     from scipy.optimize import minimize as scipy_minimize
 
@@ -242,7 +237,7 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimu
             value, _ = objective(theta)
     steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
-    return LocalOptimum(theta, value, covariance, bool(slope < 0.05), steps)
+    return Mode(theta, value, covariance, bool(slope < 0.05), steps)
 
 
 def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, float]:
@@ -294,9 +289,7 @@ def _hessian(objective: _Objective, theta: Floats) -> Floats | None:
     return hessian
 
 
-def _distinct(
-    optima: list[LocalOptimum], objective: _Objective, error: float
-) -> list[LocalOptimum]:
+def _distinct(optima: list[Mode], objective: _Objective, error: float) -> list[Mode]:
     """Return the modes within 30 nats of the best optimum, best first.
 
     Optima closer than a hundredth of the prior's width are the same.
@@ -319,8 +312,8 @@ def _distinct(
 def share_mode(
     objective: Callable[[Floats], tuple[float, Floats]],
     unit: Floats,
-    first: LocalOptimum,
-    second: LocalOptimum,
+    first: Mode,
+    second: Mode,
     barrier: float,
 ) -> bool:
     """Return whether two optima are of one mode: no barrier in nats lies between them.
@@ -350,7 +343,7 @@ def share_mode(
 
 
 def _findings(
-    evaluator: Evaluator, objective: _Objective, modes: list[LocalOptimum], weights: Floats
+    evaluator: Evaluator, objective: _Objective, modes: list[Mode], weights: Floats
 ) -> list[Finding]:
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
@@ -386,16 +379,12 @@ def _findings(
     for mode, weight in zip(modes[1:], weights[1:], strict=True):
         if weight < 0.01:
             continue
-        point = point_at(evaluator, mode.theta)
-        free = [str(rv.name) for rv in evaluator.model.free_RVs]
-        where = ", ".join(
-            f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free
-        )
         findings.append(
             Finding(
                 "second-mode",
-                f"A second optimum at {where} has {weight:.0%} of the posterior's mass; NUTS "
-                "chains may stay in the mode where they start; prb.sample_smc samples both.",
+                f"A second optimum at {place(evaluator, mode.theta)} has {weight:.0%} of the "
+                "posterior's mass; NUTS chains may stay in the mode where they start; "
+                "prb.sample_smc samples both.",
                 "likelihood.md#several-modes",
             )
         )
@@ -604,5 +593,4 @@ def specimen_refits(optimum: Optimum, caller: str, *, simulated: bool = False) -
     obstacle = find(evaluator)
     if obstacle is not None:
         raise ValueError(f"{caller}: {obstacle}; use prb.sample_smc")
-    require_minimiser(optimum, caller)
     return SpecimenRefits(evaluator, optimum.theta, optimum.covariance)
