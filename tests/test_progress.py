@@ -22,7 +22,6 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=120)
     monkeypatch.setattr(prbayes._progress, "CONSOLE", console)
-    monkeypatch.setattr("prbayes.posterior.smc.CONSOLE", console)
     monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.01)
     return text
 
@@ -90,8 +89,8 @@ def test_a_sampler_without_a_terminal_says_where_it_is(
     monkeypatch.setattr(prbayes._progress, "_LINE_EVERY", 0.0)
     prb.sample_smc(20, chains=2, model=build(), adjustment=None, random_seed=1)
     said = [line for line in log.getvalue().splitlines() if line.startswith("SMC")]
-    assert said[-1] == "SMC chain 2 of 2: beta 1 of 1"
-    assert said[0].startswith("SMC chain 1 of 2: beta 0.")
+    assert said[-1].endswith(" chain 2 of 2: beta 1 of 1")
+    assert said[0].startswith("SMC stages 1 chain 1 of 2: beta 0.")
 
 
 def test_the_seconds_left_are_those_at_the_pace_so_far() -> None:
@@ -158,7 +157,7 @@ def test_everything_inside_the_sampler_follows_its_keyword(
     model = build(propagation=prb.Resimulated(16), epsilon=None)
     settings = {"model": model, "adjustment": None, "random_seed": 1}
     prb.sample_smc(20, chains=1, progressbar=visible, **settings)
-    for text in ("SMC chain 0", "evaluations", "discrepancy"):
+    for text in ("SMC stages", "evaluations", "discrepancy"):
         assert (text in screen.getvalue()) == visible
     if not visible:
         assert screen.getvalue() == ""
