@@ -286,8 +286,8 @@ def _frequencies(
         conflicting = "pm.Data" if specimens is None else "specimens="
         raise TypeError(
             f"{name}: weights: got whole numbers, which are frequencies, beside {conflicting}, "
-            "expected a row for each specimen; pass np.repeat(observed, weights), or relative weights as "
-            "floats"
+            "expected a row for each specimen; pass np.repeat(observed, weights), or relative "
+            "weights as floats"
         )
     return np.repeat(np.arange(frequencies.size), frequencies)
 
