@@ -79,8 +79,17 @@ class Hyperparameters:
             )
         for v in model.value_vars:
             refuse_single_precision(f"model: {v.name}", v.dtype)
+        refuse_reserved_names("model", map(str, model.named_vars))
         with interpreted():
-            return cls(model, model.initial_point(random_seed=0))
+            hyperparameters = cls(model, model.initial_point(random_seed=0))
+        names = hyperparameters.readable_names
+        twice = [name for i, name in enumerate(names) if name in names[:i]]
+        if twice:
+            raise ValueError(
+                f"model: got two hyperparameters called {twice[0]!r}, one of them an element of "
+                f"{variable_of(twice[0])!r}, expected different names; rename the other"
+            )
+        return hyperparameters
 
     def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
         """Return graphs of the value variables as graphs of one vector theta, and that vector."""
@@ -317,9 +326,23 @@ def element_names(name: str, shape: Sequence[int], labels: Sequence[Any] = ()) -
     return [element_name(name, index) for index in product(*axes)]
 
 
-def variable_of(element: str) -> str:
-    """Return the name of the variable that an element belongs to."""
-    return element.partition("[")[0]
+def variable_of(element: str, variables: Collection[str] = ()) -> str:
+    """Return the name of the variable that an element belongs to, of variables if one is there.
+
+    A variable's own name may have brackets, as that of ``pm.Normal("mu[1]")``.
+    """
+    names = [element[:i] for i, letter in enumerate(element) if letter == "["] + [element]
+    return next((name for name in reversed(names) if name in variables), names[0])
+
+
+def refuse_reserved_names(caller: str, names: Iterable[str]) -> None:
+    """Raise for variables with the name of a dimension of draws."""
+    for name in names:
+        if name in ("chain", "draw"):
+            raise ValueError(
+                f"{caller}: got a variable called {name!r}, which is a dimension of draws, "
+                "expected another name; rename it"
+            )
 
 
 def coordinates(model: Any, name: str) -> tuple[Any, ...]:

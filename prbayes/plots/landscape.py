@@ -333,11 +333,11 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
 def _thetas_at(evaluator: Evaluator, elements: dict[str, Floats]) -> Floats:
     """Return thetas of elements by name, (n,) or (1,) each; NaN outside the priors' support."""
     hyperparameters = evaluator.hyperparameters
+    names = [str(rv.name) for rv in evaluator.model.free_RVs]
     columns: dict[str, list[Floats]] = {}
     for name, column in zip(elements, np.broadcast_arrays(*elements.values()), strict=True):
-        columns.setdefault(variable_of(name), []).append(column)
+        columns.setdefault(variable_of(name, names), []).append(column)
     shapes = hyperparameters.constrained(hyperparameters.initial[None])
-    names = [str(rv.name) for rv in evaluator.model.free_RVs]
     values = [np.column_stack(columns[x]).reshape(-1, *shapes[x].shape[1:]) for x in names]
     with np.errstate(all="ignore"):
         return hyperparameters.thetas_of(values)

@@ -487,8 +487,9 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
         estimates = {
             name: (points[name], errors[name]) for name in optimum_elements(optimum, stderr)
         }
-    variables = readable_variables(m.hyperparameters, {variable_of(name) for name in estimates})
-    return {name: pair for name, pair in estimates.items() if variable_of(name) in variables}
+    owners = {name: variable_of(name, m.hyperparameters) for name in estimates}
+    variables = readable_variables(m.hyperparameters, set(owners.values()))
+    return {name: pair for name, pair in estimates.items() if owners[name] in variables}
 
 
 def _agreement(m: Material) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
@@ -119,15 +119,17 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     aleatory: list[TensorVariable] = []
     parents: dict[TensorVariable, None] = {}
     is_nested = False
-    for i, x in enumerate(inputs):
+    for i, argument in enumerate(inputs):
         label = f"{name}: input {i + 1}"
+        is_constant = isinstance(argument, Variable) and _is_constant(argument)
+        x = argument.eval(mode=PLAIN) if is_constant else argument
         if not isinstance(x, Variable):
             try:
                 array = real_array(x, label)
             except TypeError as error:
                 raise TypeError(
                     f"{error}; an input is a `.dist()` (varies between specimens), a model "
-                    "variable (common to all) or a number"
+                    "variable (common to all) or a number; pass several as several inputs"
                 ) from None
             if not np.isfinite(array).all():
                 raise ValueError(
@@ -181,6 +183,13 @@ def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) 
     return list(walk(variables, parents))
 
 
+def _is_constant(x: Variable) -> bool:
+    """Return whether a graph, not of `pymc.dims`, contains constants alone."""
+    ancestry = _ancestry([x])
+    has_dims = any(hasattr(v.type, "dims") for v in ancestry)
+    return not has_dims and all(isinstance(v, Constant) for v in ancestry if v.owner is None)
+
+
 def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:
     """Return whether the density of an input depends on no value of its parts, as of a mixture."""
     try:
@@ -205,10 +214,7 @@ def _refuse_foreign_variables(
     loose = [
         v
         for v in ancestry
-        if v.owner is None
-        and isinstance(v, TensorVariable)
-        and not hasattr(v, "data")
-        and not hasattr(v, "get_value")
+        if v.owner is None and not hasattr(v, "data") and not hasattr(v, "get_value")
     ]
     # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
     foreign = [v for v in latent if hasattr(v, "str_repr")]

@@ -132,8 +132,8 @@ def compare(
     in_all = set.intersection(*map(set, columns))
     shared = [name for name in columns[0] if name in in_all]
     if model is not None:
-        variables = {variable.name for variable in model.unobserved_RVs}
-        shared = [name for name in shared if variable_of(name) in variables]
+        variables = {str(variable.name) for variable in model.unobserved_RVs}
+        shared = [name for name in shared if variable_of(name, variables) in variables]
     in_table = set.intersection(*shown)
     names = readable_elements([name for name in shared if name in in_table])
     if not names:

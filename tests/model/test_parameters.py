@@ -9,6 +9,7 @@ import xarray as xr
 from pymc.model.fgraph import clone_model
 from scipy import stats
 
+import prbayes as prb
 from prbayes.model.parameters import (
     Hyperparameters,
     element_name,
@@ -22,6 +23,7 @@ from prbayes.model.parameters import (
     split_elements,
     stacked_draws,
     table_elements,
+    variable_of,
 )
 
 THETAS = np.array([[0.0, 4.0, 0.3], [2.0, 6.0, -0.4]])
@@ -253,3 +255,46 @@ def test_a_packed_factor_is_shown_by_its_standard_deviations_and_correlations() 
     elements = ["mu[0]", "chol[0]", "chol[1]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
     assert readable_elements(elements) == ["mu[0]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
     assert readable_elements(["chol[0]", "chol_stds[0]"]) == ["chol[0]", "chol_stds[0]"]
+
+
+@pytest.mark.parametrize("name", ["chain", "draw"])
+@pytest.mark.parametrize("place", ["hyperparameter", "deterministic", "simulator"])
+def test_names_of_dimensions_of_draws_are_refused(name: str, place: str) -> None:
+    with pm.Model() as model:
+        mu = pm.Normal(name if place == "hyperparameter" else "mu")
+        if place == "deterministic":
+            pm.Deterministic(name, 2 * mu)
+        elif place == "simulator":
+            refuse = f"prb.Simulator: got a variable called '{name}'"
+            with pytest.raises(ValueError, match=refuse):
+                prb.Simulator(name, np.square, pm.Normal.dist(mu), observed=[1.0, 2.0])
+            return
+    with pytest.raises(ValueError, match=f"model: got a variable called '{name}', which is a dim"):
+        Hyperparameters.of(model)
+
+
+def test_hyperparameters_of_one_name_are_refused() -> None:
+    with pm.Model() as model:
+        pm.Normal("mu", shape=2)
+        pm.Normal("mu[1]")
+    with pytest.raises(ValueError, match=r"called 'mu\[1\]', one of them an element of 'mu'"):
+        Hyperparameters.of(model)
+
+
+@pytest.mark.parametrize(
+    ("element", "variables", "expected"),
+    [
+        ("mu", (), "mu"),
+        ("mu[1]", (), "mu"),
+        ("mu[1]", ("mu", "sigma"), "mu"),
+        ("mu[1]", ("mu[1]", "sigma"), "mu[1]"),
+        ("mu[1][0]", ("mu[1]", "sigma"), "mu[1]"),
+        ("E [MPa][steel]", ("E [MPa]",), "E [MPa]"),
+        ("mu[a[1]]", ("mu",), "mu"),
+        ("chol_stds[0]", ("chol",), "chol_stds"),
+    ],
+)
+def test_the_variable_of_an_element(
+    element: str, variables: tuple[str, ...], expected: str
+) -> None:
+    assert variable_of(element, variables) == expected

@@ -229,3 +229,20 @@ def test_scores_that_compute_responses_have_to_be_requested() -> None:
     assert "KullbackLeibler" not in table
     # The area between the distribution functions of two normals of one width.
     assert float(table["AreaMetric"][0]) == pytest.approx(abs(data.mean() - 1.0), abs=0.15)
+
+
+def test_names_with_brackets_are_those_of_variables() -> None:
+    with pm.Model() as model:
+        mus = [pm.Normal(f"mu[{i}]", 1 + 2 * i, 1) for i in range(2)]
+        for i in range(2):
+            x = pm.Normal.dist(mus[i], 0.5)
+            observed = DATA[:, i]
+            prb.Simulator(
+                f"y[{i}]", np.positive, x, metric=prb.KullbackLeibler(), observed=observed,
+                propagation=prb.Reweighted(64),
+            )  # fmt: skip
+    optimum = prb.minimize(model)
+    table = prb.compare({"a": optimum, "b": optimum}, model=model)
+    assert table["hyperparameter"].values.tolist() == ["mu[0]", "mu[1]"]
+    expected = [float(optimum.point[f"mu[{i}]"]) for i in range(2)]
+    np.testing.assert_array_equal(table["estimate"].sel(result="b"), expected)
