@@ -60,6 +60,12 @@ class Hyperparameters:
             labels = coordinates(self.model, variable)
             names += element_names(str(v.name), shapes[str(v.name)], labels)
             readable_names += element_names(variable, shapes[str(v.name)], labels)
+        twice = [name for name in readable_names if readable_names.count(name) > 1]
+        if twice:
+            raise ValueError(
+                f"model: got two hyperparameters called {twice[0]!r}, an element of one and the "
+                "name of another, expected different names"
+            )
         vars(self).update(
             shapes=shapes,
             initial=initial,
@@ -77,19 +83,15 @@ class Hyperparameters:
                 f"model: got discrete hyperparameters {discrete}, expected continuous ones; "
                 "use pm.sample, or fix them"
             )
+        for name in {"chain", "draw"} & set(map(str, model.named_vars)):
+            raise ValueError(
+                f"model: got a variable called {name!r}, which is a dimension of posterior draws, "
+                "expected another name"
+            )
         for v in model.value_vars:
             refuse_single_precision(f"model: {v.name}", v.dtype)
-        refuse_reserved_names("model", map(str, model.named_vars))
         with interpreted():
-            hyperparameters = cls(model, model.initial_point(random_seed=0))
-        names = hyperparameters.readable_names
-        twice = [name for i, name in enumerate(names) if name in names[:i]]
-        if twice:
-            raise ValueError(
-                f"model: got two hyperparameters called {twice[0]!r}, one of them an element of "
-                f"{variable_of(twice[0])!r}, expected different names; rename the other"
-            )
-        return hyperparameters
+            return cls(model, model.initial_point(random_seed=0))
 
     def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
         """Return graphs of the value variables as graphs of one vector theta, and that vector."""
@@ -326,23 +328,13 @@ def element_names(name: str, shape: Sequence[int], labels: Sequence[Any] = ()) -
     return [element_name(name, index) for index in product(*axes)]
 
 
-def variable_of(element: str, variables: Collection[str] = ()) -> str:
-    """Return the name of the variable that an element belongs to, of variables if one is there.
+def variable_of(element: str, variables: Iterable[str] = ()) -> str:
+    """Return the name of the variable that an element belongs to.
 
-    A variable's own name may have brackets, as that of ``pm.Normal("mu[1]")``.
+    A name among ``variables`` may have a bracket itself, such as 'mu[1]' or 'force [N]'.
     """
-    names = [element[:i] for i, letter in enumerate(element) if letter == "["] + [element]
-    return next((name for name in reversed(names) if name in variables), names[0])
-
-
-def refuse_reserved_names(caller: str, names: Iterable[str]) -> None:
-    """Raise for variables with the name of a dimension of draws."""
-    for name in names:
-        if name in ("chain", "draw"):
-            raise ValueError(
-                f"{caller}: got a variable called {name!r}, which is a dimension of draws, "
-                "expected another name; rename it"
-            )
+    matches = [name for name in variables if element == name or element.startswith(f"{name}[")]
+    return max(matches, key=len, default=element.partition("[")[0])
 
 
 def coordinates(model: Any, name: str) -> tuple[Any, ...]:

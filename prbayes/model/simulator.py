@@ -31,7 +31,6 @@ from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.data_checks import warn_duplicates
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
-from prbayes.model.parameters import refuse_reserved_names
 from prbayes.model.random_variable import (
     AnySimulator,
     SimulatorDistribution,
@@ -180,7 +179,6 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             f"prb.Simulator: name: got {name!r}, which is in the model already, expected a new "
             "name; to run this again, run `with pm.Model():` and all below it again"
         )
-    refuse_reserved_names("prb.Simulator", [name, *map(str, model.named_vars)])
     refuse_uncallable(name, response)
     arguments = read_inputs(name, inputs, model)
     for rv in simulators(model):

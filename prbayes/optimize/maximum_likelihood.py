@@ -31,7 +31,7 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
-from prbayes.model.specimen_likelihood import arrays, draw_readings
+from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.points import farthest_rows
 from prbayes.optimize.convergence import Result
@@ -83,6 +83,9 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         max(preparation.points.difference, likelihood.options.half_difference)
         for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
     ]
+    is_supported = _supported(evaluator, optima)
+    if is_supported.any():
+        optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
     modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
     best = modes[0]
     point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
@@ -92,6 +95,8 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         log_prior = hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
     findings = [finding for preparation in preparations for finding in preparation.findings]
+    if not is_supported.any():
+        findings += report(_UNSUPPORTED)
     findings += report(*_findings(evaluator, objective, modes, weights))
     local_optima = tuple(
         local_optimum(evaluator, mode.theta, mode.value, comparable=mode.value - best.value < 6.0)
@@ -100,7 +105,8 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     )
     log_likelihoods = specimen_log_likelihoods(evaluator, best.theta[None])
     # The covariance is NaN at the edge of a support.
-    is_converged = best.converged and not np.isnan(best.covariance).any()
+    is_jump = np.isnan(best.covariance).any()
+    is_converged = best.converged and not is_jump and bool(is_supported.any())
     return Optimum(
         point=point,
         stderr=stderr,
@@ -125,6 +131,29 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         local_optima=local_optima,
         findings=tuple(findings),
     )
+
+
+_UNSUPPORTED = Finding(
+    "narrow-population",
+    "The likelihood is largest for a population that is narrower than the distances between the "
+    "points of the specimens, where its value is not known to one nat: the data do not bound the "
+    "spread of an input from below. Sample the posterior with prb.sample, or fix the spread.",
+    "likelihood.md#narrow-population",
+)
+
+
+def _supported(
+    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 1.0
+) -> NDArray[np.bool_]:
+    """Return which optima have a log-likelihood that is known to ``largest`` nats.
+
+    Where points lie farther apart than a population is wide, a few points that lie close to each
+    other make a spurious maximum.
+    """
+    thetas = np.stack([optimum.theta for optimum in optima])
+    values = evaluator.hyperparameters.constrained(thetas)
+    variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
+    return np.asarray(np.sqrt(variance) <= largest)
 
 
 def mode_weights(

@@ -333,8 +333,8 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
 def _thetas_at(evaluator: Evaluator, elements: dict[str, Floats]) -> Floats:
     """Return thetas of elements by name, (n,) or (1,) each; NaN outside the priors' support."""
     hyperparameters = evaluator.hyperparameters
-    names = [str(rv.name) for rv in evaluator.model.free_RVs]
     columns: dict[str, list[Floats]] = {}
+    names = [str(rv.name) for rv in evaluator.model.free_RVs]
     for name, column in zip(elements, np.broadcast_arrays(*elements.values()), strict=True):
         columns.setdefault(variable_of(name, names), []).append(column)
     shapes = hyperparameters.constrained(hyperparameters.initial[None])

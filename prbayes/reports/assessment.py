@@ -487,9 +487,10 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
         estimates = {
             name: (points[name], errors[name]) for name in optimum_elements(optimum, stderr)
         }
-    owners = {name: variable_of(name, m.hyperparameters) for name in estimates}
-    variables = readable_variables(m.hyperparameters, set(owners.values()))
-    return {name: pair for name, pair in estimates.items() if owners[name] in variables}
+    names = m.hyperparameters
+    variable = {name: variable_of(name, names) for name in estimates}
+    variables = readable_variables(names, set(variable.values()))
+    return {name: pair for name, pair in estimates.items() if variable[name] in variables}
 
 
 def _agreement(m: Material) -> str:

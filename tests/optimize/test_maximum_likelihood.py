@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from scipy import stats
 
 import prbayes as prb
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
+from prbayes.model.specimen_likelihood import monte_carlo_error
 from prbayes.optimize.maximum_likelihood import Mode, mode_weights, share_mode
 
 N = 25
@@ -224,3 +227,57 @@ def test_hyperparameters_that_only_the_prior_links_to_the_data_are_not_reported(
     (finding,) = fit(model).findings
     assert finding.code == "not-identified"
     assert "do not identify idle;" in finding.text
+
+
+SPREADS = np.random.default_rng(2).normal(1.0, 0.2, 30), np.random.default_rng(3).normal(2, 0.2, 30)
+
+
+def growing(a: Any, b: Any) -> Any:
+    return a * np.exp(0.5 * b)
+
+
+@cache
+def two_spreads() -> pm.Model:
+    """Return a model of one output, which identifies the spread of two inputs together."""
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("m1", 1, 0.5), pm.HalfNormal("s1", 0.5))
+        b = pm.Normal.dist(pm.Normal("m2", 2, 0.5), pm.HalfNormal("s2", 0.5))
+        prb.Simulator("y", growing, a, b, observed=growing(*SPREADS))
+    return model
+
+
+def exact_log_likelihood(point: Mapping[str, Any]) -> float:
+    """Return the log-likelihood by quadrature over the second input."""
+    m1, s1, m2, s2 = (float(point[name]) for name in ("m1", "s1", "m2", "s2"))
+    b = np.linspace(m2 - 8 * s2, m2 + 8 * s2, 20001)
+    growth = np.exp(0.5 * b)
+    a = growing(*SPREADS)[:, None] / growth
+    density = stats.norm.pdf(a, m1, s1) / growth * stats.norm.pdf(b, m2, s2)
+    return float(np.log(np.trapezoid(density, b, axis=1)).sum())
+
+
+def test_a_population_between_the_points_is_no_optimum() -> None:
+    """Populations of a spread near zero have spurious maxima, several nats high."""
+    optimum = fit(two_spreads())
+    assert optimum.converged
+    exact = exact_log_likelihood(optimum.point)
+    assert -optimum.discrepancy == pytest.approx(exact, abs=0.1)
+    assert exact > exact_log_likelihood({"m1": 1.0, "s1": 0.2, "m2": 2.0, "s2": 0.2})
+    (likelihood,) = optimum.evaluator.likelihoods
+    points = {"m1": 0.8308, "s1": [0.00104, 0.2], "m2": 2.306, "s2": 0.5255}
+    values = {name: np.broadcast_to(value, 2) for name, value in points.items()}
+    narrow, wide = monte_carlo_error(likelihood, values)
+    assert narrow > 2
+    assert wide < 0.2
+
+
+def test_an_optimum_whose_likelihood_is_not_known_has_not_converged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "prbayes.optimize.maximum_likelihood._supported",
+        lambda _, optima: np.zeros(len(optima), bool),
+    )
+    optimum = fit(normal_model())
+    assert not optimum.converged
+    assert [finding.code for finding in optimum.findings] == ["narrow-population"]

@@ -143,8 +143,23 @@ def test_invalid_results(results: Any, error: type[Exception], words: str) -> No
         prb.compare(results)
     with pm.Model() as other:
         pm.Normal("tau")
-    with pytest.raises(ValueError, match="share no hyperparameter"):
+    with pytest.raises(ValueError, match=r"share no hyperparameter \(a: mean.*; the model: tau\)"):
         prb.compare({"a": optimum()}, model=other)
+
+
+def test_names_with_brackets_are_compared() -> None:
+    with pm.Model() as other:
+        pm.Normal("mu[1]")
+        pm.Normal("force [N]", shape=2)
+    draws = np.random.default_rng(0).normal(size=(2, 1, 50))
+    vector = ("chain", "draw", "i"), np.moveaxis(draws, 0, -1)
+    values = {"mu[1]": (("chain", "draw"), draws[0]), "force [N]": vector}
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(values)})
+    table = prb.compare({"a": tree, "b": tree}, model=other)
+    names = ["mu[1]", "force [N][0]", "force [N][1]"]
+    assert table["hyperparameter"].values.tolist() == names
+    expected = [draws[0].mean(), *draws.mean(axis=(1, 2))]
+    np.testing.assert_allclose(table["estimate"].sel(result="b"), expected)
 
 
 # -- scores
@@ -229,20 +244,3 @@ def test_scores_that_compute_responses_have_to_be_requested() -> None:
     assert "KullbackLeibler" not in table
     # The area between the distribution functions of two normals of one width.
     assert float(table["AreaMetric"][0]) == pytest.approx(abs(data.mean() - 1.0), abs=0.15)
-
-
-def test_names_with_brackets_are_those_of_variables() -> None:
-    with pm.Model() as model:
-        mus = [pm.Normal(f"mu[{i}]", 1 + 2 * i, 1) for i in range(2)]
-        for i in range(2):
-            x = pm.Normal.dist(mus[i], 0.5)
-            observed = DATA[:, i]
-            prb.Simulator(
-                f"y[{i}]", np.positive, x, metric=prb.KullbackLeibler(), observed=observed,
-                propagation=prb.Reweighted(64),
-            )  # fmt: skip
-    optimum = prb.minimize(model)
-    table = prb.compare({"a": optimum, "b": optimum}, model=model)
-    assert table["hyperparameter"].values.tolist() == ["mu[0]", "mu[1]"]
-    expected = [float(optimum.point[f"mu[{i}]"]) for i in range(2)]
-    np.testing.assert_array_equal(table["estimate"].sel(result="b"), expected)
