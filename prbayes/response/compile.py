@@ -21,7 +21,7 @@ from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.subtensor import Subtensor
-from pytensor.tensor.variable import TensorConstant, TensorVariable
+from pytensor.tensor.variable import TensorVariable
 
 
 def _numpy_elementwise(fgraph: Any, node: Any) -> Any:
@@ -56,12 +56,12 @@ def _index_batches(fgraph: Any, node: Any) -> Any:
     return [x[pt.arange(x.shape[0]), index]]
 
 
-def _own_constants(fgraph: Any, node: Any) -> Any:
+def copy_views(fgraph: Any, node: Any) -> Any:
     """Copy constants that are views of others, which PyTensor may make read-only later."""
     # NumPy and SciPy raise for a view that may be written if its base may not.
     copies = [
         pt.constant(x.data.copy(), dtype=x.type.dtype)
-        if isinstance(x, TensorConstant) and x.data.base is not None
+        if isinstance(x, Constant) and getattr(x.data, "base", None) is not None
         else x
         for x in node.inputs
     ]
@@ -76,7 +76,7 @@ PLAIN = (
     .excluding("fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition")
     .register((out2in(node_rewriter([Blockwise])(_index_batches)), 1000))
     .register((out2in(node_rewriter([Elemwise])(_numpy_elementwise)), 1001))
-    .register((out2in(node_rewriter(None)(_own_constants)), 1002))
+    .register((out2in(node_rewriter(None)(copy_views)), 1002))
 )
 
 _flags_lock = RLock()

@@ -196,7 +196,7 @@ def _seed(function: Any, rng: np.random.Generator) -> None:
         shared.set_value(child, borrow=True)
 
 
-def _resized(dist: TensorVariable, size: tuple[Any, ...]) -> TensorVariable:
+def resized(dist: TensorVariable, size: tuple[Any, ...]) -> TensorVariable:
     """Return independent draws of a distribution along leading axes of this size."""
     op = dist.owner.op
     if not hasattr(op, "rv_op"):
@@ -222,7 +222,7 @@ class PriorSampler:
             batches = {}
             for v in variables:
                 if variables.keys() & set(ancestors([v])) == {v}:
-                    batches[v] = _resized(v, (n,))
+                    batches[v] = resized(v, (n,))
             outputs = vectorize_graph(list(drawn), batches)
             self._function = pm.compile([n], outputs, mode=PLAIN)
             self._is_batched = True
@@ -298,7 +298,7 @@ class PopulationSampler:
         for v in filter(is_random, ancestors(aleatory)):
             parents = [a for a in ancestors([v]) if a is not v]
             if not any(a in symbols or is_random(a) for a in parents):
-                per_specimen[v] = _resized(v, size)
+                per_specimen[v] = resized(v, size)
         self._is_batched = True
         try:
             specimens = vectorize_graph(aleatory, per_specimen)
@@ -309,9 +309,19 @@ class PopulationSampler:
             self._is_batched, batched = False, symbols
             # Resized before the parents are replaced, since PyMC resizes a CustomDist with its
             # first parameters.
-            resized = self._specimens(inputs, n)
+            try:
+                if inputs.nested:  # parts of an input are drawn for each specimen too
+                    parts = set(filter(is_random, ancestors(inputs.aleatory, inputs.parents)))
+                    parts -= set(inputs.parents)
+                    first = [v for v in parts if parts & set(ancestors([v], inputs.parents)) == {v}]
+                    per_specimen = {v: resized(v, (n,)) for v in first}
+                    many = vectorize_graph(list(inputs.aleatory), per_specimen)
+                else:
+                    many = [resized(dist, (n,)) for dist in inputs.aleatory]
+            except (NotImplementedError, ValueError, MissingInputError) as error:
+                raise self.refusal(error) from None
             replaced = dict(zip(inputs.parents, symbols, strict=True))
-            specimens = graph_replace(resized, replaced, strict=False)
+            specimens = graph_replace(many, replaced, strict=False)
         self._event_shapes = inputs.event_shapes
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
         self._function = pm.compile(
@@ -322,24 +332,8 @@ class PopulationSampler:
             allow_input_downcast=True,
         )
 
-    def _specimens(self, inputs: Inputs, n: TensorVariable) -> list[TensorVariable]:
-        """Return n specimens of one population, whose parents are still those of the model."""
-        aleatory = list(inputs.aleatory)
-        try:
-            if not inputs.nested:
-                return [_resized(dist, (n,)) for dist in aleatory]
-            # Parts of an input are drawn for each specimen too.
-            parts = set(filter(is_random, ancestors(aleatory, inputs.parents)))
-            parts -= set(inputs.parents)
-            first = [v for v in parts if parts & set(ancestors([v], inputs.parents)) == {v}]
-            specimens: list[TensorVariable] = vectorize_graph(
-                aleatory, {v: _resized(v, (n,)) for v in first}
-            )
-        except (NotImplementedError, ValueError, MissingInputError) as error:
-            raise self._undrawable(error) from None
-        return specimens
-
-    def _undrawable(self, error: Exception) -> TypeError:
+    def refusal(self, error: Exception) -> TypeError:
+        """Return the error of inputs that cannot be drawn."""
         return TypeError(
             f"inputs: got {self._names}, one of which cannot be drawn "
             f"({str(error).splitlines()[0]}), expected distributions from which specimens can be "
@@ -362,7 +356,7 @@ class PopulationSampler:
                 populations = [self._function(n, *row) for row in zip(*params, strict=True)]
                 values = [np.stack(column) for column in zip(*populations, strict=True)]
         except (NotImplementedError, RuntimeError, ValueError) as error:
-            raise self._undrawable(error) from None
+            raise self.refusal(error) from None
         n_aleatory = len(self._event_shapes)
         # SciPy's generators, behind some distributions, drop leading axes of length one.
         aleatory = [

@@ -12,7 +12,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
@@ -121,8 +121,12 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     is_nested = False
     for i, argument in enumerate(inputs):
         label = f"{name}: input {i + 1}"
-        is_constant = isinstance(argument, Variable) and _is_constant(argument)
-        x = argument.eval(mode=PLAIN) if is_constant else argument
+        x = argument
+        if isinstance(x, Variable):
+            ancestry = _ancestry([x])
+            has_dims = any(hasattr(v.type, "dims") for v in ancestry)
+            if not has_dims and all(hasattr(v, "data") for v in ancestry if v.owner is None):
+                x = x.eval(mode=PLAIN)  # of constants alone
         if not isinstance(x, Variable):
             try:
                 array = real_array(x, label)
@@ -181,13 +185,6 @@ def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) 
         return None if variable in ends or variable.owner is None else variable.owner.inputs
 
     return list(walk(variables, parents))
-
-
-def _is_constant(x: Variable) -> bool:
-    """Return whether a graph, not of `pymc.dims`, contains constants alone."""
-    ancestry = _ancestry([x])
-    has_dims = any(hasattr(v.type, "dims") for v in ancestry)
-    return not has_dims and all(isinstance(v, Constant) for v in ancestry if v.owner is None)
 
 
 def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:
