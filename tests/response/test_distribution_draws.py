@@ -49,10 +49,13 @@ def _assert_same_distribution(draws: Any, expected: Any) -> None:
 
 
 # Scalars are inputs in tests/test_distributions.py too.
-_LONG = {name: [pytest.mark.long] if "," in name else [] for name in CASES}
+_SLOW = (",", "Hurdle", "ZeroInflated", "Mixture")
+_LONG = {n: [pytest.mark.long] if any(part in n for part in _SLOW) else [] for n in CASES}
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::UserWarning")  # of PyMC
+@pytest.mark.filterwarnings(  # of PyMC
+    "ignore::RuntimeWarning", "ignore::UserWarning", "ignore::FutureWarning"
+)
 @pytest.mark.parametrize(
     "size", [pytest.param(None, marks=pytest.mark.long), 2], ids=["scalar", "vector"]
 )
