@@ -92,11 +92,13 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         batch shape, in units of the observed values; for m outputs of a specimen an array with them
         in a last axis, or a mapping of arrays with the keys of ``observed``. NaN is a point without
         response, +inf a specimen that failed. The response of a specimen depends on the inputs of
-        that specimen alone: one of them is also computed by itself, and a difference is refused.
-        Where inputs repeat, as discrete ones do, a design computes the response once, unless four
-        of them differ when they are computed again. Model random scatter of the response as an
-        input, such as ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs
-        and propagation, and metrics of distributions, share runs.
+        that specimen alone: three of the first ones are computed again, by themselves, and a
+        difference is refused. Where inputs repeat, as discrete ones do, a design computes the
+        response once. Model random scatter of the response as an input, such as
+        ``pm.Normal.dist(0, 1)``, or use `Fresh`. Simulators with the same response object, inputs
+        and propagation, and metrics of distributions, share runs. Variables that the response
+        reads have to stay as they are: a few runs are computed again where runs serve another
+        simulator or function, and a difference is refused.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
@@ -210,7 +212,12 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
     calls: dict[str, Any] = {key: getattr(settings, key) for key in _CALL_SETTINGS}
-    calls["outputs"] = outputs
+    scatter = 0.0 if by_specimen else 0.01
+    calls |= {
+        "outputs": outputs,
+        "caller": name,
+        "scatter": None if settings.is_random else scatter,
+    }
     labels = None
     if specimens is not None:
         labels = sample_labels(specimens, len(values), f"{name}: specimens")
