@@ -7,6 +7,7 @@ before it waits for the next.
 from __future__ import annotations
 
 import io
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -501,26 +502,32 @@ def computed_again(
     return values, raised
 
 
+def by_output(values: NDArray[Any]) -> NDArray[Any]:
+    """Return responses, (n,) or (n, m), with a column for each output."""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
+
+
 def revealing_rows(values: Floats) -> Rows:
     """Return rows of responses, (n,) or (n, m), at which a change of the function can show.
 
-    The smallest, the middle and the largest response, one that is NaN and one that is infinite.
+    The largest, the middle and the smallest response, one that is NaN and one that is infinite.
+    The largest comes first, as the first run of a design may be the smallest.
     """
-    columns = values.reshape(len(values), -1)
+    columns = by_output(values)
     is_finite = np.isfinite(columns).all(axis=1)
     is_nan = np.isnan(columns).any(axis=1)
     finite = np.flatnonzero(is_finite)
     size = np.abs(columns[finite]).max(axis=0, initial=0.0)
     sums = (columns[finite] / np.where(size > 0, size, 1.0)).sum(axis=1)
     order = finite[np.argsort(sums, kind="stable")]
-    selected = [order[:1], order[len(order) // 2 :][:1], order[-1:]]
+    selected = [order[-1:], order[len(order) // 2 :][:1], order[:1]]
     selected += [np.flatnonzero(kind)[:1] for kind in (is_nan, ~is_finite & ~is_nan)]
-    return np.unique(np.concatenate(selected)).astype(np.intp)
+    return np.array(list(dict.fromkeys(np.concatenate(selected).tolist())), dtype=np.intp)
 
 
 def typical_size(values: Floats) -> Any:
     """Return the median size of finite responses, (n,) or (n, m), of each output."""
-    finite = values[np.isfinite(values.reshape(len(values), -1)).all(axis=1)]
+    finite = values[np.isfinite(by_output(values)).all(axis=1)]
     return np.median(np.abs(finite), axis=0) if len(finite) else 0.0
 
 
@@ -534,7 +541,7 @@ def first_change(values: Floats, again: Floats, tolerance: Any) -> int | None:
     is_same = (again == values) | (np.isnan(again) & np.isnan(values))
     with np.errstate(invalid="ignore"):
         is_same |= np.abs(again - values) <= np.maximum(tolerance, 1e-6 * np.abs(values))
-    rows = np.flatnonzero(~is_same.reshape(len(values), -1).all(axis=1))
+    rows = np.flatnonzero(~by_output(is_same).all(axis=1))
     return int(rows[0]) if rows.size else None
 
 

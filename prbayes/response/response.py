@@ -21,6 +21,7 @@ from prbayes.response.call import (
     CallSettings,
     Points,
     Tally,
+    by_output,
     checked,
     computed_again,
     first_change,
@@ -260,7 +261,8 @@ class Responses:
             if self.outputs is None:
                 self.outputs = self._tally.named
             responses = responses.reshape(batch + responses.shape[1:])
-        if not self._is_checked and size > 1 and self.computed > n_computed:
+        # Runs of which a store has some were checked by those.
+        if not self._is_checked and size > 1 and self.computed >= n_computed + size:
             specimens = [v.reshape(size, *v.shape[len(batch) :]) for v in full]
             self._refuse_state(specimens, responses.reshape(size, *responses.shape[len(batch) :]))
             if written_form(self.function) != self._written_form:
@@ -272,6 +274,12 @@ class Responses:
         runs.last = ([x.copy() for x in values], responses.copy()) if is_kept else None
         return responses
 
+    def used_by(self, caller: str) -> Responses:
+        """Return the same response for another use of its runs."""
+        other = copy.copy(self)
+        other.caller = caller
+        return other
+
     def refuse_change(self, points: Sequence[Floats], values: Floats, stored: Responses) -> None:
         """Raise if stored runs differ when a few of them are computed again, once for each caller.
 
@@ -279,6 +287,7 @@ class Responses:
         (n, m). With a version of the store the user answers for the runs.
         """
         store = stored._settings.store
+        self._is_checked |= stored._is_checked
         if self.caller in stored.runs.users or (store is not None and store.version is not None):
             return
         rows = revealing_rows(values)
@@ -350,6 +359,14 @@ class Responses:
             settings = replace(self._settings, outputs=self.outputs)
             return computed_again(settings, self._points(values, (n,)), self._tally.copied())[0]
 
+    def _by_itself(self, values: Sequence[Floats]) -> Floats:
+        """Compute specimens again; where a function takes no batch of one, as a batch of two."""
+        try:
+            return self._again(values)
+        except ResponseError:
+            n = len(values[0])
+            return self._again([np.concatenate([x, x]) for x in values])[:n]
+
     @property
     def _one_system(self) -> float:
         """By how many standard deviations a solver that steps a batch as one system differs."""
@@ -361,21 +378,21 @@ class Responses:
         The last one, which depends on the most if the response has a state from specimen to
         specimen, then one in the middle, and the first one, after all others.
         """
-        finite = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+        finite = np.flatnonzero(np.isfinite(by_output(values)).all(axis=1))
         if finite.size < 2 or (self.scatter is None and not self.is_batched):
             return
         rows = np.unique(finite[[0, len(finite) * 3 // 4, -1]])[::-1]
         parts = [rows[i : i + 1] for i in range(rows.size)] if self.is_batched else [rows]
         for part in parts:
+            selected = [x[part] for x in specimens]
             try:
-                selected = [x[part] for x in specimens]
-                again = self._again(selected)
+                again = self._by_itself(selected)
                 accuracy = _accuracy(values, 0.01 if self.scatter is None else self.scatter)
                 changed = first_change(values[part], again, accuracy)
                 if changed is None or np.isnan(again[changed]).all():
                     continue
-                second = self._again(selected)
-            except ResponseError:  # it takes no batch of one
+                second = self._by_itself(selected)
+            except ResponseError:  # it takes no small batch
                 return
             is_random = first_change(again, second, _accuracy(values)) is not None
             if is_random and self.scatter is None:
@@ -426,7 +443,7 @@ class Responses:
 
 def _accuracy(values: Floats, share: float = 0.0) -> Any:
     """Return how much one of the responses (n,) or (n, m) may change: a share of their spread."""
-    finite = values[np.isfinite(values.reshape(len(values), -1)).all(axis=1)]
+    finite = values[np.isfinite(by_output(values)).all(axis=1)]
     spread = finite.std(axis=0) if len(finite) else 0.0
     return np.maximum(1e-6 * typical_size(values), share * spread)
 
