@@ -468,17 +468,18 @@ def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
         if changed is not None:
             row = rows[changed]
             text = numbers_text(again[changed])
+            remedy = "pass"
             if changed in raised:
                 text = f"nothing ({raised[changed]})"
             elif np.isnan(values[row]).any():
-                text += "; to compute points without response again, pass retry_failed=True"
+                remedy = "after a repair pass retry_failed=True, which computes NaN again, or pass"
             raise StoreError(
                 f"{settings.name}: store: got a response that gives {text} at "
                 f"({', '.join(f'{x:.6g}' for x in keys[row])}), expected "
                 f"{numbers_text(values[row])}, which is stored in {store.path}: it is of another "
-                "function, or its variables have changed; nothing was changed: pass another "
-                "folder, or version= with a name for the response as it is now, whose runs are "
-                "then kept apart"
+                "function, or its variables have changed; nothing was changed: "
+                f"{remedy} another folder, or version= with a name for the response as it is now, "
+                "whose runs are then kept apart"
             )
     store.verified = True
 
