@@ -212,12 +212,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
     calls: dict[str, Any] = {key: getattr(settings, key) for key in _CALL_SETTINGS}
-    scatter = 0.0 if by_specimen else 0.01
-    calls |= {
-        "outputs": outputs,
-        "caller": name,
-        "scatter": None if settings.is_random else scatter,
-    }
+    calls |= {"outputs": outputs, "caller": name, "scatter": None if settings.is_random else 0.01}
     labels = None
     if specimens is not None:
         labels = sample_labels(specimens, len(values), f"{name}: specimens")
@@ -227,7 +222,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         arguments = _inputs_of_partners(name, arguments, partners)
         if weights is not None:
             weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
-        responses = Responses(name, response, arguments, **calls)
+        responses = Responses(name, response, arguments, **calls | {"scatter": 0.0})
         extras = _measurement_variables(name, model, metric, partners)
         measurement = Measurement(
             name, cast(LogLikelihood, metric), values, weights, labels, arguments, responses,

@@ -158,6 +158,29 @@ def test_clones_and_the_original_have_the_same_runs() -> None:
     assert len({id(node.bound) for node in found}) == 3
 
 
+def test_shared_runs_are_computed_again_a_few_times_for_each_simulator() -> None:
+    class Machine(Counted):
+        load = 1.0
+
+        def __call__(self, x: float) -> float:
+            return self.load * super().__call__(x)
+
+    machine = Machine()
+    response = prb.scalar(machine)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        given: dict[str, Any] = {"metric": AREA, "observed": 2 * OBSERVED, "propagation": DESIGN}
+        prb.Simulator("a", response, x, **given)
+        first_use(model)
+        prb.Simulator("b", response, x, **given)
+        first_use(model)
+        assert machine.runs == 32 + 2 * AGAIN
+        machine.load = 2.0
+        prb.Simulator("c", response, x, **given)
+        with pytest.raises(prb.response.ResponseError, match=r"^c: got .* has changed since; bui"):
+            first_use(model)
+
+
 def test_data_may_be_set_before_and_after_the_first_use() -> None:
     response = Counted()
     model = build(response)
