@@ -267,17 +267,6 @@ def test_simulation_based_calibration(problem: Problem) -> None:
         assert float(ranks[name].mean()) == pytest.approx(0.5, abs=0.29)
 
 
-@pytest.mark.long
-@pytest.mark.usefixtures("no_run")
-def test_diagnosis_of_an_optimum_states_the_power(optimum: prb.Optimum) -> None:
-    found = prb.diagnose(optimum)
-    assert found.ok
-    assert not found.untested
-    assert any("a power of 0.23 for skewness 1" in note for note in found.notes)
-    assert any("the emulator of" in note for note in found.notes)
-    assert prb.diagnose(optimum).notes == found.notes
-
-
 @pytest.mark.usefixtures("no_run")
 def test_scores_of_the_population_test_are_those_of_the_inputs(
     problem: Problem, optimum: prb.Optimum
@@ -295,8 +284,10 @@ def test_scores_of_the_population_test_are_those_of_the_inputs(
 
 
 @pytest.mark.usefixtures("no_run")
-def test_diagnosis_of_draws(problem: Problem, posterior: xr.DataTree) -> None:
-    found = prb.diagnose(posterior, model=problem.model)
+@pytest.mark.parametrize("name", ["posterior", pytest.param("optimum", marks=pytest.mark.long)])
+def test_a_diagnosis_states_the_power(problem: Problem, results: Any, name: str) -> None:
+    model = problem.model if name == "posterior" else None
+    found = prb.diagnose(results[name], model=model)
     assert found.ok
     assert not found.untested
     assert str(found).startswith("No problem was found.")
@@ -339,12 +330,11 @@ def test_a_prior_that_agrees_with_the_data_is_no_conflict(optimum: prb.Optimum) 
         assert not checked.findings
 
 
-def test_conflict_of_prior_and_data() -> None:
-    observed = np.exp(0.5 * np.random.default_rng(7).normal(1.0, 0.4, N))
+def test_conflict_of_prior_and_data(problem: Problem) -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", -1.0, 0.1), pm.HalfNormal("sigma", 1.0))
-        prb.Simulator("y", lambda x: np.exp(0.5 * x), x, observed=observed)
-    optimum = prb.minimize(model, progressbar=False)
+        prb.Simulator("y", lambda x: np.exp(0.5 * x), x, observed=problem.observed)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
     checked = check_conflict(optimum, (optimum.theta - [1.5, 0.0])[None])
     assert [finding.code for finding in checked.findings] == ["prior-conflict"]
     assert str(checked.findings[0]).startswith("mu: got prior")

@@ -52,21 +52,15 @@ def draws(model: pm.Model) -> Any:
     return found.posterior
 
 
-@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64)])
+@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64)])
 def test_a_log_density_has_no_randomness_of_its_own(propagation: Any) -> None:
-    """Unlike that of PyMC's simulator, which is another one at each call."""
+    """Unlike that of PyMC's simulator and of fresh responses, which is another one at each call."""
     model = build(propagation)
     density = model.compile_logp(mode=PLAIN)
     point = model.initial_point()
-    assert density(point) == density(point)
+    is_same = density(point) == density(point)
+    assert is_same == (not isinstance(propagation, prb.Fresh))
     assert not [v for v in density.f.get_shared() if isinstance(v.type, RandomType)]
-
-
-def test_a_log_density_of_fresh_responses_is_another_one_each_time() -> None:
-    model = build(prb.Fresh(64))
-    density = model.compile_logp(mode=PLAIN)
-    point = model.initial_point()
-    assert density(point) != density(point)
 
 
 def test_a_named_model_has_named_results() -> None:
@@ -116,17 +110,3 @@ def test_a_simulator_above_another_is_refused_before_its_response_is_computed() 
             with pytest.raises(TypeError, match=r"t: got inputs that depend on the simulator s"):
                 prb.Simulator("t", response, x, metric=prb.AreaMetric(), observed=OBSERVED)
     assert len(CALLS) == before
-
-
-@pytest.mark.parametrize("call", [prb.sample_smc, prb.minimize])
-def test_discrete_hyperparameters_are_refused(call: Any) -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(2.0 * pm.Bernoulli("z", 0.5) - 1.0, 0.5)
-        prb.Simulator("s", response, x, metric=prb.AreaMetric(), observed=OBSERVED)
-    with pytest.raises(TypeError, match=r"got discrete hyperparameters \['z'\], expected"):
-        call(model=model)
-
-
-def test_too_few_draws_are_refused() -> None:
-    with pytest.raises(ValueError, match="draws: got 5, expected an integer >= 10"):
-        prb.sample_smc(5, model=named())

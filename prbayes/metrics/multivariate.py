@@ -23,7 +23,6 @@ from prbayes.metrics.base import (
     joined,
 )
 from prbayes.metrics.whitening import (
-    FEWEST,
     LEFT_OUT,
     MOST_OUTPUTS,
     Components,
@@ -460,9 +459,12 @@ def _order(key: frozenset[int]) -> tuple[int, list[int]]:
     return -len(key), sorted(key)
 
 
-def _is_rare(key: frozenset[int], has: NDArray[np.bool_]) -> bool:
-    """Return whether too few specimens have these outputs to whiten them, or their components."""
-    needed = len(key) + 2 if len(key) <= MOST_OUTPUTS else FEWEST
+def _is_rare(key: frozenset[int], has: NDArray[np.bool_], fewest: int = 10) -> bool:
+    """Return whether too few specimens have these outputs to whiten them, or their components.
+
+    The fewest for two components are five each: scatters of fewer are uncertain.
+    """
+    needed = len(key) + 2 if len(key) <= MOST_OUTPUTS else fewest
     return int(has[:, list(key)].all(axis=-1).sum()) < needed
 
 

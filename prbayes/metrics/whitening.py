@@ -19,8 +19,6 @@ from prbayes.metrics.density import spread
 MOST_OUTPUTS = 8
 # Share of the variance, of the data and of the design, that components may leave out.
 LEFT_OUT = 0.01
-# Fewest specimens for two components, five each: scatters of fewer are uncertain.
-FEWEST = 10
 
 
 @dataclass(frozen=True, eq=False)

@@ -415,10 +415,10 @@ def missing_mass(evaluator: Evaluator, theta: Floats, k: int) -> dict[str, float
     return {"lost_mass": float(missing.lost[0]), "failed_mass": float(missing.failed[0])}
 
 
-def coarser_evaluator(evaluator: Evaluator, theta: Floats | None = None) -> Evaluator | None:
+def coarser_evaluator(evaluator: Evaluator, theta: Floats) -> Evaluator:
     """Return an evaluator with an eighth of the points of large designs.
 
-    None if no design is large, or if the smaller designs do not support theta, (d,).
+    The same one if no design is large, or if the smaller designs do not support theta, (d,).
     """
     bounds: list[Bound] = []
     for node in evaluator.nodes:
@@ -428,14 +428,13 @@ def coarser_evaluator(evaluator: Evaluator, theta: Floats | None = None) -> Eval
         else:
             bounds.append(node.bound)
     if bounds == [node.bound for node in evaluator.nodes]:
-        return None
+        return evaluator
     pairs = zip(evaluator.nodes, bounds, strict=True)
     coarse_nodes = tuple(replace(node, bound=bound) for node, bound in pairs)
     coarse = replace(evaluator, nodes=coarse_nodes, has_graph=False)
-    support = {} if theta is None else coarse.support(theta[None])
-    for name, values in support.items():
+    for name, values in coarse.support(theta[None]).items():
         if not values["weight_ess"][0] >= coarse.reweighted[name].required_ess:
-            return None
+            return evaluator
     return coarse
 
 

@@ -110,6 +110,33 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     return result if weights is None else result * weights
 
 
+def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
+    """Return the error of the log-likelihood of populations by finitely many points, (P,), in nats.
+
+    It is that of the difference between two independent halves of the points of each specimen. A
+    population that is narrower than the distances between points has a large one. A specimen
+    without a point in one of the halves is left out; zero if the error of the readings is unknown.
+    """
+    shared, shared_log_a = arrays(likelihood)
+    log_a = shared_log_a.get_value(borrow=True)
+    x = [variable.get_value(borrow=True) for variable in shared]
+    size, half = len(next(iter(values.values()))), log_a.shape[1] // 2
+    variance = np.zeros(size)
+    if not likelihood.error_is_known:
+        return variance
+    for group, rows in likelihood.by_group:
+        parents = parent_values(values, likelihood.inputs, group)
+        logs = []
+        for part in (slice(half), slice(half, None)):
+            of_half = [v[rows, part] for v in x]
+            points = WeightedPoints.of(likelihood.inputs, of_half, log_a[rows, part])
+            logs.append(likelihood.density.log_likelihoods(parents, points))
+        with np.errstate(invalid="ignore"):
+            difference = logs[0] - logs[1]
+        variance += np.nansum(np.where(np.isfinite(difference), difference / 2, 0) ** 2, axis=1)
+    return np.sqrt(variance)
+
+
 def _errors(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Floats:
     """Return the unknown error of each output, (P, M), one where it is known."""
     size = len(next(iter(values.values())))

@@ -473,7 +473,7 @@ def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
     Without overlap density metrics are the same everywhere, up to rounding.
     """
     evaluator = search.evaluator
-    if all(apart_from_data(evaluator, theta) for theta in thetas):
+    if all(stored_overlap(evaluator, theta) < OVERLAP for theta in thetas):
         values = AreaGuide(evaluator, scales)(thetas)
     else:
         values = evaluator.total(thetas, scales)
@@ -489,13 +489,12 @@ def overlapping_populations(
     return populations, np.array([overlap(node.target, *population) for node, population in pairs])
 
 
-def apart_from_data(evaluator: Evaluator, theta: Floats, least: float = OVERLAP) -> bool:
-    """Return whether stored responses, with the weights of theta, overlap with no data.
+def stored_overlap(evaluator: Evaluator, theta: Floats) -> float:
+    """Return the largest overlap of stored responses, with the weights of theta, with the data.
 
-    Their densities then overlap by less than ``least``. False if this would compute responses, or
-    a metric compares no densities.
+    Infinite if it would compute responses, or a metric compares no densities.
     """
     if not is_stored(evaluator):
-        return False
+        return np.inf
     _, overlaps = overlapping_populations(evaluator, theta[None])
-    return bool((overlaps < least).all())
+    return float(overlaps.max())

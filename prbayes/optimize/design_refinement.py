@@ -19,13 +19,14 @@ from prbayes.inference.resampling import families, siblings
 from prbayes.model.evaluator import Evaluator, Shortcoming, n_design_runs, shortcomings
 from prbayes.model.parameters import THETAS
 from prbayes.optimize.convergence import (
+    OVERLAP,
     OVERLAP_ENOUGH,
     AreaGuide,
     Fit,
     Search,
-    apart_from_data,
     approach,
     best_or_nearest,
+    stored_overlap,
 )
 from prbayes.optimize.objective import Ridge
 from prbayes.propagation.base import DesignError
@@ -77,8 +78,9 @@ def refine_designs(
         refuse(short, evaluator, findings)
     if short:
         return fit, _cover(search, fit, nearby, seed)
-    is_apart = apart_from_data(evaluator, fit.theta)
-    if round_ < MAX_ROUNDS and apart_from_data(evaluator, fit.theta, OVERLAP_ENOUGH):
+    overlap = stored_overlap(evaluator, fit.theta)
+    is_apart = overlap < OVERLAP
+    if round_ < MAX_ROUNDS and overlap < OVERLAP_ENOUGH:
         # The design supports this point, but the fit is poor: continue along the area metric.
         theta, _ = approach(search, fit.theta, fit.scales, seed, fit.trace, OVERLAP_ENOUGH)
         if refine_at(evaluator, theta[None]):
@@ -90,12 +92,10 @@ def refine_designs(
     fit = replace(fit, design_error=errors.whole)
     if not errors.whole > AGREE:
         return fit, None
-    remaining = runs_left(evaluator, errors)
-    note = f"error {errors.whole:.2f} standard errors, {AGREE} are wanted"
-    note += f", about {remaining} runs to go" if remaining else ", no more runs are needed"
     previous = n_design_runs(evaluator)
     if not grow(evaluator, nearby, errors):
         return fit, None
+    note = f"error {errors.whole:.2f} standard errors, {AGREE} are wanted"
     advance(n_design_runs(evaluator) - previous, note)
     # The fit may be an artefact of the smaller design.
     theta = best_or_nearest(search, np.vstack([fit.theta, nearby]), fit.scales)
@@ -226,31 +226,16 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     names = set(evaluator.reweighted)
-    factor = _growth_factor(evaluator, errors)
-    # At most twice as many runs at a time: the estimate of the error is itself uncertain.
-    if factor > 1 and _add_runs(evaluator, thetas, names, min(2.0, factor)):
-        return True
+    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
+    if not is_emulated or errors.emulators > _SHARE * AGREE:
+        # The error of a design of several inputs is taken to fall with the power .65 of its size.
+        # At most twice as many runs at a time: the estimate of the error is itself uncertain.
+        factor = float(min(2.0, (errors.whole / AGREE) ** (1 / 0.65)))
+        if _add_runs(evaluator, thetas, names, factor):
+            return True
     if not errors.points > _SHARE * AGREE:
         return False
     return draw_samples(evaluator, thetas, names, larger=True)
-
-
-def runs_left(evaluator: Evaluator, errors: DesignErrors) -> int:
-    """Return how many more runs are expected until the designs' error is small enough."""
-    more = _growth_factor(evaluator, errors) - 1
-    bounds = evaluator.reweighted.values()
-    return round(sum(min(more * b.n_runs, max(0, b.config.most - b.n_runs)) for b in bounds))
-
-
-def _growth_factor(evaluator: Evaluator, errors: DesignErrors) -> float:
-    """Return the factor by which the number of runs has to grow; one if runs do not help.
-
-    The error of a design of several inputs is taken to fall with the power .65 of its size.
-    """
-    is_emulated = all(bound.design.is_emulated for bound in evaluator.reweighted.values())
-    if is_emulated and not errors.emulators > _SHARE * AGREE:
-        return 1.0
-    return float((errors.whole / AGREE) ** (1 / 0.65))
 
 
 def _add_runs(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:
@@ -301,7 +286,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         values = (evaluation.discrepancies / scales).sum(axis=-1) - evaluation.log_other
         values = np.where(np.isfinite(evaluation.log_prior), values, np.inf)
         order = np.argsort(values)[:THETAS]
-        is_apart = apart_from_data(evaluator, thetas[order[0]])
+        is_apart = stored_overlap(evaluator, thetas[order[0]]) < OVERLAP
         if is_apart:
             # Discrepancies are equal, up to rounding.
             order = np.argsort(AreaGuide(evaluator, scales)(thetas))[:THETAS]
@@ -368,29 +353,15 @@ def draw_samples(
 
 
 @contextmanager
-def temporary_samples(
-    evaluator: Evaluator,
-    thetas: Floats,
-    names: set[str] | None = None,
-    *,
-    same_surfaces: bool = True,
-) -> Iterator[None]:
+def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
     """Redraw emulated samples for the populations at thetas within the context.
 
-    Those of all designs, or of the simulators with the given names and their siblings.
+    Those of designs of a model that was never calibrated, which cover the prior alone.
     """
-    names = set(evaluator.reweighted) if names is None else names
-    with designs_restored(list(evaluator.reweighted.values())):
-        draw_samples(evaluator, thetas, names, same_surfaces=same_surfaces)
-        yield
-
-
-@contextmanager
-def temporary_first_samples(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
-    """Do the same in designs of a model that was never calibrated, which cover the prior alone."""
     bounds = evaluator.reweighted.items()
     names = {name for name, bound in bounds if len(bound.design.groups) == 1}
-    with temporary_samples(evaluator, thetas, names, same_surfaces=False):
+    with designs_restored(list(evaluator.reweighted.values())):
+        draw_samples(evaluator, thetas, names)
         yield
 
 

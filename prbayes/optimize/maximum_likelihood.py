@@ -31,17 +31,17 @@ from prbayes.model.evaluator import (
 )
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.measurement import SpecimenLikelihood, specimen_numbers
-from prbayes.model.specimen_likelihood import arrays, draw_readings
+from prbayes.model.specimen_likelihood import arrays, draw_readings, monte_carlo_error
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.points import farthest_rows
 from prbayes.optimize.convergence import Result
 from prbayes.optimize.optimum import (
     Optimum,
     SearchRecord,
+    local_optimum,
     n_computed,
+    place,
     point_and_stderr,
-    point_at,
-    require_minimiser,
     require_sampling,
 )
 from prbayes.propagation.specimen_emulation import specimen_roots
@@ -50,7 +50,7 @@ from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
 
 
 @dataclass(frozen=True, eq=False)
-class LocalOptimum:
+class Mode:
     """A local minimum of minus the log-likelihood, or of minus the log-posterior."""
 
     theta: Floats  # (d,)
@@ -83,6 +83,9 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         max(preparation.points.difference, likelihood.options.half_difference)
         for preparation, likelihood in zip(preparations, evaluator.likelihoods, strict=True)
     ]
+    is_supported = _supported(evaluator, optima)
+    if is_supported.any():
+        optima = [optimum for optimum, ok in zip(optima, is_supported, strict=True) if ok]
     modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
     best = modes[0]
     point, stderr = point_and_stderr(evaluator, best.theta, best.covariance)
@@ -92,20 +95,18 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
         log_prior = hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
         weights = mode_weights(modes, log_prior, hyperparameters.prior_sd)
     findings = [finding for preparation in preparations for finding in preparation.findings]
+    if not is_supported.any():
+        findings += report(_UNSUPPORTED)
     findings += report(*_findings(evaluator, objective, modes, weights))
     local_optima = tuple(
-        {
-            "point": point_at(evaluator, mode.theta),
-            "discrepancy": mode.value,
-            "theta": mode.theta,
-            "comparable": mode.value - best.value < 6.0,
-            "weight": float(weight),
-        }
+        local_optimum(evaluator, mode.theta, mode.value, comparable=mode.value - best.value < 6.0)
+        | {"weight": float(weight)}
         for mode, weight in zip(modes[1:], weights[1:], strict=True)
     )
     log_likelihoods = specimen_log_likelihoods(evaluator, best.theta[None])
     # The covariance is NaN at the edge of a support.
-    is_converged = best.converged and not np.isnan(best.covariance).any()
+    is_jump = np.isnan(best.covariance).any()
+    is_converged = best.converged and not is_jump and bool(is_supported.any())
     return Optimum(
         point=point,
         stderr=stderr,
@@ -132,8 +133,31 @@ def maximize_likelihood(evaluator: Evaluator, settings: Any) -> Optimum:
     )
 
 
+_UNSUPPORTED = Finding(
+    "narrow-population",
+    "The likelihood is largest for a population that is narrower than the distances between the "
+    "points of the specimens, where its value is not known to one nat: the data do not bound the "
+    "spread of an input from below. Sample the posterior with prb.sample, or fix the spread.",
+    "likelihood.md#narrow-population",
+)
+
+
+def _supported(
+    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 1.0
+) -> NDArray[np.bool_]:
+    """Return which optima have a log-likelihood that is known to ``largest`` nats.
+
+    Where points lie farther apart than a population is wide, a few points that lie close to each
+    other make a spurious maximum.
+    """
+    thetas = np.stack([optimum.theta for optimum in optima])
+    values = evaluator.hyperparameters.constrained(thetas)
+    variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
+    return np.asarray(np.sqrt(variance) <= largest)
+
+
 def mode_weights(
-    modes: list[LocalOptimum], log_prior: Floats | None = None, prior_sd: Floats | None = None
+    modes: list[Mode], log_prior: Floats | None = None, prior_sd: Floats | None = None
 ) -> Floats:
     """Return the share of each mode in the posterior's mass, by Laplace's approximation.
 
@@ -209,7 +233,7 @@ def _starts(evaluator: Evaluator, settings: Any) -> tuple[list[Floats], int]:
     return list(candidates[rows] * hyperparameters.prior_sd), n_screened
 
 
-def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimum:
+def _descend(objective: _Objective, start: Floats, settings: Any) -> Mode:
     """Return the local minimum that BFGS reaches, with its inverse Hessian."""
     from scipy.optimize import minimize as scipy_minimize
 
@@ -242,7 +266,7 @@ def _descend(objective: _Objective, start: Floats, settings: Any) -> LocalOptimu
             value, _ = objective(theta)
     steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
-    return LocalOptimum(theta, value, covariance, bool(slope < 0.05), steps)
+    return Mode(theta, value, covariance, bool(slope < 0.05), steps)
 
 
 def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, float]:
@@ -294,9 +318,7 @@ def _hessian(objective: _Objective, theta: Floats) -> Floats | None:
     return hessian
 
 
-def _distinct(
-    optima: list[LocalOptimum], objective: _Objective, error: float
-) -> list[LocalOptimum]:
+def _distinct(optima: list[Mode], objective: _Objective, error: float) -> list[Mode]:
     """Return the modes within 30 nats of the best optimum, best first.
 
     Optima closer than a hundredth of the prior's width are the same.
@@ -319,8 +341,8 @@ def _distinct(
 def share_mode(
     objective: Callable[[Floats], tuple[float, Floats]],
     unit: Floats,
-    first: LocalOptimum,
-    second: LocalOptimum,
+    first: Mode,
+    second: Mode,
     barrier: float,
 ) -> bool:
     """Return whether two optima are of one mode: no barrier in nats lies between them.
@@ -350,7 +372,7 @@ def share_mode(
 
 
 def _findings(
-    evaluator: Evaluator, objective: _Objective, modes: list[LocalOptimum], weights: Floats
+    evaluator: Evaluator, objective: _Objective, modes: list[Mode], weights: Floats
 ) -> list[Finding]:
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
@@ -386,16 +408,12 @@ def _findings(
     for mode, weight in zip(modes[1:], weights[1:], strict=True):
         if weight < 0.01:
             continue
-        point = point_at(evaluator, mode.theta)
-        free = [str(rv.name) for rv in evaluator.model.free_RVs]
-        where = ", ".join(
-            f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free
-        )
         findings.append(
             Finding(
                 "second-mode",
-                f"A second optimum at {where} has {weight:.0%} of the posterior's mass; NUTS "
-                "chains may stay in the mode where they start; prb.sample_smc samples both.",
+                f"A second optimum at {place(evaluator, mode.theta)} has {weight:.0%} of the "
+                "posterior's mass; NUTS chains may stay in the mode where they start; "
+                "prb.sample_smc samples both.",
                 "likelihood.md#several-modes",
             )
         )
@@ -604,5 +622,4 @@ def specimen_refits(optimum: Optimum, caller: str, *, simulated: bool = False) -
     obstacle = find(evaluator)
     if obstacle is not None:
         raise ValueError(f"{caller}: {obstacle}; use prb.sample_smc")
-    require_minimiser(optimum, caller)
     return SpecimenRefits(evaluator, optimum.theta, optimum.covariance)

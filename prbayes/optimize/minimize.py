@@ -62,7 +62,13 @@ from prbayes.optimize.design_refinement import (
 from prbayes.optimize.local_optima import LocalOptimum, find_local_optima
 from prbayes.optimize.maximum_likelihood import maximize_likelihood
 from prbayes.optimize.objective import Method, Minimisation, Ridge, initial_scales
-from prbayes.optimize.optimum import Optimum, SearchRecord, n_computed, optimum_of
+from prbayes.optimize.optimum import (
+    Optimum,
+    SearchRecord,
+    local_optimum,
+    n_computed,
+    optimum_of,
+)
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
 
@@ -502,7 +508,10 @@ def _report(
         *smoothing_bias(evaluator, fit.theta, fit.scales, local),
         *optimum_findings(evaluator, fit.sampling, optima, fit.design_error),
     )
-    local_optima = tuple(mode.as_dict(evaluator) for mode in optima)
+    local_optima = tuple(
+        local_optimum(evaluator, mode.theta, mode.value, comparable=mode.comparable)
+        for mode in optima
+    )
     return replace(
         optimum, design_error=fit.design_error, local_optima=local_optima, findings=findings
     )

@@ -44,10 +44,17 @@ from prbayes.model.fingerprint import (
     require_same,
 )
 from prbayes.model.locking import locked
-from prbayes.model.parameters import THETAS, optimum_elements, readable_variables, single_elements
+from prbayes.model.parameters import (
+    THETAS,
+    optimum_elements,
+    readable_variables,
+    single_elements,
+    split_elements,
+    table_elements,
+)
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
-from prbayes.optimize.convergence import Fit, Result, Search, apart_from_data
+from prbayes.optimize.convergence import OVERLAP, Fit, Result, Search, stored_overlap
 
 # A smaller share is displayed as 0.0%.
 SMALLEST_SHARE = 5e-4
@@ -268,14 +275,8 @@ class Optimum:
         return failures_dataset(self.evaluator)
 
     @locked
-    def sampling(self, *, weakest: float = 1.0) -> SamplingDistribution:
+    def sampling(self) -> SamplingDistribution:
         """Return the sampling distribution of the minimiser around the optimum.
-
-        Parameters
-        ----------
-        weakest : float
-            Largest standard error of a direction that counts as identified, in spreads of the
-            prior.
 
         Raises
         ------
@@ -291,7 +292,7 @@ class Optimum:
             raise TypeError(f"sampling: {obstacle}")
         require_minimiser(self, "sampling")
         scales = np.array(list(self.scales.values()))
-        return SamplingDistribution.of(self.evaluator, self.theta, scales, weakest)
+        return SamplingDistribution.of(self.evaluator, self.theta, scales)
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree.
@@ -361,7 +362,7 @@ def optimum_of(search: Search, fit: Fit, record: SearchRecord, n_previous: int) 
         result = Result.AT_EDGE
     elif is_flat:
         result = Result.NO_INFORMATION
-    elif is_affordable and not search.prior and apart_from_data(evaluator, theta):
+    elif is_affordable and not search.prior and stored_overlap(evaluator, theta) < OVERLAP:
         # Such a minimum is one of the mass beyond the grid, and no fit.
         result = Result.NO_OVERLAP
     if is_affordable:
@@ -416,6 +417,25 @@ def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:
     """Return variables and deterministics at theta in the user's units."""
     values = evaluator.hyperparameters.constrained(theta[None])
     return {name: _number(value[0]) for name, value in values.items()}
+
+
+def place(evaluator: Evaluator, theta: Floats) -> str:
+    """Return the free variables at theta in words, without constants."""
+    hyperparameters = evaluator.hyperparameters
+    # Beside a second point, so that constants can be recognised.
+    points = hyperparameters.constrained(np.stack([theta, hyperparameters.initial]))
+    names = readable_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
+    values = labelled(evaluator, {name: points[name] for name in names}, {"point": 2}).data_vars
+    elements = split_elements(values)
+    return ", ".join(f"{name} = {elements[name][0]:.4g}" for name in table_elements(values))
+
+
+def local_optimum(
+    evaluator: Evaluator, theta: Floats, value: float, *, comparable: bool
+) -> dict[str, Any]:
+    """Return the record of a local optimum in `Optimum.local_optima`."""
+    point = point_at(evaluator, theta)
+    return {"point": point, "discrepancy": value, "theta": theta, "comparable": comparable}
 
 
 def point_and_stderr(

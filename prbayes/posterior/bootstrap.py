@@ -17,7 +17,7 @@ from prbayes.inference.resampling import dirichlet_weights, reweighted_sets, sim
 from prbayes.model.description import observed_dataset, versions
 from prbayes.model.locking import locked
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
-from prbayes.optimize.optimum import Optimum, require_refits
+from prbayes.optimize.optimum import Optimum, require_minimiser, require_refits
 from prbayes.posterior.results import posterior_group
 
 
@@ -125,6 +125,7 @@ def _specimen_estimates(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return maximum-likelihood estimates, (draws, d), and whether they converged."""
     refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
+    require_minimiser(optimum, "bootstrap")
     is_infinite = np.isinf(np.diag(optimum.covariance))
     _require_identified(np.array(optimum.evaluator.hyperparameters.names)[is_infinite].tolist())
     if not parametric:

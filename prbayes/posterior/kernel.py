@@ -19,7 +19,6 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
-from scipy.special import logsumexp
 
 from prbayes._validate import Floats, called, positive_integer, real_array, share
 from prbayes.model.evaluator import Evaluator
@@ -41,12 +40,15 @@ class KernelOptions:
     tempered_correlation: float = 0.3  # before the last stage; later stages forget the rest
     # Beside the hard ends of a uniform population 25 steps leave posteriors a tenth too wide.
     steps: int = 60
-    effective: float = 0.2  # smallest effective share of particles that `reweight` accepts
 
 
 _OPTIONS = KernelOptions()
 
+# Attributes of the kernel that are a part of its state.
+_STATE = ("stages", "beta", "log_marginal_likelihood", "iteration")
+
 Stages = dict[str, list[float]]  # statistics of a chain by name, a value for each stage
+State = tuple[dict[str, Floats], dict[str, Any]]  # arrays of particles, and a note for JSON
 
 
 class Particles(NamedTuple):
@@ -124,7 +126,6 @@ class BatchedKernel(SMC_KERNEL):
         shapes = self.evaluator.hyperparameters.shapes.items()
         self.var_info = {name: (shape, int(np.prod(shape, dtype=int))) for name, shape in shapes}
         self.rng = np.random.default_rng(random_seed)
-        self.is_coarse = False  # whether `reweight` by a finer evaluator follows
         self.stages: Stages = {}
         self._reset_state()
 
@@ -174,37 +175,17 @@ class BatchedKernel(SMC_KERNEL):
         self.resampling_indexes = systematic_resampling(self.weights, self.rng)
         self._take(Particles(*[array[self.resampling_indexes] for array in self.particles]))
 
-    def tempered(self, evaluator: Evaluator, max_stages: int | None = None) -> Iterator[None]:
-        """Do the remaining stages, the last one with this evaluator, and yield after each."""
-        while self.beta < 1 or self.is_coarse:
+    def tempered(self, max_stages: int | None = None) -> Iterator[None]:
+        """Do the remaining stages, and yield after each."""
+        while self.beta < 1:
             if len(self.stages["beta"]) == max_stages:
                 raise BudgetError(
                     f"max_stages = {max_stages} was reached (beta {self.beta:.3g}, of 1)"
                 )
-            if self.beta < 1:
-                self.update_beta_and_weights()
-            elif not self.reweight(evaluator):
-                # The coarse posterior differs: once more, on all points.
-                self.initialize(self.start, self.rng)
-                continue
+            self.update_beta_and_weights()
             for name, value in self.step().items():
                 self.stages[name].append(value)
             yield
-
-    def reweight(self, evaluator: Evaluator) -> bool:
-        """Weigh the particles by another evaluator; return whether enough of them have weight."""
-        self.evaluator = evaluator
-        self.is_coarse = False
-        coarse = self.particles.log_likelihood
-        self._take(self._evaluate(self.particles.thetas))
-        with np.errstate(invalid="ignore"):
-            log_weights = np.nan_to_num(self.particles.log_likelihood - coarse, nan=-np.inf)
-        total = logsumexp(log_weights)
-        if not np.isfinite(total):
-            return False
-        self.weights = np.exp(log_weights - total)
-        self.log_marginal_likelihood += total - np.log(self.draws)
-        return bool(1 / np.square(self.weights).sum() > _OPTIONS.effective * self.draws)
 
     def mutate(self) -> None:
         """Move all particles by Metropolis-Hastings steps that preserve the tempered posterior."""
@@ -214,8 +195,7 @@ class BatchedKernel(SMC_KERNEL):
         covariance = np.atleast_2d(np.cov(start, rowvar=False))
         jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
         root = np.linalg.cholesky(covariance + jitter)
-        is_last = self.beta == 1 and not self.is_coarse
-        limit = _OPTIONS.correlation if is_last else _OPTIONS.tempered_correlation
+        limit = _OPTIONS.correlation if self.beta == 1 else _OPTIONS.tempered_correlation
         # The best scale for normal targets, steered to an acceptance rate between those for many
         # dimensions and for one (Roberts, Gelman and Gilks 1997, doi:10.1214/aoap/1034625254).
         scale = 2.38 / np.sqrt(start.shape[1])
@@ -268,28 +248,23 @@ class BatchedKernel(SMC_KERNEL):
         """Return the settings of the run."""
         return {"_n_draws": self.draws, "threshold": self.threshold, "_n_tune": self.n_steps}
 
-    def state(self) -> tuple[dict[str, Floats], dict[str, Any]]:
-        """Return the state that the next stage depends on: arrays, and a note for JSON."""
-        note = {
-            "stages": self.stages,
-            "is_coarse": self.is_coarse,
-            "beta": self.beta,
-            "log_marginal_likelihood": self.log_marginal_likelihood,
-            "iteration": self.iteration,
-            "generator": self.rng.bit_generator.state,
-        }
+    def state(self) -> State:
+        """Return the state that the next stage depends on."""
+        note = {name: getattr(self, name) for name in _STATE}
+        note["generator"] = self.rng.bit_generator.state
+        # Evaluations so far determine random responses.
+        note["evaluations"] = [node.bound.draws for node in self.evaluator.nodes]
         return self.particles._asdict(), note
 
     def restore(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
         """Take over a state."""
         self._take(Particles(**arrays))
-        self.stages = note["stages"]
-        self.is_coarse = note["is_coarse"]
-        self.beta = note["beta"]
-        self.log_marginal_likelihood = note["log_marginal_likelihood"]
-        self.iteration = note["iteration"]
+        for name in _STATE:
+            setattr(self, name, note[name])
         self.rng = np.random.default_rng()
         self.rng.bit_generator.state = note["generator"]
+        for node, draws in zip(self.evaluator.nodes, note["evaluations"], strict=True):
+            node.bound.draws = draws
 
 
 def correlation(start: Floats, end: Floats) -> float:
@@ -349,7 +324,7 @@ def starting_thetas(hyperparameters: Hyperparameters, start: Any, draws: int) ->
     return thetas
 
 
-_FORMAT = 5  # of the content of a file; files of other formats are refused
+_FORMAT = 6  # of the content of a file; files of other formats are refused
 _DIGEST = hashlib.sha256
 
 
@@ -366,8 +341,7 @@ class Checkpoint:
     ) -> None:
         self.path = Path(path)
         self.problem = problem
-        # As from JSON, so that settings equal those of a file.
-        self.settings: dict[str, Any] = json.loads(json.dumps(settings))
+        self.settings = dict(settings)
         self.arrays: dict[str, Floats] = {}
         self.note: dict[str, Any] = {}
         if self.path.exists():

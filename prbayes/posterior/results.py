@@ -48,9 +48,9 @@ class Chains:
     log_likelihood: Floats | None = None  # (chains, draws), up to a constant; None by specimen
     discrepancies: Floats | None = None  # (chains, draws, k); NaN if they would cost responses
     lost: Floats | None = None  # (chains, draws, k): share without response; NaN if stored
-    errors: Floats | None = None  # (k,): of the discrepancies at the best draw
-    # By simulator: shares of the best draw's population that were lost or failed.
-    missing: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    # By simulator, at the best draw: error of the discrepancy, and lost and failed shares of the
+    # population.
+    at_best: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     stopped: str = ""  # the budget that ended the run early
 
 
@@ -115,15 +115,14 @@ def _calibration(evaluator: Evaluator, chains: Chains) -> xr.Dataset:
     lost = by_draw["lost_mass"]
     bounds = [node.bound for node in nodes]
     designs = [node.reweighted for node in nodes]
-    at_best = [chains.missing.get(node.name, {}) for node in nodes]
-    errors = np.full(len(nodes), np.nan) if chains.errors is None else chains.errors
+    at_best = [chains.at_best.get(node.name, {}) for node in nodes]
     by_simulator = {
         "lossy_draws": [
             share_of_lossy(lost[:, :, k], bound.max_lost) for k, bound in enumerate(bounds)
         ],
-        "discrepancy_error": errors,
-        "lost_mass_at_best": [missing.get("lost_mass", np.nan) for missing in at_best],
-        "failed_mass_at_best": [missing.get("failed_mass", np.nan) for missing in at_best],
+        "discrepancy_error": [values.get("discrepancy_error", np.nan) for values in at_best],
+        "lost_mass_at_best": [values.get("lost_mass", np.nan) for values in at_best],
+        "failed_mass_at_best": [values.get("failed_mass", np.nan) for values in at_best],
         "epsilon": evaluator.epsilon,
         "required_ess": [np.nan if bound is None else bound.required_ess for bound in designs],
         "max_lost": [bound.max_lost for bound in bounds],
@@ -180,10 +179,6 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, by_metric: xr.Dataset) ->
     }
     variables: dict[str, Any] = {key: ("simulator", x) for key, x in by_simulator.items()}
     variables["discrepancy"] = (_BY_DRAW, discrepancies.reshape(chains, draws, -1))
-    for name, variable in by_metric.data_vars.items():
-        if name not in variables and "simulator" in variable.dims:
-            shape = [len(names) if dim == "simulator" else n for dim, n in variable.sizes.items()]
-            variables[str(name)] = (variable.dims, np.full(shape, np.nan))
     return xr.Dataset(variables, coords={**by_metric.coords, "simulator": names})
 
 

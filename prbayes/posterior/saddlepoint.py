@@ -178,7 +178,7 @@ def estimate_likelihood(
     if any(events) or len(nodes) > 1 or fewest < options.few_specimens:
         for _ in range(options.rounds):
             evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
-    evaluator = coarser_evaluator(evaluator, point) or evaluator
+    evaluator = coarser_evaluator(evaluator, point)
     # The combinations of the scores that vary, by the populations at the point.
     score_groups = [
         _group_scores(evaluator, members, point, scales, options)

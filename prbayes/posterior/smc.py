@@ -14,17 +14,16 @@ from typing import Any, Literal
 import numpy as np
 import pymc as pm
 import xarray as xr
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
 from prbayes._finding import Finding, as_json, report
-from prbayes._progress import CONSOLE, lines, live, shown
+from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes.inference.checks.population import refuse_lost_specimens
 from prbayes.model.cost import designs_as_before, explained
 from prbayes.model.evaluator import (
     Evaluator,
-    coarser_evaluator,
     is_current,
     missing_mass,
     n_design_runs,
@@ -41,7 +40,7 @@ from prbayes.optimize.objective import Minimisation
 from prbayes.optimize.optimum import Optimum, require_sampling
 from prbayes.posterior.epsilon import calibrate_epsilon, checked_epsilon
 from prbayes.posterior.importance import LogDensity
-from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, starting_thetas
+from prbayes.posterior.kernel import BatchedKernel, Checkpoint, Stages, State, starting_thetas
 from prbayes.posterior.results import (
     Chains,
     arviz_groups,
@@ -59,8 +58,6 @@ from prbayes.response.inputs import model_on_context
 _log = logging.getLogger("prbayes")
 
 Adjustment = Literal["estimate"] | None
-
-_SAVED = ("thetas", "discrepancies", "lost")  # arrays of a finished chain
 
 
 @locked
@@ -330,21 +327,17 @@ def result_of(
         )
         page = "expensive.md#a-night-is-not-enough"
         findings += report(Finding("budget-spent", text, page))
-    thetas, lost, discrepancies = chains.thetas, chains.lost, chains.discrepancies
-    rows = thetas.reshape(-1, evaluator.hyperparameters.size)
+    thetas = chains.thetas
     if not is_pseudo:
-        discrepancies = np.full((*thetas.shape[:2], len(evaluator.nodes)), np.nan)
-        lost = discrepancies
-        is_stored = [node.bound.stored for node in evaluator.nodes]
-        if not all(is_stored):
-            lost = _lost_of_some(evaluator, thetas)
-    assert lost is not None
-    findings += _lost_findings(evaluator, lost, chains.missing)
+        lost = _lost_of_some(evaluator, thetas)
+        chains = replace(chains, lost=lost, discrepancies=np.full_like(lost, np.nan))
+    findings += _lost_findings(evaluator, chains)
+    rows = thetas.reshape(-1, evaluator.hyperparameters.size)
     refuse_lost_specimens(evaluator, rows.mean(axis=0))
     with unlimited():
         if not is_pseudo and evaluator.nodes and not evaluator.responses_per_theta:
             discrepancies = evaluator(rows).discrepancies.reshape(lost.shape)
-        chains = replace(chains, discrepancies=discrepancies, lost=lost)
+            chains = replace(chains, discrepancies=discrepancies)
         groups = {}
         if settings.with_groups:
             groups = arviz_groups(evaluator, chains, settings.random_seed)
@@ -366,7 +359,10 @@ def result_of(
 
 
 def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floats:
-    """Return the share without response, (chains, draws, k), at some draws; NaN at others."""
+    """Return the share without response, (chains, draws, k), at some draws.
+
+    NaN at others, and of simulators with stored responses.
+    """
     chains, draws, _ = thetas.shape
     lost = np.full((chains, draws, len(evaluator.nodes)), np.nan)
     rows = np.linspace(0, chains * draws - 1, count).astype(np.intp)
@@ -382,14 +378,14 @@ def _lost_of_some(evaluator: Evaluator, thetas: Floats, count: int = 64) -> Floa
     return lost
 
 
-def _lost_findings(
-    evaluator: Evaluator, lost: Floats, missing: Mapping[str, Mapping[str, float]]
-) -> tuple[Finding, ...]:
+def _lost_findings(evaluator: Evaluator, chains: Chains) -> tuple[Finding, ...]:
     """Report draws whose populations lack responses; raise if most draws, or the best, do."""
+    lost = chains.lost
+    assert lost is not None
     shares = {}
     findings = []
     for k, node in enumerate(evaluator.nodes):
-        shares[node.name] = missing.get(node.name, {}).get("lost_mass", 0.0)
+        shares[node.name] = chains.at_best.get(node.name, {}).get("lost_mass", 0.0)
         if np.isnan(lost[:, :, k]).all():
             continue
         shares[node.name] = max(shares[node.name], float(np.nanmedian(lost[:, :, k])))
@@ -443,7 +439,7 @@ def _set_epsilons(evaluator: Evaluator, settings: SamplingSettings) -> Optimum |
 
 
 def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
-    """Return chains with log-likelihoods, and errors and missing responses at the best draw."""
+    """Return chains with log-likelihoods, and the error and missing mass at the best draw."""
     discrepancies = chains.discrepancies
     assert discrepancies is not None
     kernels = np.asarray(log_kernel(discrepancies, evaluator.epsilon))
@@ -452,15 +448,15 @@ def _with_errors(evaluator: Evaluator, chains: Chains) -> Chains:
     chains = replace(chains, log_likelihood=kernels.sum(axis=-1) + other_terms)
     total = (discrepancies / evaluator.epsilon).sum(axis=-1)
     best = chains.thetas[np.unravel_index(total.argmin(), total.shape)]
-    errors = []
-    missing = {}
+    at_best = {}
     try:
         for k, node in enumerate(evaluator.nodes):
-            errors.append(discrepancy_error(node.bound, evaluator.parents(best[None], k)))
-            missing[node.name] = missing_mass(evaluator, best, k)
+            error = discrepancy_error(node.bound, evaluator.parents(best[None], k))
+            masses = missing_mass(evaluator, best, k)
+            at_best[node.name] = {"discrepancy_error": error, **masses}
     except BudgetError as spent:
         return replace(chains, stopped=chains.stopped or str(spent))
-    return replace(chains, errors=np.array(errors), missing=missing)
+    return replace(chains, at_best=at_best)
 
 
 # -- chains ----------------------------------------------------------------------------------------
@@ -539,118 +535,71 @@ def run_chains(
 ) -> Chains:
     """Run a chain for each seed on the designs as they are, or as many as a budget allows.
 
-    ``log_likelihood`` replaces that of the evaluator. The checkpoint gets the state after each
-    stage, and ``refinements``, the thetas of earlier rounds. Raises BudgetError if a budget is
-    spent before the first chain is finished.
+    ``log_likelihood`` replaces that of the evaluator. The checkpoint gets the states of all kernels
+    after each stage, and ``refinements``, the thetas of earlier rounds. Raises BudgetError if a
+    budget is spent before the first chain is finished.
     """
-    saved = {} if checkpoint is None else checkpoint.note
-    if saved.get("round") != len(refinements):
-        saved = {}
-    coarse = coarser_evaluator(evaluator) if log_likelihood is None else None
-    finished: list[dict[str, Floats]] = []
-    stages: list[Stages] = []
+    saved = [] if checkpoint is None else _saved_states(checkpoint, len(refinements))
+    states: list[State] = []  # of the kernels of finished chains
     stopped = ""
-    columns = (
-        TextColumn("SMC chain {task.fields[chain]}"),
-        BarColumn(),
-        TextColumn("beta {task.completed:.4f}"),
-        TextColumn("acceptance {task.fields[rate]:.2f}"),
-        TimeElapsedColumn(),
-    )
-    with (
-        shown(settings.progressbar) as visible,
-        Progress(*columns, console=CONSOLE, disable=not (visible and live())) as progress,
-    ):
-        write = lines()
+    with shown(settings.progressbar), progress("SMC stages") as advance:
         for chain, seed in enumerate(seeds):
-            task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
-            if checkpoint is not None and chain < saved.get("chain", 0):
-                finished.append(checkpoint.arrays_of(f"chain{chain}_"))
-                stages.append(saved["stages"][chain])
-                continue
             kernel = BatchedKernel(
                 settings.draws,
                 None if starts is None else starts[chain],
                 evaluator.model,
                 threshold=settings.threshold,
-                evaluator=coarse or evaluator,
+                evaluator=evaluator,
                 log_likelihood=log_likelihood,
             )
-            kernel.is_coarse = coarse is not None
+            (stream,) = seed.generate_state(1)
+            for node in evaluator.nodes:
+                node.bound.stream, node.bound.draws = int(stream), 0
+            place = f"chain {chain + 1} of {len(seeds)}"
             try:
-                is_resumed = chain == saved.get("chain")
-                _begin(kernel, evaluator, seed, checkpoint if is_resumed else None)
-                for _ in kernel.tempered(evaluator, settings.max_stages):
+                if chain < len(saved):
+                    kernel.restore(*saved[chain])
+                else:
+                    kernel.initialize(kernel.start, np.random.default_rng(seed))
+                for _ in kernel.tempered(settings.max_stages):
                     if checkpoint is not None:
-                        _save(checkpoint, kernel, evaluator, finished, stages, refinements)
-                    progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
-                    write(f"SMC chain {chain + 1} of {len(seeds)}: beta {kernel.beta:.3g} of 1")
+                        _save(checkpoint, [*states, kernel.state()], refinements)
+                    advance(1, f"{place}: beta {kernel.beta:.3g} of 1")
             except BudgetError as spent:
-                stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
+                stopped = f"{spent} in {place}"
                 break
-            finished.append({name: getattr(kernel.particles, name) for name in _SAVED})
-            stages.append(kernel.stages)
-    if not finished:
+            states.append(kernel.state())
+    if not states:
         raise BudgetError(stopped)
-    thetas, discrepancies, lost = [
-        np.array([arrays[name] for arrays in finished]) for name in _SAVED
-    ]
-    stats, evidence = _stage_statistics(stages)
+    particles, notes = zip(*states, strict=True)
+    arrays = {name: np.array([of_chain[name] for of_chain in particles]) for name in particles[0]}
+    stats, evidence = _stage_statistics([note["stages"] for note in notes])
     is_pseudo = bool(evaluator.nodes) and settings.adjustment is None
     return Chains(
-        thetas=thetas,
+        thetas=arrays["thetas"],
         sampler={"sampler": "SMC-ABC" if is_pseudo else "SMC", **evidence},
         sample_stats=stats,
-        discrepancies=discrepancies,
-        lost=lost,
+        discrepancies=arrays["discrepancies"],
+        lost=arrays["lost"],
         stopped=stopped,
     )
 
 
-def _begin(
-    kernel: BatchedKernel,
-    evaluator: Evaluator,
-    seed: np.random.SeedSequence,
-    checkpoint: Checkpoint | None,
-) -> None:
-    """Begin a chain at its start, or in the state of a checkpoint."""
-    (stream,) = seed.generate_state(1)
-    for node in evaluator.nodes:
-        node.bound.stream, node.bound.draws = int(stream), 0
-    if checkpoint is None:
-        kernel.initialize(kernel.start, np.random.default_rng(seed))
-        return
-    kernel.restore(checkpoint.arrays_of("now_"), checkpoint.note["state"])
-    if not kernel.is_coarse:
-        kernel.evaluator = evaluator
-    for node in evaluator.nodes:
-        if node.bound.random:
-            node.bound.draws = checkpoint.note["generators"][node.name]
+def _saved_states(checkpoint: Checkpoint, round_: int) -> list[State]:
+    """Return the states of the kernels that have begun in this round of refinement."""
+    if checkpoint.note.get("round") != round_:
+        return []
+    notes = checkpoint.note["states"]
+    return [(checkpoint.arrays_of(f"chain{i}_"), note) for i, note in enumerate(notes)]
 
 
-def _save(
-    checkpoint: Checkpoint,
-    kernel: BatchedKernel,
-    evaluator: Evaluator,
-    finished: Sequence[dict[str, Floats]],
-    stages: Sequence[Stages],
-    refinements: Sequence[Floats],
-) -> None:
-    """Save finished chains with their stages, the state of the next one, and refinements."""
-    now, state = kernel.state()
-    arrays = {f"now_{name}": array for name, array in now.items()}
-    for i, chain in enumerate(finished):
-        arrays |= {f"chain{i}_{name}": array for name, array in chain.items()}
-    arrays |= {f"refined{i}_thetas": thetas for i, thetas in enumerate(refinements)}
-    bounds = [node.bound for node in evaluator.nodes]
-    note = {
-        "round": len(refinements),
-        "chain": len(finished),
-        "stages": stages,
-        "state": state,
-        "generators": {bound.name: bound.draws for bound in bounds if bound.random},
-    }
-    checkpoint.save(arrays, note)
+def _save(checkpoint: Checkpoint, states: Sequence[State], refinements: Sequence[Floats]) -> None:
+    """Save the states of the kernels that have begun, and refinements."""
+    arrays = {f"refined{i}_thetas": thetas for i, thetas in enumerate(refinements)}
+    for i, (particles, _) in enumerate(states):
+        arrays |= {f"chain{i}_{name}": array for name, array in particles.items()}
+    notes = [note for _, note in states]
+    checkpoint.save(arrays, {"round": len(refinements), "states": notes})
 
 
 def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, float]]:
@@ -664,9 +613,8 @@ def _stage_statistics(chains: Sequence[Stages]) -> tuple[xr.Dataset, dict[str, f
         variables[name] = (["chain", "stage"], table)
     coords = {"chain": np.arange(len(chains)), "stage": np.arange(n_stages)}
     logs = np.array([stages["log_marginal_likelihood"][-1] for stages in chains])
-    top = logs.max()
     evidence = {
-        "log_marginal_likelihood": float(top + np.log(np.exp(logs - top).mean())),
+        "log_marginal_likelihood": float(logsumexp(logs) - np.log(logs.size)),
         "log_marginal_likelihood_sd": float(logs.std(ddof=1)) if logs.size > 1 else np.nan,
     }
     return xr.Dataset(variables, coords=coords), evidence

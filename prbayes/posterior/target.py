@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +26,8 @@ from prbayes._finding import Finding
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.inference.refits import BatchObjective, SamplingDistribution, refit
+from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import (
-    DataSets,
     groups,
     observable,
     observed_set,
@@ -45,6 +43,7 @@ from prbayes.optimize.optimum import Optimum, optima_of
 from prbayes.posterior.importance import LogDensity, importance_sample, laplace
 from prbayes.posterior.saddlepoint import (
     Cumulants,
+    EstimateLikelihood,
     SaddlepointOptions,
     Scores,
     cumulants,
@@ -84,7 +83,13 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     """Return the posterior given the metrics' own estimate, by scores or refits, or raise."""
     require_density(evaluator)
     is_mean = score_obstacle(evaluator) is None
-    likelihood = (estimate_likelihood if is_mean else refit_likelihood)(evaluator, optimum)
+    likelihood_of = estimate_likelihood if is_mean else refit_likelihood
+    return _target_of(likelihood_of(evaluator, optimum))
+
+
+def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
+    """Return the posterior of a likelihood given the estimate, with the model's other terms."""
+    evaluator = likelihood.evaluator
 
     def log_likelihood(thetas: Floats) -> Floats:
         return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
@@ -146,7 +151,6 @@ class RefitLikelihoodOptions:
     """Options of the likelihood given an estimate, from refits."""
 
     n_sets: int = 1024  # synthetic data sets
-    n_starts: int = 64  # points around the estimate as starts of refits, with local optima
     # Rounds that share the data sets. The first ones are drawn in a ball of ``radius`` standard
     # errors around the estimate, later ones from the previous posterior, ``inflation`` times wider.
     rounds: int = 2
@@ -295,7 +299,7 @@ def refit_likelihood(
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
     # Identified directions are known from all stored responses; an eighth is enough for the rest.
     theta = continuation.within(thetas[:1])[0]
-    evaluator = coarser_evaluator(evaluator, theta) or evaluator
+    evaluator = coarser_evaluator(evaluator, theta)
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
     sampling = centers[0] = _moved_to_minimiser(centers[0])
@@ -348,14 +352,9 @@ def _points_of_ball(number: int, r: int, options: RefitLikelihoodOptions, shift:
 
 def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
     """Return coordinates of draws from the posterior, spread out around each optimum, (n, r)."""
-    options, evaluator = likelihood.options, likelihood.evaluator
-
-    def log_likelihood(thetas: Floats) -> Floats:
-        return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
-
-    density = partial(log_posterior, evaluator.hyperparameters, log_likelihood=log_likelihood)
-    modes = laplace(density, likelihood.starts, likelihood.scale)
-    sample = importance_sample(density, modes, number, options.seed)
+    options, target = likelihood.options, _target_of(likelihood)
+    modes = laplace(target.log_posterior, target.starts, target.scale)
+    sample = importance_sample(target.log_posterior, modes, number, options.seed)
     thetas = likelihood.continuation.coordinates(sample.draws)
     x = likelihood.centers[0].coordinates(thetas)
     center_of, _ = nearest(likelihood.centers, thetas)
@@ -388,7 +387,8 @@ def _draw(
     x, thetas = x[is_supported], thetas[is_supported]
     rng = np.random.default_rng([options.seed, seed])
     data, points = sets_along(evaluator, thetas, rng)
-    starts = x if len(centers) == 1 else _best_starts(centers, data, options)
+    # Populations at another optimum have their estimates near the first one.
+    starts = x if len(centers) == 1 else np.zeros_like(x)
     estimates, converged = refit(sampling, data, starts, is_rough=True)
     if converged.mean() < options.converged:
         raise ValueError(
@@ -431,23 +431,6 @@ def _log_likelihoods(
             logs = np.log(rows / rows.sum(axis=1, keepdims=True))
         total += (count @ np.ascontiguousarray(logs.T)).T
     return total
-
-
-def _best_starts(
-    centers: Sequence[SamplingDistribution], data: DataSets, options: RefitLikelihoodOptions
-) -> Floats:
-    """Return the best of some points near the estimate for each data set, (R, r)."""
-    sampling = centers[0]
-    ball = _points_of_ball(options.n_starts, sampling.stderr.size, options)
-    thetas = sampling.thetas(ball)
-    is_nearest = nearest(centers, thetas)[0] == 0
-    ball, thetas = ball[is_nearest], thetas[is_nearest]
-    objective = BatchObjective.of(sampling.evaluator, sampling.scales, data)
-    best = [
-        objective(thetas[None], slice(first, first + 16)).argmin(axis=1)
-        for first in range(0, objective.n_sets, 16)
-    ]
-    return np.asarray(ball[np.concatenate(best)])
 
 
 def _continued(evaluator: Evaluator, continuation: Continuation) -> Evaluator:

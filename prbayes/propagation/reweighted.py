@@ -59,10 +59,6 @@ from prbayes.response.response import (
 # Largest basis in a compiled graph, 1 GiB, for the largest design. Graphs without a basis are as
 # fast, but JAX does not know their operations.
 _MAX_BASIS = 1 << 27
-# Weights of a block of populations, 2 MiB, which stay in the cache. A
-# product of matrices reads all stored responses for each block: no fewer populations than these.
-_BLOCK = 1 << 18
-_MIN_POPULATIONS = 64
 
 
 @dataclass(frozen=True)
@@ -503,7 +499,9 @@ class ReweightedBound(Bound):
         basis = self._basis[2]
         is_lost = is_missing(sample.values)
         size = len(params[0])
-        step = max(_MIN_POPULATIONS, _BLOCK // len(sample))
+        # The weights of a block stay in the cache. A product of matrices reads all stored responses
+        # for each block: no fewer than 64 populations.
+        step = max(64, IN_CACHE // len(sample))
         parts = []
         # A single population leaves little to linear algebra.
         with one_thread() if size > 1 else nullcontext():

@@ -162,6 +162,15 @@ def gather(
             names |= {str(variable["name"]) for variable in description["variables"]}
         evaluator = None if model is None else Evaluator.of(model)
         refuse_labels(labels, sorted(names), evaluator=evaluator)
+    diagnoses: dict[str, Diagnosis | None] = {}
+    for label, result in results.items():
+        if label in live_optima:
+            diagnoses[label] = diagnose(live_optima[label])
+            continue
+        own_model = _model_of(result, model)
+        needs_model = not {"optimum", "calibration"} & set(result.children)
+        is_possible = own_model is not None or not needs_model
+        diagnoses[label] = diagnose(result, model=own_model) if is_possible else None
     return Material(
         model=model,
         description=description,
@@ -172,9 +181,7 @@ def gather(
         comparison=comparison,
         observed=observed,
         outputs=outputs,
-        diagnoses={
-            label: _diagnosis(result, model) for label, result in (results | live_optima).items()
-        },
+        diagnoses=diagnoses,
         decisions=decisions,
         validation=dict(validation),
         labels=dict(labels or {}),
@@ -329,18 +336,12 @@ def _observed(
     return observed, outputs
 
 
-def _diagnosis(result: Optimum | xr.DataTree, model: pm.Model | None) -> Diagnosis | None:
-    """Return the diagnosis of a result; None where it needs the model, which is not at hand."""
-    if isinstance(result, Optimum):
-        return diagnose(result)
+def _model_of(result: xr.DataTree, model: pm.Model | None) -> pm.Model | None:
+    """Return the model for the diagnosis of a saved result; None if its metric or prior differs."""
     identity = identity_in(result)
-    if model is not None and identity is not None:
-        # The model is of no use to a saved result by another metric or prior
-        is_other = differences(identity, identity_of(model), Level.OPTIMUM)
-        model = None if is_other else model
-    if model is None and not {"optimum", "calibration"} & set(result.children):
-        return None
-    return diagnose(result, model=model)
+    if model is None or identity is None:
+        return model
+    return None if differences(identity, identity_of(model), Level.OPTIMUM) else model
 
 
 # -- schema of results in files --------------------------------------------------------------

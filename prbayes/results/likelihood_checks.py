@@ -34,7 +34,7 @@ from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.maximum_likelihood import simulation_obstacle, specimen_refits
-from prbayes.optimize.optimum import Optimum
+from prbayes.optimize.optimum import Optimum, require_minimiser
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs, aleatory_names
@@ -122,6 +122,7 @@ def check_population(optimum: Optimum) -> Checked:
         for likelihood, function in zip(likelihoods, functions, strict=True)
     ]
     refits = specimen_refits(optimum, "diagnose", simulated=True)
+    require_minimiser(optimum, "diagnose")
     data = [
         ([x.get_value() for x in points], log_a.get_value())
         for points, log_a in map(arrays, likelihoods)

@@ -25,7 +25,7 @@ from prbayes.model.evaluator import Evaluator, specimen_log_likelihoods
 from prbayes.model.locking import locked
 from prbayes.model.measurement import specimen_numbers
 from prbayes.optimize.maximum_likelihood import is_specimen_optimum, specimen_refits
-from prbayes.optimize.optimum import Optimum, require_refits
+from prbayes.optimize.optimum import Optimum, require_minimiser, require_refits
 
 
 @locked
@@ -94,14 +94,19 @@ def cross_validate(
     (('fold', 'simulator'), True)
     """
     by_specimen = is_specimen_optimum(optimum)
-    evaluator = _require_refits(optimum).evaluator
+    if by_specimen:
+        refits = specimen_refits(optimum, "cross_validate")
+        require_minimiser(optimum, "cross_validate")
+    else:
+        require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
+    evaluator = optimum.evaluator
     folds = most_folds(optimum, 5) if folds is None else folds
     folds = positive_integer(folds, "folds", minimum=2)
     seed = seed_number(random_seed)
     held_out, kept, sizes = _folds(evaluator.simulators, folds, seed)
     with shown(progressbar):
         if by_specimen:
-            thetas, converged = specimen_refits(optimum, "cross_validate").reweighted(kept)
+            thetas, converged = refits.reweighted(kept)
         else:
             observed = [node.target.observed for node in evaluator.nodes]
             sampling = optimum.sampling()
@@ -130,16 +135,8 @@ def cross_validate(
 
 def most_folds(optimum: Optimum, limit: int) -> int:
     """Return the largest number of folds of two specimens or more, at most a limit."""
-    _, total = specimens(_require_refits(optimum).evaluator.simulators)
+    _, total = specimens(optimum.evaluator.simulators)
     return max(2, min(limit, total // 2))
-
-
-def _require_refits(optimum: Optimum) -> Optimum:
-    """Return an optimum whose model can be calibrated to parts of the specimens, or raise."""
-    if is_specimen_optimum(optimum):
-        specimen_refits(optimum, "cross_validate")
-        return optimum
-    return require_refits(optimum, "cross_validate", "; the model cannot be recalibrated")
 
 
 def _folds(

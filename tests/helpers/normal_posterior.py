@@ -1,15 +1,56 @@
-"""Exact posteriors of a normal population with a prior of its mean and standard deviation."""
+"""Exact posteriors of a normal population, and those given the estimate of a metric."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pymc as pm
+from scipy import stats
 
+import prbayes as prb
 from prbayes._validate import Floats
+from prbayes.metrics.base import Metric
+from prbayes.posterior.importance import importance_sample, laplace
+from prbayes.posterior.target import Target
 
 LogPrior = Callable[[Floats, Floats], Floats]  # of mu and sigma
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Mean and standard deviation of a population: their variables within a model, and density."""
+
+    variables: Callable[[], tuple[Any, Any]]
+    log_density: LogPrior
+
+
+VAGUE = Prior(
+    lambda: (pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1)),
+    lambda mu, s: stats.norm(0, 2).logpdf(mu) + stats.halfnorm.logpdf(s),
+)
+SHARP = Prior(
+    lambda: (pm.Normal("mu", 0.7, 0.1), pm.LogNormal("sigma", np.log(0.4), 0.1)),
+    lambda mu, s: stats.norm(0.7, 0.1).logpdf(mu) + stats.lognorm(0.1, scale=0.4).logpdf(s),
+)
+BOUNDED = Prior(
+    lambda: (pm.Uniform("mu", 0, 1.05), pm.Uniform("sigma", 0, 0.55)),
+    lambda mu, s: stats.uniform(0, 1.05).logpdf(mu) + stats.uniform(0, 0.55).logpdf(s),
+)
+
+
+def normal_model(
+    metric: Metric, *parts: Floats, prior: Prior = VAGUE, n: int = 512, **keywords: Any
+) -> pm.Model:
+    """Return a model of a normal population, with a simulator y = x for each part of the data."""
+    settings = {"metric": metric, "propagation": prb.Reweighted(n), **keywords}
+    with pm.Model() as model:
+        x = pm.Normal.dist(*prior.variables())
+        for k, part in enumerate(parts):
+            prb.Simulator(f"y{k}", lambda x: 1.0 * x, x, observed=part, **settings)
+    return model
 
 
 @dataclass(frozen=True)
@@ -18,6 +59,20 @@ class Moments:
 
     mean: Floats
     sd: Floats
+
+
+def draws_of(target: Target, size: int = 1000) -> dict[str, Floats]:
+    """Return draws of a posterior by name."""
+    modes = laplace(target.log_posterior, target.starts, target.scale)
+    sample = importance_sample(target.log_posterior, modes, size, seed=0)
+    assert sample.pareto_k < 0.7
+    return target.evaluator.hyperparameters.constrained(sample.draws)
+
+
+def moments_of(draws: Mapping[str, Any], mu: str = "mu", sigma: str = "sigma") -> Moments:
+    """Return moments of draws by name."""
+    pair = np.stack([np.ravel(draws[mu]), np.log(np.ravel(draws[sigma]))])
+    return Moments(pair.mean(axis=1), pair.std(axis=1))
 
 
 def exact_moments(log_prior: LogPrior, y: Floats) -> Moments:

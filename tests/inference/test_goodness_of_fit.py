@@ -13,6 +13,7 @@ from prbayes._validate import Floats
 from prbayes.inference.goodness_of_fit import (
     UNLIKELY,
     FittedSets,
+    _fit_distances,
     output_misfits,
     population_misfit,
     worst_p_value,
@@ -107,6 +108,17 @@ def test_the_largest_of_standardised_statistics_is_compared() -> None:
     unknown = np.where(np.arange(999)[:, None] < 998, np.nan, drawn)
     assert worst_p_value(np.array([5.0, 0.0]), unknown) == 1.0
     assert worst_p_value(np.array([np.nan, 0.0]), drawn) == 1.0
+
+
+def test_distances_of_a_fit_leave_out_points_without_a_finite_response() -> None:
+    simulated, masses = np.array([1.0, 2.0, 3.0, 4.0]), np.array([[0.4, 0.3, 0.2, 0.1]])
+    data = np.array([2.5, 1.5]), np.array([[0.25, 0.75]])
+    # F is .4 at 1.5, and .7 at 2.5; the middles of the steps of the data are .375 and .875.
+    squares = np.array([0.75, 0.25]) * np.square([0.375 - 0.4, 0.875 - 0.7])
+    expected = np.log([squares.sum(), (squares / [0.4 * 0.6, 0.7 * 0.3]).sum()])
+    np.testing.assert_allclose(_fit_distances(simulated, masses, *data), [expected])
+    simulated, masses = np.append(simulated, [np.inf, np.nan]), np.append(masses / 2, [[0.3, 0.2]])
+    np.testing.assert_allclose(_fit_distances(simulated, masses[None], *data), [expected])
 
 
 def test_where_it_is_not_looked_at_a_line_says_why() -> None:

@@ -322,14 +322,13 @@ def test_large_designs_have_coarser_ones() -> None:
     with pm.Model() as model:
         inputs = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0), pm.Normal.dist(0.0, 1.0)
         given = {"metric": prb.KullbackLeibler(), "observed": np.linspace(-1, 3, 9)}
-        for name, n in {"small": 128, "large": 8192}.items():
+        for name, n in {"small": 512, "large": 8192}.items():
             design = prb.Reweighted(n, emulator=None)
             prb.Simulator(name, lambda x, y: x + y**2, *inputs, propagation=design, **given)
     evaluator = Evaluator.of(model)
-    coarse = coarser_evaluator(evaluator)
-    assert coarse is not None
-    assert [node.bound.n_points for node in coarse.nodes] == [128, 1024]
-    assert [node.bound.n_points for node in evaluator.nodes] == [128, 8192]
+    coarse = coarser_evaluator(evaluator, np.array([1.0]))
+    assert [node.bound.n_points for node in coarse.nodes] == [512, 1024]
+    assert [node.bound.n_points for node in evaluator.nodes] == [512, 8192]
     assert coarse.nodes[0].bound is evaluator.nodes[0].bound
     values = evaluator.reweighted["large"].design.sample.values
     np.testing.assert_array_equal(coarse.reweighted["large"].design.sample.values, values[:1024])
@@ -338,8 +337,8 @@ def test_large_designs_have_coarser_ones() -> None:
     np.testing.assert_array_equal(found[:, 0], expected[:, 0])
     assert np.all(found[:, 1] != expected[:, 1])
     np.testing.assert_allclose(found[:, 1], expected[:, 1], rtol=0.1)
-    assert coarser_evaluator(coarse) is None
-    assert coarser_evaluator(evaluator, np.array([50.0])) is None, "no design supports it"
+    assert coarser_evaluator(coarse, np.array([1.0])) is coarse
+    assert coarser_evaluator(evaluator, np.array([50.0])) is evaluator, "no design supports it"
 
 
 def test_an_evaluator_of_other_data_has_a_pickle() -> None:

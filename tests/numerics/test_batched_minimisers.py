@@ -7,7 +7,13 @@ import pytest
 from scipy import optimize
 
 from prbayes._validate import Floats
-from prbayes.numerics.batched_minimisers import _bfgs, descend, descend_by_simplex
+from prbayes.numerics.batched_minimisers import (
+    _bfgs,
+    _sorted,
+    _step,
+    descend,
+    descend_by_simplex,
+)
 
 CENTERS = np.random.default_rng(1).normal(size=(20, 3))
 
@@ -161,3 +167,30 @@ def test_a_simplex_without_parameters() -> None:
     x, _, converged = descend_by_simplex(parabola, np.empty((3, 0)), sizes=(1.0,))
     assert x.shape == (3, 0)
     assert converged.all()
+
+
+@pytest.mark.parametrize("r", [2, 3])
+def test_steps_are_those_of_scipys_adaptive_simplex(r: int) -> None:
+    def value(x: Floats, rows: Any) -> Floats:
+        # Curved valleys, in other places by row: all kinds of steps, and shrinking.
+        away = gap(x, rows)
+        bend = (away[..., 1:] - away[..., :-1] ** 2) ** 2
+        return np.asarray(5 * bend.sum(axis=-1) + ((away + 0.3) ** 2).sum(axis=-1))
+
+    rows = np.arange(len(CENTERS))
+    simplices = np.tile(np.vstack([np.zeros(r), 2.0 * np.eye(r)]), (len(rows), 1, 1))
+    points, values = _sorted(simplices, value(simplices, rows))
+    for _ in range(40):
+        points, values = _step(value, points, values, rows)
+    for row in rows:
+        alone = optimize.minimize(
+            lambda t, row=row: value(t[None, None], np.array([row]))[0, 0],
+            np.zeros(r),
+            method="Nelder-Mead",
+            options={
+                "adaptive": True, "initial_simplex": simplices[row], "maxiter": 41, "xatol": 0.0,
+                "fatol": 0.0,
+            },
+        )  # fmt: skip
+        np.testing.assert_allclose(points[row], alone.final_simplex[0], atol=1e-8)
+        np.testing.assert_allclose(values[row], alone.final_simplex[1], atol=1e-10)

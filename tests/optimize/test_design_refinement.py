@@ -10,13 +10,11 @@ import pytest
 import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.inference.asymptotics import Local
-from prbayes.inference.design_error import DesignErrors
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.optimize.design_refinement import (
     neighbourhood,
     pilot,
     refuse,
-    runs_left,
 )
 from prbayes.propagation.base import DesignError
 
@@ -73,25 +71,6 @@ def test_a_refusal_tells_what_the_data_do_not() -> None:
     with pytest.raises(DesignError, match=rf"y: .*; narrow the priors, .*\. {text}"):
         refuse(short, evaluator, [Finding("not-identified", text)])
     refuse({}, evaluator, [Finding("not-identified", text)])
-
-
-def test_the_runs_that_are_left_follow_from_the_error_and_the_room() -> None:
-    with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
-        prb.Simulator(
-            "y",
-            lambda a, b: a * b,
-            *(a, pm.Normal.dist(1, 0.1)),
-            metric=prb.AreaMetric(),
-            observed=np.linspace(-1, 3, 20),
-            propagation=prb.Reweighted(64, max_points=192, emulator=None),
-        )
-    evaluator = Evaluator.of(model)
-    assert runs_left(evaluator, DesignErrors(points=0.15, emulators=np.nan)) == pytest.approx(
-        64 * (1.5 ** (1 / 0.65) - 1), abs=1
-    )
-    assert runs_left(evaluator, DesignErrors(points=np.inf, emulators=np.nan)) == 128
-    assert runs_left(evaluator, DesignErrors(points=0.1, emulators=np.nan)) == 0
 
 
 def test_a_pilot_goes_towards_data_that_are_far() -> None:

@@ -1,7 +1,7 @@
 """Mirror solutions, and what is said about them."""
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
@@ -16,18 +16,8 @@ from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.numerics.batched_minimisers import descend
-from prbayes.optimize.design_refinement import refine_at
-from prbayes.optimize.local_optima import (
-    LocalOptimum,
-    Reference,
-    are_connected,
-    has_barrier,
-    mirror_optimum,
-    optima_from_prior,
-    verified_optima,
-)
+from prbayes.optimize.local_optima import Reference, optima_from_prior
 from prbayes.optimize.objective import Ridge
-from prbayes.propagation.reweighted import designs_restored
 
 DATA = (np.random.default_rng(3).normal(2.0, 0.3, 40) - 1) ** 2
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -149,18 +139,6 @@ def test_a_linear_problem_has_no_other_optimum(name: str) -> None:
     assert optimum.local_optima == optimum.findings == ()
 
 
-def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
-    optimum = fit("pr")
-    evaluator = Evaluator.of(optimum.model)
-    local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
-    best = Reference(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
-    assert optima_from_prior(best, 16, 0)
-    assert optima_from_prior(replace(best, noise=1e3), 16, 0) == []
-    # Nor is there one where a search that is held cannot go.
-    ridge = Ridge(optimum.theta, np.eye(2), 1e3)
-    assert optima_from_prior(replace(best, ridge=ridge), 16, 0) == []
-
-
 # -- the posterior of two modes ----------------------------------------------------------------------
 
 
@@ -192,6 +170,7 @@ def test_unidentified_directions_are_named_and_make_no_optima(response: Any) -> 
     assert len(comparable) == (response is parabola)
     for mode in comparable:
         assert mode["point"]["idle"] == pytest.approx(optimum.point["idle"], abs=1e-6)
+    assert np.isinf(optimum.stderr["idle"])
     (text,) = [str(f) for f in optimum.findings if f.code == "not-identified"]
     assert "about idle (" in text
     assert text.endswith("; see docs/optimum_or_abc.md#no-answer.")
@@ -224,159 +203,128 @@ def test_one_output_of_many_excludes_a_mirror(slope: float, comparable: bool) ->
 # -- optima of designs whose points follow the search ------------------------------------------------
 
 
-def two_outputs(x: Any, y: Any) -> Any:
-    """Symmetric about x = 1."""
-    return np.stack([(x - 1) ** 2 + 0.2 * y, y], axis=-1)
+def has_supported_mirror(optimum: prb.Optimum) -> bool:
+    """Return whether both optima about mu = 1 are found, and the design supports them."""
+    (other,) = [r for r in optimum.local_optima if r["comparable"]]
+    assert optimum.point["mu"] + other["point"]["mu"] == pytest.approx(2, abs=0.1)
+    return not any(
+        shortcomings(optimum.evaluator, t[None]) for t in (optimum.theta, other["theta"])
+    )
 
 
-@cache
-def followed(starts: int) -> prb.Optimum:
+def test_a_mirror_far_from_the_runs_gets_runs() -> None:
+    data = (np.random.default_rng(3).normal(11.0, 0.3, 40) - 1) ** 2
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 10), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", parabola, x, metric=METRICS["pr"], observed=data, propagation=R256)
+    optimum = prb.minimize(model, starts=8)
+    assert optimum.n_responses > 2 * 256
+    assert has_supported_mirror(optimum)
+
+
+@pytest.mark.long
+def test_a_mirror_far_from_an_emulated_sample_gets_a_sample() -> None:
+    def two_outputs(x: Any, y: Any) -> Any:
+        return np.stack([(x - 1) ** 2 + 0.2 * y, y], axis=-1)  # symmetric about x = 1
+
     rng = np.random.default_rng(3)
     data = two_outputs(rng.normal(2.0, 0.05, 25), rng.normal(0.0, 0.2, 25))
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 4), pm.HalfNormal("sigma", 2))
         y = pm.Normal.dist(pm.Normal("nu", 0, 3), 0.2)
-        prb.Simulator(
-            "y",
-            two_outputs,
-            x,
-            y,
-            metric=prb.Joint(prb.ProbabilityResidual()),
-            observed=data,
-            propagation=prb.Reweighted(256),
-        )
-    return prb.minimize(model, starts=starts)
+        metric = prb.Joint(prb.ProbabilityResidual())
+        few = prb.Reweighted(128)
+        prb.Simulator("y", two_outputs, x, y, metric=metric, observed=data, propagation=few)
+    optimum = prb.minimize(model, starts=8)
+    assert optimum.n_responses == 128
+    assert has_supported_mirror(optimum)
 
 
-def test_a_mirror_far_from_the_points_is_found_and_both_are_supported() -> None:
-    optimum = followed(16)
-    (other,) = [r for r in optimum.local_optima if r["comparable"]]
-    assert optimum.point["mu"] + other["point"]["mu"] == pytest.approx(2, abs=0.1)
-    thetas = np.stack([optimum.theta, other["theta"]])
-    for theta in thetas:
-        assert not shortcomings(optimum.evaluator, theta[None])
-
-
-@cache
-def around(starts: int) -> Reference:
-    """Return what is known of the optimum, to look for others."""
-    optimum = followed(starts)
-    evaluator = optimum.evaluator
-    local = Local(evaluator.hyperparameters.prior_sd, np.eye(3), np.zeros((3, 0)), 1e-3 * np.eye(3))
-    return Reference(evaluator, optimum.theta, np.ones(1), local, 0.05)
-
-
-@pytest.mark.parametrize(("mu", "sigma", "real"), [(None, 0.05, True), (-6.0, 0.3, False)])
-def test_what_few_points_tell_is_looked_at_with_more(
-    mu: float | None, sigma: float, real: bool
-) -> None:
-    optimum = followed(0)
-    bound = optimum.evaluator.reweighted["y"]
-    mirror = 2 - optimum.point["mu"]
-    there = optimum.theta.copy()
-    there[:2] = mirror + 0.05 if mu is None else mu, np.log(sigma)
-    before = bound.design
-    found = mirror_optimum(around(0), there)
-    assert bound.design is before  # and not a run more
-    if not real:
-        assert found is None
-        return
-    assert found is not None
-    assert found[0] == pytest.approx(mirror, abs=0.05)
-
-
-def test_clouds_that_reach_a_mirror_reach_the_best_optimum_as_well() -> None:
-    best = around(0)
-    there = best.theta.copy()
-    there[0] = 2 - there[0]
-    far = LocalOptimum(there, 0.0, comparable=True, better=False)
-
-    def at_the_best() -> float:
-        return float(best.evaluator.support(best.theta[None])["y"]["weight_ess"][0])
-
-    bound = best.evaluator.reweighted["y"]
-    with designs_restored([bound]):
-        (found,) = verified_optima(best, [far])
-        beside = at_the_best()
-    assert found.theta[0] == pytest.approx(there[0], abs=0.05)
-    with designs_restored([bound]):
-        refine_at(best.evaluator, found.theta[None])
-        alone = at_the_best()
-    assert beside > 1.2 * alone
-
-
-def test_what_is_worse_by_more_than_the_noise_is_no_mirror_image() -> None:
-    best = around(0)
-    optimum = followed(0)
-    mirror = optimum.theta.copy()
-    mirror[0] = 2 - mirror[0]
-    assert mirror_optimum(best, mirror) is not None
-    # A hold adds about a sixth there.
-    ridge = Ridge(optimum.theta, np.eye(3), 1.5)
-    assert mirror_optimum(replace(best, ridge=ridge), mirror) is None
-
-
-def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
-    assert mirror_optimum(around(0), followed(0).theta + 0.02) is None
-    best = around(0)
-    ends, values = best.polish(best.theta[None] + 0.02)
-    assert best.separated(ends, values, float(best(best.theta[None])[0])) == []
+# -- landscapes in closed form -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Landscape:
-    """A discrepancy that is a formula, in place of a model."""
+    """A discrepancy that is a formula, with the attributes of an evaluator."""
 
     formula: Any
-    reweighted: dict[str, Any] = field(default_factory=dict)
-    nodes: tuple[Any, ...] = ()
-
-    def total(self, thetas: Floats, scales: Floats) -> Floats:
-        return np.asarray(self.formula(*thetas.T))
-
-
-@pytest.mark.parametrize(
-    ("formula", "joined"),
-    [
-        (lambda x, y: 5 * (y - x**2) ** 2, True),  # a valley that bends
-        (lambda x, y: 5 * (x**2 - 1) ** 2 + (y - 1) ** 2, False),  # two hollows
-        (lambda x, y: 5 * (x**2 - y) ** 2 + 3 * np.exp(-20 * x**2), False),  # a ridge across it
-    ],
-)
-def test_a_bent_valley_has_no_two_optima(formula: Any, joined: bool) -> None:
-    a, b = np.array([-1.0, 1.0]), np.array([1.0, 1.0])
-    evaluator: Any = Landscape(formula)
-    local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), 0.01 * np.eye(2))
-    best = Reference(evaluator, a, np.ones(1), local, noise=0.1)
-    assert has_barrier(best, a, 0.0, b, 0.0)  # straight on
-    assert are_connected(best, a, b, 5) is joined
-
-
-class Valley:
-    """A bent valley with one minimum, at (1, 1), and the attributes of an evaluator."""
-
-    nodes: tuple[()] = ()
 
     @property
     def hyperparameters(self) -> Any:
         return self
 
     def total(self, thetas: Floats, scales: Floats) -> Floats:
-        x, y = thetas.T
-        return np.asarray((1 - x) ** 2 + 100 * (y - x**2) ** 2)
+        return np.asarray(self.formula(*thetas.T))
 
     def prior_points(self, n: int, seed: int) -> Floats:
         return np.random.default_rng(seed).normal(size=(n, 2))
+
+
+def reference(
+    formula: Any, theta: Any, covariance: Any, noise: float, prior_sd: Any = (2.0, 0.5)
+) -> Reference:
+    """Return a reference whose parameters may have other units than the formula."""
+    evaluator: Any = Landscape(formula)
+    standardised = np.asarray(covariance) / np.outer(prior_sd, prior_sd)
+    local = Local(np.array(prior_sd), np.eye(2), np.zeros((2, 0)), standardised)
+    return Reference(evaluator, np.array(theta), np.ones(1), local, noise)
+
+
+def two_hollows(x: Floats, y: Floats) -> Floats:
+    """Minima of 0.04 at about (1, 1), and of 0 at about (-1, 1); 1.02 between them."""
+    return np.asarray((x**2 - 1) ** 2 + (y - 1) ** 2 + 0.02 * (1 + x))
+
+
+@pytest.mark.parametrize(
+    ("side", "noise", "comparable", "better"),
+    [
+        (1.0, 0.1, True, True),
+        (1.0, 0.9, True, False),
+        (-1.0, 0.012, False, False),
+        (-1.0, 0.015, True, False),
+    ],
+)
+def test_what_a_barrier_separates_is_judged_by_the_noise(
+    side: float, noise: float, comparable: bool, better: bool
+) -> None:
+    best = reference(two_hollows, [side, 1.0], 0.01 * np.eye(2), noise)
+    lowest = float(best(best.theta[None])[0])
+    ends = np.array([[-side, 1.0], [-0.9 * side, 1.1], [0.9 * side, 0.9], [-side, 1.0]])
+    values = best(ends)
+    values[3] = np.nan
+    (other,) = best.separated(ends, values, lowest)
+    assert (other.theta.tolist(), other.value) == ([-side, 1.0], values[0])
+    assert (other.comparable, other.better) == (comparable, better)
+    # The barrier is .98 higher than the worse of both.
+    assert replace(best, noise=0.97).separated(ends, values, lowest)
+    assert replace(best, noise=0.99).separated(ends, values, lowest) == []
+
+
+def test_the_other_hollow_is_found_from_points_of_the_prior() -> None:
+    best = reference(two_hollows, [1.0, 1.0], 0.01 * np.eye(2), 0.1)
+    (other,) = optima_from_prior(best, 16, 0)
+    np.testing.assert_allclose(other.theta, [-1.0025, 1.0], atol=0.01)
+    assert other.value == pytest.approx(two_hollows(*other.theta))
+    # A candidate is a start as well; alone, its point of the prior ends at the reference.
+    for candidates in ([], [np.array([-0.5, 0.5])]):
+        assert len(optima_from_prior(best, 1, 0, candidates)) == len(candidates)
+    # Neither a barrier below the noise nor a penalty that pulls to the reference separates them.
+    assert optima_from_prior(replace(best, noise=1.5), 16, 0) == []
+    ridge = Ridge(best.theta, np.eye(2), 1e3)
+    assert optima_from_prior(replace(best, ridge=ridge), 16, 0) == []
+
+
+def valley(x: Floats, y: Floats) -> Floats:
+    """A bent valley with one minimum, at (1, 1)."""
+    return np.asarray((1 - x) ** 2 + 100 * (y - x**2) ** 2)
 
 
 @pytest.mark.parametrize("iterations", [10, 40])
 def test_where_a_descent_was_stopped_in_a_valley_is_no_optimum(
     iterations: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    evaluator: Any = Valley()
     covariance = 0.01 * np.linalg.inv([[802.0, -400.0], [-400.0, 200.0]])
-    local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), covariance)
-    best = Reference(evaluator, np.ones(2), np.ones(1), local, noise=0.01)
+    best = reference(valley, [1.0, 1.0], covariance, 0.01, (1.0, 1.0))
     short = partial(descend, max_iterations=iterations)
     monkeypatch.setattr("prbayes.optimize.local_optima.descend", short)
     assert optima_from_prior(best, 16, 0) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -9,11 +10,13 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from scipy import stats
 
 import prbayes as prb
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
-from prbayes.optimize.maximum_likelihood import LocalOptimum, mode_weights, share_mode
+from prbayes.model.specimen_likelihood import monte_carlo_error
+from prbayes.optimize.maximum_likelihood import Mode, mode_weights, share_mode
 
 N = 25
 X = np.random.default_rng(3).normal(0.8, 0.5, N)
@@ -28,13 +31,6 @@ def normal_model(sigma: float | None = None, prior_sd: float = 2.0) -> pm.Model:
         mu = pm.Normal("mu", 0, prior_sd)
         sd = pm.HalfNormal("sigma", 1) if sigma is None else sigma
         prb.Simulator("y", line, pm.Normal.dist(mu, sd), observed=line(X))
-    return model
-
-
-def folded_model() -> pm.Model:
-    with pm.Model() as model:
-        mu, sigma = pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 0.5)
-        prb.Simulator("y", lambda x: x**2, pm.Normal.dist(mu, sigma), observed=X**2)
     return model
 
 
@@ -80,8 +76,8 @@ def test_standard_errors_are_those_of_the_fisher_information() -> None:
     assert optimum.local_optima == ()
 
 
-@pytest.mark.parametrize(("sd", "prior_sd"), [(0.7, 0.2), (0.5, 0.1)])
-def test_the_mode_with_the_prior(sd: float, prior_sd: float) -> None:
+def test_the_mode_with_the_prior() -> None:
+    sd, prior_sd = 0.7, 0.2
     model = normal_model(sigma=sd, prior_sd=prior_sd)
     precision = N / sd**2 + 1 / prior_sd**2
     optimum = fit(model, prior=True)
@@ -90,8 +86,11 @@ def test_the_mode_with_the_prior(sd: float, prior_sd: float) -> None:
     assert optimum.stderr["mu"] == pytest.approx(precision**-0.5, abs=1e-4)
 
 
-def test_a_folded_response_has_two_modes(codes: list[str]) -> None:
-    optimum = fit(folded_model())
+def test_a_folded_response_has_two_modes_and_a_start_selects_one(codes: list[str]) -> None:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 0.5)
+        prb.Simulator("y", lambda x: x**2, pm.Normal.dist(mu, sigma), observed=X**2)
+    optimum = fit(model)
     assert codes == ["second-mode"]
     assert "of the posterior's mass" in optimum.findings[0].text
     (mirror,) = optimum.local_optima
@@ -100,10 +99,7 @@ def test_a_folded_response_has_two_modes(codes: list[str]) -> None:
     # The roots of each specimen are weighted by masses that are right to .01.
     assert mirror["weight"] == pytest.approx(0.5, abs=0.02)
     assert mirror["comparable"]
-
-
-def test_a_start_selects_the_mode(codes: list[str]) -> None:
-    model = folded_model()
+    codes.clear()
     for sign in (-1, 1):
         optimum = fit(model, start={"mu": 0.7 * sign, "sigma": 0.4})
         assert np.sign(optimum.point["mu"]) == sign
@@ -121,7 +117,7 @@ def quartic(theta: Floats) -> tuple[float, Floats]:
 def test_optima_on_a_curved_ridge_are_one_mode(angle: float) -> None:
     unit = np.array([1.0, 1.0])
     first, second = (
-        LocalOptimum(np.array([np.cos(a), np.sin(a)]), 0.0, np.eye(2), True) for a in (0.0, angle)
+        Mode(np.array([np.cos(a), np.sin(a)]), 0.0, np.eye(2), True) for a in (0.0, angle)
     )
     assert share_mode(quartic, unit, first, second, 0.01)
     assert share_mode(quartic, unit, second, first, 0.01)
@@ -136,9 +132,7 @@ def test_a_barrier_divides_modes(height: float, expected: bool) -> None:
         gradient = [slope[0] * height / 20 - 6 * scaled, 2 * scaled / 1e6]
         return height / 20 * value + scaled**2, np.array(gradient)
 
-    first, second = (
-        LocalOptimum(np.array([s, 3e6 * s]), 0.0, np.eye(2), True) for s in (-1.0, 1.0)
-    )
+    first, second = (Mode(np.array([s, 3e6 * s]), 0.0, np.eye(2), True) for s in (-1.0, 1.0))
     assert share_mode(double_well, np.array([1.0, 1e6]), first, second, 1.0) == expected
 
 
@@ -151,7 +145,7 @@ def test_ripples_within_the_error_of_the_likelihood_are_no_barrier(
         value = 20 * theta[0] ** 2 + 0.05 * (1 - np.cos(phase))
         return value, np.array([40 * theta[0], 0.3 * np.pi * np.sin(phase)])
 
-    first, second = (LocalOptimum(np.array([0.0, at]), 0.0, np.eye(2), True) for at in (0.0, 1.0))
+    first, second = (Mode(np.array([0.0, at]), 0.0, np.eye(2), True) for at in (0.0, 1.0))
     assert share_mode(ridge, np.ones(2), first, second, error) == expected
 
 
@@ -168,9 +162,9 @@ def test_a_ridge_of_four_hyperparameters_is_one_mode(codes: list[str]) -> None:
     assert optimum.local_optima == ()
 
 
-def mode(value: float, variance: Any) -> LocalOptimum:
+def mode(value: float, variance: Any) -> Mode:
     covariance = np.diag(np.atleast_1d(np.asarray(variance, dtype=float)))
-    return LocalOptimum(np.zeros(len(covariance)), value, covariance, True)
+    return Mode(np.zeros(len(covariance)), value, covariance, True)
 
 
 def test_weights_of_modes_are_those_of_laplace() -> None:
@@ -211,7 +205,7 @@ def test_an_end_of_a_support_at_the_largest_specimen(codes: list[str]) -> None:
 
 def test_the_number_of_evaluations_is_limited() -> None:
     most = 20
-    optimum = fit(normal_model(), max_evaluations=most)
+    optimum = fit(normal_optimum().model, max_evaluations=most)
     # A descent has ten evaluations at least, and the Hessian up to twelve of them.
     assert optimum.search.n_evaluations <= most + 40
     # The trace is that of the best descent.
@@ -233,3 +227,57 @@ def test_hyperparameters_that_only_the_prior_links_to_the_data_are_not_reported(
     (finding,) = fit(model).findings
     assert finding.code == "not-identified"
     assert "do not identify idle;" in finding.text
+
+
+SPREADS = np.random.default_rng(2).normal(1.0, 0.2, 30), np.random.default_rng(3).normal(2, 0.2, 30)
+
+
+def growing(a: Any, b: Any) -> Any:
+    return a * np.exp(0.5 * b)
+
+
+@cache
+def two_spreads() -> pm.Model:
+    """Return a model of one output, which identifies the spread of two inputs together."""
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("m1", 1, 0.5), pm.HalfNormal("s1", 0.5))
+        b = pm.Normal.dist(pm.Normal("m2", 2, 0.5), pm.HalfNormal("s2", 0.5))
+        prb.Simulator("y", growing, a, b, observed=growing(*SPREADS))
+    return model
+
+
+def exact_log_likelihood(point: Mapping[str, Any]) -> float:
+    """Return the log-likelihood by quadrature over the second input."""
+    m1, s1, m2, s2 = (float(point[name]) for name in ("m1", "s1", "m2", "s2"))
+    b = np.linspace(m2 - 8 * s2, m2 + 8 * s2, 20001)
+    growth = np.exp(0.5 * b)
+    a = growing(*SPREADS)[:, None] / growth
+    density = stats.norm.pdf(a, m1, s1) / growth * stats.norm.pdf(b, m2, s2)
+    return float(np.log(np.trapezoid(density, b, axis=1)).sum())
+
+
+def test_a_population_between_the_points_is_no_optimum() -> None:
+    """Populations of a spread near zero have spurious maxima, several nats high."""
+    optimum = fit(two_spreads())
+    assert optimum.converged
+    exact = exact_log_likelihood(optimum.point)
+    assert -optimum.discrepancy == pytest.approx(exact, abs=0.1)
+    assert exact > exact_log_likelihood({"m1": 1.0, "s1": 0.2, "m2": 2.0, "s2": 0.2})
+    (likelihood,) = optimum.evaluator.likelihoods
+    points = {"m1": 0.8308, "s1": [0.00104, 0.2], "m2": 2.306, "s2": 0.5255}
+    values = {name: np.broadcast_to(value, 2) for name, value in points.items()}
+    narrow, wide = monte_carlo_error(likelihood, values)
+    assert narrow > 2
+    assert wide < 0.2
+
+
+def test_an_optimum_whose_likelihood_is_not_known_has_not_converged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "prbayes.optimize.maximum_likelihood._supported",
+        lambda _, optima: np.zeros(len(optima), bool),
+    )
+    optimum = fit(normal_model())
+    assert not optimum.converged
+    assert [finding.code for finding in optimum.findings] == ["narrow-population"]

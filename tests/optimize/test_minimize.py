@@ -22,11 +22,10 @@ from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import nodes
 from prbayes.optimize import minimize as minimization
-from prbayes.optimize.convergence import Fit, Search, Trace
+from prbayes.optimize.convergence import Fit, Search
 from prbayes.optimize.design_refinement import Restart
-from prbayes.optimize.local_optima import LocalOptimum
 from prbayes.optimize.minimize import optimum_findings
-from prbayes.optimize.objective import Ridge
+from prbayes.optimize.objective import Method, Ridge, initial_scales
 from prbayes.propagation.importance import SIZES
 from prbayes.response.compile import PLAIN
 
@@ -158,8 +157,8 @@ def test_a_quadratic_case_with_everything_mixed_in() -> None:
         assert optimum.to_datatree()["optimum"].attrs["prior"] == int(prior)
 
 
-def with_term(term: Callable[[Any], Any], epsilon: float | None = None) -> pm.Model:
-    model = normal_model("area", sigma=lambda: 0.5, epsilon=epsilon)
+def with_term(term: Callable[[Any], Any]) -> pm.Model:
+    model = normal_model("area", sigma=lambda: 0.5)
     with model:
         term(model["mu"])
     return model
@@ -176,26 +175,12 @@ def test_terms_without_epsilon_to_weigh_them_against_are_refused(term: str) -> N
     got = "minus the log prior" if term == "prior" else "other likelihood terms or potentials"
     model = with_term(TERMS.get(term, lambda mu: None))
     with pytest.raises(ValueError, match=rf"minimize: got {got} .*without epsilon, \['y'\]"):
-        prb.minimize(model, prior=term == "prior")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("term", TERMS)
-def test_other_terms_are_weighed_by_epsilon(term: str) -> None:
-    for epsilon in (0.02, 0.2):
-        model = with_term(TERMS[term], epsilon)
-        optimum = prb.minimize(model, starts=0)
-        density = model.compile_logp(vars=model.observed_RVs + model.potentials, mode=PLAIN)
-        grid = np.linspace(MEAN - 1, 4, 401)
-        best = grid[np.argmax([density({"mu": mu}) for mu in grid])]
-        assert abs(optimum.point["mu"] - best) < 0.02
+        initial_scales(Evaluator.of(model), prior=term == "prior")
 
 
 def test_a_potential_that_only_excludes_needs_no_epsilon() -> None:
     model = with_term(lambda mu: pm.Potential("positive", pm.math.switch(mu > 0, 0.0, -np.inf)))
-    plain, excluded = prb.minimize(with_term(lambda mu: None)), prb.minimize(model)
-    assert excluded.scales == plain.scales == {"y": 1.0}
-    assert abs(excluded.point["mu"] - plain.point["mu"]) < 0.1 * plain.stderr["mu"]
+    assert initial_scales(Evaluator.of(model), prior=False).tolist() == [1.0]
 
 
 def test_prior_true_is_find_map() -> None:
@@ -246,30 +231,6 @@ def test_given_epsilons_weigh_the_simulators() -> None:
     # Each gradient is linear in the mean of its data: the sandwich in closed form.
     noise = (precision**2 * np.array([0.25 / N, 0.25 / 20])).sum()
     np.testing.assert_allclose(optimum.stderr["mu"], noise**0.5 / precision.sum(), rtol=0.02)
-
-
-@pytest.mark.slow
-def test_vector_hyperparameters_of_a_multivariate_input() -> None:
-    covariance = np.array([[1.0, 0.5], [0.5, 1.0]])
-    data = np.random.default_rng(4).multivariate_normal([1.0, 2.0], covariance, 30)
-    with pm.Model(coords={"axis": ["a", "b"]}) as model:
-        mean = pm.MvNormal("mean", [0.0, 0.0], 4 * np.eye(2), dims="axis")
-        x = pm.MvNormal.dist(mean, covariance)
-        for i, name in enumerate(("first", "second")):
-            given = {"metric": METRICS["kl"], "propagation": prb.Reweighted(64)}
-            prb.Simulator(name, lambda x, i=i: x[..., i], x, observed=data[:, i], **given)
-        pm.Deterministic("gap", mean[1] - mean[0])
-    optimum = prb.minimize(model)
-    assert optimum.evaluator.hyperparameters.names == ["mean[a]", "mean[b]"]
-    assert optimum.point["mean"].shape == optimum.stderr["mean"].shape == (2,)
-    # A quadratic in each mean; correlation does not matter to marginal conditions.
-    off = np.abs(optimum.point["mean"] - data.mean(axis=0))
-    assert (off < 0.25 * optimum.stderr["mean"]).all()
-    np.testing.assert_allclose(optimum.stderr["mean"], 1 / 30**0.5, rtol=0.1)
-    np.testing.assert_allclose(optimum.point["gap"], np.diff(optimum.point["mean"])[0], rtol=1e-12)
-    tree = optimum.to_datatree()
-    assert tree["optimum"]["mean"].dims == ("axis",)
-    assert list(tree["optimum"]["axis"].values) == ["a", "b"]
 
 
 # -- supports --------------------------------------------------------------------------------------
@@ -327,11 +288,10 @@ def collapsing(spread: Callable[[], Any]) -> pm.Model:
     ("spread", "keywords"),
     [
         (lambda: pm.LogNormal("sigma", np.log(0.1), 4.0), {}),  # less than three spreads of it away
-        (lambda: pm.InverseGamma("sigma", 2, 0.3), {}),
         (lambda: pm.HalfNormal("sigma", 0.3), {"tolerance": 1e-3}),
         (lambda: pm.HalfNormal("sigma", 0.3), {"method": "Powell"}),
     ],
-    ids=["wide", "inverse gamma", "coarse", "Powell"],
+    ids=["wide", "coarse", "Powell"],
 )
 def test_a_collapsed_population_is_identified_by_the_objective(
     spread: Callable[[], Any], keywords: dict[str, Any]
@@ -377,16 +337,14 @@ def test_a_hyperparameter_without_effect_is_at_no_edge_however_far_out() -> None
     assert optimum.converged
 
 
-@pytest.mark.parametrize("name", ["ll", "pr"])
-def test_an_optimum_far_outside_the_prior_is_not_taken_for_an_edge(name: str) -> None:
-    # Fewer responses have too few tails for standard errors of a log-likelihood.
+def test_an_optimum_far_outside_the_prior_is_not_taken_for_an_edge() -> None:
     observed = 1.0 + 0.002 * (OBSERVED - 1.0)
-    model = normal_model(name, prb.Resimulated(16384), observed=observed)
+    model = normal_model("pr", prb.Resimulated(4096), observed=observed)
     optimum = prb.minimize(model, start={"mu": 1.0, "sigma": 0.002})
     assert optimum.converged
     assert optimum.search.at_edge == ()
-    assert optimum.point["sigma"] == pytest.approx(0.002 * fitted(name).point["sigma"], rel=0.1)
-    np.testing.assert_allclose(errors(optimum), 0.002 * errors(fitted(name)), rtol=0.5)
+    assert optimum.point["sigma"] == pytest.approx(0.002 * fitted("pr").point["sigma"], rel=0.1)
+    np.testing.assert_allclose(errors(optimum), 0.002 * errors(fitted("pr")), rtol=0.5)
 
 
 # -- jumps -----------------------------------------------------------------------------------------
@@ -410,13 +368,18 @@ def lossy(name: str, seed: int, n: int) -> pm.Model:
     return model
 
 
-@pytest.mark.parametrize(("name", "seed"), [("kl", 0), ("kl", 1), ("pr", 0)])
+@pytest.mark.parametrize(("name", "seed"), [("kl", 0), ("pr", 1)])
 def test_bfgs_steps_over_the_jumps_of_points_that_lose_their_response(name: str, seed: int) -> None:
     model = lossy(name, seed, 4096)
     by_simplex = prb.minimize(model, start=START, method="Nelder-Mead")
     optimum = prb.minimize(model, start=START)
     assert optimum.discrepancy < by_simplex.discrepancy * (1 + 1e-4)
     assert optimum.converged
+    if name == "pr":  # standard errors are those at the simplex's end
+        assert "A simplex from there" in optimum.message
+        local = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1)).local
+        np.testing.assert_allclose(optimum.covariance, local.in_theta, rtol=1e-6)
+        np.testing.assert_array_equal(optimum.sampling().local.in_theta, local.in_theta)
 
 
 def test_at_a_jump_there_are_no_standard_errors() -> None:
@@ -426,14 +389,6 @@ def test_at_a_jump_there_are_no_standard_errors() -> None:
     assert "points lose their response" in str(prb.diagnose(optimum))
     with pytest.raises(ValueError, match=r"calibrate_epsilon: .* points lose their response"):
         prb.calibrate_epsilon(optimum)
-
-
-def test_standard_errors_are_those_of_where_the_simplex_ended() -> None:
-    optimum = prb.minimize(lossy("pr", 1, 4096), start=START)
-    assert "A simplex from there" in optimum.message
-    expected = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1)).local.in_theta
-    np.testing.assert_allclose(optimum.covariance, expected, rtol=1e-6)
-    np.testing.assert_array_equal(optimum.sampling().local.in_theta, expected)
 
 
 @pytest.mark.long
@@ -484,7 +439,7 @@ def test_a_start_that_does_not_fit_is_refused(start: Any, error: Any, words: str
         prb.minimize(fitted("pr").model, start=start)
 
 
-@pytest.mark.parametrize("name", ["pr", "kl", "area"])
+@pytest.mark.parametrize("name", ["pr", "area"])
 def test_data_that_no_population_reaches_are_no_convergence(name: str) -> None:
     # All weight is on the outermost design point: nothing changes any more.
     model = normal_model(name, observed=OBSERVED + 1000)
@@ -493,9 +448,9 @@ def test_data_that_no_population_reaches_are_no_convergence(name: str) -> None:
     assert "try another start" in optimum.message
 
 
-@pytest.mark.parametrize("propagation", [R256, prb.Resimulated(1024)], ids=["stored", "computed"])
+@pytest.mark.parametrize("propagation", [R256, prb.Resimulated(512)], ids=["stored", "computed"])
 @pytest.mark.parametrize("name", ["pr", pytest.param("kl", marks=pytest.mark.slow)])
-def test_far_starts_converge(name: str, propagation: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_far_starts_converge(name: str, propagation: Any) -> None:
     model = normal_model(name, propagation)
     alone = {"refine": False, "starts": 0}
     best = prb.minimize(model, start={"mu": MEAN, "sigma": SD}, **alone)
@@ -510,10 +465,6 @@ def test_far_starts_converge(name: str, propagation: Any, monkeypatch: pytest.Mo
         if propagation is not R256:  # the first point is the start, and no draw of the prior
             np.testing.assert_allclose(trace["theta"][0], [start[0], np.log(start[1])], rtol=1e-12)
         np.testing.assert_allclose(trace["discrepancy"].min(), optimum.discrepancy, rtol=1e-9)
-    if name == "pr":
-        monkeypatch.setattr(minimization, "approach", lambda search, theta, *_: (theta, Trace()))
-        lost = prb.minimize(model, start={"mu": 30.0, "sigma": 0.1}, **alone)
-        assert abs(lost.point["mu"] - MEAN) > 1.0
 
 
 # -- standard errors -------------------------------------------------------------------------------
@@ -543,43 +494,6 @@ def test_standard_errors_against_refitting_200_data_sets_with_minimize(name: str
     fits = [pair(prb.minimize(normal_model(name, observed=y), **options)) for y in data]
     # Both sides have a relative standard error of 5% for the area metric, one side for the residual.
     np.testing.assert_allclose(errors(optimum), np.std(fits, axis=0, ddof=1), rtol=4 * 0.07)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("name", "tolerance"), [("kl", 0.05), ("area", 0.25)])
-def test_standard_errors_of_unidentified_elements_are_infinite(name: str, tolerance: float) -> None:
-    model = normal_model(name)
-    with model:
-        pm.Normal("idle", 0, 1)
-    optimum = prb.minimize(model)
-    np.testing.assert_allclose(errors(optimum), errors(fitted(name)), rtol=tolerance)
-    assert np.isinf(optimum.stderr["idle"])
-    assert optimum.n_responses <= 512  # an idle hyperparameter asks for no responses
-
-
-def test_standard_errors_are_carried_to_deterministics() -> None:
-    model = normal_model("kl")
-    with model:
-        pm.Deterministic("both", pm.math.stack([2 * model["mu"], model["sigma"] ** 2]))
-    optimum = prb.minimize(model)
-    mu, sigma = pair(optimum)
-    np.testing.assert_allclose(optimum.point["both"], [2 * mu, sigma**2])
-    np.testing.assert_allclose(optimum.stderr["both"], [2, 2 * sigma] * errors(optimum), rtol=1e-3)
-
-
-@pytest.mark.long
-def test_a_users_own_metric_is_minimised_and_has_standard_errors() -> None:
-    def moments(z: Any, observed: Any, w: Any) -> Any:
-        first = (z * w).sum(axis=-1) - observed.mean()
-        return first**2 + ((z**2 * w).sum(axis=-1) - (observed**2).mean()) ** 2
-
-    # The minimiser is exact on its design, whose moments are not quite those of the population.
-    for n, tolerance in ((256, 0.03), (1024, 3e-4)):
-        model = normal_model(prb.FunctionMetric(moments, weighted=True), prb.Reweighted(n))
-        optimum = prb.minimize(model, method="Nelder-Mead")
-        # Those of the mean and of the standard deviation of 50 normal values.
-        np.testing.assert_allclose(errors(optimum), [SD / 50**0.5, SD / 100**0.5], rtol=0.25)
-        assert (np.abs(pair(optimum) - [MEAN, SD]) < tolerance * errors(optimum)).all()
 
 
 # -- what it costs ---------------------------------------------------------------------------------
@@ -704,7 +618,7 @@ def test_unidentified_directions_are_regularised_and_named() -> None:
     assert abs(optimum.point["ratio"] - np.median(observed)) < error
 
 
-def test_a_minimisation_goes_on_where_a_gradient_is_nan() -> None:
+def test_a_gradient_that_is_nan_is_differenced() -> None:
     # PyMC's gradient of a normal cut off on one side is NaN at values that are cut off.
     values = np.random.default_rng(0).normal(1.0, 0.7, 400)
     with pm.Model() as model:
@@ -712,23 +626,27 @@ def test_a_minimisation_goes_on_where_a_gradient_is_nan() -> None:
         x = pm.TruncatedNormal.dist(mu, pm.HalfNormal("sd", 1), lower=mu - w)
         data = values[values > 0][:40]
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=data, propagation=R256)
-    start = {"mu": 0.9, "w": 1.4, "sd": 0.5}
-    evaluator = Evaluator.of(model)
-    exact = evaluator.objective(prior=False, gradient=True)
-    value, gradient = exact(evaluator.hyperparameters.unconstrained(start), np.ones(1))
+    evaluator, scales = Evaluator.of(model), np.ones(1)
+    theta = evaluator.hyperparameters.unconstrained({"mu": 0.9, "w": 1.4, "sd": 0.5})
+    prior_sd = evaluator.hyperparameters.prior_sd
+    value, gradient = evaluator.objective(prior=False, gradient=True)(theta, scales)
     assert np.isfinite(value)
     assert np.isnan(gradient).any()
-    optimum = prb.minimize(model, start=start, starts=0, refine=False)
-    by_simplex = prb.minimize(model, start=start, starts=0, refine=False, method="Nelder-Mead")
-    assert optimum.discrepancy < min(1.1 * by_simplex.discrepancy, 0.5 * value)
+    search = Search(evaluator, prior_sd, Method(), False, 1e-6, 100)
+    objective = search.objective(theta, scales, 1.0, 0, gradient=True)
+    differenced, slope = objective(np.zeros(3))
+    assert differenced == pytest.approx(value)
+    assert objective.count == 1 + 2 * 3
+    step = 1e-3 * np.eye(3)
+    around = [evaluator.total(theta + side * step * prior_sd, scales) for side in (1, -1)]
+    np.testing.assert_allclose(slope, (around[0] - around[1]) / 2e-3, rtol=0.02, atol=1e-3)
 
 
 @pytest.mark.parametrize("supported", [True, False])
 def test_a_ridge_ends_once_designs_identify_its_directions(
     supported: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = normal_model("kl")
-    expected = prb.minimize(model, starts=0)
+    expected = fitted("kl")
 
     def regularised(search: Any, fit: Any, round_: int, *_: Any) -> Any:
         # As by a design that was too small at first to identify anything.
@@ -741,7 +659,7 @@ def test_a_ridge_ends_once_designs_identify_its_directions(
         return fit, None
 
     monkeypatch.setattr(minimization, "refine_designs", regularised)
-    optimum = prb.minimize(model, starts=0)
+    optimum = prb.minimize(normal_model("kl"), starts=0)
     # Else it stays at the ridge's center, with a message.
     assert bool(np.abs(optimum.theta - expected.theta).max() < 1e-4) is supported
     assert ("were regularised" not in optimum.message) is supported
@@ -782,23 +700,3 @@ def test_a_large_error_of_the_design_is_reported(sizes: list[int | None], advice
     assert "by about 0.40 standard errors, expected at most 0.1" in finding.text
     assert advice in finding.text
     assert optimum_findings(evaluator, None, (), 0.14) == ()
-
-
-def test_a_mirror_solution_is_reported_by_standard_deviations_and_correlations() -> None:
-    """Not by the elements of a packed factor."""
-    response = np.random.default_rng(0).normal(size=(20, 2))
-    with pm.Model(coords={"part": ["rod", "pin"]}) as model:
-        mean = pm.Normal("mean", 0, 1, dims="part")
-        sds = pm.HalfNormal.dist(1, shape=2)
-        chol, _, _ = pm.LKJCholeskyCov("cov", n=2, eta=2, sd_dist=sds)
-        x = pm.MvNormal.dist(mean, chol=chol, shape=2)
-        prb.Simulator("y", np.positive, x, metric=prb.Joint(METRICS["area"]), observed=response)
-    evaluator = Evaluator.of(model)
-    point = {"mean": [1.0, 2.0], "cov": [0.5, -0.3, 0.4]}
-    theta = evaluator.hyperparameters.unconstrained(point)
-    mirror = LocalOptimum(theta, 0.1, comparable=True, better=False)
-    (finding,) = optimum_findings(evaluator, None, (mirror,), 0.0)
-    place = (
-        "mean[rod] = 1, mean[pin] = 2, cov_stds[0] = 0.5, cov_stds[1] = 0.5, cov_corr[0,1] = -0.6"
-    )
-    assert f"come from {place}: another optimum" in finding.text

@@ -117,7 +117,6 @@ def steepest_descent(
         ("Newton-CG", None),
         ("COBYQA", None),
         ("COBYLA", None),
-        (steepest_descent, None),
         (steepest_descent, {"steps": 1500}),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -14,7 +14,9 @@ import pytest
 import prbayes as prb
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator
-from prbayes.optimize.convergence import apart_from_data
+from prbayes.optimize.convergence import OVERLAP, stored_overlap
+from prbayes.optimize.local_optima import LocalOptimum
+from prbayes.optimize.minimize import optimum_findings
 from prbayes.optimize.optimum import (
     delta_method,
     point_and_stderr,
@@ -75,12 +77,14 @@ def test_an_optimum_survives_plain_pickle_into_a_fresh_process(tmp_path: Path) -
     assert pickle.loads(pickle.dumps(tree)).identical(tree)
 
 
-def test_standard_deviations_and_correlations_of_a_covariance_are_shown() -> None:
+def test_a_covariance_is_shown_as_standard_deviations_and_correlations() -> None:
+    """Not as the elements of a packed factor."""
     response = np.random.default_rng(0).normal(size=(20, 2))
-    with pm.Model() as model:
+    with pm.Model(coords={"part": ["rod", "pin"]}) as model:
+        mean = pm.Normal("mean", 0, 1, dims="part")
         sds = pm.HalfNormal.dist(1, shape=2)
         chol, _, _ = pm.LKJCholeskyCov("cov", n=2, eta=2, sd_dist=sds)
-        x = pm.MvNormal.dist(np.zeros(2), chol=chol, shape=2)
+        x = pm.MvNormal.dist(mean, chol=chol, shape=2)
         metric = prb.Joint(prb.AreaMetric())
         few = prb.Reweighted(64)
         prb.Simulator("y", np.positive, x, metric=metric, observed=response, propagation=few)
@@ -89,6 +93,15 @@ def test_standard_deviations_and_correlations_of_a_covariance_are_shown() -> Non
     r, r_error = optimum.point["cov_corr"][0, 1], optimum.stderr["cov_corr"][0, 1]
     assert [line.partition(" = ")[0] for line in lines] == ["cov_stds", "cov_corr[0,1]"]
     assert lines[1] == f"cov_corr[0,1] = {r:.4g} ± {r_error:.4g}"
+    # And so is a mirror solution.
+    point = {"mean": [1.0, 2.0], "cov": [0.5, -0.3, 0.4]}
+    theta = optimum.evaluator.hyperparameters.unconstrained(point)
+    mirror = LocalOptimum(theta, 0.1, comparable=True, better=False)
+    (finding,) = optimum_findings(optimum.evaluator, None, (mirror,), 0.0)
+    expected = (
+        "mean[rod] = 1, mean[pin] = 2, cov_stds[0] = 0.5, cov_stds[1] = 0.5, cov_corr[0,1] = -0.6"
+    )
+    assert f"come from {expected}: another optimum" in finding.text
 
 
 def test_elements_with_labels_are_shown_one_by_one() -> None:
@@ -177,15 +190,15 @@ def test_a_population_far_from_all_data_is_known_by_its_overlap(
     evaluator = Evaluator.of(_normal(metric, propagation))
     there = evaluator.hyperparameters.unconstrained({"mu": 6.0, "sigma": 0.3})
     here = evaluator.hyperparameters.unconstrained({"mu": 0.5, "sigma": 0.4})
-    assert apart_from_data(evaluator, there) is far
-    assert apart_from_data(evaluator, here) is False
+    assert (stored_overlap(evaluator, there) < OVERLAP) is far
+    assert stored_overlap(evaluator, here) > OVERLAP
 
 
 @pytest.mark.parametrize("prior", [False, True])
 def test_a_minimum_apart_from_the_data_is_no_convergence_unless_the_prior_holds_it_there(
     prior: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("prbayes.optimize.optimum.apart_from_data", lambda *_: True)
+    monkeypatch.setattr("prbayes.optimize.optimum.stored_overlap", lambda *_: 0.0)
     model = _normal(prb.ProbabilityResidual(), prb.Reweighted(256))
     prb.set_epsilon(model, {"y": 0.1})
     optimum = prb.minimize(model, prior=prior, progressbar=False)

@@ -55,7 +55,7 @@ def epsilon_of(model: pm.Model, **keywords: Any) -> float:
 def area_fit(unit: float = 1.0) -> prb.Optimum:
     response = Line(unit)
     model = build(AREA, response, observed=unit * OBSERVED)
-    optimum = prb.minimize(model, method="Nelder-Mead")
+    optimum = prb.minimize(model, starts=0)
     calls = response.calls
     assert prb.calibrate_epsilon(optimum) == prb.calibrate_epsilon(optimum)
     assert response.calls == calls  # no response is computed, and nothing is random
@@ -63,27 +63,22 @@ def area_fit(unit: float = 1.0) -> prb.Optimum:
 
 
 @cache
-def residual_fit(n: int | None = 256) -> tuple[prb.Optimum, Information]:
+def residual_fit() -> tuple[prb.Optimum, Information]:
     """Return the optimum of a mean."""
-    propagation = prb.Resimulated(1024) if n is None else prb.Reweighted(n)
-    optimum = prb.minimize(build(PR, sd=0.5, propagation=propagation))
+    optimum = prb.minimize(build(PR, sd=0.5), starts=0)
     return optimum, Information(Evaluator.of(optimum.model), 0, optimum.theta)
 
 
 # -- likelihoods
 
 
-@pytest.mark.parametrize(
-    "metric", [KL, LL, prb.KullbackLeibler(reverse=True), prb.KullbackLeibler(Histogram())]
-)
-def test_likelihoods_start_at_one_over_n(metric: prb.Metric) -> None:
-    assert node(build(metric, n=16)).epsilon_value == pytest.approx(1 / N)
-
-
-@pytest.mark.parametrize("metric", [PR, AREA])
-def test_other_metrics_start_unset(metric: prb.Metric) -> None:
-    assert np.isnan(node(build(metric, n=16)).epsilon_value)
-    assert node(build(metric, n=16, epsilon=0.3)).epsilon_value == 0.3
+def test_likelihoods_start_at_one_over_n_and_other_metrics_unset() -> None:
+    divergences = [prb.KullbackLeibler(reverse=True), prb.KullbackLeibler(Histogram())]
+    for metric in (KL, LL, *divergences):
+        assert node(build(metric, n=16)).epsilon_value == pytest.approx(1 / N)
+    for metric in (PR, AREA):
+        assert np.isnan(node(build(metric, n=16)).epsilon_value)
+        assert node(build(metric, n=16, epsilon=0.3)).epsilon_value == 0.3
 
 
 def test_calibration_of_a_likelihood_is_one_over_the_effective_number() -> None:
@@ -97,20 +92,18 @@ def test_calibration_of_a_likelihood_is_one_over_the_effective_number() -> None:
     assert node(model).epsilon_value == 7.0  # calibrating sets nothing
 
 
-@pytest.mark.parametrize("metric", [KL, LL])
-def test_a_likelihood_counts_specimens_and_not_observations(metric: prb.Metric) -> None:
-    model = build(metric, observed=np.repeat(OBSERVED[:10], 3), specimens=np.arange(30) // 3)
+def test_a_likelihood_counts_specimens_and_not_observations() -> None:
+    model = build(KL, observed=np.repeat(OBSERVED[:10], 3), specimens=np.arange(30) // 3)
     assert node(model).epsilon_value == pytest.approx(0.1)
     assert has_default_epsilon(node(model))
-    assert epsilon_of(model) == pytest.approx(0.1)
+    assert epsilon_of(model, starts=0) == pytest.approx(0.1)
 
 
 # -- the sandwich of the residual
 
 
-@pytest.mark.parametrize("n", [256, None])
-def test_epsilon_of_one_hyperparameter_is_noise_over_curvature(n: int | None) -> None:
-    optimum, information = residual_fit(n)
+def test_epsilon_of_one_hyperparameter_is_noise_over_curvature() -> None:
+    optimum, information = residual_fit()
     expected = information.sampling_covariance[0, 0] / information.hessian[0, 0]
     np.testing.assert_allclose(prb.calibrate_epsilon(optimum)["y"], expected, rtol=1e-10)
 
@@ -175,7 +168,7 @@ def test_epsilons_have_the_units_of_the_discrepancy() -> None:
     # that.
     np.testing.assert_allclose(ten, 10 * one, rtol=0.01)
     optimum, _ = residual_fit()
-    other = prb.minimize(build(PR, Line(10.0), sd=0.5, observed=10 * OBSERVED))
+    other = prb.minimize(build(PR, Line(10.0), sd=0.5, observed=10 * OBSERVED), starts=0)
     scale, other_scale = (node(o.model).target.scale_factor for o in (optimum, other))
     factor = other_scale / scale / 10  # of int (p - q)^2
     np.testing.assert_allclose(other.discrepancy, factor * optimum.discrepancy, rtol=1e-6)
@@ -203,10 +196,9 @@ def square(z: Floats, y: Floats, w: Floats) -> Floats:
     ("function", "expected", "rtol"),
     [
         (square, 2 * 0.25 / N, 0.36),
-        (lambda z, y, w: 1e3 * square(z, y, w), 1e3 * 2 * 0.25 / N, 0.36),
         (lambda z, y, w: square(z, y, w) ** 0.5, (2 / np.pi) ** 0.5 * 0.5 / N**0.5, 0.2),
     ],
-    ids=["square", "a thousand squares", "absolute value"],
+    ids=["square", "absolute value"],
 )
 def test_epsilon_by_refits(function: Any, expected: float, rtol: float) -> None:
     model = build(prb.FunctionMetric(function, weighted=True), sd=0.5)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, multivariate_t
 
 from prbayes._validate import Floats
@@ -58,6 +57,9 @@ def test_moments_and_evidence_of_a_normal_density() -> None:
     assert (np.abs(sample.draws.mean(axis=0) - MEAN) < 5 * sd / np.sqrt(4000)).all()
     np.testing.assert_allclose(np.cov(sample.draws.T), COVARIANCE, atol=5 * np.sqrt(2 / 4000))
     np.testing.assert_allclose(sample.log_density, normal(sample.draws))
+    # Rows are in random order: halves have the same mean.
+    first, second = sample.draws.reshape(2, 2000, -1).mean(axis=1)
+    assert (np.abs(first - second) < 5 * sd * np.sqrt(2 / 2000)).all()
 
 
 def test_the_error_of_draws_is_at_most_that_of_independent_ones() -> None:
@@ -106,15 +108,6 @@ def test_draws_depend_on_the_seed_alone() -> None:
     assert not np.array_equal(first.draws, other.draws)
 
 
-def test_chains_are_independent_halves() -> None:
-    """Resampled rows are in random order: halves have the same mean."""
-    sample = importance_sample(normal, laplace(normal, MEAN[None], SCALE), 4000, seed=5)
-    halves = sample.draws.reshape(2, 2000, -1).mean(axis=1)
-    sd = np.sqrt(np.diag(COVARIANCE))
-    assert (np.abs(halves[0] - halves[1]) < 5 * sd * np.sqrt(2 / 2000)).all()
-    assert np.isfinite(logsumexp(sample.log_density))
-
-
 def test_further_rounds_follow_a_bent_ridge_into_the_prior() -> None:
     """Only the sum of two variances is known: either may be nearly zero."""
     prior = multivariate_normal(np.zeros(2), 4 * np.eye(2))
@@ -130,8 +123,8 @@ def test_further_rounds_follow_a_bent_ridge_into_the_prior() -> None:
     sample = importance_sample(ridge, modes, 4000, seed=0, prior=(draws, prior.logpdf))
     assert sample.effective_size / sample.efficiency > 8000  # points
     assert sample.is_reliable
-    x = np.linspace(-14, 1, 3001)
-    grid = np.stack([a.ravel() for a in np.meshgrid(x, np.linspace(-14, 1, 3001))], axis=1)
+    x = np.linspace(-14, 1, 1001)
+    grid = np.stack([a.ravel() for a in np.meshgrid(x, x)], axis=1)
     weights = np.exp(ridge(grid))
     mean = weights @ grid[:, 0] / weights.sum()
     sd = np.sqrt(weights @ (grid[:, 0] - mean) ** 2 / weights.sum())

@@ -21,7 +21,6 @@ from prbayes.model.fingerprint import identity_of
 from prbayes.posterior.kernel import (
     BatchedKernel,
     Checkpoint,
-    KernelOptions,
     Particles,
     correlation,
     starting_thetas,
@@ -36,14 +35,8 @@ AREA = prb.AreaMetric()
 DRAWS, CHAINS = 20, 3
 PROPAGATIONS: dict[str, Any] = {
     "stored": prb.Reweighted(64),
-    "large": prb.Reweighted(512),
     "random": prb.Fresh(32),
 }
-
-
-@pytest.fixture(autouse=True)
-def _large(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("prbayes.model.evaluator._LARGE", 512)
 
 
 def one_mean(propagation: Any, response: Any = np.positive, metric: Any = AREA) -> pm.Model:
@@ -154,28 +147,6 @@ def test_resampling_follows_the_weights() -> None:
     rows = np.repeat([2, 7], [3, 7])
     np.testing.assert_array_equal(kernel.tempered_posterior, particles.thetas[rows])
     np.testing.assert_array_equal(kernel.particles.discrepancies, particles.discrepancies[rows])
-
-
-def test_another_evaluator_weighs_the_particles() -> None:
-    # A standard normal at beta 1, of prior and likelihood exp(-x^2 / 4) each.
-    kernel = at_standard_normal(4000, Quadratic())
-    kernel.beta, kernel.is_coarse = 1.0, True
-    coarse = kernel.particles._replace(log_likelihood=kernel.likelihood_logp / 2)
-    kernel._take(coarse)
-    assert kernel.reweight(stored())
-    assert not kernel.is_coarse
-    # The mean of exp(-x^2 / 4) in two dimensions is 2/3; variances become 2/3.
-    assert kernel.log_marginal_likelihood == pytest.approx(np.log(2 / 3), abs=0.03)
-    kernel.resample()
-    np.testing.assert_allclose(kernel.tempered_posterior.var(axis=0), 2 / 3, rtol=0.1)
-
-
-@pytest.mark.parametrize(("within", "is_enough"), [(0.0, False), (0.2, False), (0.4, True)])
-def test_a_fifth_of_the_particles_needs_weight(within: float, is_enough: bool) -> None:
-    """Of a standard normal, 0, 16 and 31 per cent are within."""
-    kernel = at_standard_normal(1000, Quadratic())
-    kernel._evaluate = Quadratic(within)
-    assert kernel.reweight(stored()) == is_enough
 
 
 STEPS = {
@@ -312,82 +283,31 @@ def test_finished_chains_compute_nothing_again(tmp_path: Path) -> None:
         require_same(run("stored", tmp_path / "run.nc"), expected)
 
 
-def test_a_restarted_chain_has_the_particles_of_the_user_again() -> None:
-    start = np.random.default_rng(4).normal(0, 2, (DRAWS, 1))
-    kernel = BatchedKernel(DRAWS, start, stored().model, evaluator=stored())
-    kernel.initialize(kernel.start, np.random.default_rng(1))
-    kernel.restore(*kernel.state())
-    kernel.initialize(kernel.start, kernel.rng)
-    np.testing.assert_array_equal(kernel.particles.thetas, start)
-
-
-@pytest.mark.parametrize("name", ["stored", "large"])
-def test_chains_are_independent_and_have_their_discrepancies(name: str) -> None:
-    chains = undisturbed(name)
+def test_chains_are_independent_and_have_their_discrepancies() -> None:
+    chains = undisturbed("stored")
     assert np.unique(chains.thetas[:, :, 0]).size > 0.5 * CHAINS * DRAWS
     for i in range(CHAINS):
         assert not np.isin(chains.thetas[i], chains.thetas[:i]).any()
-    again = evaluator(name)(chains.thetas.reshape(-1, 1)).discrepancies
+    again = stored()(chains.thetas.reshape(-1, 1)).discrepancies
     np.testing.assert_allclose(chains.discrepancies.reshape(-1, 1), again)
-
-
-def test_large_designs_are_complete_in_the_last_stage_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    n_points: list[int] = []
-    original = BatchedKernel.mutate
-
-    def mutate(self: BatchedKernel) -> None:
-        n_points.append(self.evaluator.nodes[0].bound.n_points)
-        original(self)
-
-    monkeypatch.setattr(BatchedKernel, "mutate", mutate)
-    stats_ = run("large").sample_stats
-    expected = []
-    for betas, evidence in zip(stats_["beta"], stats_["log_marginal_likelihood"], strict=True):
-        betas = betas[~np.isnan(betas)]
-        expected += [64] * (betas.size - 1) + [512]
-        # Twice at one: on an eighth of the points, and on all of them.
-        assert betas[-2:].values.tolist() == [1, 1]
-        assert betas[:-2].max() < 1
-        assert np.isnan(evidence[: betas.size - 2]).all()
-    assert n_points == expected
-
-
-def mean_evidence(chains: Chains) -> Any:
-    logs = chains.sample_stats["log_marginal_likelihood"].values
-    return np.mean([row[~np.isnan(row)][-1] for row in logs])
-
-
-def test_a_chain_with_few_weights_starts_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("prbayes.posterior.kernel._OPTIONS", KernelOptions(effective=1.1))
-    chains = run("large")
-    for betas in chains.sample_stats["beta"].values:
-        betas = betas[~np.isnan(betas)]
-        assert (betas == 1).sum() == 1
-        assert (np.diff(betas) > 0).all()
-    # From the prior: the whole evidence again.
-    expected = mean_evidence(undisturbed("large"))
-    assert mean_evidence(chains) == pytest.approx(expected, abs=0.5)
-
-
-def test_coarser_designs_change_no_posterior(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = evaluator("large")
-    settings = SamplingSettings(draws=500)
-    coarse = run_chains(problem, settings, np.random.SeedSequence(1).spawn(4))
-    monkeypatch.setattr("prbayes.model.evaluator._LARGE", 513)
-    whole = run_chains(problem, settings, np.random.SeedSequence(3).spawn(4))
-    assert abs(coarse.thetas.mean() - whole.thetas.mean()) < 0.2 * whole.thetas.std()
-    assert coarse.thetas.std() == pytest.approx(whole.thetas.std(), rel=0.15)
-    evidence, expected = (mean_evidence(chains) for chains in (coarse, whole))
-    np.testing.assert_allclose(evidence, expected, atol=0.2)
 
 
 # -- checkpoints
 
 
-def sample(path: Path, response: Any = np.positive, **changes: Any) -> xr.DataTree:
+@cache
+def best(response: Any = np.positive) -> prb.Optimum:
     model = one_mean(prb.Reweighted(64, max_lost=0.9), response, prb.KullbackLeibler())
+    return prb.minimize(model, starts=0, progressbar=False)
+
+
+def sample(path: Path, response: Any = np.positive, **changes: Any) -> xr.DataTree:
+    optimum = best(response)
     settings = {"draws": 20, "chains": 1, "random_seed": 1, "adjustment": None} | changes
-    return prb.sample_smc(model=model, checkpoint=path, progressbar=False, refine=False, **settings)
+    return prb.sample_smc(
+        model=optimum.model, optimum=optimum, checkpoint=path, progressbar=False, refine=False,
+        **settings,
+    )  # fmt: skip
 
 
 def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:

@@ -106,19 +106,15 @@ def test_the_tree_of_a_sampler() -> None:
             values = calibration[key].sel(simulator=name).values.ravel()
             np.testing.assert_allclose(values, support[key], rtol=1e-9)
     np.testing.assert_allclose(calibration["epsilon"], [0.02, 1 / 40])
+    divergence = "KullbackLeibler(density=GaussianKDE(bandwidth=twice_silverman), reverse=False)"
+    assert list(calibration["metric"].values) == ["AreaMetric()", divergence]
+    assert list(calibration["propagation"].values) == [repr(prb.Reweighted(256))] * 2
     expected_attrs = {"inference_library": "prbayes", "random_seed": "1", **versions()}
     assert expected_attrs.items() <= posterior.attrs.items()
     assert posterior.attrs["n_responses"] == calibration["n_points"].sum()
     observed = tree["observed_data"]
     np.testing.assert_array_equal(observed["first"].sel(specimen="s3"), DATA[3, 0])
     assert observed["second"].dims == ("second_dim_0",)
-
-
-def test_metrics_are_described_the_same_in_every_session() -> None:
-    divergence = "KullbackLeibler(density=GaussianKDE(bandwidth=twice_silverman), reverse=False)"
-    for tree in (optimum().to_datatree(), idata()):
-        assert list(tree["calibration"]["metric"].values) == ["AreaMetric()", divergence]
-    assert list(idata()["calibration"]["propagation"].values) == [repr(prb.Reweighted(256))] * 2
 
 
 def test_chains_with_different_numbers_of_stages() -> None:
@@ -174,8 +170,8 @@ def known_sd(propagation: prb.propagation.Propagation) -> pm.Model:
 @cache
 def sampled() -> tuple[pm.Model, prb.Optimum, xr.DataTree]:
     model = known_sd(prb.Reweighted(256))
-    optimum = prb.minimize(model, progressbar=False)
-    return model, optimum, prb.sample_smc(500, chains=2, model=model, optimum=optimum, **QUIET)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    return model, optimum, prb.sample(500, chains=2, model=model, optimum=optimum, **QUIET)
 
 
 def test_priors_are_in_the_units_of_the_user() -> None:
@@ -289,15 +285,11 @@ def test_responses_that_cost_runs_are_not_computed_for_groups() -> None:
     assert prb.diagnose(tree, model=model).support.sizes["simulator"] == 0
 
 
-@pytest.mark.parametrize(
-    "plot", ["plot_dist", "plot_trace", "plot_rank", "plot_forest", "plot_ess"]
-)
-def test_arviz_draws_the_tree(plot: str, tmp_path: Path) -> None:
+def test_arviz_draws_the_tree() -> None:
     mpl.use("Agg")
-    collection = getattr(az, plot)(idata(), backend="matplotlib")
-    collection.savefig(tmp_path / "figure.png")
+    for plot in (az.plot_trace, az.plot_rank, az.plot_forest):
+        assert list(plot(idata(), backend="matplotlib").viz.children)
     mpl.pyplot.close("all")
-    assert (tmp_path / "figure.png").stat().st_size > 5000
     summary = az.summary(idata())
     assert {"r_hat", "ess_bulk"} <= set(summary.columns)
     assert list(summary.index)[:2] == ["mean[north]", "mean[south]"]
@@ -329,6 +321,8 @@ def test_selected_variables_dimensions_and_groups() -> None:
         assert tree[group]["second"].dims[-1] == "plate"
         assert tree[group]["first"].dims[-1] == "specimen"
         assert tree[group].coords["plate"].size == 40
+    with pytest.raises(ValueError, match=r"got \[\], expected 1 names"):
+        results.selected(tree, None, {"dims": {"second": []}})
     x = pm.Normal.dist(model()["mean"][0], 1.0)
     with pytest.raises(KeyError, match=r"got a result without \['sigma'\]"):
         prb.predict(tree, np.positive, x, model=model())
@@ -336,18 +330,18 @@ def test_selected_variables_dimensions_and_groups() -> None:
 
 def test_chains_begin_at_their_start(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    prior = {"mean": rng.normal(1, 1, (40, 2)), "sigma": np.abs(rng.normal(size=40))}
+    prior = {"mean": rng.normal(1, 1, (20, 2)), "sigma": np.abs(rng.normal(size=20))}
     transformed = {"mean": prior["mean"], "sigma_log__": np.log(prior["sigma"])}
     path = tmp_path / "run.nc"
-    one = sample(start=prior, cores=1, checkpoint=path)
-    both = sample(start=[transformed, prior])
+    one = sample(20, start=prior, cores=1, checkpoint=path)
+    both = sample(20, start=[transformed, prior])
     np.testing.assert_allclose(one.posterior["mean"], both.posterior["mean"], rtol=1e-9)
-    assert not np.allclose(one.posterior["mean"], idata().posterior["mean"])
+    assert not np.isin(one.posterior["mean"], idata().posterior["mean"]).any()
     with pytest.raises(ValueError, match="start: got 1 dicts, expected one, or 2"):
-        sample(start=[prior])
+        sample(20, start=[prior])
     for start in (None, {**prior, "mean": prior["mean"] + 1}):
         with pytest.raises(prb.response.StoreError, match="belongs to another run"):
-            sample(start=start, checkpoint=path)
+            sample(20, start=start, checkpoint=path)
 
 
 @pytest.mark.parametrize(
@@ -360,7 +354,6 @@ def test_chains_begin_at_their_start(tmp_path: Path) -> None:
         ({"idata_kwargs": {"save_warmup": True}}, TypeError, r"got \['save_warmup'\]"),
         ({"idata_kwargs": {"log_prior": 1}}, TypeError, "log_prior: got int 1, expected True"),
         ({"idata_kwargs": {"dims": 1}}, TypeError, "dims: got int 1, expected a dict"),
-        ({"idata_kwargs": {"dims": {"second": []}}}, ValueError, r"got \[\], expected 1 names"),
         ({"cores": 0}, ValueError, "cores: got 0, expected an integer >= 1"),
         ({"return_inferencedata": None}, TypeError, "expected True or False"),
     ],

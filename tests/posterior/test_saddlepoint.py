@@ -2,36 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytest
-from normal_posterior import LogPrior, Moments, exact_moments, require_close
+import xarray as xr
+from normal_posterior import (
+    BOUNDED,
+    SHARP,
+    VAGUE,
+    Prior,
+    draws_of,
+    exact_moments,
+    moments_of,
+    normal_model,
+    require_close,
+)
 from scipy import stats
 
 import prbayes as prb
+from prbayes._finding import from_json
 from prbayes._validate import Floats
 from prbayes.metrics.base import Metric
 from prbayes.metrics.score import WeightSlopes, specimen_scores
-from prbayes.posterior.importance import importance_sample, laplace
+from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.saddlepoint import (
     EstimateLikelihood,
     EstimateLikelihoodOptions,
     SaddlepointOptions,
     Scores,
+    StoredScores,
     cumulants,
     estimate_likelihood,
     log_density,
     varying_combinations,
 )
-from prbayes.posterior.target import Target
+from prbayes.posterior.target import Target, prior_conflicts
 
 KLD = prb.KullbackLeibler()
 PR = prb.ProbabilityResidual()
-Parameters = Callable[[], tuple[Any, Any]]  # within a model: mean and standard deviation
+QUIET: dict[str, Any] = {"progressbar": False, "random_seed": 1}
 
 
 # -- cumulant functions --
@@ -145,95 +157,84 @@ def test_metrics_without_a_mean_score_are_refused() -> None:
             specimen_scores(metric.against(observed), normal_population(1), observed)
 
 
+def test_weights_are_those_of_responses_that_can_be_observed() -> None:
+    evaluator = Evaluator.of(normal_model(KLD, Y, n=64))
+    is_observable = np.arange(64) % 3 > 0
+    values = np.arange(2.0 * is_observable.sum()).reshape(-1, 2)
+    combinations = np.array([[2.0], [-1.0]])
+    stored = StoredScores(0, is_observable, values, 20, combinations, rows=16)
+    thetas = np.array([[0.0, 0.0], [1.0, -0.5]])
+    log_weights, scores = stored.population(evaluator, thetas)
+    _, weights = evaluator.populations(thetas, 0)
+    expected = weights[:, is_observable] / weights[:, is_observable].sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(np.exp(log_weights), expected)
+    np.testing.assert_allclose(scores.values[:, 0], 2 * values[:, 0] - values[:, 1])
+
+
 # -- posteriors --
 
-
-def vague() -> tuple[Any, Any]:
-    return pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1)
-
-
-def sharp() -> tuple[Any, Any]:
-    return pm.Normal("mu", 0.7, 0.1), pm.LogNormal("sigma", np.log(0.4), 0.1)
-
-
-def bounded() -> tuple[Any, Any]:
-    return pm.Uniform("mu", 0, 1.05), pm.Uniform("sigma", 0, 0.55)
-
-
-LOG_PRIORS: dict[Parameters, LogPrior] = {
-    vague: lambda mu, s: stats.norm(0, 2).logpdf(mu) + stats.halfnorm.logpdf(s),
-    sharp: lambda mu, s: stats.norm(0.7, 0.1).logpdf(mu) + stats.lognorm(0.1, scale=0.4).logpdf(s),
-    bounded: lambda mu, s: stats.uniform(0, 1.05).logpdf(mu) + stats.uniform(0, 0.55).logpdf(s),
-}
 Y = np.random.default_rng(4).normal(1, 0.5, 20)
 
 
-def optimum_of(parameters: Parameters, *groups: Floats, **keywords: Any) -> prb.Optimum:
-    """Return the optimum of a normal population with a simulator y = x for each group of data."""
-    with pm.Model() as model:
-        mu, sigma = parameters()
-        for k, observed in enumerate(groups):
-            x = pm.Normal.dist(mu, sigma)
-            settings = {"metric": KLD, "propagation": prb.Reweighted(1024), **keywords}
-            prb.Simulator(f"y{k}", lambda x: x, x, observed=observed, **settings)
-    return prb.minimize(model=model, progressbar=False)
+def optimum_of(model: pm.Model) -> prb.Optimum:
+    return prb.minimize(model=model, starts=0, progressbar=False)
 
 
 def likelihood_at(optimum: prb.Optimum) -> EstimateLikelihood:
     return estimate_likelihood(optimum.evaluator, optimum)
 
 
-def draws_of(likelihood: EstimateLikelihood) -> dict[str, Floats]:
+def posterior_of(likelihood: EstimateLikelihood) -> dict[str, Floats]:
     """Return draws of the posterior given the estimate, by name."""
-    evaluator = likelihood.evaluator
     starts = likelihood.starts[:1]
-    target = Target(evaluator, likelihood.log_likelihood, starts, likelihood.scale)
-    modes = laplace(target.log_posterior, starts, target.scale)
-    sample = importance_sample(target.log_posterior, modes, 1000, seed=0)
-    assert sample.pareto_k < 0.7
-    return evaluator.hyperparameters.constrained(sample.draws)
+    return draws_of(
+        Target(likelihood.evaluator, likelihood.log_likelihood, starts, likelihood.scale)
+    )
 
 
-def moments_of(draws: dict[str, Floats], mu: str = "mu", sigma: str = "sigma") -> Moments:
-    pair = np.stack([draws[mu], np.log(draws[sigma])], axis=1)
-    return Moments(pair.mean(axis=0), pair.std(axis=0))
-
-
-def require_exact(likelihood: EstimateLikelihood, parameters: Parameters, y: Floats) -> None:
+def require_exact(
+    likelihood: EstimateLikelihood, y: Floats, prior: Prior = VAGUE, **limits: Any
+) -> None:
     """Mean and standard deviation are sufficient, and the divergence's estimate is close to both."""
-    require_close(moments_of(draws_of(likelihood)), exact_moments(LOG_PRIORS[parameters], y))
+    exact = exact_moments(prior.log_density, y)
+    require_close(moments_of(posterior_of(likelihood)), exact, **limits)
+
+
+STANDARD = np.random.default_rng(6).normal(size=10)
+# The spread of these data is half of what the sharp prior expects.
+NARROW = 1 + 0.2 * (STANDARD - STANDARD.mean()) / STANDARD.std()
 
 
 # The last estimate is beyond the end of its prior, where scores of an element would vanish.
 @pytest.mark.parametrize(
-    ("parameters", "shift"), [(vague, 0.0), (sharp, 0.0), (bounded, 0.0), (bounded, 0.5)]
+    ("prior", "y"), [(VAGUE, Y), (SHARP, Y), (SHARP, NARROW), (BOUNDED, Y), (BOUNDED, Y + 0.5)]
 )
-def test_the_posterior_of_a_normal_population(parameters: Parameters, shift: float) -> None:
-    likelihood = likelihood_at(optimum_of(parameters, Y + shift))
+def test_the_posterior_of_a_normal_population(prior: Prior, y: Floats) -> None:
+    likelihood = likelihood_at(optimum_of(normal_model(KLD, y, prior=prior)))
     assert likelihood.combinations.shape == (2, 2)
-    require_exact(likelihood, parameters, Y + shift)
+    require_exact(likelihood, y, prior)
 
 
 @pytest.mark.long
 def test_a_prior_far_wider_than_the_population() -> None:
     y = 3.9 + 4e-4 * np.random.default_rng(7).standard_normal(50)
-    require_exact(likelihood_at(optimum_of(vague, y)), vague, y)
+    require_exact(likelihood_at(optimum_of(normal_model(KLD, y, n=1024))), y)
 
 
 # Responses that are computed at each theta are functions of it by common random numbers.
 @pytest.mark.parametrize(
     "propagation",
-    [prb.Reweighted(1024), pytest.param(prb.Resimulated(256), marks=pytest.mark.long)],
+    [prb.Reweighted(512), pytest.param(prb.Resimulated(256), marks=pytest.mark.long)],
 )
 def test_the_score_at_another_point_is_as_good_a_statistic(
     propagation: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its observed mean is subtracted there; with the wrong sign the posterior is elsewhere."""
-    optimum = optimum_of(sharp, Y, propagation=propagation)
+    optimum = optimum_of(normal_model(KLD, Y, prior=SHARP, propagation=propagation))
     shifted = replace(optimum, theta=optimum.theta + optimum.evaluator.hyperparameters.prior_sd)
     likelihood = likelihood_at(shifted)
     np.testing.assert_allclose(likelihood.starts[0], shifted.theta)
-    require_exact(likelihood, sharp, Y)
+    require_exact(likelihood, Y, SHARP)
 
     def wrong(target: Any, population: Any, specimens: Floats, **options: Any) -> Floats:
         sign = -1 if len(specimens) == len(Y) else 1
@@ -241,20 +242,20 @@ def test_the_score_at_another_point_is_as_good_a_statistic(
 
     monkeypatch.setattr("prbayes.posterior.saddlepoint.specimen_scores", wrong)
     with pytest.raises(AssertionError, match=r"\["):
-        require_exact(likelihood_at(shifted), sharp, Y)
+        require_exact(likelihood_at(shifted), Y, SHARP)
 
 
 def test_a_population_of_bounded_support() -> None:
     """The scores include the points that the ends pass; widths are about the standard errors."""
     y = np.random.default_rng(3).uniform(0.2, 1.8, 20)
     with pm.Model() as model:
-        mu, sigma = vague()
+        mu, sigma = VAGUE.variables()
         x = pm.Uniform.dist(mu - 1.73 * sigma, mu + 1.73 * sigma)
         prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD)
-    optimum = prb.minimize(model=model, progressbar=False)
+    optimum = optimum_of(model)
     likelihood = likelihood_at(optimum)
     assert likelihood.combinations.shape == (2, 2)
-    for name, values in draws_of(likelihood).items():
+    for name, values in posterior_of(likelihood).items():
         # The prior is vague, and a posterior of 20 specimens is wider than the standard error.
         assert 0.9 < values.std() / optimum.stderr[name] < 1.4, name
 
@@ -263,30 +264,38 @@ def test_two_simulators_are_as_one_with_all_data() -> None:
     """They have one bandwidth, so that all specimens count alike."""
     y = np.random.default_rng(4).normal(1, 0.5, 40)
     metric = prb.KullbackLeibler(prb.GaussianKDE(0.3))
-    likelihood = likelihood_at(optimum_of(vague, y[:20], y[20:], metric=metric))
+    likelihood = likelihood_at(optimum_of(normal_model(metric, y[:20], y[20:])))
     assert len(likelihood.groups) == 2
-    require_exact(likelihood, vague, y)
+    require_exact(likelihood, y)
+
+
+FEW = np.random.default_rng(701).normal(1, 0.5, (5, 4))
+
+
+# With the wide bandwidth of four specimens mean and spread of all decide on the residual.
+@pytest.mark.parametrize("metric", [KLD, pytest.param(PR, marks=pytest.mark.long)])
+def test_few_specimens_in_each_of_several_simulators(metric: Metric) -> None:
+    likelihood = likelihood_at(optimum_of(normal_model(metric, *FEW, n=256)))
+    require_exact(likelihood, FEW.ravel())
 
 
 def test_specimens_in_two_simulators_add_their_scores() -> None:
     with pm.Model() as model:
-        x = pm.Normal.dist(*vague())
-        settings = {"propagation": prb.Reweighted(1024), "specimens": np.arange(20)}
-        prb.Simulator("y", lambda x: x, x, observed=Y, metric=KLD, **settings)
-        prb.Simulator("z", lambda x: 3 * x, x, observed=3 * Y, metric=KLD, **settings)
-    likelihood = likelihood_at(prb.minimize(model=model, progressbar=False))
+        x = pm.Normal.dist(*VAGUE.variables())
+        settings = {"propagation": prb.Reweighted(512), "specimens": np.arange(20), "metric": KLD}
+        prb.Simulator("y", lambda x: x, x, observed=Y, **settings)
+        prb.Simulator("z", lambda x: 3 * x, x, observed=3 * Y, **settings)
+    likelihood = likelihood_at(optimum_of(model))
     assert len(likelihood.groups) == 1
-    require_exact(likelihood, vague, Y)
+    require_exact(likelihood, Y)
 
 
 def test_the_posterior_of_an_unidentified_hyperparameter_is_its_prior() -> None:
-    def parameters() -> tuple[Any, Any]:
+    with normal_model(KLD, Y) as model:
         pm.Normal("unused", 3, 2)
-        return vague()
-
-    likelihood = likelihood_at(optimum_of(parameters, Y))
+    likelihood = likelihood_at(optimum_of(model))
     assert likelihood.combinations.shape == (3, 2)
-    draws = draws_of(likelihood)["unused"]
+    draws = posterior_of(likelihood)["unused"]
     # Four standard errors of 1000 independent draws.
     assert abs(draws.mean() - 3) < 4 * 2 / np.sqrt(1000)
     assert abs(draws.std() / 2 - 1) < 4 / np.sqrt(2000)
@@ -296,16 +305,16 @@ def test_an_estimate_at_an_edge_is_moved_inside() -> None:
     """Known scatter of .5 exceeds that of the data: the standard deviation of inputs is zero."""
     y = 1 + np.random.default_rng(5).normal(0, 0.3, 20)
     with pm.Model() as model:
-        mu, sigma = vague()
+        mu, sigma = VAGUE.variables()
         x = pm.Normal.dist(mu, pm.math.sqrt(sigma**2 + 0.25))
         prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD)
-    likelihood = likelihood_at(prb.minimize(model=model, progressbar=False))
+    likelihood = likelihood_at(optimum_of(model))
     assert likelihood.combinations.shape[1] == 2
-    draws = draws_of(likelihood)
+    draws = posterior_of(likelihood)
     grids = {"mu": np.linspace(0.2, 1.8, 401)[:, None], "sigma": np.linspace(1e-3, 1.5, 600)[None]}
     variance = grids["sigma"] ** 2 + 0.25
     logs = -10 * np.log(variance) - 10 * ((y.mean() - grids["mu"]) ** 2 + y.var()) / variance
-    logs = logs + LOG_PRIORS[vague](grids["mu"], grids["sigma"])
+    logs = logs + VAGUE.log_density(grids["mu"], grids["sigma"])
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     for name, grid in grids.items():
@@ -328,22 +337,58 @@ def test_two_outputs_by_a_joint_metric(metric: Metric) -> None:
     # A correlation by chance is what the whitening removes.
     x[:, 1] += 0.9 * (x[:, 0] - x[:, 0].mean())
     with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        a = pm.Normal.dist(*VAGUE.variables())
         b = pm.Normal.dist(pm.Normal("nu", 0, 2), pm.HalfNormal("tau", 1))
         observed = x @ np.array([[1.0, 1.0], [1.0, -1.0]])
         settings = {"metric": prb.Joint(metric), "propagation": prb.Reweighted(256)}
         response = lambda a, b: np.stack([a + b, a - b], axis=-1)  # noqa: E731
         prb.Simulator("y", response, a, b, observed=observed, **settings)
     optimum = prb.minimize(model=model, progressbar=False)
-    draws = draws_of(likelihood_at(optimum))
+    draws = posterior_of(likelihood_at(optimum))
     for mean_name, sd_name, inputs in (("mu", "sigma", x[:, 0]), ("nu", "tau", x[:, 1])):
-        exact = exact_moments(LOG_PRIORS[vague], inputs)
+        exact = exact_moments(VAGUE.log_density, inputs)
         require_close(moments_of(draws, mean_name, sd_name), exact)
     by_data = EstimateLikelihoodOptions(rounds=0)
-    narrow = draws_of(estimate_likelihood(optimum.evaluator, optimum, by_data))
+    narrow = posterior_of(estimate_likelihood(optimum.evaluator, optimum, by_data))
     assert (np.log(narrow["tau"]).mean() - exact.mean[1]) / exact.sd[1] < -0.2
 
 
+@pytest.mark.long
+def test_groups_with_a_common_prior_are_pooled() -> None:
+    """With a known standard deviation the exact posterior is normal; estimates are the means."""
+    names = ["a", "b", "c"]
+    centers = np.array([0.6, 1.0, 1.5])
+    y = np.random.default_rng(8).normal(centers[:, None], 0.5, (3, 6))
+    labels = ("specimen", np.repeat(names, 6))
+    observed = xr.DataArray(y.ravel(), {"supplier": labels}, "specimen")
+    with pm.Model(coords={"supplier": names}) as model:
+        mu = pm.Normal("mu", pm.Normal("common", 1, 2), 0.3, dims="supplier")
+        x = pm.Normal.dist(mu[prb.response.group("supplier")], 0.5)
+        settings = {"metric": KLD, "propagation": prb.Reweighted(256)}
+        prb.Simulator("y", lambda x: 1.0 * x, x, observed=observed, **settings)
+    tree = prb.sample(500, chains=2, model=model, optimum=optimum_of(model), **QUIET)
+    prior = 0.3**2 * np.eye(3) + 2.0**2
+    gain = prior @ np.linalg.inv(prior + np.eye(3) * 0.5**2 / 6)
+    mean = 1 + gain @ (y.mean(axis=1) - 1)
+    sd = np.sqrt(np.diag(prior - gain @ prior))
+    draws = tree.posterior["mu"].values.reshape(-1, 3)
+    assert (np.abs(draws.mean(axis=0) - mean) < 0.2 * sd).all()
+    assert (np.abs(draws.std(axis=0) / sd - 1) < 0.15).all()
+
+
+def test_a_prior_away_from_the_estimate_is_reported() -> None:
+    low = Prior(lambda: (pm.Normal("mu", 0, 0.2), pm.HalfNormal("sigma", 1)), VAGUE.log_density)
+    model = normal_model(KLD, Y, prior=low, n=1024)
+    optimum = optimum_of(model)
+    assert prior_conflicts(optimum, optimum.evaluator, optimum.theta[None]) == ()
+    tree = prb.sample(50, chains=1, model=model, optimum=optimum, **QUIET)
+    findings = from_json(tree.posterior.attrs["findings"])
+    (finding,) = [finding for finding in findings if finding.code == "prior-conflict"]
+    assert "mu" in finding.text
+
+
 def test_a_gradient_that_is_no_mean_is_refused() -> None:
+    area = Evaluator.of(normal_model(prb.AreaMetric(), Y, n=64))
+    optimum = optimum_of(normal_model(KLD, Y, n=64))
     with pytest.raises(ValueError, match=r"y0 has a AreaMetric.*expected a refit_likelihood"):
-        likelihood_at(optimum_of(vague, Y, metric=prb.AreaMetric()))
+        estimate_likelihood(area, optimum)

@@ -10,9 +10,11 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from normal_posterior import exact_moments, moments_of, require_close
 from scipy.stats import norm
 
 import prbayes as prb
+from prbayes._validate import Floats
 from prbayes.posterior.importance import ImportanceOptions
 
 X = np.random.default_rng(0).normal(10, 1, 20)
@@ -27,26 +29,11 @@ def linear_model(**keywords: Any) -> pm.Model:
     return model
 
 
-@cache
-def exact_moments() -> dict[str, tuple[float, float]]:
-    """Return posterior means and standard deviations of `linear_model` by quadrature."""
-    mu, sigma = (a.ravel() for a in np.meshgrid(np.linspace(7, 13, 400), np.linspace(0.3, 4, 400)))
-    logs = norm.logpdf(X[:, None], mu, sigma).sum(axis=0)
-    logs += norm.logpdf(mu, 9, 3) + norm.logpdf(sigma, 0, 2)
-    weights = np.exp(logs - logs.max())
-    weights /= weights.sum()
-    moments = {}
-    for name, values in {"mu": mu, "sigma": sigma}.items():
-        mean = float(weights @ values)
-        moments[name] = mean, float(np.sqrt(weights @ (values - mean) ** 2))
-    return moments
+def require_exact(result: xr.DataTree, **limits: Any) -> None:
+    def log_prior(mu: Floats, sigma: Floats) -> Floats:
+        return np.asarray(norm.logpdf(mu, 9, 3) + norm.logpdf(sigma, 0, 2))
 
-
-def require_exact(result: xr.DataTree, offset: float, widths: tuple[float, float]) -> None:
-    for name, (mean, sd) in exact_moments().items():
-        draws = result.posterior[name]
-        assert abs(float(draws.mean()) - mean) < offset * sd
-        assert widths[0] < float(draws.std()) / sd < widths[1]
+    require_close(moments_of(result.posterior), exact_moments(log_prior, X), **limits)
 
 
 @cache
@@ -61,7 +48,7 @@ def test_the_posterior_is_exact() -> None:
     assert attrs["pareto_k"] < 0.7
     assert attrs["efficiency"] > 0.5
     # Five standard errors of 4000 independent draws.
-    require_exact(result, 5 / np.sqrt(4000), (0.91, 1.09))
+    require_exact(result, offset=5 / np.sqrt(4000), widths=(0.91, 1.09))
     assert prb.diagnose(result, model=linear_model()).ok
 
 
@@ -108,7 +95,7 @@ def _unreliable(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_unreliable_importance_sampling_is_replaced() -> None:
     result = prb.sample(500, chains=2, model=linear_model(), progressbar=False)
     assert result.posterior.attrs["sampler"] == "NUTS"
-    require_exact(result, 0.3, (0.8, 1.2))
+    require_exact(result, offset=0.3, widths=(0.8, 1.2))
     result = prb.sample(50, chains=1, model=linear_model(metric=DIVERGENCE), progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC"
     assert result.posterior.attrs["adjustment"] == "estimate"
@@ -119,7 +106,7 @@ def test_the_posterior_given_the_estimate_of_the_divergence_is_nearly_the_exact_
     result = prb.sample(1000, model=model, progressbar=False)
     assert result.posterior.attrs["sampler"] == "importance sampling"
     assert result.posterior.attrs["adjustment"] == "estimate"
-    require_exact(result, 0.2, (0.9, 1.15))
+    require_exact(result)
     # The log-likelihood is that of the draws' density, up to a constant, for power-scaling.
     log_prior = sum(result.log_prior[name] for name in ("mu", "sigma"))
     jacobian = np.log(result.posterior["sigma"])

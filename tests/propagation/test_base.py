@@ -101,6 +101,9 @@ def test_missing_shares_of_weighted_values() -> None:
     values[0, :2], values[0, 2:6] = np.nan, np.inf
     missing = Missing.of(values, weights)
     np.testing.assert_allclose((missing.lost[0], missing.failed[0]), (0.2, 0.5))
+    computed = bound(prb.Resimulated(128), response).missing(at([1.0], [1.0]))
+    np.testing.assert_allclose(computed.lost, 0.159, atol=0.02)
+    np.testing.assert_allclose(computed.failed, 0.159 / 0.841, atol=0.02)
     support = bound(prb.Reweighted(512), response).support(at([1.0], [1.0]))  # type: ignore[attr-defined]
     np.testing.assert_allclose(support["lost_mass"], 0.159, atol=0.02)
     np.testing.assert_allclose(support["failed_mass"], 0.159 / 0.841, atol=0.02)

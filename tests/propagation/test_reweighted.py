@@ -204,11 +204,10 @@ def test_blocks_of_populations_change_nothing(monkeypatch: pytest.MonkeyPatch) -
         return pm.Uniform.dist(pm.Normal("low", 0, 1), 2.0)
 
     evaluator = Evaluator.of(model_of(moving, 64, metric=KL, observed=[0.5, 1.0, 1.5]))
-    thetas = np.linspace(-1.0, 1.5, 11)[:, None]
+    thetas = np.linspace(-1.0, 1.5, 150)[:, None]
     thetas[4] = 3.0  # no population at all
     whole = evaluator.discrepancies(thetas, 0)
-    monkeypatch.setattr("prbayes.propagation.reweighted._BLOCK", 1)
-    monkeypatch.setattr("prbayes.propagation.reweighted._MIN_POPULATIONS", 3)
+    monkeypatch.setattr("prbayes.propagation.reweighted.IN_CACHE", 1)  # blocks of 64
     np.testing.assert_allclose(evaluator.discrepancies(thetas, 0), whole, rtol=1e-12)
     assert np.flatnonzero(np.isinf(whole)).tolist() == [4]
     assert evaluator.discrepancies(thetas[:0], 0).shape == (0,)
