@@ -261,12 +261,13 @@ class Responses:
             if self.outputs is None:
                 self.outputs = self._tally.named
             responses = responses.reshape(batch + responses.shape[1:])
-        # Runs of which a store has some were checked by those.
-        if not self._is_checked and size > 1 and self.computed >= n_computed + size:
-            specimens = [v.reshape(size, *v.shape[len(batch) :]) for v in full]
-            self._refuse_state(specimens, responses.reshape(size, *responses.shape[len(batch) :]))
-            if written_form(self.function) != self._written_form:
-                self._refuse_late_change(specimens, responses.reshape(size, -1))
+        if not self._is_checked and size > 1:
+            # Where a store has some of the runs, the first ones were checked.
+            if self.computed >= n_computed + size:
+                specimens = [v.reshape(size, *v.shape[len(batch) :]) for v in full]
+                rows = responses.reshape(size, *responses.shape[len(batch) :])
+                self._refuse_state(specimens, rows)
+                self._refuse_late_change(specimens, rows)
             self._is_checked = True
         # For the next simulator. Before there is one, only the trial at some points of the prior,
         # which all simulators make.
@@ -387,9 +388,10 @@ class Responses:
             selected = [x[part] for x in specimens]
             try:
                 again = self._by_itself(selected)
+                again = np.where(np.isnan(again), values[part], again)  # it may fail by chance
                 accuracy = _accuracy(values, 0.01 if self.scatter is None else self.scatter)
                 changed = first_change(values[part], again, accuracy)
-                if changed is None or np.isnan(again[changed]).all():
+                if changed is None:
                     continue
                 second = self._by_itself(selected)
             except ResponseError:  # it takes no small batch
@@ -419,7 +421,8 @@ class Responses:
 
     def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
         """Raise if a few runs differ from those of the function when the simulator was written."""
-        if self._written_form is None or self.scatter is None:
+        is_unchanged = written_form(self.function) == self._written_form
+        if is_unchanged or self._written_form is None or self.scatter is None:
             return
         rows = revealing_rows(values)
         selected = [x[rows] for x in specimens]
@@ -427,11 +430,12 @@ class Responses:
         try:
             written.function = unpacked(self._written_form)
             written._settings = replace(self._settings, function=written.function)
-            then = written._again(selected).reshape(len(rows), -1)
+            then = written._again(selected)
+            then = np.where(np.isnan(then), values[rows], then)
         except Exception:  # such as of a function that was not defined yet
             return
         changed = first_change(values[rows], then, _accuracy(values, self._one_system))
-        if changed is not None and not np.isnan(then[changed]).all():
+        if changed is not None:
             raise ResponseError(
                 f"{self.name}: got {numbers_text(values[rows[changed]])} from the response "
                 f"{_place(selected, changed)}, expected {numbers_text(then[changed])}, which it "

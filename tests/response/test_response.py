@@ -504,3 +504,11 @@ def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinemen
     np.testing.assert_array_equal(
         node.reweighted.design.sample.values, 2.0 * node.reweighted.design.runs.points[0]
     )
+
+
+def test_the_last_call_of_shared_runs_is_reused() -> None:
+    response = Counted(lambda x: 2 * x)
+    first, second = (Responses(name, response, inputs(X)) for name in "yz")
+    second.share(first)
+    np.testing.assert_array_equal(first([POINTS], []), second([POINTS], []))
+    assert response.asked == [64]
