@@ -143,8 +143,23 @@ def test_invalid_results(results: Any, error: type[Exception], words: str) -> No
         prb.compare(results)
     with pm.Model() as other:
         pm.Normal("tau")
-    with pytest.raises(ValueError, match="share no hyperparameter"):
+    with pytest.raises(ValueError, match=r"share no hyperparameter \(a: mean.*; the model: tau\)"):
         prb.compare({"a": optimum()}, model=other)
+
+
+def test_names_with_brackets_are_compared() -> None:
+    with pm.Model() as other:
+        pm.Normal("mu[1]")
+        pm.Normal("force [N]", shape=2)
+    draws = np.random.default_rng(0).normal(size=(2, 1, 50))
+    vector = ("chain", "draw", "i"), np.moveaxis(draws, 0, -1)
+    values = {"mu[1]": (("chain", "draw"), draws[0]), "force [N]": vector}
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(values)})
+    table = prb.compare({"a": tree, "b": tree}, model=other)
+    names = ["mu[1]", "force [N][0]", "force [N][1]"]
+    assert table["hyperparameter"].values.tolist() == names
+    expected = [draws[0].mean(), *draws.mean(axis=(1, 2))]
+    np.testing.assert_allclose(table["estimate"].sel(result="b"), expected)
 
 
 # -- scores
