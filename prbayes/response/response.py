@@ -181,10 +181,10 @@ class Responses:
 
     def copied(self) -> Responses:
         """Return the same function with its own counts, and the same executor and store."""
-        other = copy.copy(self)
-        other._tally = self._tally.copied()
-        other.runs = Runs(list(self.runs.stored), users=set(self.runs.users))
-        return other
+        duplicate = copy.copy(self)
+        duplicate._tally = self._tally.copied()
+        duplicate.runs = Runs(list(self.runs.stored), users=set(self.runs.users))
+        return duplicate
 
     def share(self, other: Responses) -> None:
         """Use the runs of another one with the same response, inputs and settings."""
@@ -277,9 +277,9 @@ class Responses:
 
     def used_by(self, caller: str) -> Responses:
         """Return the same response for another use of its runs."""
-        other = copy.copy(self)
-        other.caller = caller
-        return other
+        duplicate = copy.copy(self)
+        duplicate.caller = caller
+        return duplicate
 
     def refuse_change(self, points: Sequence[Floats], values: Floats, stored: Responses) -> None:
         """Raise if stored runs differ when a few of them are computed again, once for each caller.
