@@ -12,6 +12,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 from prbayes._display import view
+from prbayes._finding import Finding, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called
 from prbayes.metrics.area import AreaMetric
@@ -131,6 +132,11 @@ def compare(
     columns, shown, costs = zip(*read, strict=True)
     in_all = set.intersection(*map(set, columns))
     shared = [name for name in columns[0] if name in in_all]
+    left_out = [name for column in columns for name in column if name not in in_all]
+    if left_out and shared and None in identities.values():  # results of other tools
+        listed = ", ".join(dict.fromkeys(left_out))
+        text = f"compare: left out {listed:.300}, as not all results have these names."
+        report(Finding("names-differ", text))
     if model is not None:
         variables = [str(variable.name) for variable in model.unobserved_RVs]
         shared = [name for name in shared if variable_of(name, variables) in variables]

@@ -147,6 +147,18 @@ def test_invalid_results(results: Any, error: type[Exception], words: str) -> No
         prb.compare({"a": optimum()}, model=other)
 
 
+def test_names_that_not_all_results_have_are_reported(caplog: pytest.LogCaptureFixture) -> None:
+    one = tree_of(mu=[[1.0, 2.0]], sigma=[[1.0, 2.0]])
+    other = tree_of(m=[[1.0, 2.0]], sigma=[[1.0, 2.0]])
+    with caplog.at_level("WARNING", "prbayes"):
+        assert prb.compare({"a": one, "b": other})["hyperparameter"].values.tolist() == ["sigma"]
+    assert "compare: left out mu, m, as not all results have these names" in caplog.text
+    caplog.clear()
+    with caplog.at_level("WARNING", "prbayes"):
+        prb.compare({"a": one, "b": one})
+    assert not caplog.text
+
+
 def test_names_with_brackets_are_compared() -> None:
     with pm.Model() as other:
         pm.Normal("mu[1]")
