@@ -60,7 +60,7 @@ from prbayes.response.inputs import (
     model_on_context,
     read_inputs,
 )
-from prbayes.response.outputs import read_observed
+from prbayes.response.outputs import Outputs, in_order_of, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
 # Settings of a propagation for calls of the response.
@@ -90,15 +90,17 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         ``response(*inputs)``, a NumPy-style function. Each input is an array of any leading batch
         shape; a multivariate input has its event axis last. The function returns an array of the
         batch shape, in units of the observed values; for m outputs of a specimen an array with them
-        in a last axis, or a mapping of arrays with the keys of ``observed``. NaN is a point without
-        response, +inf a specimen that failed. The response of a specimen depends on the inputs of
-        that specimen alone: three of the first ones are computed again, by themselves, and a
-        difference is refused. Where inputs repeat, as discrete ones do, a design computes the
-        response once. Model random scatter of the response as an input, such as
-        ``pm.Normal.dist(0, 1)``, or use `Fresh`. Simulators with the same response object, inputs
-        and propagation, and metrics of distributions, share runs. Variables that the response
-        reads have to stay as they are: a few runs are computed again where runs serve another
-        simulator or function, and a difference is refused.
+        in a last axis, or a mapping of arrays with the keys of ``observed``. Labels of a DataArray
+        or DataFrame are matched to those of ``observed``. NaN, or a masked number, is a point
+        without response, +inf a specimen that failed; -inf is refused. The response of a specimen
+        depends on the inputs of that specimen alone: three of the first ones are computed again, by
+        themselves, and a difference is refused, and so is a function that takes one number of
+        specimens. Where inputs repeat, as discrete ones do, a design computes the response once.
+        Model random scatter of the response as an input, such as ``pm.Normal.dist(0, 1)``, or use
+        `Fresh`. Simulators with the same response object, inputs and propagation, and metrics of
+        distributions, share runs. Variables that the response reads have to stay as they are: a few
+        runs are computed again where runs serve another simulator or function, and a difference is
+        refused.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
@@ -119,7 +121,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         effective number N of specimens; unset for other metrics, until `calibrate_epsilon` and
         `set_epsilon`, or `sample_smc`, set it.
     weights : array_like, shape (N,), optional
-        Weights of the observed responses.
+        Integers are frequencies: as many specimens have the value, as in a histogram, and N is
+        their sum. Other numbers are relative weights of N specimens, whose effective number is that
+        of Kish, (sum w)^2 / sum w^2. An index is matched to that of ``observed``.
     specimens : array_like, shape (N,), optional
         Labels of the specimens. Observations with the same label, also of several simulators,
         belong together: data sets are drawn specimen by specimen. With a metric of distributions
@@ -192,12 +196,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             )
     for parent in arguments.parents:
         refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
-    groups, measured = None, observed
-    if arguments.groups is not None:
-        groups, measured = group_indices(name, observed, arguments.groups)
-    if isinstance(measured, Variable):
-        measured = _present_numbers(name, measured)
-    values, outputs = read_observed(name, measured)
+    weights = in_order_of(weights, observed, f"{name}: weights")
+    values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
+    weights = weights if rows is None else None
     metric = LogLikelihood() if metric is None else metric
     by_specimen = isinstance(metric, Metric) and metric.by_specimen
     if by_specimen:
@@ -213,9 +214,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         )
     calls: dict[str, Any] = {key: getattr(settings, key) for key in _CALL_SETTINGS}
     calls |= {"outputs": outputs, "caller": name, "scatter": None if settings.is_random else 0.01}
-    labels = None
-    if specimens is not None:
-        labels = sample_labels(specimens, len(values), f"{name}: specimens")
+    labels = checked_labels(f"{name}: specimens", specimens, observed, len(values))
     if by_specimen:
         settings.check_likelihood(name)
         partners = _with_common_specimens(name, labels, model)
@@ -254,6 +253,45 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
 
 
 # The log-likelihood by specimen.
+
+
+def _read_specimens(
+    name: str, observed: Any, arguments: Inputs, weights: Any, specimens: Any
+) -> tuple[Floats, Outputs, NDArray[np.intp] | None, NDArray[np.intp] | None]:
+    """Return values and outputs of the specimens, their groups, and their rows by frequency."""
+    groups, measured = None, observed
+    if arguments.groups is not None:
+        groups, measured = group_indices(name, observed, arguments.groups)
+    if isinstance(measured, Variable):
+        measured = _present_numbers(name, measured)
+    values, outputs = read_observed(name, measured)
+    rows = _frequencies(name, weights, np.shape(values)[:1], observed, specimens)
+    if rows is not None:
+        values = values[rows]
+        groups = None if groups is None else groups[rows]
+    return values, outputs, groups, rows
+
+
+def _frequencies(
+    name: str, weights: Any, shape: tuple[int, ...], observed: Any, specimens: Any
+) -> NDArray[np.intp] | None:
+    """Return the row of each specimen where weights are frequencies, whole numbers; else None."""
+    frequencies = np.asarray(weights)
+    if weights is None or frequencies.dtype.kind not in "iu":
+        return None
+    if not shape or frequencies.shape != shape or (frequencies < 0).any() or frequencies.sum() < 2:
+        raise ValueError(
+            f"{name}: weights: got {frequencies.tolist()!s:.60}, expected {shape} frequencies, "
+            "whole numbers from 0 whose sum is at least 2, one for each observed value"
+        )
+    if specimens is not None or isinstance(observed, Variable):
+        other = "pm.Data" if specimens is None else "specimens="
+        raise TypeError(
+            f"{name}: weights: got whole numbers, which are frequencies, beside {other}, expected "
+            "a row for each specimen; pass np.repeat(observed, weights), or relative weights as "
+            "floats"
+        )
+    return np.repeat(np.arange(frequencies.size), frequencies)
 
 
 def _add_measurement(
@@ -432,7 +470,7 @@ def _refuse_by_specimen(
 
 def checked_specimens(name: str, observed: Floats) -> Floats:
     """Return measured outputs, (N,) or (N, m), of at least two specimens."""
-    values = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
+    values = np.asarray(observed, dtype=np.float64)
     if values.ndim not in (1, 2) or len(values) < 2:
         raise ValueError(
             f"{name}: observed: got shape {values.shape}, expected (N,) or (N, m) with at least "
@@ -528,6 +566,15 @@ def _parts_by_group(
     return parts
 
 
+def checked_labels(
+    name: str, specimens: ArrayLike | None, observed: Any, size: int
+) -> NDArray[Any] | None:
+    """Return the labels of the specimens, (N,), in the order of the observed ones."""
+    if specimens is None:
+        return None
+    return sample_labels(in_order_of(specimens, observed, name), size, name)
+
+
 def _prepared_metric(
     name: str, metric: Metric, observed: Floats, weights: ArrayLike | None
 ) -> Discrepancy:
@@ -545,9 +592,21 @@ def _prepared_metric(
             raise ValueError(
                 f"observed: got {len(observed)} specimen(s), expected at least 2 of them"
             )
-        return metric.against(observed, weights)
+        target = metric.against(observed, weights)
+        if not metric.symbolic:
+            try_function(target)
+        return target
     except (TypeError, ValueError) as error:
         raise type(error)(f"{name}: {error}") from None
+
+
+def try_function(target: Discrepancy) -> None:
+    """Call a user's function before any run, for two populations in the range of the data."""
+    finite = np.where(np.isfinite(target.observed), target.observed, np.nan)
+    low, high = np.nanmin(finite, axis=0), np.nanmax(finite, axis=0)
+    trial = np.linspace(low, high, 2 * len(finite)).reshape(2, *finite.shape)
+    with np.errstate(all="ignore"):
+        target(trial)
 
 
 def _warn_shared_specimens(

@@ -134,7 +134,6 @@ class Runs:
         inputs = likelihood.coordinates.inputs(z)
         parts = [response(inputs, []).reshape(len(z), -1) for response in responses]
         values = np.concatenate(parts, axis=1)
-        values = np.where(np.isneginf(values), np.nan, values)
         if likelihood.shared_emulation is None and self.first is None:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             refuse_unused_inputs(likelihood.name, z, values, _coordinate_names(likelihood))

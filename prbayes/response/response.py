@@ -18,11 +18,14 @@ from prbayes._finding import report
 from prbayes._validate import Floats, called, executes, folder_path
 from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
+    PER_SPECIMEN,
     CallSettings,
     Points,
     Tally,
+    array_advice,
     by_output,
     checked,
+    column_names,
     computed_again,
     first_change,
     numbers_text,
@@ -37,7 +40,7 @@ from prbayes.response.call import (
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
-from prbayes.response.inputs import Inputs, broadcast_batch
+from prbayes.response.inputs import Inputs, argument_names, broadcast_batch
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.store import Store
 
@@ -147,7 +150,7 @@ class Responses:
             n_outputs = None
             if outputs is not None:
                 n_outputs = max(1, len(outputs.labels))
-                if version is not None and outputs.keys:
+                if version is not None and outputs.keys and outputs.labels:
                     # In another order they are other numbers.
                     version = f"{version} ({', '.join(outputs.names)})"
             database = Store(
@@ -174,8 +177,9 @@ class Responses:
         self._is_checked = False
         self._written_form = written_form(function)
         self._n_reused = 0
+        columns = column_names(argument_names(inputs, function), inputs.sizes)
         self._settings = CallSettings(
-            name, function, executor, database, policy, retry_failed, timeout, outputs
+            name, function, executor, database, policy, retry_failed, timeout, outputs, columns
         )
         self._tally = Tally()
 
@@ -338,7 +342,7 @@ class Responses:
             raise ResponseError(
                 f"{self.name}: the response raised {type(error).__name__}: {error}; it was called "
                 f"with inputs of shapes {shapes(arguments)} and is expected to take arrays of any "
-                "leading shape, or to be wrapped in prb.scalar"
+                f"leading shape, or to be wrapped in prb.scalar{array_advice(str(error))}"
             ) from error
         self.count += size
         try:
@@ -360,13 +364,13 @@ class Responses:
             settings = replace(self._settings, outputs=self.outputs)
             return computed_again(settings, self._points(values, (n,)), self._tally.copied())[0]
 
-    def _by_itself(self, values: Sequence[Floats]) -> Floats:
-        """Compute specimens again; where a function takes no batch of one, as a batch of two."""
+    def _by_itself(self, values: Sequence[Floats], copies: int) -> Floats:
+        """Compute specimens again; where a function takes no batch of one, as several copies."""
         try:
             return self._again(values)
         except ResponseError:
             n = len(values[0])
-            return self._again([np.concatenate([x, x]) for x in values])[:n]
+            return self._again([np.concatenate([x] * copies) for x in values])[:n]
 
     @property
     def _one_system(self) -> float:
@@ -384,17 +388,20 @@ class Responses:
             return
         rows = np.unique(finite[[0, len(finite) * 3 // 4, -1]])[::-1]
         parts = [rows[i : i + 1] for i in range(rows.size)] if self.is_batched else [rows]
+        copies = 3 if len(values) == 2 else 2
         for part in parts:
             selected = [x[part] for x in specimens]
             try:
-                again = self._by_itself(selected)
+                again = self._by_itself(selected, copies)
                 again = np.where(np.isnan(again), values[part], again)  # it may fail by chance
                 accuracy = _accuracy(values, 0.01 if self.scatter is None else self.scatter)
                 changed = first_change(values[part], again, accuracy)
                 if changed is None:
                     continue
-                second = self._by_itself(selected)
-            except ResponseError:  # it takes no small batch
+                second = self._by_itself(selected, copies)
+            except ResponseError as error:  # it takes no small batch
+                if self.is_batched:
+                    self._refuse_one_size(specimens, (len(values),), error)
                 return
             is_random = first_change(again, second, _accuracy(values)) is not None
             if is_random and self.scatter is None:
@@ -418,6 +425,25 @@ class Responses:
                 "another order over the axis of specimens, and for a state from one specimen to "
                 "the next, or write it for one specimen, in prb.scalar"
             )
+
+    def _refuse_one_size(
+        self, values: Sequence[Floats], batch: tuple[int, ...], error: ResponseError
+    ) -> None:
+        """Raise if the response takes no other number of specimens than that of its batch.
+
+        An array of as many values inside it would be paired with points of the population.
+        """
+        size = int(np.prod(batch, dtype=int))
+        few = (*[1] * (len(batch) - 1), 3 if size == 2 else 2)
+        rows = np.arange(few[-1]) % size
+        specimens = [v.reshape(size, *v.shape[len(batch) :])[rows] for v in values]
+        try:
+            self._called([x.reshape(few + x.shape[1:]) for x in specimens], few, is_run=False)
+        except ResponseError:
+            raise ResponseError(
+                f"{self.name}: the response takes {size} specimens, and neither one nor "
+                f"{few[-1]}, expected any number; {PER_SPECIMEN} ({str(error).split(';')[0]})"
+            ) from None
 
     def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
         """Raise if a few runs differ from those of the function when the simulator was written."""
