@@ -36,6 +36,7 @@ from prbayes.model.random_variable import (
     SimulatorDistribution,
     SimulatorRV,
     Specification,
+    common_targets,
     effective_specimens,
     has_default_epsilon,
     known_value,
@@ -248,6 +249,11 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         )  # fmt: skip
         data = observed if arguments.groups is None else part.observed
         variables.append(_add_simulator(model, specification, place, data, dims))
+    present = list(simulators(model).values())
+    targets = common_targets(present, [simulator.target for simulator in present])
+    for simulator, shared in zip(present, targets, strict=True):
+        if isinstance(simulator, Specification) and simulator.node is None:
+            vars(simulator)["target"] = shared  # `nodes` does this for those in use
     return tuple(variables) if arguments.groups is not None else variables[0]
 
 
