@@ -483,7 +483,7 @@ def with_common_bandwidths(
     for k, target in enumerate(targets):
         kinds.append((responses[k], target.metric if _has_bandwidth_rule(target) else None))
     for kind in [kind for k, kind in enumerate(kinds) if kind not in kinds[:k]]:
-        members = [k for k, other in enumerate(kinds) if other == kind]
+        members = [k for k, second in enumerate(kinds) if second == kind]
         if kind[1] is None or len(members) < 2:
             continue
         rule = kind[1].density.bandwidth

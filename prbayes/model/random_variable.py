@@ -621,15 +621,24 @@ def common_targets(
     """Return the prepared metrics of simulators, where those of one response share a bandwidth."""
     responses, conditions = [], []
     for simulator in simulators:
-        function, group = simulator.responses.function, simulator.group
-        of_response = [other.responses.function is function for other in simulators]
-        of_condition = [
-            other.group == group and other.responses.same_as(simulator.responses)
-            for other in simulators
-        ]
-        responses.append(of_response.index(True))
-        conditions.append(of_condition.index(True))
+        calls, group = simulator.responses, simulator.group
+        of_response = (s.responses.function is calls.function for s in simulators)
+        of_condition = (s.group == group and s.responses.same_as(calls) for s in simulators)
+        responses.append(next(k for k, is_same in enumerate(of_response) if is_same))
+        conditions.append(next(k for k, is_same in enumerate(of_condition) if is_same))
     return with_common_bandwidths(targets, responses, conditions)
+
+
+def share_bandwidths(model: pm.Model) -> None:
+    """Prepare metrics again that share a bandwidth with a new simulator.
+
+    The next call of `nodes` does this for simulators in use.
+    """
+    present = list(simulators(model).values())
+    targets = common_targets(present, [simulator.target for simulator in present])
+    for simulator, target in zip(present, targets, strict=True):
+        if isinstance(simulator, Specification) and simulator.node is None:
+            vars(simulator)["target"] = target
 
 
 class abc_distance(Op):  # noqa: N801 (reads as a function in a model)

@@ -36,11 +36,11 @@ from prbayes.model.random_variable import (
     SimulatorDistribution,
     SimulatorRV,
     Specification,
-    common_targets,
     effective_specimens,
     has_default_epsilon,
     known_value,
     rv_signature,
+    share_bandwidths,
     shared_epsilon,
     simulators,
 )
@@ -210,8 +210,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
-    calls: dict[str, Any] = {key: getattr(settings, key) for key in _CALL_SETTINGS}
-    calls["outputs"] = outputs
+    calls: dict[str, Any] = {k: getattr(settings, k) for k in _CALL_SETTINGS} | {"outputs": outputs}
     labels = None
     if specimens is not None:
         labels = sample_labels(specimens, len(values), f"{name}: specimens")
@@ -249,11 +248,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         )  # fmt: skip
         data = observed if arguments.groups is None else part.observed
         variables.append(_add_simulator(model, specification, place, data, dims))
-    present = list(simulators(model).values())
-    targets = common_targets(present, [simulator.target for simulator in present])
-    for simulator, shared in zip(present, targets, strict=True):
-        if isinstance(simulator, Specification) and simulator.node is None:
-            vars(simulator)["target"] = shared  # `nodes` does this for those in use
+    share_bandwidths(model)
     return tuple(variables) if arguments.groups is not None else variables[0]
 
 

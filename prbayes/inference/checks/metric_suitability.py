@@ -172,7 +172,7 @@ def few_for_whitening(name: str, target: Discrepancy) -> list[Finding]:
 
 
 def refit_bias(fitted: FittedSets) -> list[Finding]:
-    """Report a hyperparameter that refits of simulated data sets miss by half a standard deviation."""
+    """Report a hyperparameter that refits of simulated data sets miss on average."""
     thetas = fitted.sampling.thetas(fitted.x[fitted.converged])
     if len(thetas) < 2:
         return []
