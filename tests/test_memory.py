@@ -228,3 +228,21 @@ def test_points_of_a_model_that_was_never_compiled_go() -> None:
     del model, likelihood
     gc.collect()
     assert points() is None
+
+
+def test_many_observed_values_are_compared_in_blocks_of_populations() -> None:
+    observed = np.random.default_rng(0).normal(2.0, 1.0, 100_000)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), 1.0)
+        prb.Simulator(
+            "y", line, x, metric=prb.AreaMetric(), observed=observed, propagation=prb.Reweighted(64)
+        )
+    evaluator = Evaluator.of(model)
+    thetas = np.linspace(1, 3, 128)[:, None]
+    single = evaluator.discrepancies(thetas[[7]], 0)
+    tracemalloc.start()
+    distances = evaluator.discrepancies(thetas, 0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 250 * MIB  # 128 populations at a time take 400
+    np.testing.assert_allclose(distances[7], single[0], rtol=1e-12)

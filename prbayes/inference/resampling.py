@@ -7,7 +7,7 @@ weighted, together.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -178,13 +178,16 @@ def simulated_points(
     """
     nodes = evaluator.nodes
     rng = np.random.default_rng([seed, 1])
-    size = (n_sets, specimens(nodes)[1] + more)
+    size = specimens(nodes)[1] + more
     responses = [values[0] for values, _ in populations]
     points: dict[int, NDArray[np.intp]] = {}
     for group in _aligned_groups(nodes):
         # Simulators that share specimens have the same points, with the same weights.
         mass = populations[group[0]][1][0] * _observable_by_all(evaluator, responses, group)
-        points |= dict.fromkeys(group, _points_of(mass, rng.random(size)))
+        drawn = np.empty((n_sets, size), dtype=np.intp)
+        for rows in _blocks(n_sets, size):
+            drawn[rows] = _points_of(mass, rng.random(drawn[rows].shape))
+        points |= dict.fromkeys(group, drawn)
     return [points[k] for k in range(len(nodes))]
 
 
@@ -225,13 +228,24 @@ def sets_at(
                 pairs, places = np.unique(cells + size * row.ravel(), return_inverse=True)
                 cells = places.reshape(cells.shape)
                 occurring = np.where(patterns[pairs // size], occurring[pairs % size], np.nan)
-        # The observations' weights, added up by value; all data sets in one row.
-        n_sets, size = len(cells), len(occurring)
-        stacked = cells + (size * np.arange(n_sets))[:, None]
-        summed = np.bincount(stacked.ravel(), np.tile(node.target.weights, n_sets), n_sets * size)
+        # The observations' weights, added up by value; the data sets of a block in one row.
+        size = len(occurring)
+        summed = np.empty((len(cells), size))
+        for rows in _blocks(len(cells), cells.shape[1]):
+            count = len(cells[rows])
+            stacked = cells[rows] + (size * np.arange(count))[:, None]
+            repeated = np.tile(node.target.weights, count)
+            summed[rows] = np.bincount(stacked.ravel(), repeated, count * size).reshape(count, size)
         values.append(occurring)
-        weights.append(np.asarray(summed.reshape(n_sets, size)))
+        weights.append(summed)
     return DataSets(values, weights)
+
+
+def _blocks(n_sets: int, size: int) -> Iterator[slice]:
+    """Yield blocks of data sets whose specimens fit into the memory."""
+    step = max(1, AT_ONCE // size)
+    for first in range(0, n_sets, step):
+        yield slice(first, min(first + step, n_sets))
 
 
 def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, report
-from prbayes._validate import IN_CACHE, Floats, positive_integer
+from prbayes._validate import AT_ONCE, IN_CACHE, Floats, positive_integer
 from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
 from prbayes.metrics.base import Basis, Discrepancy
@@ -488,8 +488,10 @@ class ReweightedBound(Bound):
         is_lost = is_missing(sample.values)
         size = len(params[0])
         # The weights of a block stay in the cache. A product of matrices reads all stored responses
-        # for each block: no fewer than 64 populations.
-        step = max(64, IN_CACHE // len(sample))
+        # for each block: no fewer than 64 populations, unless the basis of many observed values is
+        # so wide that these would fill the memory.
+        width = max(array.shape[-1] for array in basis.arrays)
+        step = max(1, min(max(64, IN_CACHE // len(sample)), AT_ONCE // width))
         parts = []
         # A single population leaves little to linear algebra.
         with one_thread() if size > 1 else nullcontext():
