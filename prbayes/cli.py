@@ -74,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--author", default="", help="below the title")
     add("--date", default="", help="below the title; none is made up")
     add("--out", type=Path, metavar="REPORT.html", help="report.html by default")
+    add("--force", action="store_true", help="replace files that exist")
     pictures = "write report.md and pictures into a folder"
     add("--markdown", type=Path, metavar="FOLDER", help=pictures)
     add("--no-pictures", action="store_true", help="text and tables only")
@@ -86,6 +87,8 @@ def _report(options: argparse.Namespace) -> list[Path]:
     from prbayes.reports.document import Report
 
     files = ", ".join(map(str, options.files))
+    html = options.out or (None if options.markdown is not None else Path("report.html"))
+    _refuse_to_replace(options, html)
     try:
         report = Report(
             options.title or options.files[0].stem,
@@ -107,11 +110,28 @@ def _report(options: argparse.Namespace) -> list[Path]:
     try:
         if options.markdown is not None:
             paths.append(report.to_markdown(options.markdown))
-        if options.out is not None or options.markdown is None:
-            paths.append(report.to_html(options.out or Path("report.html")))
+        if html is not None:
+            paths.append(report.to_html(html))
     except (OSError, ValueError) as error:
         raise UserError(f"cannot write: {_line(error)}") from error
     return paths
+
+
+def _refuse_to_replace(options: argparse.Namespace, html: Path | None) -> None:
+    """Raise if the documents would replace results, or without --force any file."""
+    if html is not None and any(html.resolve() == path.resolve() for path in options.files):
+        raise UserError(f"{html}: got the path of results, expected one for the report")
+    if options.force:
+        return
+    taken = [html] if html is not None and html.is_file() else []
+    if options.markdown is not None and options.markdown.is_dir():
+        for pattern in ("report.md", "[0-9][0-9]-*.*g"):  # pictures: svg, png, jpg
+            taken += sorted(options.markdown.glob(pattern))
+    if taken:
+        raise UserError(
+            f"{taken[0]}: there is such a file, expected a new one; pass --out or --markdown with "
+            "another path, or --force to replace it"
+        )
 
 
 def _results(files: Sequence[Path]) -> dict[str, Any]:

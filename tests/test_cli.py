@@ -106,6 +106,33 @@ def test_markdown_and_defaults(folder: Path, capsys: pytest.CaptureFixture[str])
     assert (folder / "report.html").stat().st_size > 5000
 
 
+def test_no_file_is_replaced_without_force(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "md").mkdir()
+    (folder / "md" / "other.txt").write_text("not of a report")
+    asked = ["report", "v.nc", "--markdown", "md", "--out", "r.html", "--no-pictures"]
+    assert main(asked) == 0
+    for name in ("r.html", "md/report.md", "md/02-picture.jpg", "results.svg"):
+        path = folder / name
+        for old in (folder / "r.html", folder / "md" / "report.md", path):
+            old.unlink(missing_ok=True)
+        path.write_text("old")
+        is_free = name == "results.svg"
+        assert main(asked) == (0 if is_free else 2)
+        assert is_free or f"{Path(name)}: there is such a file" in capsys.readouterr().err
+        assert path.read_text(encoding="utf-8") == "old"
+        assert main([*asked, "--force"]) == 0
+        if name.endswith(("html", "md")):
+            assert path.stat().st_size > 1000
+        else:
+            path.unlink()
+    before = (folder / "v.nc").read_bytes()
+    assert main(["report", "v.nc", "--out", "./v.nc", "--force"]) == 2
+    assert "got the path of results" in capsys.readouterr().err
+    assert (folder / "v.nc").read_bytes() == before
+
+
 def test_several_posteriors_are_compared_by_the_names_of_their_files(folder: Path) -> None:
     (folder / "b").mkdir()
     for name in ("q.nc", "b/p.nc"):

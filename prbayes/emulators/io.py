@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
 from prbayes.response.failures import Abort, Replace
 from prbayes.response.outputs import outputs_of_keys
-from prbayes.response.store import StoreError
+from prbayes.response.store import StoreError, replace_files
 
 _SHIPPED: tuple[Any, ...] = (RadialBasis, Polynomial, GaussianProcess)
 
@@ -65,7 +66,7 @@ def write(path: str | PathLike[str], surrogate: Any, joined: bool | None, probes
         },
         attrs={"prbayes_surrogate": 1, "configuration": json.dumps(configuration)},
     )
-    data.to_netcdf(path, engine="h5netcdf")
+    replace_files({Path(path): bytes(data.to_netcdf(engine="h5netcdf"))}, "Surrogate.save: path")
 
 
 def read(path: str | PathLike[str]) -> SavedSurrogate:

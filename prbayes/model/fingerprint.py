@@ -308,9 +308,13 @@ def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
     """Return the differences of two problems, up to a level, as texts; numbers up to rounding."""
     if got.shapes != expected.shapes:
         texts = []
-        for shapes in (got.shapes, expected.shapes):
-            names = [f"{name} {shape}" if shape else name for name, shape in shapes.items()]
-            texts.append(", ".join(names))
+        for shapes, others in ((got.shapes, expected.shapes), (expected.shapes, got.shapes)):
+            names = [
+                f"{name} {shape}" if shape else name
+                for name, shape in shapes.items()
+                if others.get(name) != shape
+            ]
+            texts.append(", ".join(names) or "none")
         return [_unlike("hyperparameters", *texts)]
     names_of = [[simulator.name for simulator in i.simulators] for i in (got, expected)]
     if names_of[0] != names_of[1]:

@@ -60,6 +60,12 @@ class Hyperparameters:
             labels = coordinates(self.model, variable)
             names += element_names(str(v.name), shapes[str(v.name)], labels)
             readable_names += element_names(variable, shapes[str(v.name)], labels)
+        twice = [name for name in readable_names if readable_names.count(name) > 1]
+        if twice:
+            raise ValueError(
+                f"model: got two hyperparameters called {twice[0]!r}, an element of one and the "
+                "name of another, expected different names"
+            )
         vars(self).update(
             shapes=shapes,
             initial=initial,
@@ -76,6 +82,11 @@ class Hyperparameters:
             raise TypeError(
                 f"model: got discrete hyperparameters {discrete}, expected continuous ones; "
                 "use pm.sample, or fix them"
+            )
+        for name in {"chain", "draw"} & set(map(str, model.named_vars)):
+            raise ValueError(
+                f"model: got a variable called {name!r}, which is a dimension of posterior draws, "
+                "expected another name"
             )
         for v in model.value_vars:
             refuse_single_precision(f"model: {v.name}", v.dtype)
@@ -317,9 +328,13 @@ def element_names(name: str, shape: Sequence[int], labels: Sequence[Any] = ()) -
     return [element_name(name, index) for index in product(*axes)]
 
 
-def variable_of(element: str) -> str:
-    """Return the name of the variable that an element belongs to."""
-    return element.partition("[")[0]
+def variable_of(element: str, variables: Iterable[str] = ()) -> str:
+    """Return the name of the variable that an element belongs to.
+
+    A name among ``variables`` may have a bracket itself, such as 'mu[1]' or 'force [N]'.
+    """
+    matches = [name for name in variables if element == name or element.startswith(f"{name}[")]
+    return max(matches, key=len, default=element.partition("[")[0])
 
 
 def coordinates(model: Any, name: str) -> tuple[Any, ...]:

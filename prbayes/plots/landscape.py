@@ -334,10 +334,10 @@ def _thetas_at(evaluator: Evaluator, elements: dict[str, Floats]) -> Floats:
     """Return thetas of elements by name, (n,) or (1,) each; NaN outside the priors' support."""
     hyperparameters = evaluator.hyperparameters
     columns: dict[str, list[Floats]] = {}
-    for name, column in zip(elements, np.broadcast_arrays(*elements.values()), strict=True):
-        columns.setdefault(variable_of(name), []).append(column)
-    shapes = hyperparameters.constrained(hyperparameters.initial[None])
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
+    for name, column in zip(elements, np.broadcast_arrays(*elements.values()), strict=True):
+        columns.setdefault(variable_of(name, names), []).append(column)
+    shapes = hyperparameters.constrained(hyperparameters.initial[None])
     values = [np.column_stack(columns[x]).reshape(-1, *shapes[x].shape[1:]) for x in names]
     with np.errstate(all="ignore"):
         return hyperparameters.thetas_of(values)

@@ -9,9 +9,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -27,7 +27,7 @@ from prbayes.model.parameters import Hyperparameters
 from prbayes.posterior.importance import LogDensity
 from prbayes.response.budget import BudgetError
 from prbayes.response.inputs import event_shape, model_on_context
-from prbayes.response.store import StoreError
+from prbayes.response.store import StoreError, replace_files
 
 
 @dataclass(frozen=True)
@@ -337,13 +337,14 @@ class Checkpoint:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], problem: Identity, settings: dict[str, Any]
+        self, path: str | PathLike[str], problem: Identity, settings: dict[str, Any]
     ) -> None:
         self.path = Path(path)
         self.problem = problem
         self.settings = dict(settings)
         self.arrays: dict[str, Floats] = {}
         self.note: dict[str, Any] = {}
+        self.digest = b""  # of the file as this run has read or written it last
         if self.path.exists():
             self._read()
         elif not self.path.parent.is_dir():
@@ -376,23 +377,15 @@ class Checkpoint:
         data = xr.Dataset(variables, attrs=attributes)
         # Made in memory: HDF5 may end the process where the disk is full.
         content = bytes(data.to_netcdf(engine="h5netcdf"))
-        # Written to another file and then renamed: the file is whole whenever the process ends.
-        part = self.path.with_name(self.path.name + ".part")
+        digest = _DIGEST(content).digest()
+        if self.path.exists() and self.path.read_bytes()[-len(digest) :] != self.digest:
+            raise StoreError(self._refusal("belongs to another run, which is writing to it"))
         try:
-            with part.open("wb") as file:
-                # netCDF allows bytes after its end.
-                file.write(content + _DIGEST(content).digest())
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(self.path)
+            # netCDF allows bytes after its end.
+            replace_files({self.path: content + digest}, "checkpoint")
         except OSError as error:
-            part.unlink(missing_ok=True)
-            raise StoreError(
-                f"checkpoint: got {self.path}, which cannot be written ({error}), expected space "
-                "and the right to write there; the state of the stage before is kept: free some "
-                "space and run again"
-            ) from error
-        self.arrays, self.note = arrays, note
+            raise StoreError(error.strerror) from error
+        self.arrays, self.note, self.digest = arrays, note, digest
 
     def _read(self) -> None:
         try:
@@ -423,6 +416,7 @@ class Checkpoint:
             raise StoreError(self._refusal(f"belongs to another run: {'; '.join(reasons)}"))
         self.arrays = {str(name): a.values for name, a in data.data_vars.items()}
         self.note = note
+        self.digest = _DIGEST(content).digest()
 
     def _refusal(self, reason: str) -> str:
         return (

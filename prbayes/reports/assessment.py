@@ -487,8 +487,10 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
         estimates = {
             name: (points[name], errors[name]) for name in optimum_elements(optimum, stderr)
         }
-    variables = readable_variables(m.hyperparameters, {variable_of(name) for name in estimates})
-    return {name: pair for name, pair in estimates.items() if variable_of(name) in variables}
+    names = m.hyperparameters
+    variable = {name: variable_of(name, names) for name in estimates}
+    variables = readable_variables(names, set(variable.values()))
+    return {name: pair for name, pair in estimates.items() if variable[name] in variables}
 
 
 def _agreement(m: Material) -> str:

@@ -21,6 +21,7 @@ from prbayes.reports.material import gather
 from prbayes.reports.numbers import cells
 from prbayes.reports.section import Section, is_broad, kind_of
 from prbayes.reports.sections import sections_of
+from prbayes.response.store import replace_files
 from prbayes.validation.area_test import ValidityTest
 
 # Markup of Markdown, or of HTML inside it (CommonMark 0.31, 2.4; tables and strikethrough of
@@ -175,11 +176,17 @@ class Report:
         return replace(self, sections=sections)
 
     def to_html(self, path: str | PathLike[str]) -> Path:
-        """Write one file with everything, for a browser and for print; return its path."""
-        return _write(file_path(path, "path"), self._html())
+        """Write one file with everything, for a browser and for print; return its path.
+
+        A file of this name is replaced; it is kept if the new one cannot be written (`OSError`).
+        """
+        return _write(file_path(path, "path"), self._html(), {})
 
     def to_markdown(self, folder: str | PathLike[str]) -> Path:
-        """Write ``report.md`` into a folder, with pictures beside it; return its path."""
+        """Write ``report.md`` into a folder, with pictures beside it; return its path.
+
+        Files of these names are replaced, all of them or none.
+        """
         folder = folder_path(folder, "folder")
         files: list[str | None] = []
         for i, section in enumerate(self.sections, 1):
@@ -188,11 +195,12 @@ class Report:
             files.append(f"{i:02d}-{slug}.{section.kind}" if has_picture else None)
         template = _template("report.md.j2", autoescape=False)
         text = template.render(report=self, byline=self._byline, cells=cells, files=files)
-        folder.mkdir(parents=True, exist_ok=True)
-        for section, name in zip(self.sections, files, strict=True):
-            if name is not None and section.picture is not None:
-                (folder / name).write_bytes(section.picture)
-        return _write(folder / "report.md", text.rstrip("\n") + "\n")
+        pictures = {
+            folder / name: section.picture
+            for section, name in zip(self.sections, files, strict=True)
+            if name is not None and section.picture is not None
+        }
+        return _write(folder / "report.md", text.rstrip("\n") + "\n", pictures)
 
     @property
     def _byline(self) -> str:
@@ -226,9 +234,10 @@ class Report:
         return f'<iframe sandbox srcdoc="{text}" title="report" style="{style}"></iframe>'
 
 
-def _write(path: Path, text: str) -> Path:
+def _write(path: Path, text: str, pictures: Mapping[Path, bytes]) -> Path:
+    """Write a document and its pictures, all or none of them."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8", newline="\n")
+    replace_files({**pictures, path: text.encode()}, "Report")
     return path
 
 

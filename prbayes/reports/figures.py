@@ -265,19 +265,19 @@ def with_graph(sections: tuple[Section, ...], m: Material) -> tuple[Section, ...
 def _graph(model: pm.Model) -> bytes | None:
     """Return the model's graph; None without Graphviz, which is no reader's affair."""
     if _computes_responses(model):  # PyMC draws each variable once for its shape
-        _log.info("report: no graph: PyMC would compute responses for it")
+        _log.info("report: without the graph of the model, as PyMC would compute responses for it")
         return None
     try:
         graphviz: Any = import_module("graphviz")  # a package that users may lack
     except ImportError:
-        _log.info("report: no graph: there is no Python package graphviz")
+        _log.info("report: without the graph of the model; pip install graphviz adds it")
         return None
     try:
         return _svg(model)
     except (graphviz.ExecutableNotFound, OSError):
-        _log.info("report: no graph: there is no program dot of Graphviz")
+        _log.info("report: without the graph of the model, as there is no program dot of Graphviz")
     except CalledProcessError:
-        _log.info("report: no graph: Graphviz does not take a name in it")
+        _log.info("report: without the graph of the model, as Graphviz does not take a name in it")
     return None
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import sqlite3
+import stat
 import threading
 import uuid
 import weakref
@@ -390,7 +391,7 @@ def checksum(*row: Any) -> int:
 def create(path: Path) -> None:
     """Make an empty store; it appears complete or not at all, and replaces none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
+    part = _part_of(path)
     try:
         with closing(connect(part, "rwc")) as connection:
             # Readers and the writer do not wait for each other, and a commit is one flush.
@@ -408,6 +409,42 @@ def create(path: Path) -> None:
             part.rename(path)  # a file system without links
     finally:
         part.unlink(missing_ok=True)
+
+
+def _part_of(path: Path) -> Path:
+    """Return the path of an unfinished file, another one in each process."""
+    return path.with_name(f"{path.name[:40]}.{uuid.uuid4().hex}.part")
+
+
+def replace_files(contents: Mapping[Path, bytes], name: str) -> None:
+    """Write files whole, or raise an `OSError` that says what is left, and change none of them."""
+    parts: dict[Path, Path] = {}
+    try:
+        for path, content in contents.items():
+            if path.exists() and not path.is_file():
+                path.write_bytes(content)  # a device or a pipe
+                continue
+            target = path.resolve()  # a link stays one
+            part = _part_of(target)
+            parts[part] = target
+            with part.open("xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            if target.exists():
+                part.chmod(stat.S_IMODE(target.stat().st_mode))
+        for part, target in parts.items():
+            part.replace(target)
+    except OSError as error:
+        raise OSError(
+            error.errno,
+            f"{name}: got {path}, which cannot be written ({error.strerror}), expected space and "
+            "the right to write there; what was there before is kept: free some space, or pass "
+            "another path",
+        ) from error
+    finally:
+        for part in parts:
+            part.unlink(missing_ok=True)
 
 
 def connect(path: Path, mode: str = "rw") -> sqlite3.Connection:

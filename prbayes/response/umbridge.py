@@ -5,18 +5,23 @@ The protocol: https://um-bridge-benchmarks.readthedocs.io, version 1.0.
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import math
 import os
 import re
 import socket
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from http.client import HTTPResponse
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import urllib3
-from urllib3.connection import HTTPConnection
+from urllib3.connection import HTTPConnection, HTTPSConnection
 from urllib3.exceptions import HTTPError, LocationParseError, ProtocolError, ReadTimeoutError
 
 from prbayes._finding import Finding, report
@@ -41,7 +46,8 @@ def umbridge(
     Parameters
     ----------
     url : str
-        Address of the server, such as ``"http://localhost:4242"``.
+        Address of the server, such as ``"http://localhost:4242"``. A name and a password in it
+        are sent (HTTP Basic), and a query is kept; messages show neither.
     model : str
         Name of one of its models.
     config : mapping, optional
@@ -57,7 +63,7 @@ def umbridge(
     TypeError, ValueError
         If an argument is not as described, or the server has no such model.
     ConnectionError
-        If there is no server, or it is none of UM-Bridge.
+        If there is no server, or its answers are none of UM-Bridge.
 
     Notes
     -----
@@ -68,7 +74,8 @@ def umbridge(
     The server computes, so threads serve as an executor: as many as it has workers. Connections
     are reused. A request whose connection is lost is sent again, twice at most, as soon as the
     server is back; the propagation's ``on_failure`` decides on a final failure. A late response is
-    abandoned, although the server may continue to compute it. The response can be pickled.
+    abandoned, although the server may continue to compute it. An answer of more than 1 MB and 64
+    bytes a number is refused. The response can be pickled, with the password in it.
 
     Examples
     --------
@@ -107,48 +114,78 @@ def umbridge(
     array([[2., 6.],
            [4., 7.]])
     """
-    url = plain_text(url, "umbridge: url").rstrip("/")
-    try:
-        parts = urllib3.util.parse_url(url)
-    except LocationParseError:
-        parts = urllib3.util.Url()
-    if parts.scheme not in ("http", "https") or not parts.host or parts.port == 0:
-        raise ValueError(
-            f"umbridge: url: got {url!r}, expected the address of a server, such as "
-            "'http://localhost:4242'"
-        )
+    address = _address(url)
     limit = None if timeout is None else positive_number(timeout, "umbridge: timeout")
     patience = positive_number(patience, "umbridge: patience")
     request = {"name": plain_text(model, "umbridge: model"), "config": _plain_config(config)}
-    try:
-        info = _known(url, "/Info", None)
-        version, models = info["protocolVersion"], [str(name) for name in info["models"]]
-    except (RuntimeError, KeyError, TypeError) as error:
-        raise ConnectionError(
-            f"umbridge: url: got {url}, where something else answers ({error!s:.200}), "
-            "expected a server of UM-Bridge"
-        ) from None
+    version, models = _known(address, "/Info", None)
     if version != 1.0:
         raise ValueError(
             f"umbridge: url: got a server that speaks version {version} of the protocol at "
-            f"{url}, expected 1.0"
+            f"{address}, expected 1.0"
         )
     if model not in models:
         raise ValueError(
             f"umbridge: model: got {model!r}, expected one of those that the server at "
-            f"{url} has: {', '.join(map(repr, models)) or 'none'}"
+            f"{address} has: {', '.join(map(repr, models)) or 'none'}"
         )
-    if not _known(url, "/ModelInfo", {"name": model}).get("support", {}).get("Evaluate"):
+    (support,) = _known(address, "/ModelInfo", {"name": model})
+    if not support.get("Evaluate"):
         raise ValueError(
-            f"umbridge: model: got {model!r}, which the server at {url} cannot evaluate, "
+            f"umbridge: model: got {model!r}, which the server at {address} cannot evaluate, "
             "expected a model that supports Evaluate"
         )
-    inputs = _sizes(_known(url, "/InputSizes", request), model, "inputSizes")
-    outputs = _sizes(_known(url, "/OutputSizes", request), model, "outputSizes")
-    remote = RemoteModel(
-        url, model, json.dumps(request["config"]), inputs, outputs, limit, patience
+    (inputs,) = _known(address, "/InputSizes", request)
+    (outputs,) = _known(address, "/OutputSizes", request)
+    config_text = json.dumps(request["config"])
+    return scalar(
+        RemoteModel(address, model, config_text, tuple(inputs), tuple(outputs), limit, patience)
     )
-    return scalar(remote)
+
+
+@dataclass(frozen=True)
+class Address:
+    """The address of a server; its name, password and query are sent, and never shown."""
+
+    shown: str
+    user: str = field(default="", repr=False)  # name and password
+    query: str = field(default="", repr=False)
+
+    def __str__(self) -> str:
+        """Return the address without what is secret."""
+        return self.shown
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """The authorization of the user (RFC 7617)."""
+        if not self.user:
+            return {}
+        return {"Authorization": f"Basic {base64.b64encode(self.user.encode()).decode()}"}
+
+    def of(self, path: str) -> str:
+        """Return the address of a path of the server."""
+        return f"{self.shown}{path}?{self.query}" if self.query else self.shown + path
+
+
+def _address(url: object) -> Address:
+    """Return the address of a server, or raise if it is none."""
+    text = plain_text(url, "umbridge: url")
+    try:
+        parts = urllib3.util.parse_url(text)
+    except LocationParseError:
+        parts = urllib3.util.Url()
+    is_plain = text.isprintable() and " " not in text and not parts.fragment
+    if parts.scheme not in ("http", "https") or not parts.host or parts.port == 0 or not is_plain:
+        shown = re.sub(r"^(\w+://)?.*@", r"\1...@", text, flags=re.DOTALL).partition("?")[0]
+        raise ValueError(
+            f"umbridge: url: got {shown!r}, expected the address of a server, such as "
+            "'http://localhost:4242', without blanks, line ends or a fragment"
+        )
+    name, _, password = (parts.auth or "").partition(":")
+    user = f"{unquote(name)}:{unquote(password)}" if parts.auth else ""
+    path = (parts.path or "").rstrip("/")
+    shown = urllib3.util.Url(parts.scheme, None, parts.host, parts.port, path).url
+    return Address(shown, user, parts.query or "")
 
 
 def _plain_config(config: object) -> Any:
@@ -165,22 +202,11 @@ def _plain_config(config: object) -> Any:
     )
 
 
-def _sizes(answer: Mapping[str, Any], model: str, key: str) -> tuple[int, ...]:
-    """Return the sizes of a model's vectors."""
-    sizes = answer.get(key)
-    if isinstance(sizes, list) and all(isinstance(n, int) and n >= 0 for n in sizes) and any(sizes):
-        return tuple(sizes)
-    raise ValueError(
-        f"umbridge: got {key} = {sizes!r:.100} of the model {model!r}, expected the sizes of its "
-        "vectors, such as [2]; look at the server"
-    )
-
-
 @dataclass(frozen=True)
 class RemoteModel:
     """A model behind a server as a function of one specimen's inputs."""
 
-    url: str
+    address: Address
     model: str
     config: str  # as JSON
     inputs: tuple[int, ...]  # sizes of the model's input vectors
@@ -203,49 +229,48 @@ class RemoteModel:
             "input": [vector.tolist() for vector in vectors],
             "config": json.loads(self.config),
         }
-        output = self._answer(request).get("output")
-        try:
-            rows = [np.asarray(vector, dtype=np.float64) for vector in output or ()]
-        except (TypeError, ValueError):
-            rows = []
-        if [row.shape for row in rows] != [(size,) for size in self.outputs]:
+        (output,) = self._answer(request)
+        if [len(vector) for vector in output] != list(self.outputs):
             raise RuntimeError(
-                f"{self.model}: got {output!r:.300}, expected vectors of numbers, of sizes "
-                f"{list(self.outputs)}"
+                f"{self.model}: got output = {output!r:.300}, expected vectors of numbers, of "
+                f"sizes {list(self.outputs)}"
             )
-        values = np.concatenate(rows)
-        return values if values.size > 1 else float(values[0])
+        values = np.array([np.nan if y is None else y for vector in output for y in vector])
+        return values.astype(np.float64) if values.size > 1 else float(values[0])
 
-    def _answer(self, request: Any) -> dict[str, Any]:
-        """Return the answer for one specimen, from a server that may be away for a while."""
+    def _answer(self, request: Any) -> list[Any]:
+        """Return the values for one specimen, from a server that may be away for a while."""
         n_lost, give_up_at, pause = 0, 0.0, 0.1
         while True:
             try:
-                status, text = _exchange(self.url, "/Evaluate", request, self.timeout)
+                status, text = _exchange(
+                    self.address, "/Evaluate", request, self.timeout, sum(self.outputs)
+                )
                 if status not in (502, 503):  # of a gateway whose server is away
-                    return _read_answer(self.model, status, text)
+                    return _read_answer(self.model, "/Evaluate", status, text)
                 reason = f"it answered {status}"
             except TimeoutError:
                 raise TimeoutError(
-                    f"{self.model}: no response within timeout = {self.timeout:g} s from {self.url}"
+                    f"{self.model}: no response within timeout = {self.timeout:g} s from "
+                    f"{self.address}"
                 ) from None
             except ProtocolError as error:
                 # Lost after the request was sent: the specimen may be what ends the server.
                 n_lost, give_up_at, pause, reason = n_lost + 1, 0.0, 0.1, str(error)
                 if n_lost == 3:
                     raise ConnectionError(
-                        f"{self.model}: the server at {self.url} was lost 3 times while it was at "
-                        f"work on this specimen ({reason})"
+                        f"{self.model}: the server at {self.address} was lost 3 times while it "
+                        f"was at work on this specimen ({reason})"
                     ) from None
             except (HTTPError, OSError) as error:
                 reason = f"{type(error).__name__}: {error}"
             if not give_up_at:
                 give_up_at = time.monotonic() + self.patience
-                text = f"{self.model}: the server at {self.url} is away ({reason}); waiting."
+                text = f"{self.model}: the server at {self.address} is away ({reason}); waiting."
                 report(Finding("server-away", text))
             if time.monotonic() > give_up_at:
                 raise ConnectionError(
-                    f"{self.model}: the server at {self.url} is away for more than patience = "
+                    f"{self.model}: the server at {self.address} is away for more than patience = "
                     f"{self.patience:g} s ({reason})"
                 )
             time.sleep(pause)
@@ -260,7 +285,7 @@ class RemoteModel:
             got, expected = (str(("N", *e)).replace("'", "") for e in (outputs.event, event))
             raise ValueError(
                 f"{name}: observed: got shape {got}, expected {expected}, a number for each "
-                f"output: the model {self.model!r} at {self.url} has outputs of sizes "
+                f"output: the model {self.model!r} at {self.address} has outputs of sizes "
                 f"{list(self.outputs)}"
             )
 
@@ -278,11 +303,61 @@ class RemoteModel:
         raise ValueError(
             f"{name}: got inputs of {', '.join(map(str, sizes))} numbers, expected such as fill "
             f"vectors of sizes {list(self.inputs)} one after the other ({reason}), which the model "
-            f"{self.model!r} at {self.url} has; pass other inputs, or in another order"
+            f"{self.model!r} at {self.address} has; pass other inputs, or in another order"
         )
 
 
 # -- requests --------------------------------------------------------------------------------------
+
+
+class _Until(io.RawIOBase):
+    """The bytes of a socket until a time; a socket's own limit holds for each piece."""
+
+    def __init__(self, sock: socket.socket, raw: io.RawIOBase, seconds: float) -> None:
+        self.sock, self.raw, self.end = sock, raw, time.monotonic() + seconds
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        """Read a piece; raise `TimeoutError` at the end of the time."""
+        seconds = self.end - time.monotonic()
+        if seconds <= 0:
+            raise TimeoutError
+        self.sock.settimeout(seconds)
+        return self.raw.readinto(buffer)
+
+    def close(self) -> None:
+        """Close the socket's file, too."""
+        self.raw.close()
+        super().close()
+
+
+class _TimedResponse(HTTPResponse):
+    """An answer whose time limit, that of the socket, holds for headers and body together."""
+
+    def __init__(self, sock: socket.socket, *arguments: Any, **keywords: Any) -> None:
+        super().__init__(sock, *arguments, **keywords)
+        seconds = sock.gettimeout()
+        if seconds is not None:
+            self.fp = io.BufferedReader(_Until(sock, self.fp.detach(), seconds))
+
+
+class _Http(HTTPConnection):
+    response_class = _TimedResponse
+
+
+class _Https(HTTPSConnection):
+    response_class = _TimedResponse
+
+
+class _HttpPool(urllib3.HTTPConnectionPool):
+    ConnectionCls = _Http
+
+
+class _HttpsPool(urllib3.HTTPSConnectionPool):
+    ConnectionCls = _Https
 
 
 def _new_pool() -> urllib3.PoolManager:
@@ -291,7 +366,9 @@ def _new_pool() -> urllib3.PoolManager:
     for option, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
         if hasattr(socket, option):
             options.append((socket.IPPROTO_TCP, getattr(socket, option), value))
-    return urllib3.PoolManager(maxsize=64, retries=False, socket_options=options)
+    pool = urllib3.PoolManager(maxsize=64, retries=False, socket_options=options)
+    pool.pool_classes_by_scheme = {"http": _HttpPool, "https": _HttpsPool}
+    return pool
 
 
 _pool = _new_pool()
@@ -309,62 +386,138 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew_pool)
 
 
-def _known(url: str, path: str, request: Any) -> dict[str, Any]:
-    """Return an answer for which the server need not compute; it has to be there."""
+def _known(address: Address, path: str, request: Any) -> list[Any]:
+    """Return the values of an answer for which the server need not compute; it has to be there."""
     try:
-        return _read_answer(path, *_exchange(url, path, request, 60.0))
+        return _read_answer(path, path, *_exchange(address, path, request, 60.0))
+    except RuntimeError as error:
+        raise ConnectionError(
+            f"umbridge: url: got {address}, where something else answers ({error!s:.400}), "
+            "expected a server of UM-Bridge"
+        ) from None
     except (OSError, HTTPError) as error:
         raise ConnectionError(
-            f"umbridge: url: got {url}, where no server answers {path} ({error}), expected one "
+            f"umbridge: url: got {address}, where no server answers {path} ({error}), expected one "
             "that runs; start it, and look at its port"
         ) from None
 
 
-def _exchange(url: str, path: str, request: Any, seconds: float | None) -> tuple[int, str]:
+def _exchange(
+    address: Address, path: str, request: Any, seconds: float | None, n_numbers: int = 0
+) -> tuple[int, str]:
     """Return status and text of an answer; `ProtocolError` if it is lost after the request."""
-    end = None if seconds is None else time.monotonic() + seconds
+    # Bytes: a number in text takes fewer than 64.
+    largest = 1_000_000 + 64 * n_numbers
+    text = bytearray()
     try:
         response = _pool.request(
             "GET" if request is None else "POST",
-            url + path,
+            address.of(path),
             json=request,
+            headers=address.headers,
             preload_content=False,
+            decode_content=False,  # no encoding was asked for: a few bytes may become gigabytes
             timeout=urllib3.Timeout(connect=10.0, read=seconds),
         )
-        # In pieces, as the time limit of a socket applies to each.
-        pieces = []
         while piece := response.read1(1 << 20):
-            pieces.append(piece)
-            if end is not None and time.monotonic() > end:
+            text += piece
+            if len(text) > largest:
                 response.close()
-                raise TimeoutError
+                raise RuntimeError(
+                    f"{path}: got an answer of more than {largest} bytes from {address}, expected "
+                    f"at most that for {n_numbers} numbers; look at the server"
+                )
         response.release_conn()
     except ReadTimeoutError as error:
         # The system's own, of a machine that is gone, has a number.
         if getattr(error.__cause__, "errno", None) is not None:
             raise ProtocolError(str(error.__cause__)) from None
-        raise TimeoutError from None
-    return response.status, b"".join(pieces).decode("utf-8", "replace")
+        raise TimeoutError(f"not within {seconds:g} s") from None
+    return response.status, text.decode("utf-8", "replace")
 
 
-def _read_answer(name: str, status: int, text: str) -> dict[str, Any]:
-    """Return an answer in JSON, or raise `RuntimeError` with its error."""
+# -- answers ---------------------------------------------------------------------------------------
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _are_sizes(value: object) -> bool:
+    """Return whether a value is a list of integers, one of them above zero."""
+    if not isinstance(value, list):
+        return False
+    return any(value) and all(type(size) is int and 0 <= size < 2**31 for size in value)
+
+
+def _are_vectors(value: object) -> bool:
+    """Return whether a value is a list of lists of numbers; null is NaN, which JSON lacks."""
+    return isinstance(value, list) and all(
+        isinstance(vector, list) and all(y is None or _is_number(y) for y in vector)
+        for vector in value
+    )
+
+
+# What the five answers have to contain: keys, their values in words, and the tests of these.
+_ANSWERS: dict[str, list[tuple[str, str, Callable[[Any], bool]]]] = {
+    "/Info": [
+        ("protocolVersion", "a number", _is_number),
+        (
+            "models",
+            "a list of names",
+            lambda x: isinstance(x, list) and all(isinstance(name, str) for name in x),
+        ),
+    ],
+    "/ModelInfo": [
+        (
+            "support",
+            'a mapping such as {"Evaluate": true}',
+            lambda x: isinstance(x, dict) and isinstance(x.get("Evaluate", False), bool),
+        )
+    ],
+    "/InputSizes": [("inputSizes", "the sizes of vectors, such as [2]", _are_sizes)],
+    "/OutputSizes": [("outputSizes", "the sizes of vectors, such as [2]", _are_sizes)],
+    "/Evaluate": [("output", "vectors of numbers, such as [[1.5, 2]]", _are_vectors)],
+}
+
+
+def _read_answer(name: str, path: str, status: int, text: str) -> list[Any]:
+    """Return the values of an answer in JSON, or raise `RuntimeError` with its error."""
+
+    def real(digits: str) -> float:
+        value = float(digits)
+        if math.isinf(value):
+            raise RuntimeError(f"{name}: got the number {digits:.40}, expected one below 1.8e308")
+        return value
+
+    def whole(digits: str) -> int:
+        real(digits)
+        return int(digits)
+
     words = {"nan": "NaN", "inf": "Infinity"}  # of servers in Python
     answer = None
     for form in (text, re.sub(r"\b(?:nan|inf)\b", lambda word: words[word[0]], text)):
         try:
-            answer = json.loads(form)
+            answer = json.loads(form, parse_float=real, parse_int=whole)
             break
-        except ValueError:
+        except (ValueError, RecursionError):
             pass
-    if isinstance(answer, dict) and "error" in answer:
-        error = answer["error"]
+    error = answer.get("error") if isinstance(answer, dict) else None
+    if error is not None:
         if isinstance(error, dict):
             error = f"{error.get('type')}: {error.get('message')}"
-        raise RuntimeError(f"{name}: the server answered {error!s:.1000}")
+        # JSON may have halves of characters, which no file or terminal takes.
+        reason = str(error).encode("utf-8", "backslashreplace").decode()
+        raise RuntimeError(f"{name}: the server answered {reason:.1000}")
     if status != 200 or not isinstance(answer, dict):
         log = "; what its model raised is in its own log" if status == 500 else ""
         raise RuntimeError(
             f"{name}: the server answered {status}, {text.strip()!r:.300}, expected a result{log}"
         )
-    return answer
+    for key, expected, is_right in _ANSWERS[path]:
+        if not is_right(answer.get(key)):
+            raise RuntimeError(
+                f"{name}: got {key} = {answer.get(key)!r:.300}, expected {expected}; look at the "
+                "server"
+            )
+    return [answer[key] for key, _, _ in _ANSWERS[path]]

@@ -12,6 +12,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 from prbayes._display import view
+from prbayes._finding import Finding, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called
 from prbayes.metrics.area import AreaMetric
@@ -131,15 +132,24 @@ def compare(
     columns, shown, costs = zip(*read, strict=True)
     in_all = set.intersection(*map(set, columns))
     shared = [name for name in columns[0] if name in in_all]
+    left_out = [name for column in columns for name in column if name not in in_all]
+    if left_out and shared and None in identities.values():  # results of other tools
+        listed = ", ".join(dict.fromkeys(left_out))
+        text = f"compare: left out {listed:.300}, as not all results have these names."
+        report(Finding("names-differ", text))
     if model is not None:
-        variables = {variable.name for variable in model.unobserved_RVs}
-        shared = [name for name in shared if variable_of(name) in variables]
+        variables = [str(variable.name) for variable in model.unobserved_RVs]
+        shared = [name for name in shared if variable_of(name, variables) in variables]
     in_table = set.intersection(*shown)
     names = readable_elements([name for name in shared if name in in_table])
     if not names:
+        got = {label: list(column) for label, column in zip(results, columns, strict=True)}
+        if model is not None:
+            got["the model"] = variables
+        texts = "; ".join(f"{label}: {', '.join(elements)}" for label, elements in got.items())
         raise ValueError(
-            f"compare: got results {list(results)} that share no hyperparameter, "
-            "expected the same model"
+            f"compare: got results that share no hyperparameter ({texts:.500}), expected the same "
+            "names"
         )
     table = np.array([[column[name] for name in names] for column in columns])
     estimates, sds = table[..., 0], table[..., 1]

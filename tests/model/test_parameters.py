@@ -22,6 +22,7 @@ from prbayes.model.parameters import (
     split_elements,
     stacked_draws,
     table_elements,
+    variable_of,
 )
 
 THETAS = np.array([[0.0, 4.0, 0.3], [2.0, 6.0, -0.4]])
@@ -253,3 +254,21 @@ def test_a_packed_factor_is_shown_by_its_standard_deviations_and_correlations() 
     elements = ["mu[0]", "chol[0]", "chol[1]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
     assert readable_elements(elements) == ["mu[0]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
     assert readable_elements(["chol[0]", "chol_stds[0]"]) == ["chol[0]", "chol_stds[0]"]
+
+
+def test_an_element_belongs_to_the_longest_name() -> None:
+    names = ["mu", "mu[1]", "force [N]"]
+    elements = ["mu[0]", "mu[1]", "mu[1][0]", "force [N]", "force [N][2]", "sigma[1]", "muu"]
+    expected = ["mu", "mu[1]", "mu[1]", "force [N]", "force [N]", "sigma", "muu"]
+    assert [variable_of(element, names) for element in elements] == expected
+
+
+@pytest.mark.parametrize("name", ["chain", "draw", "mu[1]"])
+def test_names_that_results_cannot_have_are_refused(name: str) -> None:
+    with pm.Model() as model:
+        pm.Normal("mu", shape=2)
+        pm.Normal(name)
+    with pytest.raises(
+        ValueError, match=r"model: got .* called .*, expected (another|different) name"
+    ):
+        Hyperparameters.of(model)

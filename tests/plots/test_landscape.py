@@ -98,7 +98,7 @@ def test_the_landscape_of_another_metric(
     thetas = np.column_stack([x, np.full(x.size, optimum.theta[1])])
     np.testing.assert_allclose(y, Evaluator.of(other)(thetas).discrepancies[:, 0])
     with pytest.raises(
-        ValueError, match=r"plot_landscape: .*hyperparameters: got mu, sigma_log__, expected mu"
+        ValueError, match=r"plot_landscape: .*hyperparameters: got sigma_log__, expected "
     ):
         prb.plot_landscape(optimum, model=_one())
 

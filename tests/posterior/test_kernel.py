@@ -17,7 +17,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.fingerprint import identity_of
+from prbayes.model.fingerprint import Identity, identity_of
 from prbayes.posterior.kernel import (
     BatchedKernel,
     Checkpoint,
@@ -383,3 +383,21 @@ def test_damaged_files_are_refused(
     with pytest.raises(StoreError, match=message):
         Checkpoint(path, problem, SETTINGS)
     assert path.read_bytes() == broken
+
+
+def test_two_runs_on_one_checkpoint_are_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "run.nc"
+    identity = Identity({"mu": ()}, {"mu": "Normal(0, 1)"}, (), ())
+    one, other = (Checkpoint(path, identity, {"entropy": "7"}) for _ in range(2))
+    one.save({"theta": np.zeros(3)}, {"stage": 1})
+    one.save({"theta": np.ones(3)}, {"stage": 2})
+    with pytest.raises(StoreError, match="belongs to another run, which is writing to it; nothing"):
+        other.save({"theta": np.zeros(3)}, {"stage": 1})
+    later = Checkpoint(path, identity, {"entropy": "7"})
+    assert later.note == {"stage": 2}
+    later.save({"theta": np.ones(3)}, {"stage": 3})
+    with pytest.raises(StoreError, match="belongs to another run, which is writing to it; nothing"):
+        one.save({"theta": np.ones(3)}, {"stage": 3, "chain": 1})
+    path.unlink()
+    one.save({"theta": np.ones(3)}, {"stage": 3})
+    assert [p.name for p in tmp_path.iterdir()] == ["run.nc"]

@@ -229,6 +229,25 @@ def test_a_browser_needs_no_sideways_scrolling(
     assert path.stat().st_size < 2_000_000
 
 
+def test_a_full_disk_keeps_the_report_of_yesterday(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    section = prb.reports.Section("a", "text")
+    prb.Report("old", (section,)).to_html(tmp_path / "r.html")
+    prb.Report("old", (section,)).to_markdown(tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    report = prb.Report("new", (section,))
+    for write, path in ((report.to_html, tmp_path / "r.html"), (report.to_markdown, tmp_path)):
+        with pytest.raises(OSError, match=r"Report: got .*cannot be written \(No space left"):
+            write(path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_bare_links_and_unseen_characters_of_a_text_are_shown_as_text(tmp_path: Path) -> None:
     text = "see http://evil.example/x and www.evil.example, \u202etxt.exe\u2066 a\x07b \x1b[2J"
     report = prb.Report(text, sections=(prb.reports.Section(text, text),), author=text)

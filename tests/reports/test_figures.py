@@ -123,7 +123,7 @@ def test_a_report_computes_no_response(calls: Calls, section: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "lacking", ["no Python package graphviz", "no program dot", "does not take a name"]
+    "lacking", ["pip install graphviz", "no program dot", "does not take a name"]
 )
 def test_without_graphviz_there_is_no_graph(
     lacking: str,
@@ -137,7 +137,7 @@ def test_without_graphviz_there_is_no_graph(
     def fails(_: Any) -> bytes:
         raise subprocess.CalledProcessError(1, "dot")
 
-    if lacking == "no Python package graphviz":
+    if lacking == "pip install graphviz":
         monkeypatch.setitem(sys.modules, "graphviz", None)
     elif lacking == "no program dot":
         monkeypatch.setenv("PATH", str(tmp_path))

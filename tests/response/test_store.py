@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import sqlite3
@@ -23,6 +24,7 @@ from prbayes.response.store import (
     connect,
     create,
     explanation,
+    replace_files,
     transaction,
 )
 
@@ -321,6 +323,35 @@ def test_many_may_make_it_at_once(tmp_path: Path) -> None:
         thread.join()
     assert [p.name for p in path.parent.iterdir()] == ["r.sqlite"]
     assert runs(path) == 0
+
+
+def test_files_are_replaced_together_or_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, link = (tmp_path / name for name in ("a.html", "b.svg", "link"))
+    first.write_text("old")
+    first.chmod(0o640)
+    link.symlink_to(first)
+    flush, seen = os.fsync, list[int]()
+
+    def full(file: int) -> None:
+        seen.append(file)
+        if len(seen) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        flush(file)
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match=r"Report: got .*b.svg, .*No space left.*is kept: free") as e:
+        replace_files({first: b"new", second: b"picture"}, "Report")
+    assert e.value.errno == errno.ENOSPC
+    assert first.read_text() == "old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "link"]
+    replace_files({link: b"new", second: b"picture", Path(os.devnull): b"x"}, "Report")
+    assert (first.read_bytes(), second.read_bytes()) == (b"new", b"picture")
+    assert link.is_symlink()
+    assert first.stat().st_mode & 0o777 == 0o640
+    with pytest.raises(FileNotFoundError, match="cannot be written"):
+        replace_files({tmp_path / "none" / "a": b""}, "Report")
 
 
 def test_a_checksum_is_that_of_files_in_use() -> None:

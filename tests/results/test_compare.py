@@ -143,8 +143,35 @@ def test_invalid_results(results: Any, error: type[Exception], words: str) -> No
         prb.compare(results)
     with pm.Model() as other:
         pm.Normal("tau")
-    with pytest.raises(ValueError, match="share no hyperparameter"):
+    with pytest.raises(ValueError, match=r"share no hyperparameter \(a: mean.*; the model: tau\)"):
         prb.compare({"a": optimum()}, model=other)
+
+
+def test_names_that_not_all_results_have_are_reported(caplog: pytest.LogCaptureFixture) -> None:
+    one = tree_of(mu=[[1.0, 2.0]], sigma=[[1.0, 2.0]])
+    other = tree_of(m=[[1.0, 2.0]], sigma=[[1.0, 2.0]])
+    with caplog.at_level("WARNING", "prbayes"):
+        assert prb.compare({"a": one, "b": other})["hyperparameter"].values.tolist() == ["sigma"]
+    assert "compare: left out mu, m, as not all results have these names" in caplog.text
+    caplog.clear()
+    with caplog.at_level("WARNING", "prbayes"):
+        prb.compare({"a": one, "b": one})
+    assert not caplog.text
+
+
+def test_names_with_brackets_are_compared() -> None:
+    with pm.Model() as other:
+        pm.Normal("mu[1]")
+        pm.Normal("force [N]", shape=2)
+    draws = np.random.default_rng(0).normal(size=(2, 1, 50))
+    vector = ("chain", "draw", "i"), np.moveaxis(draws, 0, -1)
+    values = {"mu[1]": (("chain", "draw"), draws[0]), "force [N]": vector}
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(values)})
+    table = prb.compare({"a": tree, "b": tree}, model=other)
+    names = ["mu[1]", "force [N][0]", "force [N][1]"]
+    assert table["hyperparameter"].values.tolist() == names
+    expected = [draws[0].mean(), *draws.mean(axis=(1, 2))]
+    np.testing.assert_allclose(table["estimate"].sel(result="b"), expected)
 
 
 # -- scores
