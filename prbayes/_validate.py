@@ -37,10 +37,21 @@ def called(value: object) -> str:
 # -- arrays ----------------------------------------------------------------------------------
 
 
+def unmasked(values: Any) -> Any:
+    """Return values with NaN in place of masked numbers, also of lists of masked arrays."""
+    if isinstance(values, list | tuple):
+        return [unmasked(value) for value in values]
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    if not np.ma.is_masked(values) or values.dtype.kind not in "biufcO":
+        return np.ma.getdata(values)
+    return np.ma.filled(values.astype(np.float64) if values.dtype.kind in "biu" else values, np.nan)
+
+
 def real_array(values: ArrayLike, name: str) -> Floats:
-    """Return ``values`` as a float array, or raise a `TypeError` if they are not real numbers."""
+    """Return values as a float array, NaN where masked; a `TypeError` if they are not numbers."""
     try:
-        array = np.asarray(values)
+        array = np.asarray(unmasked(values))
     except ValueError as error:
         raise TypeError(
             f"{name}: got a ragged sequence, expected a regular array of numbers"
@@ -57,15 +68,25 @@ def real_array(values: ArrayLike, name: str) -> Floats:
         with suppress(TypeError, ValueError, OverflowError):
             return array.astype(np.float64)
     got = f"an array of dtype {array.dtype}" if array.ndim else called(values)
-    raise TypeError(f"{name}: got {got}, expected real numbers")
+    text = first_text(array) if array.ndim else ""
+    raise TypeError(f"{name}: got {got}, expected real numbers{text and '; '}{text}")
+
+
+def first_text(array: NDArray[Any]) -> str:
+    """Return a clause on the first text of an array, if possible on one that is no number."""
+    texts = [(i, x) for i, x in enumerate(array.flat) if isinstance(x, str | bytes)]
+    for i, text in texts:
+        try:
+            float(text)
+        except ValueError:
+            return f"the value at index {i} is the text {str(text)!r:.60}"
+    return f"the value at index {texts[0][0]} is the text {str(texts[0][1])!r:.60}" if texts else ""
 
 
 def observed_sample(
     values: ArrayLike, name: str = "observed", *, minimum: int = 1, failures: bool = False
 ) -> Floats:
     """Return measured responses, (N,), finite or a failure (+inf) if allowed, or raise."""
-    if np.ma.is_masked(values):
-        raise ValueError(f"{name}: got masked values, expected none; leave missing specimens out")
     array = real_array(values, name)
     if array.ndim != 1:
         raise ValueError(
@@ -82,7 +103,7 @@ def observed_sample(
             advice = "; a specimen that failed, +inf, takes a metric that counts it"
         raise ValueError(
             f"{name}: got {n_invalid} NaN or infinite among {array.size} values, expected finite "
-            f"ones; leave missing specimens out{advice}"
+            f"ones; leave missing specimens, NaN or masked, out{advice}"
         )
     _refuse_huge(array, name)
     n_finite = array.size - n_failed
@@ -101,15 +122,12 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
     NaN, or a mask, is an output that was not measured; +inf a specimen that failed there. Every
     specimen needs an output, and every output a finite value.
     """
-    masked = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else None
-    array = real_array(np.ma.getdata(values) if masked is not None else values, name)
+    array = real_array(values, name)
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
             f"{name}: got an array of shape {array.shape}, expected (N, m), a row for each "
             "specimen and a column for each output"
         )
-    if masked is not None:
-        array = np.where(masked, np.nan, array)
     if np.isneginf(array).any():
         raise ValueError(
             f"{name}: got -inf, expected numbers; NaN is an output that was not measured, +inf a "

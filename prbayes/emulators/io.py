@@ -17,7 +17,7 @@ from prbayes.emulators.ranges import Range, Ranges
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
 from prbayes.response.failures import Abort, Replace
-from prbayes.response.outputs import outputs_of_keys
+from prbayes.response.outputs import Outputs, outputs_of_keys
 from prbayes.response.store import StoreError, replace_files
 
 _SHIPPED: tuple[Any, ...] = (RadialBasis, Polynomial, GaussianProcess)
@@ -53,6 +53,7 @@ def write(path: str | PathLike[str], surrogate: Any, joined: bool | None, probes
         "n_runs": surrogate.n_runs,
         "joined": joined,
         "outputs": None if names is None else names.keys,
+        "labels": None if names is None else [names.dim, *names.labels],
     }
     data = xr.Dataset(
         {
@@ -85,6 +86,9 @@ def read(path: str | PathLike[str]) -> SavedSurrogate:
         if outputs is not None:
             keys = [(str(key), None if size is None else int(size)) for key, size in outputs]
             outputs = outputs_of_keys(keys)
+            if not keys:  # labels that are numbers
+                dim, *labels = config["labels"]
+                outputs = Outputs(tuple(labels), dim)
         fields = {
             "domain": _ranges(config["inputs"], data["low"].values, data["high"].values),
             "points": data["points"].values,

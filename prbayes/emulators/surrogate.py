@@ -37,7 +37,7 @@ from prbayes.emulators.surfaces import (
     fitted,
 )
 from prbayes.numerics.points import sobol
-from prbayes.response.call import CallSettings, Points, Tally, compute, respond
+from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import check_call_settings, refuse_misfit, refuse_uncallable
@@ -302,8 +302,9 @@ class Surrogate:
         if store is not None:
             database = Store(store, name, columns=design.shape[1], version=version)
         settings = CallSettings(
-            name, response, executor, database, policy, retry_failed, outputs=None
-        )
+            name, response, executor, database, policy, retry_failed, outputs=None,
+            columns=column_names([r.name for r in domain.inputs], [r.size for r in domain.inputs]),
+        )  # fmt: skip
         tally, runs = Tally(), Points(domain.arguments(design), domain.varying)
         with shown(progressbar):
             _learn_names(settings, runs, tally)

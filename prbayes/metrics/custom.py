@@ -105,13 +105,23 @@ class FunctionDiscrepancy(Discrepancy):
                 "write function(simulated, observed, weights) and pass weighted=True, "
                 "or use prb.Resimulated"
             )
-        value = np.asarray(self.metric.function(*arguments), dtype=np.float64)
         expected = simulated.shape[:-1]
-        if value.shape != expected:
+        sizes = ", ".join(
+            f"{name} {np.shape(x)}"
+            for name, x in zip(("simulated", "observed", "weights"), arguments, strict=False)
+        )
+        convention = (
+            f"the function got {sizes}, expected a result of shape {expected}, a number for each "
+            "population; reduce over the last axis of simulated, axis=-1"
+        )
+        try:
+            value = np.asarray(self.metric.function(*arguments), dtype=np.float64)
+        except Exception as error:
             raise ValueError(
-                f"FunctionMetric: got a result of shape {value.shape} for simulated values of "
-                f"shape {simulated.shape}, expected {expected}; reduce over the last axis"
-            )
+                f"FunctionMetric: the function raised {type(error).__name__}: {error}; {convention}"
+            ) from error
+        if value.shape != expected:
+            raise ValueError(f"FunctionMetric: got a result of shape {value.shape}: {convention}")
         return value
 
     def _repeated(self, weights: Floats) -> Floats:

@@ -61,6 +61,28 @@ def warn_out_of_range(
             return
 
 
+def check_constant(name: str, responses: Floats, outputs: Sequence[str]) -> None:
+    """Report an output that is the same in all runs; raise a DesignError from 32 runs on."""
+    # Of a user's own propagation there may be none, and with +inf the data may be failures alone.
+    if len(responses) < 8 or np.isposinf(responses).any():
+        return
+    values = responses.reshape(len(responses), -1)
+    finite = values[np.isfinite(values).all(axis=1)]
+    if len(finite) < 8:
+        return
+    labels = [f"{name}[{output}]" for output in outputs] or [name]
+    for label, column in zip(labels, finite.T, strict=True):
+        if np.ptp(column) > 1e-9 * np.abs(column).max():
+            continue
+        text = (
+            f"{label}: got {column[0]:.6g} for the response at all {len(finite)} runs over the "
+            "priors, expected a response that depends on its inputs; check the response"
+        )
+        if len(finite) >= 32:
+            raise DesignError(f"{text}, or leave the output out")
+        report(Finding("constant-response", f"{text}."))
+
+
 def check_failing_region(
     name: str,
     observed: Floats,

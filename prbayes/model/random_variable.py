@@ -41,7 +41,7 @@ from prbayes._progress import shown
 from prbayes._validate import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.density import with_common_bandwidths
-from prbayes.model.data_checks import check_failing_region, warn_out_of_range
+from prbayes.model.data_checks import check_constant, check_failing_region, warn_out_of_range
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
@@ -208,12 +208,13 @@ def computed(simulator: AnySimulator) -> Node:
             if hasattr(propagation, "n"):
                 setting += f"(n={propagation.n})"
             responses.on_start = partial(log_first_runs, propagation.cost, setting, responses)
+            outputs = simulator.outputs
             with shown(simulator.progressbar):
                 bound = propagation.bind(simulator.name, responses.inputs, target, responses)
+                check_constant(simulator.name, bound.first_responses, outputs.names)
                 dimensions = bound.inputs.dimensions
                 bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
             responses.on_start = None
-            outputs = simulator.outputs
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
             check_failing_region(
                 simulator.name,

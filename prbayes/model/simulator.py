@@ -61,7 +61,7 @@ from prbayes.response.inputs import (
     model_on_context,
     read_inputs,
 )
-from prbayes.response.outputs import read_observed
+from prbayes.response.outputs import in_order_of, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
 # Settings of a propagation for calls of the response.
@@ -91,9 +91,11 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         ``response(*inputs)``, a NumPy-style function. Each input is an array of any leading batch
         shape; a multivariate input has its event axis last. The function returns an array of the
         batch shape, in units of the observed values; for m outputs of a specimen an array with them
-        in a last axis, or a mapping of arrays with the keys of ``observed``. NaN is a point without
-        response, +inf a specimen that failed. The response of a specimen depends on the inputs of
-        that specimen alone: one of them is also computed by itself, and a difference is refused.
+        in a last axis, or a mapping of arrays with the keys of ``observed``. Labels of a DataArray
+        or DataFrame are matched to those of ``observed``. NaN, or a masked number, is a point
+        without response, +inf a specimen that failed; -inf is refused. The response of a specimen
+        depends on the inputs of that specimen alone: one of them is also computed by itself, and a
+        difference is refused, and so is a function that takes one number of specimens.
         Where inputs repeat, as discrete ones do, a design computes the response once, unless four
         of them differ when they are computed again. Model random scatter of the response as an
         input, such as ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs
@@ -118,7 +120,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         effective number N of specimens; unset for other metrics, until `calibrate_epsilon` and
         `set_epsilon`, or `sample_smc`, set it.
     weights : array_like, shape (N,), optional
-        Weights of the observed responses.
+        Weights of the observed responses; an index is matched to that of ``observed``.
     specimens : array_like, shape (N,), optional
         Labels of the specimens. Observations with the same label, also of several simulators,
         belong together: data sets are drawn specimen by specimen. With a metric of distributions
@@ -197,6 +199,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     if isinstance(measured, Variable):
         measured = _present_numbers(name, measured)
     values, outputs = read_observed(name, measured)
+    weights = in_order_of(weights, observed, f"{name}: weights")
     metric = LogLikelihood() if metric is None else metric
     by_specimen = isinstance(metric, Metric) and metric.by_specimen
     if by_specimen:
@@ -210,10 +213,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
-    calls: dict[str, Any] = {k: getattr(settings, k) for k in _CALL_SETTINGS} | {"outputs": outputs}
-    labels = None
-    if specimens is not None:
-        labels = sample_labels(specimens, len(values), f"{name}: specimens")
+    calls: dict[str, Any] = {key: getattr(settings, key) for key in _CALL_SETTINGS}
+    calls["outputs"] = outputs
+    labels = checked_labels(f"{name}: specimens", specimens, observed, len(values))
     if by_specimen:
         settings.check_likelihood(name)
         partners = _with_common_specimens(name, labels, model)
@@ -431,7 +433,7 @@ def _refuse_by_specimen(
 
 def checked_specimens(name: str, observed: Floats) -> Floats:
     """Return measured outputs, (N,) or (N, m), of at least two specimens."""
-    values = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
+    values = np.asarray(observed, dtype=np.float64)
     if values.ndim not in (1, 2) or len(values) < 2:
         raise ValueError(
             f"{name}: observed: got shape {values.shape}, expected (N,) or (N, m) with at least "
@@ -527,6 +529,15 @@ def _parts_by_group(
     return parts
 
 
+def checked_labels(
+    name: str, specimens: ArrayLike | None, observed: Any, size: int
+) -> NDArray[Any] | None:
+    """Return the labels of the specimens, (N,), in the order of the observed ones."""
+    if specimens is None:
+        return None
+    return sample_labels(in_order_of(specimens, observed, name), size, name)
+
+
 def _prepared_metric(
     name: str, metric: Metric, observed: Floats, weights: ArrayLike | None
 ) -> Discrepancy:
@@ -544,9 +555,21 @@ def _prepared_metric(
             raise ValueError(
                 f"observed: got {len(observed)} specimen(s), expected at least 2 of them"
             )
-        return metric.against(observed, weights)
+        target = metric.against(observed, weights)
+        if not metric.symbolic:
+            try_function(target)
+        return target
     except (TypeError, ValueError) as error:
         raise type(error)(f"{name}: {error}") from None
+
+
+def try_function(target: Discrepancy) -> None:
+    """Call a user's function before any run, for two populations in the range of the data."""
+    finite = np.where(np.isfinite(target.observed), target.observed, np.nan)
+    low, high = np.nanmin(finite, axis=0), np.nanmax(finite, axis=0)
+    trial = np.linspace(low, high, 2 * len(finite)).reshape(2, *finite.shape)
+    with np.errstate(all="ignore"):
+        target(trial)
 
 
 def _warn_shared_specimens(

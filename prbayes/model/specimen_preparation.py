@@ -136,7 +136,6 @@ class Runs:
         inputs = likelihood.coordinates.inputs(z)
         parts = [response(inputs, []).reshape(len(z), -1) for response in responses]
         values = np.concatenate(parts, axis=1)
-        values = np.where(np.isneginf(values), np.nan, values)
         if likelihood.shared_emulation is None and self.first is None:
             if sum(response.computed for response in responses) > n_computed:
 

@@ -32,6 +32,7 @@ from prbayes.propagation.base import (
 )
 from prbayes.propagation.ops import OwnOp, ResponseOp, symbolic_discrepancy
 from prbayes.response.budget import RunCost
+from prbayes.response.call import refuse_negative_infinity
 from prbayes.response.compile import PLAIN, compile_batched, ninf_for_invalid
 from prbayes.response.distributions import PopulationSampler, quantiles, valid
 from prbayes.response.inputs import Inputs, broadcast_batch
@@ -191,6 +192,7 @@ class ResimulatedBound(Bound):
         (values,) = self._values(*params)
         if self.symbolic:
             self.responses.count_symbolic(values.shape[0] * self.n_per_theta)
+            refuse_negative_infinity(values)
         return values, np.broadcast_to(1 / self.n_per_theta, values.shape[:2])
 
 

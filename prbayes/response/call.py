@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, report
 from prbayes._progress import progress
-from prbayes._validate import Floats
+from prbayes._validate import Floats, unmasked
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import (
     Pool,
@@ -70,10 +70,10 @@ class scalar:  # noqa: N801 (reads as a function in a model)
             raise TypeError(f"scalar: got {got}, expected a function of one specimen's inputs")
         self.function = function
 
-    def __call__(self, *inputs: Any) -> Floats | dict[str, Floats]:
+    def __call__(self, *inputs: Any) -> Any:
         """Call the function for each element of arrays that broadcast against each other.
 
-        A function that returns a mapping gives a mapping of arrays.
+        A function that returns a mapping or labels gives a mapping of arrays.
         """
         arrays = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in inputs))
         outputs: Outputs | None = None
@@ -226,10 +226,13 @@ def _reason(error: BaseException) -> str:
 
 def _specimen_response(result: Any, outputs: Outputs | None) -> tuple[Floats, Outputs | None]:
     """Return the response of one specimen, shape (*event), and its outputs."""
-    is_number = np.ndim(result) == 0 if outputs is None else not outputs.event
-    if is_number and not isinstance(result, Mapping):
-        return np.asarray(float(result)), outputs
+    plain = unmasked(result)
+    is_number = np.ndim(plain) == 0 and not isinstance(result, Mapping)
     try:
+        if is_number and (outputs is None or not outputs.event):
+            value = np.asarray(float(plain))
+            refuse_negative_infinity(value)
+            return value, outputs
         return checked(result, (), (), outputs)
     except ResponseError as error:
         raise _NoResponseError(f"it {str(error).removeprefix('the response ')}") from None
@@ -243,10 +246,15 @@ def checked(
 ) -> tuple[Floats, Outputs | None]:
     """Return a result as floats, (*batch, *event), and its outputs, or raise `ResponseError`."""
     try:
+        if hasattr(result, "_fields") and (outputs is None or outputs.keys):
+            result = result._asdict()  # of a named tuple
+        if outputs is None:
+            outputs = outputs_of_result(result, len(batch))
         if isinstance(result, Mapping):
-            outputs = outputs or outputs_of_result(result, len(batch))
-            result = outputs.assembled(result)
-        array = np.asarray(result)
+            result = (outputs or SINGLE_OUTPUT).assembled(result)
+        elif outputs is not None:
+            result = outputs.ordered(result, len(batch))
+        array = np.asarray(unmasked(result))
     except KeyError as error:
         raise ResponseError(str(error.args[0])) from None
     except Exception as error:
@@ -263,7 +271,9 @@ def checked(
     expected = event[:1] if outputs is None else outputs.event
     if array.shape != batch + expected:
         remedy = "return as many numbers as were observed of a specimen"
-        if batch:
+        if np.prod(batch, dtype=int) == 1 and not expected:  # a specimen by itself
+            remedy = f"return one number; {PER_SPECIMEN}"
+        elif batch:
             remedy = (
                 "reduce over the event axis only (the last one), or wrap a function of one "
                 "specimen in prb.scalar"
@@ -283,12 +293,44 @@ def checked(
     values = array.astype(np.float64)
     if expected:  # a point with an output that is NaN has no response
         values[np.isnan(values).any(axis=-1)] = np.nan
+    refuse_negative_infinity(values)
     return values, outputs
+
+
+def refuse_negative_infinity(values: Floats) -> None:
+    """Raise if a response is -inf, such as the logarithm of 0."""
+    if np.isneginf(values).any():
+        count = f" {np.isneginf(values).sum()} times in {values.size} values" if values.ndim else ""
+        raise ResponseError(
+            f"the response returned -inf{count}, expected numbers, NaN (no response) or +inf (the "
+            "specimen failed); a logarithm of 0 is -inf: return the lowest value that can be "
+            "measured, or NaN"
+        )
+
+
+# What to do with an array of values of the measured specimens inside a response.
+PER_SPECIMEN = (
+    "a value that is known for each specimen, such as its load, is no constant: make it an input "
+    "with a distribution, such as pm.Uniform.dist(1, 2), return it as an output beside the "
+    "response, and observe both"
+)
+
+
+def array_advice(reason: str) -> str:
+    """Return advice where a response raised since its arrays do not fit together."""
+    is_size = "broadcast" in reason or "ength of values" in reason
+    return f"; {PER_SPECIMEN}" if is_size else ""
 
 
 def shapes(arguments: Sequence[Any]) -> str:
     """Return the shapes of a response's arguments, for messages."""
     return ", ".join(str(np.shape(a)) for a in arguments)
+
+
+def column_names(names: Sequence[str], sizes: Sequence[int]) -> tuple[str, ...]:
+    """Return a name of each number of a point from the names and sizes of the inputs."""
+    pairs = zip(names, sizes, strict=True)
+    return tuple(f"{x}[{i}]" if k > 1 else x for x, k in pairs for i in range(k))
 
 
 def packed(function: Callable[..., Any]) -> bytes:
@@ -321,6 +363,7 @@ class CallSettings:
     retry_failed: bool = False  # whether points that are stored as failed are computed again
     timeout: float | None = None  # seconds for one response
     outputs: Outputs | None = SINGLE_OUTPUT  # None takes them from the first run
+    columns: tuple[str, ...] = ()  # names of the numbers of a point
 
 
 @dataclass
@@ -493,18 +536,29 @@ def _apply_policy(
         n_nan = int(is_nan.sum())
         tally.failures += n_nan
         text = f"{n_nan} of {is_nan.size} responses failed, replaced by {policy.value}"
-        report(Finding("responses-replaced", f"{settings.name}: {text}; the first: {first}"))
+        row = next(iter(raised), int(np.flatnonzero(is_nan)[0]))
+        where = inputs_text(settings, points, row)
+        text = f"{text}; the first, with inputs {where}: {first}"
+        report(Finding("responses-replaced", f"{settings.name}: {text}"))
         tally.record_failures(points, dict.fromkeys(map(int, np.flatnonzero(is_nan)), "it is NaN"))
         values[is_nan] = policy.value
     return values
+
+
+def inputs_text(settings: CallSettings, points: Points, row: int) -> str:
+    """Return the inputs of a point as a text, with their names where these are known."""
+    (inputs,) = points.at(np.array([row])).keys()
+    if len(settings.columns) != inputs.size or inputs.size > 12:
+        return _numbers_text(inputs, 6)
+    pairs = zip(settings.columns, inputs, strict=True)
+    return f"({', '.join(f'{name} = {value:.6g}' for name, value in pairs)})"
 
 
 def _failure_error(settings: CallSettings, points: Points, raised: dict[int, str]) -> ResponseError:
     row, reason = next(iter(raised.items()))
     place = ""
     if isinstance(settings.function, scalar):  # the point of a batch is not known
-        (inputs,) = points.at(np.array([row])).keys()
-        place = f", the first with inputs {_numbers_text(inputs, 6)}"
+        place = f", the first with inputs {inputs_text(settings, points, row)}"
     store_text = ""
     if settings.store is not None:
         store_text = f"; {len(settings.store)} responses are kept in {settings.store.folder}"
@@ -513,6 +567,7 @@ def _failure_error(settings: CallSettings, points: Points, raised: dict[int, str
         "repair it, keep priors and inputs where it has a response, or pass "
         f"{policies} to the propagation or surrogate"
     )
+    advice += array_advice(reason)
     if is_wrong_result(reason):
         advice = f"repair it; if this is what a run that failed returns, pass {policies}"
     return ResponseError(
@@ -529,7 +584,8 @@ def chunk_size(settings: CallSettings, tally: Tally, n_left: int, workers: int) 
     is_scalar = isinstance(settings.function, scalar)
     if tally.seconds == 0:
         # The cost is not known yet, and may be minutes for each point.
-        return 1 if is_scalar else min(n_left, 16)
+        # Never all at once: a function that takes one number of specimens is refused.
+        return 1 if is_scalar else min(16, max(1, n_left // 3))
     # From twice the cost of sending a chunk on, no response waits for others to be stored.
     if is_scalar and tally.seconds >= 0.01:
         return 1

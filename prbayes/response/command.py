@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._validate import Floats, called, flag, folder_path, positive_number
+from prbayes._validate import called, flag, folder_path, positive_number, unmasked
 from prbayes.response.call import scalar
+from prbayes.response.outputs import relabelled
 
 
 def command(
@@ -185,7 +186,7 @@ class Program:
         """The name of the program."""
         return Path(self.arguments[0]).name
 
-    def __call__(self, *values: float) -> float | Floats | dict[str, float | Floats]:
+    def __call__(self, *values: float) -> Any:
         """Run the program for one specimen, and read the response."""
         if len(values) != len(self.inputs):
             hint = ""
@@ -247,7 +248,7 @@ class Program:
                 f"{self.__name__}: ended with code {code}, expected 0{self._last_lines(folder)}"
             )
 
-    def _outputs(self, folder: Path) -> float | Floats | dict[str, float | Floats]:
+    def _outputs(self, folder: Path) -> Any:
         """Return the results of the program as numbers."""
         try:
             result = self.read(folder)
@@ -293,12 +294,12 @@ def _filled(text: str, values: Mapping[str, float]) -> str:
     return re.sub(r"\{(\w+)(:[^{}]*)?\}", formatted, text)
 
 
-def _numbers(result: object) -> float | Floats:
-    """Return a result as a number, or an array of numbers; a text may be one."""
-    array = np.asarray(result)
+def _numbers(result: object) -> Any:
+    """Return a result as a number, or an array of numbers with its labels; a text may be one."""
+    array = np.asarray(unmasked(result))
     if array.dtype.kind in "Oc":
         raise TypeError(f"got {called(result)}")
-    return array.astype(np.float64) if array.ndim else float(array)
+    return relabelled(array.astype(np.float64), result) if array.ndim else float(array)
 
 
 def _kill_tree(process: subprocess.Popen[bytes]) -> None:

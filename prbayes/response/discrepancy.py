@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from prbayes._finding import Finding
-from prbayes._validate import Floats, called, real_array
+from prbayes._validate import Floats, called, real_array, unmasked
 from prbayes.response.call import scalar
+from prbayes.response.outputs import relabelled
 
 
 class ModelDiscrepancy(ABC):
@@ -250,8 +251,8 @@ class Corrected:
         )
         return (Finding("extrapolated-discrepancy", text),)
 
-    def __call__(self, *inputs: Any) -> Floats:
-        """Return the response with its discrepancy."""
+    def __call__(self, *inputs: Any) -> Any:
+        """Return the response with its discrepancy, and with its labels."""
         *arguments, coefficients = inputs
         response = self.response(*arguments)
         if isinstance(response, Mapping):
@@ -259,7 +260,7 @@ class Corrected:
                 f"{self.__name__}: got a mapping, expected an array with an output for each "
                 "condition"
             )
-        response = np.asarray(response)
+        labelled, response = response, np.asarray(unmasked(response))
         coefficients = np.asarray(coefficients)
         batch_ndim = coefficients.ndim - len(self.discrepancy.event)
         outputs = self.condition.shape
@@ -275,7 +276,7 @@ class Corrected:
             # Before the axis of coefficients, one for the outputs.
             coefficients = np.expand_dims(coefficients, batch_ndim)
         value = self.discrepancy.value(coefficients, self.condition)
-        return self.discrepancy.combined(response, value)
+        return relabelled(self.discrepancy.combined(response, value), labelled)
 
 
 def has_discrepancy(function: Callable[..., Any]) -> bool:

@@ -253,20 +253,30 @@ def event_shape(dist: TensorVariable) -> tuple[int, ...]:
     return tuple(int(s) for s in draw.shape)
 
 
+def argument_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
+    """Return a name of each input: of its variable, or of the response's argument."""
+    inner: Any = getattr(function, "function", function)  # inside prb.scalar
+    declared = getattr(inner, "inputs", ())  # of a program or unit
+    arguments = [x if isinstance(x, str) else getattr(x, "name", "") for x in declared]
+    if not all(arguments) or len(arguments) != len(inputs.arguments):
+        try:
+            parameters = list(inspect.signature(inner).parameters.values())
+        except (TypeError, ValueError):
+            parameters = []
+        positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        arguments = [p.name for p in parameters if p.kind in positional]
+    names = []
+    for place, argument in enumerate(inputs.arguments):
+        x = inputs.aleatory[argument] if isinstance(argument, int) else argument
+        by_place = arguments[place] if place < len(arguments) else f"input {place + 1}"
+        names.append(str(getattr(x, "name", None) or by_place))
+    return names
+
+
 def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
     """Return a name of each aleatory input: of its distribution, or the response's argument."""
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):
-        parameters = []
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    arguments = [p.name for p in parameters if p.kind in positional]
-    names = []
-    for position, x in enumerate(inputs.aleatory):
-        place = inputs.arguments.index(position)
-        argument = arguments[place] if place < len(arguments) else f"input {place + 1}"
-        names.append(str(x.name or argument))
-    return names
+    names = argument_names(inputs, function)
+    return [names[inputs.arguments.index(position)] for position in range(len(inputs.aleatory))]
 
 
 def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._validate import Floats, real_array
+from prbayes._validate import Floats, first_text, real_array, unmasked
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,14 @@ class Outputs:
         """The labels as text."""
         return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
 
-    def by_key(self, values: Floats) -> dict[str, Floats]:
-        """Return outputs in the last axis, (..., m), as a mapping with the response's keys."""
+    def by_key(self, values: Floats) -> Any:
+        """Return outputs in the last axis, (..., m), as a mapping with the response's keys.
+
+        Outputs whose labels are numbers are a DataArray.
+        """
+        if not self.keys:
+            dims = [*(f"dim_{i}" for i in range(values.ndim - 1)), self.dim]
+            return xr.DataArray(values, dims=dims, coords={self.dim: list(self.labels)})
         arrays = {}
         start = 0
         for key, size in self.keys:
@@ -59,16 +66,116 @@ class Outputs:
             )
         columns = []
         for key, size in self.keys:
-            column = np.asarray(result[key])
+            column = np.asarray(unmasked(result[key]))
             columns.append(column[..., None] if size is None else column)
-        return np.concatenate(columns, axis=-1)
+        values = np.concatenate(columns, axis=-1)
+        return values if self.labels else values[..., 0]
+
+    def ordered(self, result: Any, batch_ndim: int) -> Any:
+        """Return a response with its outputs in this order; other labels are a KeyError.
+
+        Labels are the coordinate of a DataArray, the columns of a DataFrame, and the index of a
+        Series of one specimen. Values without labels keep their order.
+        """
+        if hasattr(result, "columns") and not self.labels and result.shape[-1] == 1:
+            column, values = result.columns[0], result.iloc[:, 0]
+            return self.assembled({column: values}) if self.keys and column != 0 else values
+        axis = output_axis(result, batch_ndim, self)
+        if axis is None or not self.labels:
+            return result
+        values = np.moveaxis(np.asarray(result), axis, -1)
+        order = output_order(labels_along(result, axis), self.labels, "the response returned")
+        return values if order is None else values[..., order]
 
 
 SINGLE_OUTPUT = Outputs()
 
 
-def outputs_of_result(result: Mapping[str, Any], batch_ndim: int) -> Outputs:
-    """Return the outputs that a response's mapping has."""
+def relabelled(values: Any, like: Any) -> Any:
+    """Return values with the labels of a Series, DataFrame, DataArray or named tuple."""
+    if hasattr(like, "_fields"):
+        return type(like)(*values)
+    if np.shape(values) != getattr(like, "shape", None) or not np.ndim(values):
+        return values
+    if hasattr(like, "dims") and hasattr(like, "coords"):
+        return like.copy(data=values)
+    if not hasattr(like, "iloc"):
+        return values
+    columns = {"columns": like.columns} if hasattr(like, "columns") else {}
+    return type(like)(values, index=like.index, **columns)
+
+
+def output_order(
+    labels: Sequence[Any], expected: Sequence[Any], found: str
+) -> NDArray[np.intp] | None:
+    """Return the places of the expected labels; None if they are equal, or one side has none.
+
+    Numbers are equal up to rounding. Other labels than the expected ones are a KeyError.
+    """
+    default = tuple(range(len(expected)))
+    labels, expected = tuple(labels), tuple(expected)
+    if len(labels) != len(expected) or labels == expected or default in (labels, expected):
+        return None
+    numbers = [np.asarray(side) for side in (labels, expected)]
+    if all(side.dtype.kind in "iuf" for side in numbers):
+        order, rank = np.argsort(numbers[0]), np.argsort(np.argsort(numbers[1]))
+        if np.allclose(numbers[0][order], np.sort(numbers[1]), rtol=1e-9, atol=0):
+            return np.asarray(order[rank])
+    elif set(labels) == set(expected) and len(set(labels)) == len(labels):
+        return np.array([labels.index(label) for label in expected], dtype=np.intp)
+    raise KeyError(
+        f"{found} the outputs {list(labels)}, expected {list(expected)}, each once, in any order"
+    )
+
+
+def labels_along(result: Any, axis: int) -> tuple[Any, ...]:
+    """Return the labels of a labelled array along an axis; numbers from 0 where it has none."""
+    if hasattr(result, "dims"):
+        dim = result.dims[axis]
+        values = result.coords[dim].values if dim in result.coords else range(result.shape[axis])
+    else:
+        values = result.columns if hasattr(result, "columns") else result.index
+    return tuple(np.asarray(values).tolist())
+
+
+def output_axis(result: Any, batch_ndim: int, outputs: Outputs | None) -> int | None:
+    """Return the axis of the outputs of a labelled array, None of other results.
+
+    Also raises a KeyError if the specimens are in another order.
+    """
+    axis = batch_ndim
+    if hasattr(result, "dims") and hasattr(result, "coords"):
+        dims = list(result.dims)
+        axis = dims.index(outputs.dim) if outputs and outputs.dim in dims else len(dims) - 1
+        places = [i for i in range(result.ndim) if i != axis or result.ndim <= batch_ndim]
+        indices = [np.asarray(labels_along(result, i)) for i in places]
+    elif hasattr(result, "iloc"):
+        indices = [np.asarray(result.index)] if batch_ndim else []
+    else:
+        return None
+    for index in indices:
+        in_order = np.arange(index.size)
+        is_permuted = not np.array_equal(index, in_order)
+        if index.dtype.kind in "iu" and is_permuted and np.array_equal(np.sort(index), in_order):
+            raise KeyError(
+                "the response returned labels of specimens in another order than the inputs, "
+                "expected theirs; sort the response by its index"
+            )
+    return axis if result.ndim > batch_ndim else None
+
+
+def outputs_of_result(result: Any, batch_ndim: int) -> Outputs | None:
+    """Return the outputs that a response's mapping or labelled array has, None without labels."""
+    if not isinstance(result, Mapping):
+        axis = output_axis(result, batch_ndim, None)
+        if axis is None:
+            return None
+        labels = labels_along(result, axis)
+        if labels == tuple(range(len(labels))):
+            return None
+        dim = str(result.dims[axis]) if hasattr(result, "dims") else "output"
+        are_names = all(isinstance(label, str) for label in labels)
+        return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else ())
     keys: list[tuple[str, int | None]] = []
     for key, column in result.items():
         array = np.asarray(column)
@@ -92,23 +199,28 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     if hasattr(observed, "columns") and hasattr(observed, "dtypes"):
         # Columns that are no numbers, such as names of groups.
         texts = []
+        first = ""
         for place, (column, kind) in enumerate(zip(observed, observed.dtypes, strict=True)):
-            if kind.kind not in "biufO" or any(isinstance(v, str) for v in observed.iloc[:, place]):
+            numbers = np.asarray(observed.iloc[:, place])
+            if kind.kind not in "biufO" or any(isinstance(v, str) for v in numbers):
                 texts.append(column)
+                first = first or first_text(numbers)
         if texts:
             raise TypeError(
-                f"{label}: got a DataFrame whose columns {texts} are no numbers, expected a "
+                f"{label}: got a DataFrame whose columns {texts} are no numbers "
+                f"({first or 'but other objects'}), expected a "
                 "column of measured responses for each output; leave others out, as in "
                 "df['life'], and where one names groups, such as suppliers, index hyperparameters "
                 f"by prb.response.group({str(texts[0])!r})"
             )
-    if np.ma.is_masked(observed) and np.ndim(observed) == 2:
-        observed = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
-    values = observed if np.ma.is_masked(observed) else real_array(observed, label)
+    values = real_array(observed, label)
     if np.ndim(values) == 2:
         if not values.shape[1]:
             raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
-        return values, _labelled_columns(observed, values.shape[1])
+        outputs = _labelled_columns(observed, values.shape[1])
+        if hasattr(observed, "columns") and values.shape[1] == 1:
+            return values[:, 0], Outputs(keys=outputs.keys)
+        return values, outputs
     unit = getattr(observed, "attrs", {}).get("units") if hasattr(observed, "dims") else None
     return values, Outputs(units=(str(unit),)) if unit else SINGLE_OUTPUT
 
@@ -135,11 +247,40 @@ def _labelled_columns(observed: Any, m: int) -> Outputs:
     return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else (), units)
 
 
+def in_order_of(values: Any, observed: Any, name: str) -> Any:
+    """Return values of specimens in the order of the observed ones, where both have an index.
+
+    An index 0, 1, ... is none, unless the other is another order of it. Raises a ValueError if the
+    labels of both are different.
+    """
+    index, expected = specimen_index(values), specimen_index(observed)
+    if index is None or expected is None or len(index) != len(expected) or index.equals(expected):
+        return values
+    if index.is_unique and expected.is_unique and set(index) == set(expected):
+        return np.asarray(values)[index.get_indexer(expected)]
+    in_order = np.arange(len(index))
+    if np.array_equal(index, in_order) or np.array_equal(expected, in_order):
+        return values
+    raise ValueError(
+        f"{name}: got values with the index {list(index[:3])}, ..., expected that of observed, "
+        f"{list(expected[:3])}, ...; where the order is the same, pass values.to_numpy()"
+    )
+
+
+def specimen_index(values: Any) -> Any:
+    """Return the index of the specimens of a Series, DataFrame or DataArray, None of others."""
+    if hasattr(values, "dims") and hasattr(values, "indexes"):
+        return values.indexes.get(values.dims[0]) if values.dims else None
+    return values.index if hasattr(values, "iloc") else None
+
+
 def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:
     columns, keys = [], []
+    first = next(iter(observed.values()), None)
     for key, column in observed.items():
         if not isinstance(key, str):
             raise TypeError(f"{label}: got the key {key!r:.60}, expected names of outputs")
+        column = in_order_of(column, first, f"{label}[{key!r}]")
         values = real_array(column, f"{label}[{key!r}]")
         if values.ndim not in (1, 2):
             raise ValueError(

@@ -17,11 +17,22 @@ from pytensor.graph.basic import Variable
 from prbayes._finding import report
 from prbayes._validate import Floats, called, executes, folder_path
 from prbayes.response.budget import budget
-from prbayes.response.call import CallSettings, Points, Tally, checked, respond, scalar, shapes
+from prbayes.response.call import (
+    PER_SPECIMEN,
+    CallSettings,
+    Points,
+    Tally,
+    array_advice,
+    checked,
+    column_names,
+    respond,
+    scalar,
+    shapes,
+)
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, Replace, ResponseError
-from prbayes.response.inputs import Inputs, broadcast_batch
+from prbayes.response.inputs import Inputs, argument_names, broadcast_batch
 from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 from prbayes.response.store import Store
 
@@ -125,7 +136,7 @@ class Responses:
             n_outputs = None
             if outputs is not None:
                 n_outputs = max(1, len(outputs.labels))
-                if version is not None and outputs.keys:
+                if version is not None and outputs.keys and outputs.labels:
                     # In another order they are other numbers.
                     version = f"{version} ({', '.join(outputs.names)})"
             database = Store(
@@ -151,8 +162,9 @@ class Responses:
         self.runs = Runs()
         self._checks_batches = self.is_batched
         self._n_reused = 0
+        columns = column_names(argument_names(inputs, function), inputs.sizes)
         self._settings = CallSettings(
-            name, function, executor, database, policy, retry_failed, timeout, outputs
+            name, function, executor, database, policy, retry_failed, timeout, outputs, columns
         )
         self._tally = Tally()
 
@@ -287,7 +299,7 @@ class Responses:
             raise ResponseError(
                 f"{self.name}: the response raised {type(error).__name__}: {error}; it was called "
                 f"with inputs of shapes {shapes(arguments)} and is expected to take arrays of any "
-                "leading shape, or to be wrapped in prb.scalar"
+                f"leading shape, or to be wrapped in prb.scalar{array_advice(str(error))}"
             ) from error
         self.count += size
         try:
@@ -319,7 +331,8 @@ class Responses:
             again = self._called([x.copy() for x in specimen], (1,), is_run=False).ravel()
             if (np.abs(again - single) > 1e-6 * np.abs(single)).any():
                 return
-        except ResponseError:  # it takes no batch of one
+        except ResponseError as error:  # it takes no batch of one
+            self._refuse_one_size(values, batch, error)
             return
         worst = int(np.nanargmax(np.abs(rows[first] - single)))
         raise ResponseError(
@@ -328,6 +341,25 @@ class Responses:
             "expected the same; look for a mean, a sum, a sort or another order over the axis of "
             "specimens, or write it for one specimen, in prb.scalar"
         )
+
+    def _refuse_one_size(
+        self, values: Sequence[Floats], batch: tuple[int, ...], error: ResponseError
+    ) -> None:
+        """Raise if the response takes no other number of specimens than that of its batch.
+
+        An array of as many values inside it would be paired with points of the population.
+        """
+        size = int(np.prod(batch, dtype=int))
+        few = (*[1] * (len(batch) - 1), 3 if size == 2 else 2)
+        rows = np.arange(few[-1]) % size
+        specimens = [v.reshape(size, *v.shape[len(batch) :])[rows] for v in values]
+        try:
+            self._called([x.reshape(few + x.shape[1:]) for x in specimens], few, is_run=False)
+        except ResponseError:
+            raise ResponseError(
+                f"{self.name}: the response takes {size} specimens, and neither one nor "
+                f"{few[-1]}, expected any number; {PER_SPECIMEN} ({str(error).split(';')[0]})"
+            ) from None
 
 
 def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:

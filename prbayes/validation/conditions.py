@@ -21,7 +21,7 @@ from prbayes.metrics.base import Projection
 from prbayes.metrics.multivariate import directions, failure_caps, sufficient_directions
 from prbayes.metrics.whitening import whitening
 from prbayes.model.fingerprint import Identity, Level, from_attributes, require_together
-from prbayes.response.outputs import read_observed
+from prbayes.response.outputs import in_order_of, output_order, read_observed
 from prbayes.results.predict import specimen_names
 
 Predicted = xr.DataArray | NDArray[Any]
@@ -148,6 +148,7 @@ def read_case(
         y = _measured(name, measured, simulated)
         names: tuple[str, ...] | None = None
         if labels is not None:
+            labels = in_order_of(labels, measured, f"{name}: specimens")
             names = tuple(specimen_names(sample_labels(labels, len(y), f"{name}: specimens")))
         # Without labels every value is of another specimen.
         keys = [(name, i) for i in range(len(y))] if names is None else names
@@ -270,16 +271,12 @@ def _measured(name: str, values: Any, simulated: Any) -> Floats:
     dims = [dim for dim in simulated.dims if dim not in _SAMPLE_DIMS]
     if len(dims) != 1 or dims[0] not in simulated.coords:
         return y
-    default = tuple(range(len(outputs.labels)))
-    labels = tuple(simulated.coords[dims[0]].values.tolist())
-    if labels == outputs.labels or default in (labels, outputs.labels):
-        return y
-    if set(labels) != set(outputs.labels):
-        raise ValueError(
-            f"{name}: observed: got the outputs {list(outputs.labels)}, expected {list(labels)}, "
-            "those of predicted"
-        )
-    return y[:, [outputs.labels.index(label) for label in labels]]
+    labels = simulated.coords[dims[0]].values.tolist()
+    try:
+        order = output_order(outputs.labels, labels, f"{name}: observed: got")
+    except KeyError as error:
+        raise ValueError(f"{error.args[0]}: those of predicted") from None
+    return y if order is None else y[:, order]
 
 
 def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 from sklearn.linear_model import Ridge
 
 import prbayes as prb
@@ -55,6 +56,21 @@ def test_multivariate_constant_and_abort_survive_a_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back(v, 2.0), found(v, 2.0))
     with pytest.raises(ValueError, match="outside its design"):
         back(v, 1.0)
+
+
+def test_labels_of_outputs_survive_a_file(tmp_path: Path) -> None:
+    times = [0.3, 0.1]
+
+    def labelled(x: Any, y: Any) -> xr.DataArray:
+        values = np.stack([x, x + y], axis=-1)
+        return xr.DataArray(values, dims=["n", "time"], coords={"time": times})
+
+    found = prb.Surrogate.fit(labelled, BOX, 30)
+    found.save(tmp_path / "s.nc")
+    for surrogate in (found, prb.Surrogate.load(tmp_path / "s.nc")):
+        values = surrogate(X, Y)
+        assert values.coords["time"].values.tolist() == times
+        np.testing.assert_allclose(values.sel(time=0.1), X + Y, atol=1e-6)
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:

@@ -261,8 +261,14 @@ def test_wrong_functions_results_and_weights() -> None:
     ok = [0.0, 1.0, 3.0]
     with pytest.raises(TypeError, match=r"function: got float, expected f\(simulated, observed\)"):
         FunctionMetric(3.0)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"shape \(3,\) .*expected \(\); reduce over"):
+    with pytest.raises(ValueError, match=r"shape \(3,\): .*simulated \(3,\).* shape \(\), a"):
         FunctionMetric(lambda x, z: x)(ok, ok)
+    # One that is written for one population.
+    joined = FunctionMetric(lambda x, z: np.concatenate([x, z]).mean())
+    with pytest.raises(
+        ValueError, match=r"ValueError: all .* got simulated \(2, 3\), observed \(3,"
+    ):
+        joined.against(ok)([ok, ok])
     with pytest.raises(ValueError, match=r"weights: got unequal .*pass weighted=True"):
         FunctionMetric(mean_difference)(ok, ok, weights=[1, 2, 3])
     with pytest.raises(ValueError, match="observed weights: got unequal"):

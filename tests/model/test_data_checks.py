@@ -13,6 +13,7 @@ from prbayes._validate import Floats
 from prbayes.model.data_checks import (
     DataCheckOptions,
     chance_of_repeats,
+    check_constant,
     count_at_ends,
     data_findings,
     identical_specimens,
@@ -20,6 +21,7 @@ from prbayes.model.data_checks import (
     warn_duplicates,
     warn_out_of_range,
 )
+from prbayes.propagation.base import DesignError
 
 
 def rounded(y: Floats, step: float) -> Floats:
@@ -293,6 +295,24 @@ def test_data_beyond_all_responses_are_reported(logged: pytest.LogCaptureFixture
     warn_out_of_range("y", -9.0 - np.abs(MEASURED[:, 0]), SIMULATED[:, 0], [])
     assert "y: got observed values from -" in logged.text
     assert "all below the first 64 responses" in logged.text
+
+
+def test_a_constant_response_is_refused_or_reported(logged: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(DesignError, match=r"y: got 1 for the response at all 64 runs .* check the"):
+        check_constant("y", np.ones(64), [])
+    with pytest.raises(DesignError, match=r"y\[b\]: got 0 for .* at all 40 runs"):
+        check_constant("y", np.stack([SIMULATED[:40, 0], np.zeros(40)], axis=1), ["a", "b"])
+    with pytest.raises(DesignError, match="at all 40 runs"):
+        check_constant("y", np.where(np.arange(64) < 40, 5.0, np.nan), [])
+    assert not logged.records
+    check_constant("y", np.ones(16), [])  # counts may be equal by chance
+    assert [record.code for record in logged.records] == ["constant-response"]  # type: ignore[attr-defined]
+    logged.clear()
+    check_constant("y", SIMULATED, ["a", "b"])
+    check_constant("y", 1 + 1e-6 * SIMULATED[:, 0], [])
+    check_constant("y", np.where(np.arange(64) < 40, 5.0, np.inf), [])  # data may be failures
+    check_constant("y", np.empty(0), [])
+    assert not logged.records
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from typing import Any
 
 import arviz as az
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 from first_use import first_use
@@ -21,7 +22,7 @@ from scipy import stats
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.random_variable import Node
+from prbayes.model.random_variable import Node, simulators
 from prbayes.propagation.base import Propagation
 from prbayes.response.compile import PLAIN
 
@@ -414,3 +415,49 @@ def test_another_constant_is_another_run() -> None:
     populations = [evaluator.populations(theta, k) for k in range(2)]
     means = [(values * weights).sum() for values, weights in populations]
     assert means[1] == pytest.approx(3 * means[0], rel=1e-9)
+
+
+def test_functions_of_a_wrong_shape_are_refused_before_any_run() -> None:
+    def refused(metric: Any, match: str, observed: Any = Y) -> None:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+            with pytest.raises(ValueError, match=match):
+                prb.Simulator("y", np.positive, x, metric=metric, observed=observed)
+        assert "y" not in model.named_vars
+
+    def scalar(s: Any, o: Any) -> Any:
+        return np.concatenate([s, o]).mean()
+
+    def total(s: Any, o: Any, w: Any = None) -> Any:
+        return abs(s.mean() - o.mean())
+
+    got = r"the function got simulated \(2, 20\), observed \(20,\)"
+    refused(
+        prb.FunctionMetric(scalar), rf"y: FunctionMetric: .*ValueError: all the.*; {got}, expec"
+    )
+    refused(prb.FunctionMetric(total), rf"y: .* result of shape \(\): {got}, expected .* \(2,\)")
+    weighted = prb.FunctionMetric(total, weighted=True)
+    refused(weighted, r"observed \(20,\), weights \(2, 20\), expected")
+    refused(prb.FunctionMetric(lambda s: s.mean(-1)), "raised TypeError: .*takes 1 positional")
+    pair = np.stack([Y, Y**2], axis=1)
+    refused(prb.Joint(prb.FunctionMetric(scalar)), f"ValueError: all the.*{got}", pair)
+
+
+Y = np.random.default_rng(3).normal(1, 0.5, 20)
+
+
+def test_weights_and_specimens_are_matched_by_their_index() -> None:
+    observed = pd.Series(Y, index=[f"s{i}" for i in range(20)])
+    weights = pd.Series(np.arange(1.0, 21), index=observed.index)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+        data = {"metric": prb.KullbackLeibler(), "observed": observed}
+        prb.Simulator("a", np.positive, x, weights=weights[::-1], **data)
+        labels = pd.Series(list(observed.index), index=observed.index)
+        prb.Simulator("b", np.positive, x, specimens=labels[::-1], **data)
+        other = weights.rename(index={"s0": "t0"})
+        with pytest.raises(ValueError, match=r"c: weights: got .*expected that of observed"):
+            prb.Simulator("c", np.positive, x, weights=other, **data)
+    a, b = simulators(model).values()
+    np.testing.assert_allclose(a.target.weights, weights / weights.sum())
+    assert b.specimens.tolist() == list(observed.index)

@@ -17,11 +17,13 @@ from concurrent.futures import (
 )
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
+import xarray as xr
 from first_use import first_use
 
 import prbayes as prb
@@ -38,7 +40,7 @@ from prbayes.response.call import (
 )
 from prbayes.response.executors import has_slipped
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError, Retry
-from prbayes.response.outputs import read_observed
+from prbayes.response.outputs import Outputs, read_observed
 from prbayes.response.store import Store, StoreError
 
 N = 64
@@ -152,7 +154,7 @@ def test_responses_that_are_done_while_the_disk_is_busy_are_stored_together(
     ("seconds", "left", "workers", "alone", "batched"),
     [
         (0.0, 1000, 1, 1, 16),  # nothing is known yet
-        (0.0, 10, 1, 1, 10),
+        (0.0, 10, 1, 1, 3),  # never all at once
         (1e-5, 1000, 1, 1000, 1000),  # all fit into 0.2 s
         (1e-3, 1000, 1, 200, 200),
         (0.02, 1000, 1, 1, 10),
@@ -564,3 +566,147 @@ def test_of_multivariate_inputs_a_call_by_hand_tells_what_to_call() -> None:
         response(np.ones((3, 2)))
     assert "response.function(...)" in caught.value.__notes__[0]
     assert response.function(np.array([1.0, 2.0])) == 3.0
+
+
+NAMED = Outputs(("p", "q"), keys=(("p", None), ("q", None)))
+PAIRS = np.array([[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]])
+BEHIND = np.array([1.0, 9.97e36, 3.0])
+MASKED = np.ma.masked_array(BEHIND, [0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    "result",
+    [
+        MASKED,
+        MASKED.astype(np.float32),
+        np.ma.masked_array([1, 2, 3], [0, 1, 0]),
+        list(MASKED),  # with np.ma.masked among numbers
+        MASKED.reshape(1, 3)[0],
+    ],
+)
+def test_a_masked_number_is_no_response(result: Any) -> None:
+    values, _ = checked(result, (3,), ())
+    np.testing.assert_array_equal(values, [1.0, np.nan, 3.0])
+
+
+def test_masks_of_one_output_and_of_one_specimen() -> None:
+    expected = PAIRS.copy()
+    expected[1] = np.nan
+    for result in (
+        {"q": PAIRS[:, 1], "p": np.ma.masked_array(PAIRS[:, 0], [0, 1, 0])},
+        np.ma.masked_array(PAIRS, [[0, 0], [1, 0], [0, 0]]),
+    ):
+        np.testing.assert_array_equal(checked(result, (3,), (), NAMED)[0], expected)
+    rows = [np.ma.masked_array(row, [row[0] == 2.0, False]) for row in PAIRS]
+    np.testing.assert_array_equal(checked(rows, (3,), (), NAMED)[0], expected)
+    response = prb.scalar(lambda x: np.ma.masked_array(x, mask=x > 2))
+    np.testing.assert_array_equal(response(np.array([1.0, 3.0])), [1.0, np.nan])
+    response = prb.scalar(lambda x: [x, np.ma.masked] if x > 2 else [x, x])
+    np.testing.assert_array_equal(response(np.array([1.0, 3.0]))[:, 0], [1.0, np.nan])
+    whole = np.ma.masked_array([1.0, 2.0, 3.0])  # as netCDF4 returns arrays without a mask
+    np.testing.assert_array_equal(checked(whole, (3,), ())[0], [1.0, 2.0, 3.0])
+
+
+def test_minus_infinity_is_refused_in_all_kinds_of_responses() -> None:
+    match = "response returned -inf 1 times in . values, expected numbers, NaN .*logarithm of 0"
+    low = np.array([0.0, -np.inf, np.inf])
+    for result, outputs in (
+        (low, Outputs()),
+        ({"p": low, "q": np.ones(3)}, NAMED),
+        (pd.DataFrame({"p": low, "q": np.ones(3)}), NAMED),
+    ):
+        with pytest.raises(ResponseError, match=match):
+            checked(result, (3,), (), outputs)
+    with pytest.raises(ResponseError, match="y: the response returned -inf"):
+        model(lambda x, a: np.where(x < 1, -np.inf, x))
+    with pytest.raises(ResponseError, match=r"inputs \(x = .*, a = 2\): it returned -inf, exp"):
+        model(prb.scalar(lambda x, a: -math.inf if x < 1 else x))
+    # NaN in another output: there is no response.
+    rows = checked([[np.nan, -np.inf], [1.0, 2.0]], (2,), (), NAMED)[0]
+    np.testing.assert_array_equal(rows, [[np.nan, np.nan], [1.0, 2.0]])
+
+
+@pytest.mark.parametrize(
+    "result",
+    [
+        xr.DataArray(PAIRS[:, ::-1], dims=["n", "out"], coords={"out": ["q", "p"]}),
+        xr.DataArray(PAIRS.T, dims=["output", "n"], coords={"output": ["p", "q"]}),
+        pd.DataFrame({"q": PAIRS[:, 1], "p": PAIRS[:, 0]}),
+        xr.Dataset({"q": ("n", PAIRS[:, 1]), "p": ("n", PAIRS[:, 0])}),
+        xr.DataArray(PAIRS, dims=["n", "out"]),  # without labels
+        pd.DataFrame(PAIRS),
+    ],
+)
+def test_outputs_are_matched_by_their_labels(result: Any) -> None:
+    np.testing.assert_array_equal(checked(result, (3,), (), NAMED)[0], PAIRS)
+
+
+def test_labels_of_one_specimen_of_curves_and_of_predictions() -> None:
+    for function in (
+        lambda x: pd.Series({"q": 10 * x, "p": x}),
+        lambda x: Reversed(q=10 * x, p=x),
+        lambda x: xr.DataArray([10 * x, x], dims="out", coords={"out": ["q", "p"]}),
+    ):
+        points = Points([PAIRS[:, 0]], [True])
+        chunk = compute(prb.scalar(function), points, True, outputs=NAMED)
+        np.testing.assert_array_equal(chunk.values, PAIRS)
+        # Without observed outputs the labels are those of the response.
+        chunk = compute(prb.scalar(function), points, True, outputs=None)
+        assert chunk.named is not None
+        assert chunk.named.labels == ("q", "p")
+        np.testing.assert_array_equal(chunk.values, PAIRS[:, ::-1])
+    curve = Outputs((0.1, 0.3), "time")
+    result = xr.DataArray(PAIRS, dims=["n", "time"], coords={"time": [0.1 * 3, 0.1]})
+    np.testing.assert_array_equal(checked(result, (3,), (), curve)[0], PAIRS[:, ::-1])
+    _, named = checked(result, (3,), (), None)
+    assert named == Outputs((0.1 * 3, 0.1), "time")
+    again = named.by_key(PAIRS)
+    np.testing.assert_array_equal(checked(again, (3,), (), curve)[0], PAIRS[:, ::-1])
+
+
+class Reversed(NamedTuple):
+    q: float
+    p: float
+
+
+@pytest.mark.parametrize(
+    ("result", "match"),
+    [
+        (pd.DataFrame(PAIRS, columns=["p", "r"]), r"outputs \['p', 'r'\], expected \['p', 'q'\]"),
+        (pd.DataFrame(PAIRS, columns=["p", "p"]), r"outputs \['p', 'p'\], expected"),
+        (
+            xr.DataArray(PAIRS, dims=["n", "out"], coords={"out": ["a", "b"]}),
+            r"outputs \['a', 'b'\], expected \['p', 'q'\], each once, in any order",
+        ),
+        (pd.DataFrame(PAIRS, columns=["p", "q"], index=[2, 0, 1]), "in another order than the in"),
+        (
+            xr.DataArray(PAIRS, dims=["n", "out"], coords={"n": [1, 0, 2]}),
+            "specimens in another order than the inputs, .*sort the response by its index",
+        ),
+    ],
+)
+def test_other_labels_than_the_observed_ones_are_refused(result: Any, match: str) -> None:
+    with pytest.raises(ResponseError, match=f"the response returned .*{match}"):
+        checked(result, (3,), (), NAMED)
+
+
+def test_a_series_of_specimens_is_in_their_order() -> None:
+    sorted_values = pd.Series([3.0, 1.0, 2.0]).sort_values()
+    with pytest.raises(ResponseError, match="in another order than the inputs"):
+        checked(sorted_values, (3,), ())
+    dates = pd.Series([3.0, 1.0, 2.0], index=pd.date_range("2020-01-01", periods=3))
+    assert checked(dates, (3,), ())[0].tolist() == [3.0, 1.0, 2.0]
+
+
+def test_one_column_is_one_output() -> None:
+    observed, outputs = read_observed("y", pd.DataFrame({"f": [1.0, 2.0, 3.0]}))
+    assert observed.tolist() == [1.0, 2.0, 3.0]
+    for result in (
+        {"f": observed},
+        pd.DataFrame({"f": observed}),
+        pd.DataFrame(observed),
+        observed,
+    ):
+        assert checked(result, (3,), (), outputs)[0].tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(ResponseError, match=r"the keys \['g'\], expected \['f'\]"):
+        checked(pd.DataFrame({"g": observed}), (3,), (), outputs)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import prbayes as prb
@@ -116,6 +117,17 @@ def test_a_run_has_several_outputs_as_an_array_or_by_name() -> None:
     assert found.pop("twice").tolist() == [6.0, 2.0]
     assert found == {"one": 2.0}
     assert type(found["one"]) is float
+
+    # A Series keeps its labels, and a masked number is no response.
+    def row(folder: Path) -> pd.Series:
+        return pd.Series(both(folder), index=["x", "thrice"])
+
+    labelled = prb.command([*PYTHON, code], read=row, **settings)
+    assert labelled.function(2.0).to_dict() == {"x": 2.0, "thrice": 6.0}
+    masked = prb.command(
+        [*PYTHON, code], read=lambda folder: np.ma.masked_greater(both(folder), 5), **settings
+    )
+    np.testing.assert_array_equal(masked.function(2.0), [2.0, np.nan])
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,19 @@ def test_each_output_has_its_condition(batch: tuple[int, ...]) -> None:
         np.testing.assert_allclose(found[..., i], x * time + b * (time - 1) / 3)
 
 
+def test_labels_and_masks_of_the_response_are_kept() -> None:
+    def labelled(x: Any) -> xr.DataArray:
+        return xr.DataArray(curve(x), dims=["n", "time"], coords={"time": TIMES})
+
+    x, b = np.random.default_rng(2).normal(size=(2, 6))
+    expected = prb.response.Additive(TIMES).of(curve, TIMES)(x, b)
+    found = prb.response.Additive(TIMES).of(labelled, TIMES)(x, b)
+    assert found.coords["time"].values.tolist() == list(TIMES)
+    np.testing.assert_array_equal(found, expected)
+    one = prb.response.Additive([0.0, 2.0]).of(lambda x: np.ma.masked_greater(x, 0), 1.0)(x, b)
+    np.testing.assert_array_equal(np.isnan(one), x > 0)
+
+
 @pytest.mark.parametrize("batch", [(), (6,), (4, 6)])
 def test_several_coefficients_are_the_last_axis(batch: tuple[int, ...]) -> None:
     rng = np.random.default_rng(3)

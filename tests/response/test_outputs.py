@@ -8,9 +8,11 @@ import xarray as xr
 from prbayes.response.outputs import (
     SINGLE_OUTPUT,
     Outputs,
+    in_order_of,
     is_missing,
     outputs_of_result,
     read_observed,
+    relabelled,
 )
 
 TABLE = np.arange(6.0).reshape(3, 2)
@@ -37,8 +39,8 @@ def test_a_column_of_no_numbers_is_named(names):
         read_observed("y", table)
     # Numbers may be objects.
     values, outputs = read_observed("y", table[["life"]].astype(object))
-    assert values.tolist() == [[1.0], [2.0]]
-    assert outputs.labels == ("life",)
+    assert values.tolist() == [1.0, 2.0]
+    assert (outputs.event, outputs.keys) == ((), (("life", None),))
 
 
 def test_a_data_array_tells_labels_and_units():
@@ -77,3 +79,52 @@ def test_mappings_of_something_else_are_refused(observed, expected):
 def test_a_point_lacks_a_response_where_one_output_is_missing():
     assert is_missing(np.array([1.0, np.nan])).tolist() == [False, True]
     assert is_missing(np.array([[1.0, np.inf], [np.nan, 2.0]])).tolist() == [False, True]
+
+
+def test_values_of_specimens_are_matched_by_their_index():
+    observed = pd.Series([10.0, 20.0, 30.0], index=["a", "b", "c"])
+    other = pd.Series([3.0, 1.0, 2.0], index=["c", "a", "b"])
+    assert in_order_of(other, observed, "w").tolist() == [1.0, 2.0, 3.0]
+    array = xr.DataArray([3.0, 1.0, 2.0], dims="i", coords={"i": ["c", "a", "b"]})
+    assert in_order_of(array, observed, "w").tolist() == [1.0, 2.0, 3.0]
+    for plain in ([3.0, 1.0, 2.0], pd.Series([3.0, 1.0, 2.0]), None):  # without labels
+        assert in_order_of(plain, observed, "w") is plain
+    moved = pd.Series([10.0, 20.0, 30.0], index=[1, 2, 0])
+    assert in_order_of(pd.Series([0.0, 1.0, 2.0]), moved, "w").tolist() == [1.0, 2.0, 0.0]
+    with pytest.raises(ValueError, match=r"w: got .* \['x', .*expected .* \['a', .*to_numpy\(\)"):
+        in_order_of(pd.Series([1.0, 2.0, 3.0], index=["x", "b", "c"]), observed, "w")
+    values, _ = read_observed("y", {"p": observed, "q": other})
+    assert values.tolist() == [[10.0, 1.0], [20.0, 2.0], [30.0, 3.0]]
+
+
+@pytest.mark.parametrize(
+    ("observed", "match"),
+    [
+        (
+            ["9.1", "9,81", "8.3"],
+            "dtype <U4, expected real numbers; the value at index 1 is .*'9,81'",
+        ),
+        (pd.Series([9.1, "n/a"]), "the value at index 1 is the text 'n/a'"),
+        (["9.1", "8.3"], "the value at index 0 is the text '9.1'"),
+        (pd.DataFrame({"f": ["9.1", "9,81"]}), r"columns \['f'\] .*index 1 is the text '9,81'"),
+        (
+            {"f": np.array(["1", "?"])},
+            r"observed\['f'\]: got .* the value at index 1 is the text '\?'",
+        ),
+    ],
+)
+def test_the_first_text_that_is_no_number_is_named(observed, match):
+    with pytest.raises(TypeError, match=match):
+        read_observed("y", observed)
+
+
+def test_labels_are_kept_where_values_change():
+    series = pd.Series([1.0, 2.0], index=["q", "p"])
+    assert relabelled(np.array([3.0, 4.0]), series).to_dict() == {"q": 3.0, "p": 4.0}
+    frame = pd.DataFrame(TABLE, columns=["q", "p"])
+    assert relabelled(2 * TABLE, frame).equals(2 * frame)
+    array = xr.DataArray([1.0, 2.0], dims="out", coords={"out": ["q", "p"]})
+    assert relabelled(np.array([3.0, 4.0]), array).sel(out="p") == 4.0
+    # Of another shape, and without labels.
+    assert relabelled(TABLE, array) is TABLE
+    assert relabelled(TABLE, TABLE + 1) is TABLE

@@ -8,6 +8,7 @@ from typing import Any
 
 import numba
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
@@ -17,6 +18,7 @@ from prbayes.model.random_variable import nodes
 from prbayes.response.call import scalar
 from prbayes.response.failures import Abort, Replace, ResponseError
 from prbayes.response.inputs import Inputs, read_inputs
+from prbayes.response.outputs import read_observed
 from prbayes.response.response import (
     Responses,
     deduplicated_responses,
@@ -107,7 +109,7 @@ def test_mistakes_are_named() -> None:
     with pytest.raises(ResponseError, match=r"shape \(3,\) .* \(2, 3\), expected \(2, 3\)"):
         call(lambda x: x[0])
     with pytest.raises(
-        ResponseError, match=r"y: .*returned shape \(2,\) .* \(6,\), expected \(6,\)"
+        ResponseError, match=r"y: .*returned shape \(2,\) .* \(4,\), expected \(4,\)"
     ):
         call(lambda x: x[:2], on_failure=Replace())
     with pytest.raises(
@@ -326,3 +328,72 @@ def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinemen
     np.testing.assert_array_equal(
         node.reweighted.design.sample.values, 2.0 * node.reweighted.design.runs.points[0]
     )
+
+
+LOAD = np.linspace(2.0, 0.5, 40)
+
+
+@pytest.mark.parametrize(
+    ("function", "constants"),
+    [
+        (lambda x, load: x * load, [LOAD]),
+        (lambda x, load: x * load, [LOAD.tolist()]),
+        (lambda x: x * LOAD, []),
+        (lambda x: x * pd.Series(LOAD), []),
+        (lambda x: np.where(LOAD > 1, x, 2 * x), []),
+    ],
+)
+def test_an_array_of_values_of_specimens_is_no_population(
+    function: Any, constants: list[Any]
+) -> None:
+    given = inputs(X, *constants)
+    x = np.linspace(1, 2, 40)
+    advice = "known for each specimen, such as its load, is no constant: make it an input"
+    with pytest.raises(
+        ResponseError, match=f"takes 40 specimens, and neither one nor 2, .*{advice}"
+    ):
+        Responses("y", function, given)([x], [])
+    for batch in (np.stack([x, x]), np.ones(64)):
+        with pytest.raises(ResponseError, match=advice):
+            Responses("y", function, given)([batch], [])
+    with pytest.raises(ResponseError, match=advice):
+        Responses("y", function, given, on_failure=Replace())([x], [])
+    with pytest.raises(ResponseError, match=advice):
+        Responses("y", scalar(function), given)([x], [])
+
+
+def test_an_array_of_two_values_and_one_inside_a_mapping_are_refused() -> None:
+    with pytest.raises(ResponseError, match="takes 2 specimens, and neither one nor 3"):
+        Responses("y", lambda x: x * LOAD[:2], inputs(X))([np.array([1.0, 2.0])], [])
+    _, outputs = read_observed("y", {"y": LOAD, "load": LOAD})
+    with pytest.raises(ResponseError, match="takes 40 specimens, and neither one nor 2"):
+        Responses("y", lambda x: {"y": x * LOAD, "load": LOAD}, inputs(X), outputs=outputs)(
+            [LOAD], []
+        )
+
+
+def test_constant_arrays_that_are_no_specimens_are_taken() -> None:
+    x = np.linspace(1, 2, 40)
+    _, outputs = read_observed("y", np.ones((40, 40)))
+    curve = Responses("y", lambda x, t: x[..., None] * t, inputs(X, LOAD), outputs=outputs)
+    np.testing.assert_array_equal(curve([x], []), x[:, None] * LOAD)
+    total = Responses("y", lambda x, t: (x[..., None] * t).sum(axis=-1), inputs(X, LOAD))
+    np.testing.assert_allclose(total([x], []), x * LOAD.sum())
+    one = Responses("y", lambda x, t: x * t, inputs(X, [2.0]))
+    np.testing.assert_array_equal(one([x], []), 2 * x)
+
+
+def test_a_failed_point_has_the_names_of_its_inputs() -> None:
+    def root(E: float, t: float, load: float) -> float:
+        raise ArithmeticError("no root")
+
+    match = r"the first with inputs \(E = 84.3, t = 1.98, load = 2\): it raised ArithmeticError"
+    named = inputs(X, pm.Normal.dist(MU, 2.0), 2.0)
+    point = [np.array([84.3]), np.array([1.98])]
+    with pytest.raises(ResponseError, match=match):
+        Responses("y", scalar(root), named)(point, [])
+    # A variable has its own name, elements of an array have their index.
+    match = r"inputs \(pair\[0\] = 1, pair\[1\] = 2, mu = 3\): it"
+    vector = Responses("y", scalar(lambda pair, m: root(*pair, m)), inputs(PAIR, MU))
+    with pytest.raises(ResponseError, match=match):
+        vector([np.array([[1.0, 2.0]])], [np.array([3.0])])

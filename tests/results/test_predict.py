@@ -329,3 +329,36 @@ def test_names_of_a_function_of_one_specimen_are_kept(workers: int) -> None:
     other_keys = prb.scalar(lambda x: {"a": x, "b": x} if x > 1 else {"a": x, "c": x})
     with pytest.raises(ResponseError, match=r"keys \['a', '[bc]'\]"):
         predict(other_keys)
+
+
+def test_labels_of_the_response_are_those_of_the_prediction() -> None:
+    def labelled(x: Any) -> xr.DataArray:
+        dims = [*(f"dim_{i}" for i in range(np.ndim(x))), "out"]
+        values = np.stack([np.exp(x) + 20, x], axis=-1)
+        return xr.DataArray(values, dims=dims, coords={"out": ["q", "p"]})
+
+    y = predict(labelled, n_samples=100)
+    assert y.dims == ("chain", "draw", "sample", "out")
+    assert y.sel(out="p").mean() == pytest.approx(1.0, abs=0.2)
+    data = np.random.default_rng(0).normal(1, 0.5, 10)
+    data = np.stack([data, np.exp(data) + 20], axis=1)
+    fresh = xr.DataArray(data, dims=["specimen", "out"], coords={"out": ["p", "q"]})
+    swapped = fresh.assign_coords(out=["q", "p"])
+    assert prb.area_test(fresh, y, random_seed=1).p_value > 0.01
+    assert prb.area_test(swapped, y, random_seed=1).p_value < 0.01
+    with pytest.raises(ValueError, match=r"got the outputs \['p', 'r'\], expected \['q', 'p'\]"):
+        prb.area_test(fresh.assign_coords(out=["p", "r"]), y)
+    # The simulator has the order of the observed outputs.
+    model, x = build()
+    with model:
+        y = prb.Simulator("z", labelled, x, observed=fresh, metric=prb.Joint(AREA))
+    first_use(model)
+    node = next(node for node in nodes(model).values() if node.name == "z")
+    stored = node.bound.first_responses
+    np.testing.assert_allclose(stored[:, 1], np.exp(stored[:, 0]) + 20)
+
+
+def test_an_array_of_values_of_specimens_is_no_population() -> None:
+    load = np.linspace(1, 2, 100)
+    with pytest.raises(ResponseError, match="takes 600 specimens, and neither one nor 2"):
+        predict(lambda x: x * load, n_samples=100, stored=False)
