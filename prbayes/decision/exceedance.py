@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
-from scipy.special import logsumexp
+from numpy.typing import NDArray
+from scipy.special import logsumexp, ndtr
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, as_json, report
 from prbayes._validate import (
     AT_ONCE,
     Floats,
@@ -25,16 +26,23 @@ from prbayes._validate import (
     share,
 )
 from prbayes.decision.populations import (
+    CentralSpecimens,
     InverseTransform,
     Populations,
     ResponseSample,
     output_column,
+    probability_bounds,
 )
-from prbayes.decision.quantities import Exceedance, interval_grid, interval_values
+from prbayes.decision.quantities import (
+    Exceedance,
+    extreme_places,
+    interval_grid,
+    interval_values,
+)
 from prbayes.model.locking import locked
 from prbayes.model.random_variable import response_name
 from prbayes.optimize.optimum import Optimum
-from prbayes.propagation.base import MAX_LOST, N_BLOCKS, DesignError
+from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.response.response import Responses, refuse_uncallable
 
 
@@ -50,7 +58,7 @@ def exceedance(
     prob: float = 0.89,
     requirement: float | None = None,
     n_draws: int = 2000,
-    points: int = 0,
+    points: int | None = None,
     steps: int = 5,
     executor: Executor | None = None,
     random_seed: Seed = 0,
@@ -61,7 +69,8 @@ def exceedance(
     probability of a new specimen. By default it comes from stored responses, whose number limits
     how small a probability they resolve. With ``points``, importance sampling computes that many
     responses near the limit, for all populations together: probabilities of one in a thousand to
-    one in a million then have an error of some percent.
+    one in a million then have an error of some percent. Where stored responses cannot decide a
+    ``requirement``, this is done without being asked, if it costs no more than the calibration.
 
     Parameters
     ----------
@@ -74,7 +83,7 @@ def exceedance(
         In units of the response.
     *inputs
         As for `predict`. A ``prb.decision.Interval`` among them is a constant known only to lie
-        between two ends: the probability then has bounds.
+        between two ends: the probability then has bounds, which are searched between the ends.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     output : label, optional
@@ -84,13 +93,16 @@ def exceedance(
     prob : float
         Probability of the interval.
     requirement : float, optional
-        Largest acceptable probability. It is met if the whole interval is below it, not met if the
-        whole interval is above it, and else not decided.
+        Largest acceptable probability. It is met if the whole interval, with two standard errors
+        of the computation on both sides, is below it, not met if it is above it, and else not
+        decided. Errors of few events are asymmetric, as those of Poisson counts.
     n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
-    points : int
+    points : int, optional
         Number of responses to compute near the limit, for each point of the intervals; 0, or at
-        least 100. The inputs need inverse distribution functions, and no stored responses.
+        least 100. The inputs need inverse distribution functions, and no stored responses. By
+        default 0; but 1000 if the error of stored responses is above .3 of the distance between
+        ``requirement`` and interval, and the calibration has at least 1000 runs.
     steps : int
         Number of values in each interval, its ends included; at least 2.
     executor : concurrent.futures.Executor, optional
@@ -101,13 +113,17 @@ def exceedance(
     -------
     xarray.Dataset
         ``probability`` of a new specimen; ``lower`` and ``upper``, the equal-tailed interval of
-        the populations' probabilities; ``error``, the standard error of ``probability`` from the
-        points, the emulator and the draws; ``by_draw``, with dimension ``draw``. With intervals
+        the populations' probabilities, all in [0, 1]; ``error``, the standard error of
+        ``probability`` from the points, the emulator and the draws; ``by_draw``, with dimension
+        ``draw``. If no point is beyond the limit, or every point is, ``error`` is one over the
+        effective number of points, and the interval has the bound of that number (three of it at
+        95%). With intervals
         ``probability``, ``error`` and ``by_draw`` have the dimension ``bound``, "lower" and
         "upper"; ``lower`` and ``upper`` are the extremes over all points of the intervals, and the
         attribute ``at`` has the points of the bounds.
-        Attributes: ``prob``, ``responses`` (number computed), ``source``, ``identity``, and with a
-        requirement ``requirement`` and ``verdict``: "met", "not met" or "not decided".
+        Attributes: ``prob``, ``responses`` (number computed), ``source``, ``findings`` (as JSON),
+        ``identity``, and with a requirement ``requirement`` and ``verdict``: "met", "not met" or
+        "not decided".
 
     Raises
     ------
@@ -123,8 +139,9 @@ def exceedance(
     -----
     The error from stored responses is the jackknife over eight blocks of them. It is rather too
     large for one input, whose points divide the population into parts of equal mass. Extremes
-    inside an interval are found among ``steps`` values only. The result of the calibration is the
-    same at all of them: vary a constant that the calibration also used there.
+    inside an interval are searched with 4 to 32 specimens at 32 further values, and from the best
+    of all by halved steps; one that is much narrower is not found. The result of the calibration is
+    the same at all values: vary a constant that the calibration also used there.
 
     References
     ----------
@@ -154,29 +171,43 @@ def exceedance(
     if requirement is not None:
         requirement = share(requirement, "requirement")
     positive_integer(n_draws, "n_draws", minimum=2)
-    positive_integer(points, "points", minimum=0)
-    if 0 < points < 100:  # a tenth of them is a step towards the limit
+    if points is not None:
+        positive_integer(points, "points", minimum=0)
+    if 0 < (points or 0) < 100:  # a tenth of them is a step towards the limit
         raise ValueError(f"points: got {points}, expected 0, or at least 100")
     positive_integer(steps, "steps", minimum=2)
     executes(executor, "executor")
     seed = seed_number(random_seed)
     populations = Populations.of(result, model, n_draws, caller)
-    grid = interval_grid(inputs, steps)
-    estimates = []
-    for place in grid:
-        quantity = Exceedance(response, *place, limit=limit, below=below, output=output)
-        if points:
-            responses = populations.responses(response, place, executor=executor)
-            estimates.append(_rare_probability(populations, responses, quantity, points, seed))
-        else:
-            sample = populations.sample(response, place, output, executor=executor)
-            estimates.append(_stored_probability(sample, quantity))
+    question = _Question(populations, response, limit, below, output, executor, seed)
+    places = interval_grid(inputs, steps)
+    estimates = [question.estimate(place, points) for place in places]
+    n_searched = 0
+    if len(places) > 1:
+        respond = CentralSpecimens(
+            populations, response, output, points or estimates[0].runs, executor
+        )
+        sign = -1.0 if below else 1.0
+        extremes = extreme_places(inputs, places, lambda x: sign * respond(x), [sign * limit])
+        places += extremes
+        estimates += [question.estimate(place, points) for place in extremes]
+        n_searched = respond.count
+    if points is None and requirement is not None:
+        estimates = [
+            question.refined(estimate, place) if estimate.is_unsure(requirement, prob) else estimate
+            for estimate, place in zip(estimates, places, strict=True)
+        ]
     by_draw = np.array([estimate.by_draw for estimate in estimates])
-    low, high = np.quantile(by_draw, [(1 - prob) / 2, (1 + prob) / 2], axis=1)
-    means = by_draw.mean(axis=1)
+    means = np.array([estimate.mean for estimate in estimates])
     errors = np.array([estimate.error for estimate in estimates])
+    low, high = np.transpose([estimate.interval(prob) for estimate in estimates])
     bounds = [int(means.argmin()), int(means.argmax())]
-    _warn_of_large_error(response, means[bounds], errors[bounds], points)
+    verdict = "" if requirement is None else _verdict(estimates, requirement, prob)
+    # Where two standard errors are a factor of two of the probability, about, or would decide.
+    is_rough = np.zeros(len(means), dtype=bool)
+    is_rough[bounds] = errors[bounds] > 0.3 * means[bounds]
+    if requirement is not None and verdict == "not decided":
+        is_rough |= [estimate.is_unsure(requirement, prob, 0.5) for estimate in estimates]
     table = xr.Dataset(
         {
             "probability": ("bound", means[bounds]),
@@ -190,50 +221,116 @@ def exceedance(
             "prob": prob,
             "limit": limit,
             "below": int(below),
-            "responses": sum(estimate.responses for estimate in estimates),
-            "source": estimates[0].source,
+            "responses": n_searched + sum(estimate.responses for estimate in estimates),
+            "source": estimates[bounds[1]].source,
             "random_seed": str(seed),
+            "findings": as_json(report(*_rough_finding(response, estimates, is_rough))),
             **populations.provenance(),
         },
     )
-    if len(grid) == 1:
+    if len(places) == 1:
         table = table.isel(bound=0, drop=True)
     else:
-        table.attrs["at"] = [interval_values(inputs, grid[bound]) for bound in bounds]
+        table.attrs["at"] = [interval_values(inputs, places[bound]) for bound in bounds]
     if requirement is not None:
-        table.attrs |= {"requirement": requirement, "verdict": _verdict(table, requirement)}
+        table.attrs |= {"requirement": requirement, "verdict": verdict}
     return table
 
 
-def _verdict(table: xr.Dataset, requirement: float) -> str:
+def _verdict(estimates: Sequence[_Estimate], requirement: float, prob: float) -> str:
     """Return whether a requirement is met by the whole interval, by none of it, or by a part."""
-    if table["upper"] <= requirement:
+    low, high = np.transpose([estimate.interval_with_error(prob) for estimate in estimates])
+    if high.max() <= requirement:
         return "met"
-    return "not met" if table["lower"] > requirement else "not decided"
+    return "not met" if low.min() > requirement else "not decided"
 
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
     """Probabilities at one point of the intervals."""
 
-    by_draw: Floats  # (k,)
+    by_draw: Floats  # (k,): NaN of populations that do not exist
     error: float
     responses: int  # computed
     source: str
+    runs: int = 0  # stored responses behind it
+    points: int = 0  # near the limit
+
+    @property
+    def mean(self) -> float:
+        """The probability of a new specimen."""
+        return float(np.nanmean(self.by_draw))
+
+    def of_populations(self, prob: float) -> Floats:
+        """Return the interval over populations."""
+        return np.asarray(np.nanquantile(self.by_draw, [(1 - prob) / 2, (1 + prob) / 2]))
+
+    def interval(self, prob: float) -> Floats:
+        """Return the interval over populations; if all or no points count, with its bound."""
+        low, high = self.of_populations(prob)
+        least, most = probability_bounds(self.mean, self.error, (1 - prob) / 2)
+        if self.mean == 1:
+            low = least
+        if self.mean == 0:
+            high = most
+        return np.array([low, high])
+
+    def interval_with_error(self, prob: float) -> Floats:
+        """Return the interval over populations, wider by two standard errors on both sides."""
+        margins = probability_bounds(self.mean, self.error, float(ndtr(-2))) - self.mean
+        return np.asarray(np.clip(self.of_populations(prob) + margins, 0.0, 1.0))
+
+    def is_unsure(self, requirement: float, prob: float, share: float = 0.3) -> bool:
+        """Return whether the error is above a share of the distance of a requirement."""
+        distances = np.abs(self.of_populations(prob) - requirement)
+        return bool(self.error > share * distances.min())
+
+
+@dataclass(frozen=True, eq=False)
+class _Question:
+    """A response beyond a limit, in populations."""
+
+    populations: Populations
+    response: Callable[..., Any]
+    limit: float
+    below: bool
+    output: Any
+    executor: Executor | None
+    seed: int
+
+    def estimate(self, inputs: Sequence[Any], points: int | None) -> _Estimate:
+        """Return the probabilities by new points near the limit, or by stored responses if none."""
+        quantity = Exceedance(
+            self.response, *inputs, limit=self.limit, below=self.below, output=self.output
+        )
+        if points:
+            responses = self.populations.responses(self.response, inputs, executor=self.executor)
+            return _rare_probability(self.populations, responses, quantity, points, self.seed)
+        sample = self.populations.sample(self.response, inputs, self.output, executor=self.executor)
+        return _stored_probability(sample, quantity)
+
+    def refined(self, estimate: _Estimate, inputs: Sequence[Any], points: int = 1000) -> _Estimate:
+        """Return an estimate by new points, if these are no more than the runs behind it.
+
+        Inputs without an inverse distribution function keep the estimate.
+        """
+        if estimate.runs < points:
+            return estimate
+        try:
+            refined = self.estimate(inputs, points)
+        except TypeError:
+            return estimate
+        return replace(refined, responses=estimate.responses + refined.responses)
 
 
 def _stored_probability(sample: ResponseSample, quantity: Exceedance) -> _Estimate:
     """Return the probabilities of each population from stored or emulated responses."""
     by_draw = sample.evaluate(quantity, sample.populations.thetas)
-    by_draw = by_draw[np.isfinite(by_draw)]
-    errors = [
-        _jackknife_error(sample, quantity),
-        _emulator_error(sample, quantity),
-        _error_of_draws(sample.populations, by_draw),
-    ]
+    error = sample.share_error(lambda values: quantity.of_specimen(values, np.nan))
+    error = np.hypot(error, _error_of_draws(sample.populations, by_draw))
     kind = "stored" if sample.emulator is None else "emulated"
     source = f"{kind} responses of {sample.populations.evaluator.simulators[sample.k].name}"
-    return _Estimate(by_draw, float(np.linalg.norm(errors)), sample.responses.count, source)
+    return _Estimate(by_draw, float(error), sample.responses.count, source, sample.n_runs)
 
 
 def _rare_probability(
@@ -268,53 +365,32 @@ def _rare_probability(
             "return +inf for specimens that fail"
         )
     error = np.hypot(event.error, _error_of_draws(populations, event.by_draw))
-    return _Estimate(event.by_draw, float(error), responses.count, "importance points")
+    source = "importance points"
+    return _Estimate(event.by_draw, float(error), responses.count, source, points=points)
 
 
 def _error_of_draws(populations: Populations, by_draw: Floats) -> float:
     """Return the Monte Carlo error of the mean over draws of the posterior, as if independent."""
-    return float(by_draw.std(ddof=1) / np.sqrt(by_draw.size)) if populations.are_draws else 0.0
+    n = np.isfinite(by_draw).sum()
+    return float(np.nanstd(by_draw, ddof=1) / np.sqrt(n)) if populations.are_draws else 0.0
 
 
-def _jackknife_error(sample: ResponseSample, quantity: Exceedance) -> float:
-    """Return the error of the mean probability, by the jackknife over blocks of the points."""
-    is_beyond = quantity.of_specimen(sample.values, np.nan)
-    weights = sample.mean_weights()
-    if not (weights * is_beyond).any():
-        return float(weights.max())  # the contribution of a single point
-    without = []
-    for block in range(N_BLOCKS):
-        rest = weights * (sample.blocks != block)
-        without.append(rest @ is_beyond / rest.sum())
-    return float(np.sqrt((N_BLOCKS - 1) * np.var(without)))
-
-
-def _emulator_error(sample: ResponseSample, quantity: Exceedance) -> float:
-    """Return the error of the mean probability, by emulators without a block of the runs each."""
-    outputs = sample.emulated(sample.points)
-    if not outputs:
-        return 0.0
-    thetas = sample.populations.thinned()
-    _, weights = sample.design.populations(sample.populations.evaluator.parents(thetas, sample.k))
-    mass = np.nanmean(weights, axis=0)
-    means = [mass @ quantity.of_specimen(values, np.nan) for values in outputs]
-    return float(np.sqrt(np.sum((np.array(means[1:]) - means[0]) ** 2)))
-
-
-def _warn_of_large_error(response: Any, means: Floats, errors: Floats, points: int) -> None:
-    """Warn where two standard errors are a factor of two of the probability, about."""
-    excess = errors - 0.3 * means
-    if not (excess > 0).any():
-        return
-    worst = int(np.argmax(excess))
-    more = f"more than points={points}" if points else "points=1000, which computes as many"
-    report(
-        Finding(
-            "rough-probability",
-            f"{response_name(response)}: a probability of {means[worst]:.2g} has a standard error "
-            f"of {errors[worst]:.2g}; pass {more} responses where the limit is exceeded.",
-        )
+def _rough_finding(
+    response: Any, estimates: Sequence[_Estimate], is_rough: NDArray[np.bool_]
+) -> list[Finding]:
+    """Return a finding if the error of a probability is too large."""
+    rough = [estimate for estimate, bad in zip(estimates, is_rough, strict=True) if bad]
+    if not rough:
+        return []
+    worst = max(rough, key=lambda estimate: estimate.error - 0.3 * estimate.mean)
+    more = "points=1000, which computes as many"
+    if worst.points:
+        more = f"more than points={worst.points}"
+    text = (
+        f"{response_name(response)}: a probability of {worst.mean:.2g} has a standard error "
+        f"of {worst.error:.2g}; pass {more} responses where the limit is exceeded."
     )
+    return [Finding("rough-probability", text)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,17 +495,44 @@ def rare_event(
     weights = np.exp(final.log_ratio + (log_normal(final.z) - final.log_mixture()))
     mean_weights = weights.mean(axis=0)
     is_beyond = ~np.isnan(final.values) & (final.values > limit)
-    terms = np.where(is_beyond, mean_weights, 0.0)
-    error = terms.std(ddof=1) / np.sqrt(len(terms))
+    _, error = weighted_share(mean_weights[None], is_beyond)
     if not is_beyond.any():
-        error = mean_weights.max() / len(terms)  # the contribution of a single point
+        # Nor is the event more probable than one that contains it and half of the points.
+        values = np.where(np.isnan(final.values), -np.inf, final.values)
+        is_above = final.values >= np.median(values)
+        above, above_error = weighted_share(mean_weights[None], is_above)
+        error = min(error, float(above[0] + 2 * above_error) / 3)
     log_weights = search.log_weights()
     shares = np.exp(log_weights - log_weights.max())
     return RareEvent(
-        by_draw=np.where(is_beyond, weights, 0.0).mean(axis=1),
-        error=float(error),
+        by_draw=weighted_share(weights, is_beyond)[0],
+        error=error,
         lost=float(shares[np.isnan(search.values)].sum() / shares.sum()),
     )
+
+
+def weighted_share(weights: Floats, counts: NDArray[np.bool_]) -> tuple[Floats, float]:
+    r"""Return shares of points that count, by rows of weights (k, n), and the first one's error.
+
+    The mean of a weight is known to be one. With this as a control variate (Owen and Zhou 2000),
+    :math:`\hat P = \overline{w 1} - \beta (\bar w - 1)`, shares of all points are one, and those
+    of few are the plain mean. If all points or none count, the error is one over the effective
+    number of points.
+    """
+    terms = np.where(counts, weights, 0.0)
+    totals = weights.mean(axis=1)
+    if counts.all() or not counts.any():
+        shares = np.full(len(weights), float(counts[0]))
+        n_effective = weights[0].sum() ** 2 / (weights[0] ** 2).sum()
+        return shares, float(1 / n_effective)
+    deviation = weights - totals[:, None]
+    variance = (deviation**2).sum(axis=1)
+    covariance = (terms * deviation).sum(axis=1)
+    slope = covariance / np.where(variance > 0, variance, 1.0)
+    shares = terms.mean(axis=1) - slope * (totals - 1)
+    residuals = terms[0] - slope[0] * weights[0]
+    error = residuals.std(ddof=1) / np.sqrt(residuals.size)
+    return np.clip(shares, 0.0, 1.0), float(error)
 
 
 def _draw_points(

@@ -11,8 +11,13 @@ import xarray as xr
 
 from prbayes._stats import ENVELOPED, distribution_function, envelope, quantile
 from prbayes._validate import Floats, positive_integer, share
-from prbayes.decision.populations import Populations, ResponseSample
-from prbayes.decision.quantities import interval_grid
+from prbayes.decision.populations import (
+    CentralSpecimens,
+    Populations,
+    ResponseSample,
+    probability_bounds,
+)
+from prbayes.decision.quantities import extreme_places, interval_grid
 from prbayes.model.locking import locked
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.response import refuse_uncallable
@@ -46,7 +51,8 @@ def p_box(
         computed once for each run of the design, unless `predict` did that before.
     *inputs
         As for `predict`. An `Interval` among them is a constant known only to lie between two ends:
-        the bands then contain those at all points of the interval.
+        the bands then contain those at all points of the interval, whose extremes are searched as
+        by `exceedance`.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     output : label, optional
@@ -63,7 +69,10 @@ def p_box(
     xarray.Dataset
         Dimensions ``y``, in units of the response, and ``band``, "pointwise" and "simultaneous".
         Variables ``lower`` and ``upper``, distribution functions; ``mean``, that of a new specimen,
-        with intervals between ``mean`` and ``mean_upper``. Attributes: ``prob``, ``responses``
+        with intervals between ``mean`` and ``mean_upper``; and ``error``, the largest standard
+        error of ``mean`` from the points, the emulator and the draws, which the bands do not
+        include: of smaller tails ask `exceedance`. Where no point is below y, or none above, the
+        bands have the bound of the effective number of points. Attributes: ``prob``, ``responses``
         (number computed) and ``identity``.
 
     Raises
@@ -99,30 +108,51 @@ def p_box(
     positive_integer(n_draws, "n_draws", minimum=2)
     positive_integer(steps, "steps", minimum=2)
     populations = Populations.of(result, model, n_draws, caller)
-    grid = interval_grid(inputs, steps)
-    samples = [populations.sample(response, place, output) for place in grid]
+    places = interval_grid(inputs, steps)
+    samples = [populations.sample(response, place, output) for place in places]
     y = _evaluation_points(samples)
-    lower, upper, means = [], [], []
+    n_searched = 0
+    if len(places) > 1:
+        respond = CentralSpecimens(populations, response, output, samples[0].n_runs)
+        # Limits beyond all responses find the places with the most extreme ones.
+        limits = [2 * y[0] - y[-1], np.median(y), 2 * y[-1] - y[0]]
+        extremes = extreme_places(inputs, places, respond, limits)
+        samples += [populations.sample(response, place, output) for place in extremes]
+        y = _evaluation_points(samples)
+        n_searched = respond.count
+    lower, upper, means, errors = [], [], [], []
+    tail = (1 - prob) / 2
     for sample in samples:
         functions = _distribution_functions(sample, y)
-        low, high = np.quantile(functions, [(1 - prob) / 2, (1 + prob) / 2], axis=0)
+        mean = functions.mean(axis=0)
+        error = sample.share_error(lambda values: (values[:, None] <= y).astype(float))
+        if populations.are_draws:
+            error = np.hypot(error, functions.std(axis=0, ddof=1) / np.sqrt(len(functions)))
+        least, most = probability_bounds(mean, error, tail)
+        low, high = np.quantile(functions, [tail, 1 - tail], axis=0)
         lowest, highest = envelope(functions, 1 - prob)
-        lower.append([low, lowest])
-        upper.append([high, highest])
-        means.append(functions.mean(axis=0))
+        at_top, at_bottom = mean > 1 - 1e-12, mean == 0
+        lower.append([np.where(at_top, least, band) for band in (low, lowest)])
+        upper.append([np.where(at_bottom, most, band) for band in (high, highest)])
+        means.append(mean)
+        errors.append(error)
+    # A bound at y is one beyond it.
+    lowest = np.min(np.maximum.accumulate(lower, axis=-1), axis=0)
+    highest = np.max(np.minimum.accumulate(np.flip(upper, -1), axis=-1), axis=0)[:, ::-1]
     data: dict[str, Any] = {
-        "lower": (["band", "y"], np.min(lower, axis=0)),
-        "upper": (["band", "y"], np.max(upper, axis=0)),
+        "lower": (["band", "y"], lowest),
+        "upper": (["band", "y"], highest),
         "mean": ("y", np.min(means, axis=0)),
+        "error": ("y", np.max(errors, axis=0)),
     }
-    if len(grid) > 1:
+    if len(places) > 1:
         data["mean_upper"] = ("y", np.max(means, axis=0))
     return xr.Dataset(
         data,
         coords={"y": y, "band": ["pointwise", "simultaneous"]},
         attrs={
             "prob": prob,
-            "responses": sum(sample.responses.count for sample in samples),
+            "responses": n_searched + sum(sample.responses.count for sample in samples),
             **populations.provenance(),
         },
     )

@@ -10,6 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._finding import Finding, as_json
 from prbayes._stats import reached
 from prbayes._validate import Floats, called, positive_integer, positive_number
 from prbayes.decision.populations import Populations, ResponseSample
@@ -109,7 +110,8 @@ def plan(
         ``"quantity"``. Variables ``sd``, the expected standard deviation in the user's units, inf
         where the quantity is infinite in some populations; ``now``, the present one; and with
         ``target``, ``specimens``: the smallest number that reaches it, inf if a million do not, NaN
-        without a target. Attributes: ``responses`` (number computed) and ``identity``.
+        without a target. Attributes: ``responses`` (number computed), ``findings`` (as JSON) and
+        ``identity``.
 
     Raises
     ------
@@ -157,9 +159,10 @@ def plan(
     populations = Populations.of(result, model, 2000, caller)
     evaluator = populations.evaluator
     quantity_sample = None
+    findings: tuple[Finding, ...] = ()
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-        quantity_sample.refuse_failed(quantity)
+        findings = quantity_sample.checked_quantity(quantity)
     draws = Draws.of(populations.thetas, evaluator.hyperparameters.prior_sd)
     forecast = _Forecast(populations, draws, quantity, quantity_sample)
     now = forecast.sd(np.zeros((evaluator.hyperparameters.size, evaluator.hyperparameters.size)))
@@ -189,6 +192,7 @@ def plan(
         coords={"candidate": list(candidates), "k": numbers, "name": list(now)},
         attrs={
             "responses": count,
+            "findings": as_json(findings),
             **({} if quantity is None else {"quantity": repr(quantity)}),
             **populations.provenance(),
         },

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -11,9 +12,10 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import gammaincinv, ndtr, ndtri
 
+from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.decision.quantities import Quantity
 from prbayes.inference.asymptotics import oriented
@@ -23,8 +25,8 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import as_attributes, identity_of
 from prbayes.numerics.points import inside, sobol
 from prbayes.optimize.optimum import Optimum, identity_in, require_sampling
-from prbayes.propagation.base import DesignError
-from prbayes.propagation.importance import through_inverses
+from prbayes.propagation.base import N_BLOCKS, DesignError
+from prbayes.propagation.importance import new_specimens, through_inverses
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import compiled_log_density
@@ -180,6 +182,14 @@ class ResponseSample:
         """The responses in ascending order, (n,)."""
         return self.select(self.outputs)[self._order]
 
+    @property
+    def n_runs(self) -> int:
+        """Number of runs behind the responses."""
+        if self.emulator is not None:
+            return len(self.emulator.z)
+        assert self.design.has_runs
+        return self.design.n_runs
+
     @cached_property
     def blocks(self) -> NDArray[np.intp]:
         """The block of the design that each of the values is in, (n,)."""
@@ -205,6 +215,31 @@ class ResponseSample:
             total += np.nansum(weights, axis=0)
         return total / total.sum()
 
+    def share_error(self, counts: Callable[[Floats], Floats]) -> Floats:
+        """Return the error of the mean share of responses that count, by points and emulator.
+
+        ``counts`` returns whether responses (n,) count, (n,) or (n, m) for m shares. Of the points
+        it is the jackknife over their blocks; if none or all of them count, one over their
+        effective number. Of the emulator it is that of emulators without a block of the runs.
+        """
+        is_counted = counts(self.values)
+        weights = self.mean_weights()
+        without = []
+        for block in range(N_BLOCKS):
+            rest = weights * (self.blocks != block)
+            without.append(rest @ is_counted / rest.sum())
+        error = np.sqrt((N_BLOCKS - 1) * np.var(without, axis=0))
+        is_weighted = is_counted[weights > 0]
+        is_same = (is_weighted == is_weighted[0]).all(axis=0)
+        error = np.where(is_same, (weights**2).sum(), error)
+        outputs = self.emulated(self.points)
+        if not outputs:
+            return np.asarray(error)
+        parents = self.populations.evaluator.parents(self.populations.thinned(), self.k)
+        mass = np.nanmean(self.design.populations(parents)[1], axis=0)
+        means = np.array([mass @ counts(values) for values in outputs])
+        return np.asarray(np.hypot(error, np.sqrt(((means[1:] - means[0]) ** 2).sum(axis=0))))
+
     def evaluate(self, quantity: Quantity, thetas: Floats) -> Floats:
         """Return a quantity of populations, (k, d) -> (k,); NaN where there is no population."""
         return np.concatenate([quantity.of(self.values, w) for w in self.weight_batches(thetas)])
@@ -225,14 +260,96 @@ class ResponseSample:
                 "repair it, or return +inf for specimens that fail"
             )
 
-    def refuse_failed(self, quantity: Quantity) -> None:
-        """Raise if specimens failed and the quantity needs finite responses."""
+    def checked_quantity(self, quantity: Quantity) -> tuple[Finding, ...]:
+        """Report a tail of few points; raise if there are none, or about failed specimens."""
+        caller, center = self.populations.caller, self.populations.center[None]
         if quantity.needs_finite and np.isposinf(self.values[-1]):
             raise ValueError(
-                f"{self.populations.caller}: {quantity!r}: got specimens that failed (+inf), of "
+                f"{caller}: {quantity!r}: got specimens that failed (+inf), of "
                 "which there is none, expected finite responses; ask for a Quantile or an "
                 "Exceedance"
             )
+        (at,) = self.evaluate(quantity, center)
+        # With the responses that are equal to a quantile, such as the largest.
+        at = np.nextafter(at, -np.inf)
+        is_beyond = quantity.of_specimen(self.values, at)
+        if not np.isin(is_beyond, (0.0, 1.0)).all():
+            return ()
+        share = float(self.mean_weights() @ is_beyond)
+        error = float(self.share_error(lambda values: quantity.of_specimen(values, at)))
+        advice = "pass more responses to the propagation, or ask for a less rare quantity"
+        if share == 0:
+            raise ValueError(
+                f"{caller}: {quantity!r}: got no response beyond it, of {1 / error:.0f} effective "
+                f"points, expected some; {advice}"
+            )
+        if error <= 0.3 * share:
+            return ()
+        text = (
+            f"{quantity!r}: the share of responses beyond it, {share:.2g}, has a standard error of "
+            f"{error:.2g}, and the quantity is no better known; {advice}."
+        )
+        return report(Finding("rough-probability", text))
+
+
+def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) -> Floats:
+    r"""Return the bounds of probabilities that leave out ``tail`` on each side, (2, ...).
+
+    Those of a Poisson mean (Garwood 1936), for :math:`(p / error)^2` events: for many the normal
+    ones, and for none of n points, with an error of 1 / n, the rule of three.
+    """
+    probability, error = np.asarray(probability, dtype=float), np.asarray(error, dtype=float)
+    rare = np.minimum(probability, 1 - probability)
+    has_events = rare > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        n_events = np.where(has_events, (rare / error) ** 2, 0.0)
+        by_event = np.where(has_events, error**2 / rare, error)
+    # For so many both are the normal ones to a thousandth of an error.
+    is_normal = n_events > 1e6
+    n_events = np.where(is_normal, 1.0, n_events)
+    low = np.where(has_events, by_event * gammaincinv(np.maximum(n_events, 1e-9), tail), 0.0)
+    high = by_event * gammaincinv(n_events + 1, 1 - tail)
+    low = np.where(is_normal, rare + ndtri(tail) * error, low)
+    high = np.minimum(np.where(is_normal, rare - ndtri(tail) * error, high), 1.0)
+    bounds = np.array([low, high])
+    return np.asarray(np.where(probability > 0.5, 1 - bounds[::-1], bounds))
+
+
+class CentralSpecimens:
+    """A response at few specimens of the central population, the same for all constant inputs."""
+
+    def __init__(
+        self,
+        populations: Populations,
+        response: Callable[..., Any],
+        output: Any,
+        n_runs: int,
+        executor: Executor | None = None,
+    ) -> None:
+        self.populations, self.response, self.output = populations, response, output
+        # 64 calls at them cost about as much as four times the runs.
+        self.size = min(max(n_runs // 16, 4), 32)
+        self.executor = executor
+        self.count = 0  # responses computed
+        self.inputs: tuple[list[Floats], list[Floats]] | None = None
+
+    def __call__(self, inputs: Sequence[Any]) -> Floats:
+        """Return the output at the specimens, (size,)."""
+        responses = self.populations.responses(self.response, inputs, executor=self.executor)
+        outputs = responses(*self._specimens(responses))[0]
+        self.count += responses.count
+        column = output_column(responses, outputs, self.output)
+        return np.asarray(outputs if column is None else outputs[:, column])
+
+    def _specimens(self, responses: Responses) -> tuple[list[Floats], list[Floats]]:
+        """Return the inputs of the specimens."""
+        if self.inputs is None:
+            evaluator = self.populations.evaluator
+            center = evaluator.hyperparameters.constrained(self.populations.center[None])
+            parents = [center[str(rv.name)] for rv in responses.inputs.parents]
+            rng = np.random.default_rng(0)
+            self.inputs = new_specimens(responses.name, responses.inputs, parents, self.size, rng)
+        return self.inputs
 
 
 class InverseTransform:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.special import log_ndtr, logsumexp
 
 from prbayes._validate import Floats, finite_number, flag, share
 from prbayes.model.random_variable import response_name
+from prbayes.numerics.points import sobol
 from prbayes.response.response import refuse_uncallable
 
 
@@ -209,7 +212,10 @@ class Exceedance(Quantity):
 
     def of(self, values: Floats, weights: Floats) -> Floats:
         """Return the probabilities."""
-        return weights @ self.of_specimen(values, np.nan)
+        is_beyond = self.of_specimen(values, np.nan)
+        beyond, rest = weights @ is_beyond, weights @ (1 - is_beyond)
+        # Sums of weights are one up to rounding.
+        return np.asarray(beyond / (beyond + rest))
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return whether each specimen is beyond the limit."""
@@ -265,6 +271,90 @@ def interval_grid(inputs: Sequence[Any], steps: int) -> list[tuple[Any, ...]]:
         for x in inputs
     ]
     return list(product(*values))
+
+
+def extreme_places(
+    inputs: Sequence[Any],
+    grid: Sequence[tuple[Any, ...]],
+    respond: Callable[[tuple[Any, ...]], Floats],
+    limits: Sequence[float],
+) -> list[tuple[Any, ...]]:
+    """Return places of the intervals with heavier or lighter tails beyond limits than the grid's.
+
+    ``respond`` returns responses of the same specimens at a place. For each limit and direction
+    the search starts from the best of the grid and of 32 quasi-random places.
+    """
+    numbers = [k for k, x in enumerate(inputs) if isinstance(x, Interval)]
+    low = np.array([inputs[k].low for k in numbers])
+    high = np.array([inputs[k].high for k in numbers])
+
+    @cache
+    def responses_at(*values: float) -> Floats:
+        return respond(place_of(values))
+
+    def place_of(values: Sequence[float]) -> tuple[Any, ...]:
+        place = list(inputs)
+        for k, value in zip(numbers, values, strict=True):
+            place[k] = value
+        return tuple(place)
+
+    starts = [[place[k] for k in numbers] for place in grid]
+    points = sobol(32, len(numbers), seed=0)
+    starts += (low + points * (high - low)).tolist()
+    width = _kernel_width(np.array([responses_at(*start) for start in starts]))
+    places = []
+    for limit, sign in product(limits, (1.0, -1.0)):
+
+        def tail(values: Sequence[float], limit: float = limit, sign: float = sign) -> float:
+            distances = sign * (responses_at(*values) - limit)
+            return _log_tail(distances / width)
+
+        heaviest = max(starts[: len(grid)], key=tail)
+        end = _climbed(tail, max(starts, key=tail), low, high)
+        if tail(end) > tail(heaviest):
+            places.append(place_of(end))
+    return places
+
+
+def _kernel_width(values: Floats) -> float:
+    """Return the bandwidth for responses of the same specimens, (places, n), by Silverman's rule.
+
+    Their spread is that at a place in the middle, or else that between places.
+    """
+    finite = np.ma.masked_invalid(values)
+    within = np.ma.filled(finite.std(axis=1), 0.0)
+    spread = np.median(within)
+    if spread == 0:
+        spread = np.ma.filled(finite.std(), 0.0)
+    width = 0.9 * float(spread) * values.shape[1] ** -0.2
+    return width or 1.0  # of equal responses
+
+
+def _log_tail(distances: Floats) -> float:
+    """Return the logarithm of a smoothed count of responses beyond a limit, in bandwidths.
+
+    It also increases towards the limit where no response is beyond it.
+    """
+    is_known = ~np.isnan(distances)
+    if not is_known.any():
+        return -np.inf
+    return float(logsumexp(log_ndtr(distances[is_known])))
+
+
+def _climbed(
+    height: Callable[[Sequence[float]], float], start: list[float], low: Floats, high: Floats
+) -> list[float]:
+    """Return a place that is higher than the start, by steps along the axes that are halved."""
+    step = (high - low) / 32 ** (1 / low.size)
+    for _ in range(10):
+        steps = np.diag(step)
+        candidates = np.clip(np.array(start) + np.concatenate([steps, -steps]), low, high)
+        highest = max(candidates.tolist(), key=height)
+        if height(highest) > height(start):
+            start = highest
+        else:
+            step = step / 2
+    return start
 
 
 def interval_values(inputs: Sequence[Any], point: Sequence[Any]) -> str:

@@ -15,6 +15,7 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
+from prbayes._finding import as_json
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.decision.populations import InverseTransform, Populations, ResponseSample
 from prbayes.decision.quantities import Quantity, refuse_quantity
@@ -85,7 +86,8 @@ def sensitivity(
         attributed to the inputs; ``value``, the quantity at the centre, and ``sd``, its standard
         deviation over the hyperparameters, both in its units; ``scatter``, the aleatory share of
         the variance of a new specimen; ``responses``, the number computed; ``inputs``, the reason
-        if indices of inputs are not known; and ``identity``.
+        if indices of inputs are not known; ``findings`` (as JSON), such as that few responses
+        are beyond the quantity; and ``identity``.
 
     Raises
     ------
@@ -138,7 +140,7 @@ def sensitivity(
     # 4000 draws: margins and correlations are then known to two percent.
     populations = Populations.of(result, model, 4000, caller)
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-    sample.refuse_failed(quantity)
+    findings = sample.checked_quantity(quantity)
     hyperparameters = _hyperparameter_indices(sample, quantity, n_samples, seed)
     inputs, obstacle = input_indices(sample, quantity, n_samples, seed, computed=computed)
     columns = {}
@@ -165,6 +167,7 @@ def sensitivity(
             "scatter": _aleatory_share(sample, quantity),
             "responses": sample.responses.count,
             "inputs": obstacle,
+            "findings": as_json(findings),
             "random_seed": str(seed),
             **populations.provenance(),
         },

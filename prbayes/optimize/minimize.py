@@ -31,6 +31,7 @@ from prbayes.inference.checks.identification import (
     confounding_findings,
     elements_at_edge,
     unidentified_findings,
+    unknown_error_findings,
 )
 from prbayes.inference.checks.metric_suitability import (
     data_between_runs,
@@ -40,7 +41,11 @@ from prbayes.inference.checks.metric_suitability import (
 )
 from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
 from prbayes.inference.design_error import design_error
-from prbayes.inference.refits import SamplingDistribution, jumping_simulators
+from prbayes.inference.refits import (
+    SamplingDistribution,
+    jumping_simulators,
+    sampling_obstacle,
+)
 from prbayes.inference.resampling import SETS
 from prbayes.metrics.multivariate import components_summary
 from prbayes.model.cost import explained, kept
@@ -500,8 +505,10 @@ def _report(
     support = optimum.search.support
     refuse_lost(evaluator, {name: numbers["lost_mass"] for name, numbers in support.items()})
     local = None if fit.sampling is None else fit.sampling.local
+    unknown = [] if at_edge or at_jump else [*optimum.stderr.items()]
     findings = report(
         *breakdown_findings(at_edge, at_jump),
+        *unknown_error_findings(dict(unknown), sampling_obstacle(evaluator)),
         *heavy_tails(evaluator, fit.theta),
         *data_between_runs(evaluator, fit.theta),
         *smoothing_bias(evaluator, fit.theta, fit.scales, local),

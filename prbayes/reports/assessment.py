@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._finding import from_json
 from prbayes._stats import INTERVAL
 from prbayes.model.parameters import (
     optimum_elements,
@@ -543,7 +544,8 @@ def _risks(m: Material) -> list[str]:
         )
         if "requirement" in table.attrs:
             most = f"at most {table.attrs['requirement']:g}"
-            sentence += f"; the requirement, {most}, is {table.attrs['verdict']}"
+            answer = table.attrs["verdict"] if m.is_usable else "not answered"
+            sentence += f"; the requirement, {most}, is {answer}"
         sentences.append(f"{sentence}.")
     return sentences
 
@@ -583,7 +585,13 @@ def next_steps(m: Material) -> list[str]:
     if m.rejected:
         return [f"{i}. {step}" for i, step in enumerate(steps[:4], 1)]
     # The questions of a decision that are open
-    if any(table.attrs.get("verdict") == "not decided" for table in m.decisions.values()):
+    undecided = [t for t in m.decisions.values() if t.attrs.get("verdict") == "not decided"]
+    if any(from_json(str(table.attrs.get("findings", "[]"))) for table in undecided):
+        steps.append(
+            "A requirement is not decided, as the error of the computation is too large: see under "
+            "Decision how many responses to compute."
+        )
+    elif undecided:
         steps.append(
             "A requirement is not decided, as too little is known of the probability: make as many "
             "more specimens as prb.plan says, with prb.decision.Exceedance as its quantity."

@@ -84,6 +84,11 @@ class Material:
         )
 
     @property
+    def is_usable(self) -> bool:
+        """Whether no test rejected the model, and no diagnosis found a problem."""
+        return not (self.rejected or self.has_problems)
+
+    @property
     def is_by_specimen(self) -> bool:
         """Whether all simulators of all results have the log-likelihood by specimen."""
         flags = [

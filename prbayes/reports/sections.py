@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes._finding import from_json
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats
 from prbayes.model.description import labelled
@@ -457,10 +458,14 @@ def decision(m: Material) -> list[Section]:
             "The calibrated model was rejected, see Validity: these answers are of a model that "
             "data contradict. Do not rely on them.",
         )
+    elif m.has_problems:
+        about.insert(0, "Remove the problems under Diagnostics before these answers are used.")
+    for label, table in m.decisions.items():
+        about += [f"{label}: {f}" for f in from_json(str(table.attrs.get("findings", "[]")))]
     sections = [Section("Decision", about)]
     for kind, (title, text, rows_of) in _KINDS.items():
         rows = [
-            {"question": label} | row
+            {"question": label} | _unanswered(row, m)
             for label, table in m.decisions.items()
             if kind_of_decision(table) == kind
             for row in rows_of(table, m.labels)
@@ -468,6 +473,13 @@ def decision(m: Material) -> list[Section]:
         if rows:
             sections.append(Section(title, text, rows_table(rows), level=3))
     return sections
+
+
+def _unanswered(row: dict[str, Any], m: Material) -> dict[str, Any]:
+    """Return a row without a verdict if the model must not be used."""
+    if row.get("requirement is") and not m.is_usable:
+        return row | {"requirement is": "not answered"}
+    return row
 
 
 def _risk(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -532,7 +544,7 @@ _KINDS: dict[str, tuple[str, str, _Rows]] = {
         "Probability of exceedance",
         "The probability is that of a new specimen; the interval is that of the share in a large "
         "batch. A requirement is met if the whole interval is below it, not met if all of it is "
-        "above, and else not decided.",
+        "above, with two errors of the computation on both sides, and else not decided.",
         _risk,
     ),
     "sensitivity": (

@@ -140,6 +140,9 @@ def predict(
     against repeated measurements. Where two simulators of the model have designs of their own, pass
     ``stored=False``.
 
+    Quantiles of the result are no better known than the few samples beyond them. Probabilities of
+    far tails, with their errors, are those of `exceedance` with ``points=1000``.
+
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb

@@ -12,9 +12,15 @@ from decisions import doubled, normal, posterior, same
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
+from prbayes._finding import from_json
 from prbayes._validate import Floats
-from prbayes.decision.exceedance import _jackknife_error, rare_event
-from prbayes.decision.populations import InverseTransform
+from prbayes.decision.exceedance import rare_event, weighted_share
+from prbayes.decision.populations import (
+    InverseTransform,
+    ResponseSample,
+    probability_bounds,
+)
+from prbayes.decision.quantities import extreme_places, interval_grid
 from prbayes.response.inputs import read_inputs
 
 MU, SIGMA = (posterior().posterior[name].values[0] for name in ("mu", "sigma"))
@@ -62,14 +68,14 @@ def test_from_points_near_the_limit() -> None:
 def test_a_requirement_is_met_or_not_or_not_decided() -> None:
     table = ask(2.0)
     assert "verdict" not in table.attrs
-    low, high = float(table.lower), float(table.upper)
+    low, high, error = float(table.lower), float(table.upper), float(table.error)
     for requirement, verdict in (
-        (1.01 * high, "met"),
-        (0.99 * low, "not met"),
-        (1.01 * low, "not decided"),
-        (0.99 * high, "not decided"),
+        (high + 2.3 * error, "met"),
+        (max(low - 2 * error, 1e-9), "not met"),
+        (high + 1.5 * error, "not decided"),
+        (high - error, "not decided"),
     ):
-        attributes = ask(2.0, requirement=requirement).attrs
+        attributes = ask(2.0, requirement=requirement, points=0).attrs
         assert (attributes["requirement"], attributes["verdict"]) == (requirement, verdict)
     with pytest.raises(ValueError, match="requirement"):
         ask(2.0, requirement=1.5)
@@ -84,12 +90,17 @@ def test_below_is_above_of_the_opposite_and_of_one_of_several_outputs(points: in
 
 def test_the_error_of_equal_points_is_that_of_their_blocks_means() -> None:
     values, blocks = np.arange(64.0), np.arange(64) % 8
-    weights = np.full(64, 1 / 64)
-    sample: Any = SimpleNamespace(values=values, blocks=blocks, mean_weights=lambda: weights)
-    quantity = prb.decision.Exceedance(same, normal()[1], limit=42.0)
+    sample: Any = SimpleNamespace(
+        values=values,
+        blocks=blocks,
+        mean_weights=lambda: np.full(64, 1 / 64),
+        emulated=lambda points: [],
+        points=[],
+    )
+    error = ResponseSample.share_error(sample, lambda y: y[:, None] > np.array([42.0, -1.0, 64.0]))
     means = [(values[blocks == b] > 42).mean() for b in range(8)]
-    expected = np.std(means, ddof=1) / np.sqrt(8)
-    assert _jackknife_error(sample, quantity) == pytest.approx(expected)
+    # Of all points, and of none: one over their number.
+    np.testing.assert_allclose(error, [np.std(means, ddof=1) / np.sqrt(8), 1 / 64, 1 / 64])
 
 
 def shifted(x: Any, by: Any) -> Any:
@@ -104,12 +115,46 @@ def test_an_interval_gives_bounds_and_no_distribution() -> None:
     np.testing.assert_allclose(table.probability, ends)
     assert table.attrs["at"] == ["-0.5", "0.5"]
     assert (float(table.lower), float(table.upper)) == (float(low.lower), float(high.upper))
-    # An extreme inside is found at one of the places.
-    inside = ask(1.5, lambda x, by: x - by**2, interval)
-    assert inside.attrs["at"][1] == "0"
     by_points = ask(1.5, shifted, interval, points=1000, steps=2)
     np.testing.assert_allclose(by_points.probability, ends, rtol=0.2)
-    assert by_points.attrs["responses"] == 2000
+    assert by_points.attrs["at"] == ["-0.5", "0.5"]
+
+
+INSIDE: dict[str, Any] = {
+    "narrow": lambda x, k: x / (1 + ((k - 0.37) / 0.05) ** 2),
+    "parabola": lambda x, k: x * (1 - 8 * (k - 0.37) ** 2),
+    "several": lambda x, k: x * np.sin(20 * k),
+    "valley": lambda x, k: x - 9 + 9 * np.abs(k - 0.63),
+    "two inputs": lambda x, k, j: x - 4 * (k - 0.37) ** 2 - 4 * (j - 0.81) ** 2,
+}
+
+
+@pytest.mark.parametrize("case", INSIDE)
+@pytest.mark.parametrize("below", [False, True])
+def test_the_worst_place_inside_an_interval_is_found(case: str, below: bool) -> None:
+    """The extreme response of a specimen of one is that of a dense grid, above as below."""
+    d = 2 if case == "two inputs" else 1
+    inputs = [0.0, *[prb.decision.Interval(0.0, 1.0)] * d]
+    axis = np.linspace(0, 1, 501)
+    dense = INSIDE[case](1.0, *np.meshgrid(*[axis] * d))
+    specimens = 1 + 0.1 * np.linspace(-1, 1, 8)
+    sign = -1.0 if below else 1.0
+    limit = float(dense.max())
+    grid = interval_grid(inputs, 5)
+    places = grid + extreme_places(
+        inputs, grid, lambda place: sign * INSIDE[case](specimens, *place[1:]), [sign * limit]
+    )
+    best = max(float(INSIDE[case](1.0, *place[1:])) for place in places)
+    assert best == pytest.approx(limit, abs=0.01 * np.ptp(dense))
+
+
+def test_a_bound_inside_an_interval_is_that_of_its_place() -> None:
+    def narrow(x: Any, k: Any) -> Any:
+        return x / (1 + ((k - 0.37) / 0.05) ** 2)
+
+    table = ask(1.5, narrow, prb.decision.Interval(0.0, 1.0))
+    assert float(table.probability[1]) == pytest.approx(float(ask(1.5).probability), rel=0.02)
+    assert float(table.attrs["at"][1]) == pytest.approx(0.37, abs=0.003)
 
 
 def test_a_population_without_stored_responses_takes_points() -> None:
@@ -136,6 +181,63 @@ def test_uncertain_probabilities_are_reported(caplog: pytest.LogCaptureFixture) 
     assert "pass points=1000" in caplog.text
     with pytest.raises(prb.propagation.DesignError, match="lost mass"):
         ask(2.0, lambda x: np.where(x < 1, np.nan, x), points=200)
+
+
+def test_probabilities_stay_between_zero_and_one() -> None:
+    for limit, probability in ((-50.0, 1.0), (50.0, 0.0)):
+        for options in ({}, {"points": 200}, {"points": 200, "below": True}, {"below": True}):
+            table = ask(limit, **options)
+            expected = 1 - probability if options.get("below") else probability
+            assert (table.by_draw == expected).all()
+            low, high = float(table.lower), float(table.upper)
+            assert 0 <= low <= expected <= high <= 1
+            # The bound of the points that were seen.
+            assert high - low == pytest.approx(-np.log(0.055) * float(table.error))
+            assert float(table.error) > 0
+
+
+def test_a_requirement_takes_points_near_the_limit_where_the_error_matters() -> None:
+    # No stored response is above 12: the requirement is not decided by them.
+    stored = ask(12.0, requirement=1e-3, points=0)
+    assert (float(stored.probability), stored.attrs["verdict"]) == (0.0, "not decided")
+    assert stored.upper > 1e-3
+    (finding,) = from_json(stored.attrs["findings"])
+    assert finding.code == "rough-probability"
+    decided = ask(12.0, requirement=1e-3)
+    assert (decided.attrs["verdict"], decided.attrs["source"]) == ("met", "importance points")
+    assert exact(12.0)[1][1] < float(decided.upper) < 1e-6
+    # Nor is one within two errors of the interval, and one far from it costs no response.
+    table = ask(3.2, points=0)
+    near, far = float(table.upper + table.error), float(100 * table.upper)
+    assert ask(3.2, requirement=near, points=0).attrs["verdict"] == "not decided"
+    assert ask(3.2, requirement=near).attrs["source"] == "importance points"
+    enough = ask(3.2, requirement=far)
+    assert (enough.attrs["verdict"], enough.attrs["responses"]) == ("met", 0)
+
+
+def test_bounds_are_those_of_poisson_counts() -> None:
+    # None of 100: the rule of three. Of one event, and of 100: Garwood (1936), table of chi2.
+    tail = 0.025
+    p, error = np.array([0.0, 0.01, 0.5, 0.99, 1.0]), np.array([0.01, 0.01, 1e-9, 0.01, 0.01])
+    low, high = probability_bounds(p, error, tail)
+    np.testing.assert_allclose(high[:2], [0.01 * -np.log(tail), 0.01 * 5.572], rtol=1e-3)
+    np.testing.assert_allclose(low[:2], [0.0, 0.01 * 0.02532], rtol=1e-3)
+    np.testing.assert_allclose([low[3:], high[3:]], [1 - high[1::-1], 1 - low[1::-1]])
+    np.testing.assert_allclose(high[2] - 0.5, 1.96e-9, rtol=1e-3)
+    many, _ = probability_bounds(0.1, 0.001, tail)
+    assert many == pytest.approx(0.1 - 1.96 * 0.001, abs=2e-5)
+
+
+def test_shares_of_weighted_points_sum_to_one() -> None:
+    rng = np.random.default_rng(0)
+    weights = rng.exponential(size=(3, 500))
+    counts = rng.random(500) < 0.2
+    shares, error = weighted_share(weights, counts)
+    np.testing.assert_allclose(shares + weighted_share(weights, ~counts)[0], 1.0)
+    assert error < (weights[0] * counts).std() / np.sqrt(500)
+    everything, bound = weighted_share(weights, np.ones(500, dtype=bool))
+    assert (everything == 1).all()
+    assert 1 / bound == pytest.approx(weights[0].sum() ** 2 / (weights[0] ** 2).sum())
 
 
 # -- rare events -----------------------------------------------------------------------------------

@@ -48,6 +48,28 @@ def test_bands_contain_their_share_of_distribution_functions(prob: float) -> Non
     assert float(found["mean"][0]) < 1e-3 < 1 - 1e-3 < float(found["mean"][-1])
 
 
+def test_tails_without_points_have_a_bound_and_an_error() -> None:
+    found = box(lambda x: np.minimum(x, 1.2))
+    expected = functions(found.y.values[:-1]).mean(axis=0)
+    assert (np.abs(found["mean"][:-1] - expected) < 4 * found.error[:-1] + 1e-4).all()
+    # No response is above the last y: the share above is below the bound of the points.
+    assert float(found["mean"][-1]) == pytest.approx(1.0)
+    low = found.lower.sel(band="pointwise")[-1]
+    assert float(low) == pytest.approx(1 + np.log(0.055) * float(found.error[-1]))
+
+
+def test_a_narrow_extreme_inside_an_interval_is_within_the_bands() -> None:
+    interval = prb.decision.Interval(0.0, 1.0)
+    found = box(lambda x, k: x / (1 + ((k - 0.37) / 0.05) ** 2), interval, steps=2)
+    at_worst = box()
+    y = at_worst.y.values
+    inner = (y > 0.3) & (y < found.y.values[-1])
+    lowest = np.interp(y[inner], found.y, found.lower.sel(band="pointwise"))
+    np.testing.assert_allclose(
+        lowest, at_worst.lower.sel(band="pointwise").values[inner], atol=0.03
+    )
+
+
 def test_an_interval_widens_to_both_ends() -> None:
     found = box(lambda x, by: x + by, prb.decision.Interval(-0.5, 0.5))
     y = found.y.values

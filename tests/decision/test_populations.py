@@ -35,6 +35,30 @@ def test_a_normal_population_has_its_mean_spread_and_tail() -> None:
     assert again.responses.count == 0
 
 
+def test_a_tail_of_few_points_is_reported_and_one_of_none_refused() -> None:
+    _, x = normal()
+    found = populations(posterior(), 500)
+
+    def findings(response: Any, quantity: Any, **options: Any) -> Any:
+        return found.sample(response, (x,), None).checked_quantity(quantity(response, x, **options))
+
+    def scattered(x: Any) -> Any:
+        return np.sin(1e4 * x)
+
+    # One response in 200 is above: some points of 300, wherever they are.
+    (finding,) = findings(scattered, prb.decision.Exceedance, limit=np.cos(np.pi / 200))
+    assert finding.code == "rough-probability"
+    assert findings(scattered, prb.decision.Exceedance, limit=0.5) == ()
+    assert findings(doubled, prb.decision.Quantile, probability=0.99) == ()
+    assert findings(doubled, prb.decision.Mean) == ()
+    # A largest response that is a limit is known, and one that is the last point is not.
+    assert findings(np.tanh, prb.decision.Quantile, probability=0.99) == ()
+    assert findings(lambda x: np.minimum(x, 1), prb.decision.Quantile, probability=0.99) == ()
+    assert len(findings(scattered, prb.decision.Quantile, probability=1 - 1e-9)) == 1
+    with pytest.raises(ValueError, match=r"got no response beyond it, of \d+ effective points"):
+        findings(doubled, prb.decision.Exceedance, limit=99.0)
+
+
 def test_an_optimum_is_its_sampling_distribution() -> None:
     found = Populations.of(optimum(), None, 4000, "prb.sensitivity")
     np.testing.assert_allclose(found.center, optimum().theta)
@@ -53,8 +77,8 @@ def test_inputs_without_design_and_lost_responses_are_refused() -> None:
         found.sample(lambda x: np.where(x > 1.0, np.nan, x), (x,), None)
     broken = found.sample(lambda x: np.where(x > 1.0, np.inf, x), (x,), None)
     with pytest.raises(ValueError, match=r"got specimens that failed \(\+inf\)"):
-        broken.refuse_failed(prb.decision.Mean(same, x))
-    broken.refuse_failed(prb.decision.Exceedance(same, x, limit=1.0))
+        broken.checked_quantity(prb.decision.Mean(same, x))
+    broken.checked_quantity(prb.decision.Exceedance(same, x, limit=1.0))
 
 
 def test_an_output_is_found_by_label_or_name() -> None:

@@ -284,6 +284,11 @@ def test_next_steps_depend_on_the_results(calibrated: Any) -> None:
         decision = {"P": risk.assign_attrs(verdict=verdict_text)}
         text = steps(posterior=posterior, validity=test, decision=decision)
         assert ("with prb.decision.Exceedance as its quantity" in text) == is_open
+    rough = risk.assign_attrs(
+        verdict="not decided", findings=as_json([Finding("rough-probability", "Pass points=.")])
+    )
+    text = steps(posterior=posterior, validity=test, decision={"P": rough})
+    assert "as the error of the computation is too large" in text
 
 
 def test_a_bootstrap_is_reported_without_the_model(calibrated: Any, section: Any) -> None:

@@ -13,6 +13,7 @@ import xarray as xr
 from decisions import normal, optimum, same
 
 import prbayes as prb
+from prbayes._finding import Finding
 from prbayes.optimize.convergence import Result
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import NOTHING, cells
@@ -387,8 +388,22 @@ def test_nothing_is_decided_by_a_model_that_is_rejected() -> None:
     assert "The questions of a decision are not answered by it." in sections[0].text
     (decision,) = [section for section in sections if section.title == "Decision"]
     assert decision.text[0].startswith("The calibrated model was rejected")
+    (risks,) = [s.table for s in sections if s.title == "Probability of exceedance"]
+    assert risks["requirement is"].tolist() == ["not answered", "", ""]
     asked = decided(validity=test).sections
     assert not [s for s in asked for line in s.text if "prb.exceedance" in line]
+
+
+def test_a_requirement_is_not_answered_before_problems_are_removed() -> None:
+    finding = Finding("not-converged", "The optimiser did not converge.")
+    unfinished = dataclasses.replace(optimum(), findings=(finding,))
+    sections = prb.Report("x", optimum=unfinished, decision=questions(), pictures=False).sections
+    (risk,) = [line for line in sections[0].text if line.startswith("risk: ")]
+    assert risk.endswith("; the requirement, at most 0.1, is not answered.")
+    (risks,) = [s.table for s in sections if s.title == "Probability of exceedance"]
+    assert risks["requirement is"].tolist()[0] == "not answered"
+    (decision,) = [section for section in sections if section.title == "Decision"]
+    assert decision.text[0].startswith("Remove the problems")
 
 
 def test_what_is_no_decision_or_another_problem_s_is_refused() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,6 +163,19 @@ def breakdown_findings(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> li
         )
         findings.append(Finding("jump-at-optimum", text, "choose.md#the-propagation"))
     return findings
+
+
+def unknown_error_findings(stderr: Mapping[str, Any], obstacle: str | None) -> list[Finding]:
+    """Report standard errors that are NaN, with the obstacle; by default the end of a support."""
+    names = [name for name, errors in stderr.items() if np.isnan(errors).any()]
+    if not names:
+        return []
+    reason = obstacle or "the optimum is at the end of a support, where nothing moves them"
+    text = (
+        f"The standard errors of {', '.join(names)} are not known (NaN): {reason}; or take the "
+        "uncertainty from prb.sample_smc."
+    )
+    return [Finding("no-standard-error", text, "choose.md#the-propagation")]
 
 
 def no_information(evaluator: Evaluator, theta: Floats) -> bool:

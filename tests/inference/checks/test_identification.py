@@ -17,6 +17,7 @@ from prbayes.inference.checks.identification import (
     correlated_estimates,
     elements_at_edge,
     mixed_directions,
+    unknown_error_findings,
 )
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -105,6 +106,31 @@ def test_a_model_without_a_discrepancy_confounds_nothing() -> None:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2) + pm.Normal("nu", 0, 2), 1.0)
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0])
     assert confounding_findings(Evaluator.of(model), local([[1.0], [1.0]], [0.1], 2)) == []
+
+
+def test_standard_errors_that_are_not_known_are_reported_with_the_reason() -> None:
+    stderr = {"mu": 0.1, "tau": np.array([np.inf, 0.2])}
+    assert unknown_error_findings(stderr, None) == []
+    (finding,) = unknown_error_findings(stderr | {"s": np.nan, "v": np.array([1.0, np.nan])}, "y")
+    assert finding.code == "no-standard-error"
+    assert "of s, v are not known (NaN): y; " in finding.text
+    (finding,) = unknown_error_findings({"s": np.nan}, None)
+    assert "end of a support" in finding.text
+
+
+def test_an_optimum_without_standard_errors_has_a_finding() -> None:
+    metric = prb.FunctionMetric(lambda s, o: (s.mean(axis=-1) - o.mean(axis=-1)) ** 2)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
+        observed, propagation = np.linspace(0, 2, 9), prb.Resimulated(64)
+        prb.Simulator(
+            "y", np.positive, x, metric=metric, observed=observed, propagation=propagation
+        )
+    optimum = prb.minimize(model, progressbar=False)
+    assert np.isnan(optimum.stderr["mu"])
+    (finding,) = [f for f in optimum.findings if f.code == "no-standard-error"]
+    assert "refits" in finding.text
+    assert not prb.diagnose(optimum).ok
 
 
 def test_what_breaks_down_is_said_by_name_and_only_then() -> None:
