@@ -61,7 +61,7 @@ from prbayes.response.inputs import (
     model_on_context,
     read_inputs,
 )
-from prbayes.response.outputs import in_order_of, read_observed
+from prbayes.response.outputs import Outputs, in_order_of, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
 # Settings of a propagation for calls of the response.
@@ -120,7 +120,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         effective number N of specimens; unset for other metrics, until `calibrate_epsilon` and
         `set_epsilon`, or `sample_smc`, set it.
     weights : array_like, shape (N,), optional
-        Weights of the observed responses; an index is matched to that of ``observed``.
+        Integers are frequencies: as many specimens have the value, as in a histogram, and N is
+        their sum. Other numbers are relative weights of N specimens, whose effective number is that
+        of Kish, (sum w)^2 / sum w^2. An index is matched to that of ``observed``.
     specimens : array_like, shape (N,), optional
         Labels of the specimens. Observations with the same label, also of several simulators,
         belong together: data sets are drawn specimen by specimen. With a metric of distributions
@@ -193,13 +195,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             )
     for parent in arguments.parents:
         refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
-    groups, measured = None, observed
-    if arguments.groups is not None:
-        groups, measured = group_indices(name, observed, arguments.groups)
-    if isinstance(measured, Variable):
-        measured = _present_numbers(name, measured)
-    values, outputs = read_observed(name, measured)
     weights = in_order_of(weights, observed, f"{name}: weights")
+    values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
+    weights = weights if rows is None else None
     metric = LogLikelihood() if metric is None else metric
     by_specimen = isinstance(metric, Metric) and metric.by_specimen
     if by_specimen:
@@ -255,6 +253,45 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
 
 
 # The log-likelihood by specimen.
+
+
+def _read_specimens(
+    name: str, observed: Any, arguments: Inputs, weights: Any, specimens: Any
+) -> tuple[Floats, Outputs, NDArray[np.intp] | None, NDArray[np.intp] | None]:
+    """Return values and outputs of the specimens, their groups, and their rows by frequency."""
+    groups, measured = None, observed
+    if arguments.groups is not None:
+        groups, measured = group_indices(name, observed, arguments.groups)
+    if isinstance(measured, Variable):
+        measured = _present_numbers(name, measured)
+    values, outputs = read_observed(name, measured)
+    rows = _frequencies(name, weights, np.shape(values)[:1], observed, specimens)
+    if rows is not None:
+        values = values[rows]
+        groups = None if groups is None else groups[rows]
+    return values, outputs, groups, rows
+
+
+def _frequencies(
+    name: str, weights: Any, shape: tuple[int, ...], observed: Any, specimens: Any
+) -> NDArray[np.intp] | None:
+    """Return the row of each specimen where weights are frequencies, whole numbers; else None."""
+    frequencies = np.asarray(weights)
+    if weights is None or frequencies.dtype.kind not in "iu":
+        return None
+    if not shape or frequencies.shape != shape or (frequencies < 0).any() or frequencies.sum() < 2:
+        raise ValueError(
+            f"{name}: weights: got {frequencies.tolist()!s:.60}, expected {shape} frequencies, "
+            "whole numbers from 0 whose sum is at least 2, one for each observed value"
+        )
+    if specimens is not None or isinstance(observed, Variable):
+        other = "pm.Data" if specimens is None else "specimens="
+        raise TypeError(
+            f"{name}: weights: got whole numbers, which are frequencies, beside {other}, expected "
+            "a row for each specimen; pass np.repeat(observed, weights), or relative weights as "
+            "floats"
+        )
+    return np.repeat(np.arange(frequencies.size), frequencies)
 
 
 def _add_measurement(

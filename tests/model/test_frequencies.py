@@ -1,0 +1,75 @@
+"""Whole numbers as weights of observed values are frequencies of specimens."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.model.random_variable import simulators
+
+SAMPLE = np.random.default_rng(0).normal(10, 2, 400)
+COUNTS, EDGES = np.histogram(SAMPLE, bins=20)
+MIDDLES = (EDGES[1:] + EDGES[:-1]) / 2
+METRICS = [
+    prb.KullbackLeibler(),
+    prb.AreaMetric(),
+    prb.ProbabilityResidual(),
+    prb.LogLikelihood(rounded=float(EDGES[1] - EDGES[0])),
+]
+
+
+def model(metric: Any, observed: Any = MIDDLES, **given: Any) -> pm.Model:
+    with pm.Model() as built:
+        x = pm.Normal.dist(pm.Normal("mu", 9, 3), pm.HalfNormal("sigma", 3))
+        settings = {"observed": observed, "propagation": prb.Reweighted(128), **given}
+        prb.Simulator("y", lambda x: 1.0 * x, x, metric=metric, **settings)
+    return built
+
+
+@pytest.mark.parametrize("metric", METRICS, ids=lambda metric: type(metric).__name__)
+def test_a_histogram_is_as_many_specimens_as_it_counts(metric: Any) -> None:
+    """The standard error of the mean is sd / sqrt(400) = .1, not that of twenty values."""
+    counted = prb.minimize(model(metric, weights=COUNTS))
+    repeated = prb.minimize(model(metric, np.repeat(MIDDLES, COUNTS)))
+    assert counted.point == repeated.point
+    assert counted.stderr == repeated.stderr
+    if isinstance(metric, prb.LogLikelihood | prb.KullbackLeibler):
+        assert counted.stderr["mu"] == pytest.approx(SAMPLE.std() / 20, rel=0.1)
+
+
+def test_a_table_of_counts_of_groups() -> None:
+    data = xr.DataArray(
+        [1.0, 2.0, 3.0], coords={"maker": ("specimen", ["a", "b", "a"])}, dims="specimen"
+    )
+    with pm.Model(coords={"maker": ["a", "b"]}) as built:
+        mu = pm.Normal("mu", 0, 2, dims="maker")[prb.response.group("maker")]
+        settings = {"metric": prb.AreaMetric(), "observed": data, "weights": [3, 4, 2]}
+        prb.Simulator("y", lambda x: 1.0 * x, pm.Normal.dist(mu, 1.0), **settings)
+    first, second = (item.target.observed for item in simulators(built).values())
+    np.testing.assert_array_equal(first, [1, 1, 1, 3, 3])
+    np.testing.assert_array_equal(second, [2, 2, 2, 2])
+
+
+def test_relative_weights_are_floats() -> None:
+    optimum = prb.minimize(model(prb.KullbackLeibler(), weights=COUNTS.astype(float)))
+    kish = COUNTS.sum() ** 2 / (COUNTS**2).sum()
+    assert optimum.stderr["mu"] == pytest.approx(SAMPLE.std() / np.sqrt(kish), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "words"),
+    [
+        ({"weights": COUNTS[1:]}, ValueError, "expected \\(20,\\) frequencies"),
+        ({"weights": -COUNTS}, ValueError, "whole numbers from 0"),
+        ({"weights": 0 * COUNTS}, ValueError, "whose sum is at least 2"),
+        ({"weights": COUNTS, "specimens": MIDDLES}, TypeError, "beside specimens="),
+    ],
+)
+def test_wrong_frequencies(given: Any, error: Any, words: str) -> None:
+    with pytest.raises(error, match=f"y: weights: got .*{words}"):
+        model(METRICS[0], **given)
