@@ -480,24 +480,36 @@ def with_common_bandwidths(
     """
     result = list(targets)
     kinds: list[tuple[int, Any]] = []
-    for k, target in enumerate(targets):
-        kinds.append((responses[k], target.metric if _has_bandwidth_rule(target) else None))
+    for response, target in zip(responses, targets, strict=True):
+        metric = None
+        if _has_bandwidth_rule(target):
+            metric = target.metric
+        kinds.append((response, metric))
     for kind in [kind for k, kind in enumerate(kinds) if kind not in kinds[:k]]:
         members = [k for k, second in enumerate(kinds) if second == kind]
-        if kind[1] is None or len(members) < 2:
+        metric = kind[1]
+        if metric is None or len(members) < 2:
             continue
-        rule = kind[1].density.bandwidth
+        rule = metric.density.bandwidth
         pools = []
         for condition in dict.fromkeys(conditions[k] for k in members):
-            pools.append([k for k in members if conditions[k] == condition])
+            pool = [k for k in members if conditions[k] == condition]
+            pools.append(pool)
         samples = [_pooled([targets[k] for k in pool]) for pool in pools]
         if len(pools) > 1 and bartlett(*(values for values, _ in samples)).pvalue > 0.01:
-            deviations = np.concatenate([values - w @ values / w.sum() for values, w in samples])
-            pools, samples = [members], [(deviations, np.concatenate([w for _, w in samples]))]
+            deviations = []
+            for values, counts in samples:
+                mean = counts @ values / counts.sum()
+                deviations.append(values - mean)
+            pooled_counts = np.concatenate([counts for _, counts in samples])
+            pools = [members]
+            samples = [(np.concatenate(deviations), pooled_counts)]
         for pool, (values, counts) in zip(pools, samples, strict=True):
+            if len(pool) < 2:
+                continue
             width = rule(values, counts / counts.sum())
             for k in pool:
-                result[k] = _with_bandwidth(targets[k], width) if len(pool) > 1 else targets[k]
+                result[k] = _with_bandwidth(targets[k], width)
     return result
 
 
@@ -512,7 +524,8 @@ def _pooled(targets: Sequence[Discrepancy]) -> tuple[Floats, Floats]:
     """Return the finite observed values of all targets, with weights that count specimens."""
     values = np.concatenate([target.observed for target in targets])
     counts = np.concatenate([target.weights * target.n_effective for target in targets])
-    is_counted = np.isfinite(values) & (counts > 0)
+    is_counted = np.isfinite(values)
+    is_counted &= counts > 0
     return values[is_counted], counts[is_counted]
 
 

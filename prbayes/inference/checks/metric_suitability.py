@@ -117,7 +117,8 @@ def small_simulators(
             cells = getattr(parts[0], "cells", None)
             widths.add(getattr(cells, "bandwidth", node.name))
     fewest = min((len(node.observed) for node in nodes), default=enough)
-    is_biased = (any(areas) and not refits) or len(widths) > 1
+    has_area = any(areas) and not refits
+    is_biased = has_area or len(widths) > 1
     if len(nodes) < 2 or fewest >= enough or not is_biased or dependent(nodes):
         return []
     # Elements of theta that enter the populations of two simulators.
@@ -151,11 +152,12 @@ def few_for_whitening(name: str, target: Discrepancy) -> list[Finding]:
     for part in target.parts:
         if part.projection is not None and part.projection.direction is not None:
             parts.setdefault(tuple(part.projection.outputs.tolist()), []).append(part)
-    findings = []
+    findings: list[Finding] = []
     for outputs, members in parts.items():
         axes = np.array([p.projection.direction for p in members if p.projection is not None])
         size = np.abs(axes).max(axis=0)
-        m = int(np.linalg.matrix_rank(axes / np.where(size > 0, size, 1.0)))
+        size = np.where(size > 0, size, 1.0)
+        m = int(np.linalg.matrix_rank(axes / size))
         n = members[0].target.n_effective
         # Five for each coordinate, and three for each number of the scatter.
         enough = max(5 * m, 3 * m * (m + 1) // 2)
@@ -178,7 +180,8 @@ def refit_bias(fitted: FittedSets) -> list[Finding]:
         return []
     center = fitted.sampling.thetas(fitted.center[None])[0]
     spread = thetas.std(axis=0)
-    shift = (thetas.mean(axis=0) - center) / np.where(spread > 0, spread, np.inf)
+    spread = np.where(spread > 0, spread, np.inf)
+    shift = (thetas.mean(axis=0) - center) / spread
     worst = int(np.abs(shift).argmax())
     # The mean of 200 refits is known to .07 standard deviations.
     if abs(shift[worst]) < 0.5:
