@@ -335,8 +335,7 @@ def _simulator_params(evaluator: Evaluator) -> list[list[Any]]:
 
 def _log_other(model: pm.Model, variables: list[Any]) -> Any:
     """Return the graph of the log-likelihood of observed variables, plus potentials."""
-    with building("ordinary"):
-        likelihood = model.logp(vars=variables) if variables else pt.constant(0.0)
+    likelihood = model.logp(vars=variables) if variables else pt.constant(0.0)
     return likelihood + model.potentiallogp
 
 

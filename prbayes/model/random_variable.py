@@ -8,7 +8,6 @@ model that is pickled, cloned, conditioned or sent to another process needs this
 from __future__ import annotations
 
 import logging
-import sys
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from inspect import signature
 from math import ceil
+from traceback import walk_stack
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -450,11 +450,7 @@ TERMS: ContextVar[str] = ContextVar("terms that are built", default="all")
 
 @contextmanager
 def building(terms: str) -> Iterator[None]:
-    """Build densities of some terms.
-
-    Of the "ordinary" ones, which contain no epsilon: no warning if it is not set. Or of the
-    "priors" alone: likelihoods by specimen are left out.
-    """
+    """Build densities of some terms: of the "priors" alone likelihoods by specimen are left out."""
     token = TERMS.set(terms)
     try:
         yield
@@ -480,9 +476,11 @@ def _log_density(
         "choose.md#epsilon-and-the-width-of-the-posterior",
     )
     if np.isnan(node.epsilon_value):
-        # nutpie shows only the number of an error; other samplers show the message themselves.
-        is_hidden = "nutpie" in sys.modules and TERMS.get() == "all"
-        report(unset, level=logging.WARNING if is_hidden else logging.DEBUG)
+        report(unset, level=logging.DEBUG)
+        # nutpie would show only the number of an error; other samplers show the message themselves.
+        modules = [str(frame.f_globals.get("__name__")) for frame, _ in walk_stack(None)]
+        if any(module.partition(".")[0] == "nutpie" for module in modules):
+            raise ValueError(str(unset))
     epsilon = CheckParameterValue(str(unset))(node.epsilon, pt.gt(node.epsilon, 0.0))
     density = log_kernel(node.bound.discrepancy(node.bound.inputs.core(params)), epsilon)
     if isinstance(value, Constant):

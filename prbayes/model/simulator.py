@@ -285,11 +285,11 @@ def _frequencies(
             "whole numbers from 0 whose sum is at least 2, one for each observed value"
         )
     if specimens is not None or isinstance(observed, Variable):
-        other = "pm.Data" if specimens is None else "specimens="
+        conflicting = "pm.Data" if specimens is None else "specimens="
         raise TypeError(
-            f"{name}: weights: got whole numbers, which are frequencies, beside {other}, expected "
-            "a row for each specimen; pass np.repeat(observed, weights), or relative weights as "
-            "floats"
+            f"{name}: weights: got whole numbers, which are frequencies, beside {conflicting}, "
+            "expected a row for each specimen; pass np.repeat(observed, weights), or relative "
+            "weights as floats"
         )
     return np.repeat(np.arange(frequencies.size), frequencies)
 
