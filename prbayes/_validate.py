@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -341,10 +342,12 @@ def file_path(value: object, name: str) -> Path:
 
 
 def executes(value: object, name: str) -> None:
-    """Raise if ``value`` is neither None nor an executor."""
-    is_executor = callable(getattr(value, "submit", None)) and callable(getattr(value, "map", None))
-    if value is not None and (isinstance(value, type) or not is_executor):
-        raise TypeError(
-            f"{name}: got {called(value)}, expected a concurrent.futures.Executor, such as "
-            "ProcessPoolExecutor(4)"
-        )
+    """Raise if ``value`` is neither None nor an executor of futures of the standard library."""
+    if value is None or isinstance(value, Executor):
+        return
+    # A Dask client has futures of another kind, and an executor.
+    is_dask = hasattr(value, "get_executor") and not isinstance(value, type)
+    advice = "its get_executor(pure=False)" if is_dask else "ProcessPoolExecutor(4)"
+    raise TypeError(
+        f"{name}: got {called(value)}, expected a concurrent.futures.Executor, such as {advice}"
+    )

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from typing import Any
 
@@ -11,6 +12,7 @@ import xarray as xr
 
 from prbayes._validate import (
     called,
+    executes,
     observed_sample,
     positive_integer,
     positive_number,
@@ -194,6 +196,36 @@ def test_single_precision_is_refused() -> None:
         TypeError, match=r"got hyperparameters of float32, expected float64.*floatX"
     ):
         refuse_single_precision("model", "float32")
+
+
+class _Lookalike:
+    """An object with the methods of an executor, whose futures are of another kind."""
+
+    def submit(self, *work: Any) -> Any:
+        """Return no future."""
+
+    def map(self, *work: Any) -> Any:
+        """Return no results."""
+
+
+class _DaskClient(_Lookalike):
+    def get_executor(self) -> Any:
+        """Return no executor."""
+
+
+@pytest.mark.parametrize(
+    ("value", "advice"),
+    [
+        (_DaskClient(), r"its get_executor\(pure=False\)"),
+        (_Lookalike(), r"ProcessPoolExecutor\(4\)"),
+        (ThreadPoolExecutor, r"ProcessPoolExecutor\(4\)"),
+        (4, r"ProcessPoolExecutor\(4\)"),
+    ],
+    ids=["Dask client", "lookalike", "class", "number"],
+)
+def test_what_is_no_executor_is_refused(value: Any, advice: str) -> None:
+    with pytest.raises(TypeError, match=f"executor: .*a concurrent.futures.Executor, .* {advice}"):
+        executes(value, "executor")
 
 
 def test_an_argument_is_told_on_one_line() -> None:

@@ -25,6 +25,7 @@ from prbayes.model.random_variable import (
     ObservedRV,
     SimulatorRV,
     building,
+    common_targets,
     log_kernel,
     nodes,
 )
@@ -258,7 +259,7 @@ class Evaluator:
             bound = node.bound
             dimensions = bound.inputs.dimensions
             targets.append(target.metric.with_design(target, bound.first_responses, dimensions))
-        return self.with_targets(targets)
+        return self.with_targets(common_targets(self.nodes, targets))
 
     def parents(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the parents of the k-th of `simulators`, shapes (P, *shape)."""
@@ -334,8 +335,7 @@ def _simulator_params(evaluator: Evaluator) -> list[list[Any]]:
 
 def _log_other(model: pm.Model, variables: list[Any]) -> Any:
     """Return the graph of the log-likelihood of observed variables, plus potentials."""
-    with building("ordinary"):
-        likelihood = model.logp(vars=variables) if variables else pt.constant(0.0)
+    likelihood = model.logp(vars=variables) if variables else pt.constant(0.0)
     return likelihood + model.potentiallogp
 
 

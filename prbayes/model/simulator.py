@@ -40,6 +40,7 @@ from prbayes.model.random_variable import (
     has_default_epsilon,
     known_value,
     rv_signature,
+    share_bandwidths,
     shared_epsilon,
     simulators,
 )
@@ -249,6 +250,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         )  # fmt: skip
         data = observed if arguments.groups is None else part.observed
         variables.append(_add_simulator(model, specification, place, data, dims))
+    share_bandwidths(model)
     return tuple(variables) if arguments.groups is not None else variables[0]
 
 
@@ -285,11 +287,11 @@ def _frequencies(
             "whole numbers from 0 whose sum is at least 2, one for each observed value"
         )
     if specimens is not None or isinstance(observed, Variable):
-        other = "pm.Data" if specimens is None else "specimens="
+        conflicting = "pm.Data" if specimens is None else "specimens="
         raise TypeError(
-            f"{name}: weights: got whole numbers, which are frequencies, beside {other}, expected "
-            "a row for each specimen; pass np.repeat(observed, weights), or relative weights as "
-            "floats"
+            f"{name}: weights: got whole numbers, which are frequencies, beside {conflicting}, "
+            "expected a row for each specimen; pass np.repeat(observed, weights), or relative "
+            "weights as floats"
         )
     return np.repeat(np.arange(frequencies.size), frequencies)
 

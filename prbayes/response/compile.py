@@ -56,6 +56,18 @@ def _index_batches(fgraph: Any, node: Any) -> Any:
     return [x[pt.arange(x.shape[0]), index]]
 
 
+def copy_views(fgraph: Any, node: Any) -> Any:
+    """Copy constants that are views of others, which PyTensor may make read-only later."""
+    # NumPy and SciPy raise for a view that may be written if its base may not.
+    copies = [
+        pt.constant(x.data.copy(), dtype=x.type.dtype)
+        if isinstance(x, Constant) and getattr(x.data, "base", None) is not None
+        else x
+        for x in node.inputs
+    ]
+    return False if copies == node.inputs else node.clone_with_new_inputs(copies).outputs
+
+
 # Batched NumPy calls: a heavy compilation does not pay. Without fusion every elementwise operation
 # is one NumPy ufunc; with it, the Python linker would loop over scalars. Sums are split last, as
 # other rewrites would merge them.
@@ -64,6 +76,7 @@ PLAIN = (
     .excluding("fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition")
     .register((out2in(node_rewriter([Blockwise])(_index_batches)), 1000))
     .register((out2in(node_rewriter([Elemwise])(_numpy_elementwise)), 1001))
+    .register((out2in(node_rewriter(None)(copy_views)), 1002))
 )
 
 _flags_lock = RLock()

@@ -196,6 +196,16 @@ def _seed(function: Any, rng: np.random.Generator) -> None:
         shared.set_value(child, borrow=True)
 
 
+def resized(dist: TensorVariable, size: tuple[Any, ...]) -> TensorVariable:
+    """Return independent draws of a distribution along leading axes of this size."""
+    op = dist.owner.op
+    if not hasattr(op, "rv_op"):
+        return change_dist_size(dist, size, expand=True)
+    # PyMC would forget the axes that come from the parameters of these, such as pm.HalfCauchy.
+    shape = event_shape(dist)[: dist.type.ndim - op.ndim_supp]
+    return change_dist_size(dist, (*size, *shape))
+
+
 class PriorSampler:
     """Draws of variables from the prior, all in one call of a compiled function."""
 
@@ -212,7 +222,7 @@ class PriorSampler:
             batches = {}
             for v in variables:
                 if variables.keys() & set(ancestors([v])) == {v}:
-                    batches[v] = change_dist_size(v, (n,), expand=True)
+                    batches[v] = resized(v, (n,))
             outputs = vectorize_graph(list(drawn), batches)
             self._function = pm.compile([n], outputs, mode=PLAIN)
             self._is_batched = True
@@ -288,20 +298,30 @@ class PopulationSampler:
         for v in filter(is_random, ancestors(aleatory)):
             parents = [a for a in ancestors([v]) if a is not v]
             if not any(a in symbols or is_random(a) for a in parents):
-                per_specimen[v] = change_dist_size(v, size, expand=True)
+                per_specimen[v] = resized(v, size)
         self._is_batched = True
         try:
             specimens = vectorize_graph(aleatory, per_specimen)
             if epistemic:
                 common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True)))
-        except (NotImplementedError, ValueError):
+        except (NotImplementedError, ValueError, MissingInputError):
             # Not vectorized by PyTensor: one population at a time.
             self._is_batched, batched = False, symbols
             # Resized before the parents are replaced, since PyMC resizes a CustomDist with its
             # first parameters.
-            resized = [change_dist_size(d, (n,), expand=True) for d in inputs.aleatory]
+            try:
+                if inputs.nested:  # parts of an input are drawn for each specimen too
+                    parts = set(filter(is_random, ancestors(inputs.aleatory, inputs.parents)))
+                    parts -= set(inputs.parents)
+                    first = [v for v in parts if parts & set(ancestors([v], inputs.parents)) == {v}]
+                    per_specimen = {v: resized(v, (n,)) for v in first}
+                    many = vectorize_graph(list(inputs.aleatory), per_specimen)
+                else:
+                    many = [resized(dist, (n,)) for dist in inputs.aleatory]
+            except (NotImplementedError, ValueError, MissingInputError) as error:
+                raise self.refusal(error) from None
             replaced = dict(zip(inputs.parents, symbols, strict=True))
-            specimens = graph_replace(resized, replaced, strict=False)
+            specimens = graph_replace(many, replaced, strict=False)
         self._event_shapes = inputs.event_shapes
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
         self._function = pm.compile(
@@ -310,6 +330,14 @@ class PopulationSampler:
             mode=PLAIN,
             on_unused_input="ignore",
             allow_input_downcast=True,
+        )
+
+    def refusal(self, error: Exception) -> TypeError:
+        """Return the error of inputs that cannot be drawn."""
+        return TypeError(
+            f"inputs: got {self._names}, one of which cannot be drawn "
+            f"({str(error).splitlines()[0]}), expected distributions from which specimens can be "
+            "drawn; give a pm.CustomDist its random="
         )
 
     def __call__(
@@ -328,11 +356,7 @@ class PopulationSampler:
                 populations = [self._function(n, *row) for row in zip(*params, strict=True)]
                 values = [np.stack(column) for column in zip(*populations, strict=True)]
         except (NotImplementedError, RuntimeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
-            raise TypeError(
-                f"inputs: got {self._names}, one of which cannot be drawn ({reason}), expected "
-                "distributions from which specimens can be drawn; give a pm.CustomDist its random="
-            ) from None
+            raise self.refusal(error) from None
         n_aleatory = len(self._event_shapes)
         # SciPy's generators, behind some distributions, drop leading axes of length one.
         aleatory = [

@@ -119,15 +119,21 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     aleatory: list[TensorVariable] = []
     parents: dict[TensorVariable, None] = {}
     is_nested = False
-    for i, x in enumerate(inputs):
+    for i, argument in enumerate(inputs):
         label = f"{name}: input {i + 1}"
+        x = argument
+        if isinstance(x, Variable):
+            ancestry = _ancestry([x])
+            has_dims = any(hasattr(v.type, "dims") for v in ancestry)
+            if not has_dims and all(hasattr(v, "data") for v in ancestry if v.owner is None):
+                x = x.eval(mode=PLAIN)  # of constants alone
         if not isinstance(x, Variable):
             try:
                 array = real_array(x, label)
             except TypeError as error:
                 raise TypeError(
                     f"{error}; an input is a `.dist()` (varies between specimens), a model "
-                    "variable (common to all) or a number"
+                    "variable (common to all) or a number; pass several as several inputs"
                 ) from None
             if not np.isfinite(array).all():
                 raise ValueError(
@@ -205,10 +211,7 @@ def _refuse_foreign_variables(
     loose = [
         v
         for v in ancestry
-        if v.owner is None
-        and isinstance(v, TensorVariable)
-        and not hasattr(v, "data")
-        and not hasattr(v, "get_value")
+        if v.owner is None and not hasattr(v, "data") and not hasattr(v, "get_value")
     ]
     # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
     foreign = [v for v in latent if hasattr(v, "str_repr")]

@@ -368,7 +368,7 @@ def lossy(name: str, seed: int, n: int) -> pm.Model:
     return model
 
 
-@pytest.mark.parametrize(("name", "seed"), [("kl", 0), ("pr", 1)])
+@pytest.mark.parametrize(("name", "seed"), [("kl", 0), ("pr", 2)])
 def test_bfgs_steps_over_the_jumps_of_points_that_lose_their_response(name: str, seed: int) -> None:
     model = lossy(name, seed, 4096)
     by_simplex = prb.minimize(model, start=START, method="Nelder-Mead")

@@ -11,6 +11,8 @@ import pymc as pm
 import pytensor.tensor as pt
 import pytest
 import xarray as xr
+from pytensor.scalar import float64
+from pytensor.tensor.type_other import NoneConst
 from suppliers import labelled
 
 import prbayes as prb
@@ -128,6 +130,21 @@ BAD: dict[str, tuple[Callable[[Any, Any], list[Any]], type[Exception], str]] = {
         TypeError,
         r"input 1: .*depends on loose.*inside the same `with pm.Model\(\)`",
     ),
+    "symbol of a scalar": (
+        lambda m, s: [pm.Normal.dist(m, s), float64("loose")],
+        TypeError,
+        r"input 2: .*depends on loose",
+    ),
+    "list of variables": (
+        lambda m, s: [pm.Normal.dist(m, s), [m, 1.0]],
+        TypeError,
+        r"input 2: got an array of dtype object.*pass several as several inputs",
+    ),
+    "constant of another kind": (
+        lambda m, s: [pm.Normal.dist(m, s), NoneConst],
+        TypeError,
+        r"input 2: got .*None.*expected real numbers",
+    ),
     "another model, above": (
         lambda m, s: [pm.Normal.dist(STRANGER, s)],
         TypeError,
@@ -167,6 +184,22 @@ def test_constants_are_changed_by_nobody() -> None:
     np.testing.assert_array_equal(kept, [1.0, 2.0])
     with pytest.raises(ValueError, match="read-only"):
         kept *= 2
+
+
+@pytest.mark.parametrize(
+    ("graph", "value"),
+    [
+        (pt.constant(3), 3.0),
+        (pt.exp(pt.constant(1.0)), np.e),
+        (pt.as_tensor([1.0, 2.0]), [1.0, 2.0]),
+        (pt.stack([pt.constant(1.0), 2.0]) * 2, [2.0, 4.0]),
+    ],
+    ids=["number", "expression", "vector", "stack"],
+)
+def test_a_graph_of_constants_is_a_constant(graph: Any, value: Any) -> None:
+    inputs, _, _ = read(lambda mu, sigma: [pm.Normal.dist(mu, sigma), graph])
+    assert inputs.epistemic == ()
+    np.testing.assert_allclose(inputs.arguments[1], value)
 
 
 def test_variables_of_pymc_dims_are_refused_by_a_sentence() -> None:
