@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._display import view
 from prbayes._finding import Finding, from_json
 from prbayes._validate import Floats
-from prbayes.inference.checks.metric_suitability import small_simulators
+from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
 from prbayes.inference.goodness_of_fit import (
     UNLIKELY,
@@ -258,14 +258,13 @@ def _not_tested(reason: str) -> Checked:
 def _check_family(optimum: Optimum) -> Checked:
     """Test whether the data can come from the best population, or report why it was not tested."""
     evaluator = optimum.evaluator
-    checked = Checked(tuple(small_simulators(evaluator)))
     obstacle = refit_obstacle(evaluator)
     if not optimum.converged or optimum.search.at_edge or optimum.search.at_jump:
         obstacle = "nothing is known of the sampling distribution of this optimum"
     elif obstacle is None and evaluator.responses_per_theta:
         obstacle = "it would take responses"
     if obstacle is not None:
-        return checked + _not_tested(obstacle)
+        return Checked(tuple(small_simulators(evaluator))) + _not_tested(obstacle)
     fitted: FittedSets | None
     if optimum.search.prior:
         scales = np.array(list(optimum.scales.values()))
@@ -275,10 +274,12 @@ def _check_family(optimum: Optimum) -> Checked:
         fitted = FittedSets.of(optimum.sampling(), SETS, 0)
     p_value = np.nan if fitted is None else fitted.p_value
     if fitted is None or np.isnan(p_value):
+        checked = Checked(tuple(small_simulators(evaluator)))
         return checked + _not_tested("the data are uninformative, or too few refits converge")
     misfits = tuple(output_misfits(fitted)) if p_value < UNLIKELY else ()
     misfit = population_misfit(p_value, with_prior=optimum.search.prior)
-    return checked + Checked(tuple(misfit), misfits)
+    biases = *small_simulators(evaluator, refits=True), *refit_bias(fitted)
+    return Checked((*biases, *misfit), misfits)
 
 
 # -- responses -------------------------------------------------------------------------------
