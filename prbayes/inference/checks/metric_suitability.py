@@ -13,8 +13,7 @@ from prbayes._finding import Finding
 from prbayes._stats import quantile
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Local, single_output_parts
-from prbayes.inference.resampling import dependent
-from prbayes.metrics.base import Minimum, is_likelihood
+from prbayes.metrics.base import Minimum
 from prbayes.metrics.likelihood import kernel_width, with_narrower_kernel
 from prbayes.model.evaluator import Evaluator
 from prbayes.numerics.derivatives import hessian_of, slopes, stencil
@@ -94,40 +93,6 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
                 )
                 findings.append(Finding("data-between-runs", text, _ADVICE))
     return findings
-
-
-def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[Finding]:
-    """Report simulators of so few specimens that the spread in common is estimated too small.
-
-    Bandwidths of few data let simulators that happen to scatter little weigh most, and a sum of
-    areas leaves out the scatter between their means. The probability residual is right.
-    """
-    nodes = evaluator.nodes
-    is_biased = [
-        node.metric.minimum is Minimum.ABSOLUTE or is_likelihood(node.target) for node in nodes
-    ]
-    fewest = min((len(node.observed) for node in nodes), default=enough)
-    if len(nodes) < 2 or fewest >= enough or not any(is_biased) or dependent(nodes):
-        return []
-    # Elements of theta that enter the populations of two simulators.
-    hyperparameters = evaluator.hyperparameters
-    prior_sd = hyperparameters.prior_sd
-    thetas = hyperparameters.initial + np.vstack([0 * prior_sd, np.diag(prior_sd)])
-    count = np.zeros(hyperparameters.size)
-    for k in range(len(nodes)):
-        flat = [parent.reshape(len(thetas), -1) for parent in evaluator.parents(thetas, k)]
-        count += np.any([(f[1:] != f[0]).any(axis=1) for f in flat], axis=0)
-    if not (count > 1).any():
-        return []
-    return [
-        Finding(
-            "small-simulators",
-            f"The optimum underestimates a spread that {len(nodes)} simulators have in common, as "
-            f"they have {fewest} specimens or more, expected at least {enough}: by 30% with 4, 10% "
-            "with 10; take the posterior of prb.sample, which corrects for it, or "
-            "prb.ProbabilityResidual(), or give one simulator all specimens of a condition.",
-        )
-    ]
 
 
 def smoothing_bias(

@@ -12,7 +12,6 @@ import prbayes as prb
 from prbayes.inference.checks.metric_suitability import (
     data_between_runs,
     heavy_tails,
-    small_simulators,
     smoothing_bias,
 )
 from prbayes.inference.refits import SamplingDistribution
@@ -88,30 +87,6 @@ def test_a_value_beside_a_response_on_either_side_is_not_reported() -> None:
     for value, count in ((low + 0.01, 0), ((low + high) / 2, 1), (high - 0.01, 0)):
         evaluator = evaluator_of(lognormal, LOG_LIKELIHOOD, np.append(bulk, value))
         assert len(data_between_runs(evaluator, theta)) == count
-
-
-@pytest.mark.parametrize(
-    ("metric", "shared", "n", "is_reported"),
-    [
-        (prb.AreaMetric(), True, 12, True),
-        (LOG_LIKELIHOOD, True, 12, True),
-        (prb.ProbabilityResidual(), True, 12, False),
-        (prb.AreaMetric(), False, 12, False),
-        (prb.AreaMetric(), True, 30, False),
-    ],
-)
-def test_few_specimens_underestimate_a_spread_in_common(
-    metric: prb.Metric, shared: bool, n: int, is_reported: bool
-) -> None:
-    with pm.Model() as model:
-        spread = pm.HalfNormal("s", 1)
-        for k in range(2):
-            x = pm.Normal.dist(0, spread if shared else pm.HalfNormal(f"s{k}", 1))
-            prb.Simulator(f"y{k}", same, x, metric=metric, observed=INPUTS[:n])
-    findings = small_simulators(Evaluator.of(model))
-    assert len(findings) == is_reported
-    for finding in findings:
-        assert f"they have {n} specimens or more, expected at least 30" in finding.text
 
 
 def branches(x: Any) -> Any:
