@@ -8,13 +8,14 @@ the metrics cheap and differentiable.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
+from scipy.stats import bartlett
 
 from prbayes._stats import finite_sample, quantile
 from prbayes._validate import AT_ONCE, Floats, positive_integer, positive_number, sample_weights
@@ -463,3 +464,75 @@ def overlap(target: Discrepancy, simulated: Floats, weights: Floats) -> Floats:
         cosine = product_sum / np.where(size > 0, size, 1.0)
         cosines.append(np.nan_to_num(cosine))
     return np.asarray(np.min(cosines, axis=0))
+
+
+def with_common_bandwidths(
+    targets: Sequence[Discrepancy], responses: Sequence[int], conditions: Sequence[int]
+) -> list[Discrepancy]:
+    """Return discrepancies where one bandwidth serves all data of a response, if it has a rule.
+
+    Bandwidths of few data each would let the simulators that happen to scatter little weigh most,
+    so that a spread in common is underestimated. This concerns metrics on the scale of a
+    likelihood. Targets with equal numbers in ``responses`` have the same units, those with equal
+    numbers in ``conditions`` the same population. Data of one condition are pooled as they are;
+    those of several, as deviations from their means, unless Bartlett's test finds that their
+    spreads differ.
+    """
+    result = list(targets)
+    kinds: list[tuple[int, Any]] = []
+    for response, target in zip(responses, targets, strict=True):
+        metric = None
+        if _has_bandwidth_rule(target):
+            metric = target.metric
+        kinds.append((response, metric))
+    for kind in [kind for k, kind in enumerate(kinds) if kind not in kinds[:k]]:
+        members = [k for k, second in enumerate(kinds) if second == kind]
+        metric = kind[1]
+        if metric is None or len(members) < 2:
+            continue
+        rule = metric.density.bandwidth
+        pools = []
+        for condition in dict.fromkeys(conditions[k] for k in members):
+            pool = [k for k in members if conditions[k] == condition]
+            pools.append(pool)
+        samples = [_pooled([targets[k] for k in pool]) for pool in pools]
+        if len(pools) > 1 and bartlett(*(values for values, _ in samples)).pvalue > 0.01:
+            deviations = []
+            for values, counts in samples:
+                mean = counts @ values / counts.sum()
+                deviations.append(values - mean)
+            pooled_counts = np.concatenate([counts for _, counts in samples])
+            pools = [members]
+            samples = [(np.concatenate(deviations), pooled_counts)]
+        for pool, (values, counts) in zip(pools, samples, strict=True):
+            if len(pool) < 2:
+                continue
+            width = rule(values, counts / counts.sum())
+            for k in pool:
+                result[k] = _with_bandwidth(targets[k], width)
+    return result
+
+
+def _has_bandwidth_rule(target: Discrepancy) -> bool:
+    """Return whether a log-likelihood or divergence has a kernel whose width its data decide."""
+    density = getattr(target.metric, "density", None)
+    has_rule = isinstance(density, GaussianKDE) and callable(density.bandwidth)
+    return isinstance(target, DensityDiscrepancy) and target.metric.likelihood and has_rule
+
+
+def _pooled(targets: Sequence[Discrepancy]) -> tuple[Floats, Floats]:
+    """Return the finite observed values of all targets, with weights that count specimens."""
+    values = np.concatenate([target.observed for target in targets])
+    counts = np.concatenate([target.weights * target.n_effective for target in targets])
+    is_counted = np.isfinite(values)
+    is_counted &= counts > 0
+    return values[is_counted], counts[is_counted]
+
+
+def _with_bandwidth(target: Any, width: float) -> Discrepancy:
+    """Return the discrepancy with a kernel of another width, itself if it is the same."""
+    if np.isclose(target.cells.bandwidth, width, rtol=1e-9, atol=0.0):
+        return cast(Discrepancy, target)
+    metric = replace(target.metric, density=GaussianKDE(width))
+    prepared: Discrepancy = metric.against(target.observed, target.weights)
+    return replace(prepared, metric=target.metric)

@@ -50,9 +50,17 @@ class Components:
 
     @property
     def missed(self) -> str:
-        """A clause about structure of the data that is left out; empty if it is noise."""
-        if self.left_out <= LEFT_OUT or self.rest_correlation < 0.5:  # white noise has .1
+        """A clause about what is left out of the data; empty if it is noise that no model has."""
+        if self.left_out <= LEFT_OUT:
             return ""
+        if self.rest_correlation < 0.5:  # white noise has .1
+            if not self.design_left_out > LEFT_OUT:
+                return ""
+            return (
+                f"{self.summary}: noise that the model has too, and whose size rests on the few "
+                "directions in which the data happen to vary most; leave metric= out, for the "
+                "log-likelihood by specimen, or use prb.MarginalCorrelation(metric)"
+            )
         return (
             f"{self.summary}: it is no noise, and the metric does not compare it; pass more "
             "components= to prb.Joint, or measure more specimens"

@@ -25,6 +25,7 @@ from prbayes.model.random_variable import (
     ObservedRV,
     SimulatorRV,
     building,
+    common_targets,
     log_kernel,
     nodes,
 )
@@ -258,7 +259,7 @@ class Evaluator:
             bound = node.bound
             dimensions = bound.inputs.dimensions
             targets.append(target.metric.with_design(target, bound.first_responses, dimensions))
-        return self.with_targets(targets)
+        return self.with_targets(common_targets(self.nodes, targets))
 
     def parents(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the parents of the k-th of `simulators`, shapes (P, *shape)."""

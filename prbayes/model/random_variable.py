@@ -40,6 +40,7 @@ from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
+from prbayes.metrics.density import with_common_bandwidths
 from prbayes.model.data_checks import check_constant, check_failing_region, warn_out_of_range
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
@@ -135,13 +136,19 @@ class Node:
             target = self.metric.against(values, target.weights if is_same_size else None)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
-        bound = bound.copied()
         dimensions = bound.inputs.dimensions
-        bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
-        changed = replace(self, target=bound.target, bound=bound)
+        changed = self.comparing(
+            target.metric.with_design(target, bound.first_responses, dimensions)
+        )
         if has_default_epsilon(self):
             changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
         return changed
+
+    def comparing(self, target: Discrepancy) -> Node:
+        """Return the same simulator with another prepared metric."""
+        bound = self.bound.copied()
+        bound.target = target
+        return replace(self, target=target, bound=bound)
 
     def copied(self) -> Node:
         """Return the same simulator with its own design, count of responses and epsilon."""
@@ -598,7 +605,39 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
         if node is not simulator:
             rv.owner.op.assign(rv.owner, node)
         by_variable[rv] = node
+    computed_nodes = list(by_variable.values())
+    targets = common_targets(computed_nodes, [node.target for node in computed_nodes])
+    for (rv, node), target in zip(by_variable.items(), targets, strict=True):
+        if target is not node.target:
+            by_variable[rv] = node.comparing(target)
+            rv.owner.op.assign(rv.owner, by_variable[rv])
     return by_variable
+
+
+def common_targets(
+    simulators: Sequence[AnySimulator], targets: Sequence[Discrepancy]
+) -> list[Discrepancy]:
+    """Return the prepared metrics of simulators, where those of one response share a bandwidth."""
+    responses, conditions = [], []
+    for simulator in simulators:
+        calls, group = simulator.responses, simulator.group
+        of_response = (s.responses.function is calls.function for s in simulators)
+        of_condition = (s.group == group and s.responses.same_as(calls) for s in simulators)
+        responses.append(next(k for k, is_same in enumerate(of_response) if is_same))
+        conditions.append(next(k for k, is_same in enumerate(of_condition) if is_same))
+    return with_common_bandwidths(targets, responses, conditions)
+
+
+def share_bandwidths(model: pm.Model) -> None:
+    """Prepare metrics again that share a bandwidth with a new simulator.
+
+    The next call of `nodes` does this for simulators in use.
+    """
+    present = list(simulators(model).values())
+    targets = common_targets(present, [simulator.target for simulator in present])
+    for simulator, target in zip(present, targets, strict=True):
+        if isinstance(simulator, Specification) and simulator.node is None:
+            vars(simulator)["target"] = target
 
 
 class abc_distance(Op):  # noqa: N801 (reads as a function in a model)

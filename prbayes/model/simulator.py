@@ -40,6 +40,7 @@ from prbayes.model.random_variable import (
     has_default_epsilon,
     known_value,
     rv_signature,
+    share_bandwidths,
     shared_epsilon,
     simulators,
 )
@@ -247,6 +248,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         )  # fmt: skip
         data = observed if arguments.groups is None else part.observed
         variables.append(_add_simulator(model, specification, place, data, dims))
+    share_bandwidths(model)
     return tuple(variables) if arguments.groups is not None else variables[0]
 
 

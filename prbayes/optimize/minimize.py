@@ -35,6 +35,7 @@ from prbayes.inference.checks.identification import (
 )
 from prbayes.inference.checks.metric_suitability import (
     data_between_runs,
+    few_for_whitening,
     heavy_tails,
     smoothing_bias,
 )
@@ -559,6 +560,8 @@ def optimum_findings(
     findings = [
         Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
     ]
+    for node in evaluator.nodes:
+        findings += few_for_whitening(node.name, node.target)
     findings += design_error_findings(evaluator, design_error)
     findings += [mode.finding(evaluator) for mode in optima if mode.comparable]
     if sampling is not None:

@@ -14,8 +14,8 @@ import xarray as xr
 from prbayes._display import view
 from prbayes._finding import Finding, from_json
 from prbayes._validate import Floats
+from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
-from prbayes.inference.checks.sample_size import small_simulators
 from prbayes.inference.goodness_of_fit import (
     UNLIKELY,
     FittedSets,
@@ -263,14 +263,13 @@ def _check_family(optimum: Optimum) -> Checked:
     """Test whether the data can come from the best population, or report why it was not tested."""
     evaluator = optimum.evaluator
     failures = unpredicted_failures(evaluator, optimum.theta) if is_stored(evaluator) else []
-    checked = Checked((*small_simulators(evaluator), *failures))
     obstacle = refit_obstacle(evaluator)
     if not optimum.converged or optimum.search.at_edge or optimum.search.at_jump:
         obstacle = "nothing is known of the sampling distribution of this optimum"
     elif obstacle is None and _seconds_of_test(optimum) > 30:
         obstacle = f"it would take {SETS * evaluator.responses_per_theta} responses"
     if obstacle is not None:
-        return checked + _not_tested(obstacle)
+        return Checked((*small_simulators(evaluator), *failures)) + _not_tested(obstacle)
     fitted: FittedSets | None
     if optimum.search.prior:
         scales = np.array(list(optimum.scales.values()))
@@ -280,6 +279,7 @@ def _check_family(optimum: Optimum) -> Checked:
         fitted = FittedSets.of(optimum.sampling(), SETS, 0)
     p_value = np.nan if fitted is None else fitted.p_value
     if fitted is None or np.isnan(p_value):
+        checked = Checked((*small_simulators(evaluator), *failures))
         return checked + _not_tested("the data are uninformative, or too few refits converge")
     misfits: tuple[Finding, ...] = ()
     ties, p_spread_out = "", np.nan
@@ -293,7 +293,10 @@ def _check_family(optimum: Optimum) -> Checked:
     misfit = population_misfit(
         p_value, with_prior=optimum.search.prior, ties=ties, p_spread_out=p_spread_out
     )
-    return checked + Checked(tuple(misfit), misfits)
+    biases = [*small_simulators(evaluator, refits=is_stored(evaluator)), *failures]
+    if is_stored(evaluator):
+        biases += refit_bias(fitted)
+    return Checked((*biases, *misfit), misfits)
 
 
 def _seconds_of_test(optimum: Optimum) -> float:

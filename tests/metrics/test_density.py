@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
+from prbayes import AreaMetric, KullbackLeibler, LogLikelihood, ProbabilityResidual
 from prbayes.metrics import density
 from prbayes.metrics.density import (
     GaussianKDE,
@@ -16,6 +18,7 @@ from prbayes.metrics.density import (
     silverman,
     spread,
     twice_silverman,
+    with_common_bandwidths,
 )
 
 INF, NAN = np.inf, np.nan
@@ -144,3 +147,72 @@ def test_values_without_weight_are_as_if_left_out(estimator: Any) -> None:
     beside = estimator.cells(np.r_[-50.0, observed, 1.0, 9.0], np.r_[0.0, weights, 0.0, 0.0])
     np.testing.assert_array_equal(beside.widths, alone.widths)
     np.testing.assert_array_equal(beside.centers, alone.centers)
+
+
+PARTS = np.random.default_rng(701).normal(1, 0.5, (5, 4))
+POPULATION = norm.ppf((np.arange(4001) + 0.5) / 4001)
+
+
+def log_spread_of_minimum(targets: Any) -> float:
+    """Return log of the spread of the best normal population, relative to that of all parts."""
+    logs = np.linspace(-1, 0.5, 301)
+    values = PARTS.mean() + PARTS.std() * np.exp(logs)[:, None] * POPULATION
+    weights = np.full(values.shape, 1 / values.shape[1])
+    total = sum(target.n_effective * target.of(values, weights) for target in targets)
+    return float(logs[np.argmin(total)])
+
+
+def log_spread_by_formula(targets: Any) -> float:
+    """Return the same from the divergence of normal parts, which are smoothed by a normal."""
+    h2 = np.array([target.cells.bandwidth**2 for target in targets])
+    own = PARTS.var(axis=1)[:, None] + (PARTS.mean(axis=1)[:, None] - PARTS.mean()) ** 2
+    logs = np.linspace(-1, 0.5, 301)
+    variance = PARTS.var() * np.exp(2 * logs) + h2[:, None]
+    return float(logs[np.argmin((np.log(variance) + (own + h2[:, None]) / variance).sum(axis=0))])
+
+
+def test_one_bandwidth_for_all_parts_gives_the_spread_of_all() -> None:
+    targets = [KullbackLeibler().against(part) for part in PARTS]
+    assert log_spread_of_minimum(targets) == pytest.approx(
+        log_spread_by_formula(targets), abs=0.011
+    )
+    assert log_spread_of_minimum(targets) < -0.05
+    common = with_common_bandwidths(targets, [0] * 5, [0] * 5)
+    assert log_spread_of_minimum(common) == pytest.approx(0.0, abs=0.006)
+    pooled: Any = KullbackLeibler().against(PARTS.ravel())
+    for target in common:
+        assert target.cells.bandwidth == pytest.approx(pooled.cells.bandwidth)
+        assert target.metric == KullbackLeibler()
+    again = with_common_bandwidths(common, [0] * 5, [0] * 5)
+    assert all(x is y for x, y in zip(again, common, strict=True))
+
+
+@pytest.mark.parametrize("metric", [KullbackLeibler(), LogLikelihood(density=GaussianKDE())])
+def test_conditions_of_a_response_with_like_spreads_have_one_bandwidth(metric: Any) -> None:
+    shifted = PARTS + 100 * np.arange(5)[:, None]
+    targets = [metric.against(part) for part in shifted]
+    widths = [t.cells.bandwidth for t in with_common_bandwidths(targets, [0] * 5, range(5))]
+    np.testing.assert_allclose(widths, widths[0])
+    middle = np.concatenate([part - part.mean() for part in PARTS])
+    assert widths[0] == pytest.approx(metric.against(middle).cells.bandwidth)
+    # In units of their own, and with another spread, data have a bandwidth of their own.
+    assert with_common_bandwidths(targets, range(5), range(5)) == targets
+    targets[-1] = metric.against(1000 * PARTS[-1])
+    assert with_common_bandwidths(targets, [0] * 5, range(5)) == targets
+    # Data of one condition are pooled nevertheless.
+    widths = [t.cells.bandwidth for t in with_common_bandwidths(targets, [0] * 5, [0, 0, 1, 2, 3])]
+    assert widths[0] == widths[1] != widths[2]
+
+
+@pytest.mark.parametrize(
+    "metric",
+    [
+        AreaMetric(),
+        ProbabilityResidual(),
+        KullbackLeibler(GaussianKDE(0.3)),
+        KullbackLeibler(Histogram()),
+    ],
+)
+def test_bandwidths_that_do_no_harm_or_were_given_stay(metric: Any) -> None:
+    targets = [metric.against(part) for part in PARTS]
+    assert with_common_bandwidths(targets, [0] * 5, [0] * 5) == targets

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ def test_two_inputs_make_two_components_and_a_remainder_is_noise_or_structure() 
     assert "it is no noise" in too_few.missed
     assert not found.missed
     assert not noisy.missed
+    assert "noise that the model has too" in replace(noisy, design_left_out=0.2).missed
 
 
 def test_the_fewest_that_leave_out_a_hundredth_of_data_and_design() -> None:

@@ -290,6 +290,32 @@ def test_set_data_gives_the_model_of_the_new_data(metric: prb.Metric) -> None:
     assert Evaluator.of(model)(THETA).discrepancies == first.evaluator(THETA).discrepancies
 
 
+def test_simulators_of_a_response_have_one_bandwidth() -> None:
+    def widths(model: pm.Model) -> list[float]:
+        return [node.target.cells.bandwidth for node in nodes(model).values()]
+
+    metric, points = prb.KullbackLeibler(), prb.Reweighted(64)
+    rows = np.random.default_rng(1).normal(size=(3, 6))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        arguments = {"metric": metric, "propagation": points}
+        first = pm.Data("first", rows[0])
+        prb.Simulator("y0", np.negative, x, observed=first, **arguments)
+        prb.Simulator("y1", np.negative, x, observed=rows[1], **arguments)
+    width = metric.against(rows[:2].ravel()).cells.bandwidth
+    np.testing.assert_allclose(widths(model), width)
+    with model:  # those in use take part
+        prb.Simulator("y2", np.negative, x, observed=rows[2], **arguments)
+    np.testing.assert_allclose(widths(model), metric.against(rows.ravel()).cells.bandwidth)
+    pm.set_data({"first": 5 + rows[0]}, model=model)
+    changed = np.concatenate([5 + rows[0], *rows[1:]])
+    np.testing.assert_allclose(widths(model), metric.against(changed).cells.bandwidth)
+    observed = {f"y{k}": row for k, row in enumerate(rows)}
+    again = Evaluator.of(model).observing(observed)
+    expected = metric.against(rows.ravel()).cells.bandwidth
+    np.testing.assert_allclose([n.target.cells.bandwidth for n in again.nodes], expected)
+
+
 def test_data_of_whole_numbers_may_change() -> None:
     model = build(observed=np.arange(5), as_data=True)
     pm.set_data({"data": np.arange(7)}, model=model)

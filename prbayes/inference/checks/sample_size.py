@@ -1,4 +1,4 @@
-"""Checks of the number of specimens: too few for standard errors, or for a sum of simulators."""
+"""Checks of the number of specimens: too few for standard errors."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from scipy.stats import chi2, norm, t
 
 from prbayes._finding import Finding
 from prbayes._stats import INTERVAL
-from prbayes.inference.resampling import dependent
-from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.model.evaluator import Evaluator
 
 
@@ -82,29 +80,3 @@ def few_specimens(evaluator: Evaluator, enough: int = 8) -> list[Finding]:
     text += "report intervals of prb.sample, not the optimum's."
     page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
     return [Finding("few-specimens", text, page)]
-
-
-def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[Finding]:
-    """Report simulators of so few specimens that the spread in common is estimated too small.
-
-    Bandwidths of few data let simulators that happen to scatter little weigh most, and a sum of
-    areas leaves out the scatter between their means. The probability residual is right.
-    """
-    nodes = evaluator.nodes
-    is_biased = [
-        node.metric.minimum is Minimum.ABSOLUTE or is_likelihood(node.target) for node in nodes
-    ]
-    fewest = min((len(node.observed) for node in nodes), default=enough)
-    if len(nodes) < 2 or fewest >= enough or not any(is_biased) or dependent(nodes):
-        return []
-    if not (elements_above(evaluator)[: len(nodes)].sum(axis=0) > 1).any():
-        return []
-    return [
-        Finding(
-            "small-simulators",
-            f"The optimum underestimates a spread that {len(nodes)} simulators have in common, as "
-            f"they have {fewest} specimens or more, expected at least {enough}: by 30% with 4, 10% "
-            "with 10; take the posterior of prb.sample, which corrects for it, or "
-            "prb.ProbabilityResidual(), or give one simulator all specimens of a condition.",
-        )
-    ]

@@ -1,5 +1,6 @@
 """Populations without a mean, data between runs, and kernels that are too wide."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,10 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes.inference.checks.metric_suitability import (
     data_between_runs,
+    few_for_whitening,
     heavy_tails,
+    refit_bias,
+    small_simulators,
     smoothing_bias,
 )
 from prbayes.inference.refits import SamplingDistribution
@@ -87,6 +91,77 @@ def test_a_value_beside_a_response_on_either_side_is_not_reported() -> None:
     for value, count in ((low + 0.01, 0), ((low + high) / 2, 1), (high - 0.01, 0)):
         evaluator = evaluator_of(lognormal, LOG_LIKELIHOOD, np.append(bulk, value))
         assert len(data_between_runs(evaluator, theta)) == count
+
+
+@pytest.mark.parametrize(
+    ("metric", "shared", "n", "is_reported"),
+    [
+        (prb.AreaMetric(), True, 12, True),
+        (prb.ProbabilityResidual(), True, 12, False),
+        (prb.AreaMetric(), False, 12, False),
+        (prb.AreaMetric(), True, 30, False),
+    ],
+)
+def test_few_specimens_underestimate_a_spread_in_common(
+    metric: prb.Metric, shared: bool, n: int, is_reported: bool
+) -> None:
+    with pm.Model() as model:
+        spread = pm.HalfNormal("s", 1)
+        for k in range(2):
+            x = pm.Normal.dist(0, spread if shared else pm.HalfNormal(f"s{k}", 1))
+            prb.Simulator(f"y{k}", same, x, metric=metric, observed=INPUTS[:n])
+    findings = small_simulators(Evaluator.of(model))
+    assert len(findings) == is_reported
+    for finding in findings:
+        assert f"they have {n} specimens or more, expected at least 30" in finding.text
+    assert not small_simulators(Evaluator.of(model), refits=True), "refits measure the bias"
+
+
+@pytest.mark.parametrize("metric", [prb.KullbackLeibler(), LOG_LIKELIHOOD])
+@pytest.mark.parametrize("response", [same, np.negative])
+def test_a_bandwidth_of_each_response_underestimates_a_spread_in_common(
+    metric: prb.Metric, response: Any
+) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(0, pm.HalfNormal("s", 1))
+        prb.Simulator("y0", same, x, metric=metric, observed=INPUTS[:12])
+        prb.Simulator("y1", response, x, metric=metric, observed=INPUTS[:20])
+    is_reported = response is not same
+    assert len(small_simulators(Evaluator.of(model), refits=True)) == is_reported
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "enough"), [(6, 3, 18), (17, 3, 18), (18, 3, None), (9, 2, 10), (30, 5, 45)]
+)
+def test_few_specimens_for_the_outputs_are_reported(n: int, m: int, enough: int | None) -> None:
+    outputs = np.random.default_rng(1).normal(size=(n, m)) * 10.0 ** np.arange(m)
+    for metric in (prb.KullbackLeibler(), prb.AreaMetric()):
+        texts = [f.text for f in few_for_whitening("y", prb.Joint(metric).against(outputs))]
+        assert len(texts) == (enough is not None)
+        for text in texts:
+            assert f"y: got {n} specimens" in text
+            assert f"at least {enough} for {m} white" in text
+        assert not few_for_whitening("y", prb.MarginalCorrelation(metric).against(outputs))
+    assert not few_for_whitening("y", prb.AreaMetric().against(outputs[:, 0]))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3, -0.8])
+def test_refits_that_are_off_on_average_are_reported(shift: float) -> None:
+    x = np.array([[0.0, 1.0], [0.0, -1.0], [9.0, 9.0]]) + np.array([0, shift])
+    fitted: Any = SimpleNamespace(
+        x=x,
+        center=np.zeros(2),
+        converged=np.array([True, True, False]),
+        sampling=SimpleNamespace(
+            thetas=lambda x: 3 + 2 * x,
+            evaluator=SimpleNamespace(
+                hyperparameters=SimpleNamespace(readable_names=["mu", "sigma"])
+            ),
+        ),
+    )
+    texts = [finding.text for finding in refit_bias(fitted)]
+    assert len(texts) == (abs(shift) > 0.5)
+    assert all("a lower sigma, on average by 0.8 of their standard dev" in text for text in texts)
 
 
 def branches(x: Any) -> Any:

@@ -9,39 +9,12 @@ from four_metrics import same
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.inference.checks.sample_size import few_specimens, interval_ratios, small_simulators
+from prbayes.inference.checks.sample_size import few_specimens, interval_ratios
 from prbayes.model.evaluator import Evaluator
 
 LOG_LIKELIHOOD = prb.LogLikelihood(density=prb.GaussianKDE())
 N = 40
 INPUTS = 0.3 + norm.ppf((np.arange(N) + 0.5) / N)
-
-
-@pytest.mark.parametrize(
-    ("metric", "shared", "n", "is_reported"),
-    [
-        (prb.AreaMetric(), True, 12, True),
-        (LOG_LIKELIHOOD, True, 12, True),
-        (prb.ProbabilityResidual(), True, 12, False),
-        (prb.AreaMetric(), False, 12, False),
-        (prb.AreaMetric(), True, 30, False),
-    ],
-)
-def test_few_specimens_underestimate_a_spread_in_common(
-    metric: prb.Metric, shared: bool, n: int, is_reported: bool
-) -> None:
-    with pm.Model() as model:
-        spread = pm.HalfNormal("s", 1)
-        for k in range(2):
-            x = pm.Normal.dist(0, spread if shared else pm.HalfNormal(f"s{k}", 1))
-            prb.Simulator(f"y{k}", same, x, metric=metric, observed=INPUTS[:n])
-    findings = small_simulators(Evaluator.of(model))
-    assert len(findings) == is_reported
-    for finding in findings:
-        assert f"they have {n} specimens or more, expected at least 30" in finding.text
-
-
-# -- few specimens --
 
 
 def test_intervals_of_two_specimens_are_those_of_a_cauchy_distribution() -> None:
