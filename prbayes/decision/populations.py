@@ -35,6 +35,7 @@ from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses
 from prbayes.results.predict import (
     known_outputs,
+    known_scatter,
     model_of,
     populations_of,
     refuse_unsupported,
@@ -88,8 +89,18 @@ class Populations:
         name = str(getattr(response, "__name__", type(response).__name__))
         sorted_inputs = read_inputs(name, inputs, self.evaluator.model)
         refuse_groups(f"{self.caller}: {name}", sorted_inputs.parents)
-        outputs = known_outputs(self.evaluator.simulators, response)
-        return Responses(name, response, sorted_inputs, outputs=outputs, **calling)
+        simulators = self.evaluator.simulators
+        outputs = known_outputs(simulators, response)
+        scatter = known_scatter(simulators, response)
+        return Responses(
+            name,
+            response,
+            sorted_inputs,
+            outputs=outputs,
+            caller=self.caller,
+            scatter=scatter,
+            **calling,
+        )
 
     @cached_property
     def _emulated_samples(self) -> dict[int, EmulatedSample]:

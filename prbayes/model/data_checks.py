@@ -8,7 +8,7 @@ nothing is wrong) and power is likelihood_guards, sections 2.6 to 2.9.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,6 @@ from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.roots import Response, Roots
-from prbayes.response.failures import ResponseError
 
 # Data beside the first responses, for all metrics.
 
@@ -377,44 +376,6 @@ def data_findings(
 
 
 # Runs of a response, for the log-likelihood by specimen.
-
-
-def refuse_scatter(
-    name: str,
-    outputs: Floats,
-    alone: Callable[[int], Floats],
-    *,
-    rounding: float = 1e-6,
-    one_system: float = 0.01,
-) -> None:
-    """Raise if the last good run differs when it is computed again: noise, or a hidden state.
-
-    ``alone`` computes the outputs, (m,), of one row of the first runs, (n, m), by itself. Two runs
-    of a specimen may differ by rounding, and a run by itself from the same in a batch by a share of
-    the standard deviation of the runs: the tolerance of a solver that takes the batch as one
-    system.
-    """
-    finite = np.isfinite(outputs).all(axis=1)
-    if finite.sum() < 2:
-        return
-    row = int(np.flatnonzero(finite)[-1])
-    last, again = outputs[row], alone(row)
-    change = np.abs(again - last)
-    accuracy = rounding * np.abs(outputs[finite]).max(axis=0)
-    if not (change > accuracy).any():
-        return
-    change_alone = np.abs(alone(row) - again)
-    tolerance = one_system * outputs[finite].std(axis=0)
-    if not (change_alone > accuracy).any() and not (change > tolerance).any():
-        return
-    unit = np.where(accuracy > 0, accuracy, 1.0)
-    j = int(np.nanargmax(change / unit))
-    raise ResponseError(
-        f"{name}: got outputs {last[j]:.6g} and {again[j]:.6g} of the same inputs, expected the "
-        "same for prb.LogLikelihood(): the response has scatter of its own, or a state from one "
-        "specimen to the next; fix its random seed or state, or use "
-        "metric=prb.ProbabilityResidual() with propagation=prb.Resimulated()"
-    )
 
 
 def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:

@@ -197,7 +197,12 @@ class EmulatedSimulator:
         emulator's runs.
         """
         if responses.same_as(self.responses):
-            return self._emulated
+            emulated = self._emulated
+            runs = self.likelihood.coordinates.inputs(emulated.z)
+            points = values_of(runs, self.likelihood.inputs, responses.inputs)
+            values = emulated.y.reshape(len(emulated.z), *emulated.event)
+            responses.refuse_change(points, values, self.responses)
+            return emulated
         return _emulate_at_runs(self.likelihood, responses)
 
     def populations(self, parents: Sequence[Floats]) -> tuple[Floats, Floats]:

@@ -94,12 +94,14 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         in a last axis, or a mapping of arrays with the keys of ``observed``. Labels of a DataArray
         or DataFrame are matched to those of ``observed``. NaN, or a masked number, is a point
         without response, +inf a specimen that failed; -inf is refused. The response of a specimen
-        depends on the inputs of that specimen alone: one of them is also computed by itself, and a
-        difference is refused, and so is a function that takes one number of specimens.
-        Where inputs repeat, as discrete ones do, a design computes the response once, unless four
-        of them differ when they are computed again. Model random scatter of the response as an
-        input, such as ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs
-        and propagation, and metrics of distributions, share runs.
+        depends on the inputs of that specimen alone: three of the first ones are computed again, by
+        themselves, and a difference is refused, and so is a function that takes one number of
+        specimens. Where inputs repeat, as discrete ones do, a design computes the response once.
+        Model random scatter of the response as an input, such as ``pm.Normal.dist(0, 1)``, or use
+        `Fresh`. Simulators with the same response object, inputs and propagation, and metrics of
+        distributions, share runs. Variables that the response reads have to stay as they are: a few
+        runs are computed again where runs serve another simulator or function, and a difference is
+        refused.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
@@ -212,7 +214,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
     calls: dict[str, Any] = {key: getattr(settings, key) for key in _CALL_SETTINGS}
-    calls["outputs"] = outputs
+    calls |= {"outputs": outputs, "caller": name, "scatter": None if settings.is_random else 0.01}
     labels = checked_labels(f"{name}: specimens", specimens, observed, len(values))
     if by_specimen:
         settings.check_likelihood(name)
@@ -220,7 +222,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         arguments = _inputs_of_partners(name, arguments, partners)
         if weights is not None:
             weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
-        responses = Responses(name, response, arguments, **calls)
+        responses = Responses(name, response, arguments, **calls | {"scatter": 0.0})
         extras = _measurement_variables(name, model, metric, partners)
         measurement = Measurement(
             name, cast(LogLikelihood, metric), values, weights, labels, arguments, responses,

@@ -21,7 +21,6 @@ from prbayes.model.data_checks import (
     data_findings,
     emulator_findings,
     misfit_findings,
-    refuse_scatter,
     refuse_undetermined,
     refuse_unreachable,
     refuse_unused_inputs,
@@ -123,7 +122,7 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
 
 @dataclass(eq=False)
 class Runs:
-    """Outputs of runs at coordinates; checks the first ones for scatter, range and influence."""
+    """Outputs of runs at coordinates; checks the first ones for range and influence."""
 
     likelihood: SpecimenLikelihood
     first: Floats | None = None  # (n, M): outputs of the first runs
@@ -132,18 +131,10 @@ class Runs:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
         likelihood = self.likelihood
         responses = [m.responses for m in likelihood.measurements]
-        n_computed = sum(response.computed for response in responses)
         inputs = likelihood.coordinates.inputs(z)
         parts = [response(inputs, []).reshape(len(z), -1) for response in responses]
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and self.first is None:
-            if sum(response.computed for response in responses) > n_computed:
-
-                def alone(row: int) -> Floats:
-                    inputs = likelihood.coordinates.inputs(z[row : row + 1])
-                    return np.concatenate([r.alone(inputs).ravel() for r in responses])
-
-                refuse_scatter(likelihood.name, values, alone)
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             refuse_unused_inputs(likelihood.name, z, values, _coordinate_names(likelihood))
             self.first = values

@@ -156,6 +156,8 @@ def refine(
             raise ValueError("thetas: got NaN or infinite values, expected finite ones")
     with shown(progressbar), explained(model, "prb.refine"), limited(max_seconds, max_runs):
         evaluator = Evaluator.of(model)
+        for bound in evaluator.reweighted.values():
+            bound.refuse_change(bound.responses.used_by("prb.refine"))
         if thetas is None:
             require_finished(find_optimum(evaluator, Minimisation()))
         else:

@@ -95,19 +95,21 @@ class Reweighted(Propagation):
         process by default.
     store : path-like, optional
         A folder with every computed response, by simulator: none is computed again, also in
-        another run. One response is recomputed at the first use of each simulator: a changed
-        response, by its code or by variables of a closure, is refused.
+        another run. A few are recomputed at the first use of each simulator, the smallest, the
+        middle and the largest response, and one that is NaN or infinite: a changed response, by
+        its code or by variables that it reads, is refused.
     version : str, optional
         Name of the response as it is, such as ``"2"`` or ``"mesh 3"``: the store separates runs of
         different versions, and of other names or another order of several outputs, and recomputes
-        none. You are then responsible for a new name whenever the response changes; necessary for
-        a response that is random, or minutes long.
+        none, nor for `predict` or `exceedance`. You are then responsible for a new name whenever
+        the response changes; for a response that is minutes long.
     on_failure : Abort, Replace or Retry
         Policy for a response that raises, and by option for one that is NaN: by default NaN is a
         specimen without response.
     retry_failed : bool
-        Whether points that failed according to the store are computed again. Under `Abort` they
-        are in any case: a failure is no result.
+        Whether points that failed according to the store, or whose response is NaN there, are
+        computed again, as after a repair. Under `Abort` those that failed are in any case: a
+        failure is no result.
     timeout : float, optional
         Seconds after which a response has failed; with executors of processes only, Dask's among
         them, as nothing else ends a response that hangs. What hangs outside Python ends with its
@@ -378,6 +380,7 @@ class ReweightedBound(Bound):
         the runs; runs alone need no emulator.
         """
         if responses.same_as(self.responses):
+            self.refuse_change(responses)
             return self._design.sample.values
         at_runs = self._at_runs(responses)
         emulated = self._design.emulated
@@ -386,6 +389,12 @@ class ReweightedBound(Bound):
         values = self._emulator_of(at_runs).at(emulated)
         has_runs = len(values) < self.n_points
         return np.concatenate([values, at_runs]) if has_runs else values
+
+    def refuse_change(self, responses: Responses) -> None:
+        """Raise if the design's own response gives other values now than at the runs."""
+        runs = self._design.runs
+        points = self.points_of(responses.inputs, runs.points)
+        responses.refuse_change(points, runs.values, self.responses)
 
     def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
         """Return a response at any points of the design's inputs by emulators, (n,) or (n, m).
@@ -416,6 +425,8 @@ class ReweightedBound(Bound):
             for x, y in zip(earlier.points, runs.points, strict=True):
                 equal &= (x[:n] == y[:n]).reshape(n, -1).all(axis=1)
             values = earlier.values[: n if equal.all() else int(equal.argmin())]
+            points = self.points_of(responses.inputs, earlier.points)
+            responses.refuse_change(points, earlier.values, pairs[0][0])
         if len(values) < len(runs):
             points = self.points_of(responses.inputs, runs.points)
             missing = [x[len(values) :] for x in points]
@@ -423,6 +434,7 @@ class ReweightedBound(Bound):
             values = np.concatenate([values.reshape(-1, *more.shape[1:]), more])
             if pairs:
                 self._other_responses.remove(pairs[0])
+            responses.runs.users.add(responses.caller)
             self._other_responses.append((responses, replace(runs, values=values)))
         return values
 

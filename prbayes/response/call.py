@@ -6,6 +6,8 @@ before it waits for the next.
 
 from __future__ import annotations
 
+import io
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -158,7 +160,7 @@ def compute(
     a function that was `packed` in another process.
     """
     if isinstance(function, bytes):
-        function = _unpacked(function)
+        function = unpacked(function)
     clock = time.perf_counter()
     stated, n = outputs, len(points)
     values = np.full((n, *(() if outputs is None else outputs.event)), np.nan)
@@ -340,8 +342,33 @@ def packed(function: Callable[..., Any]) -> bytes:
     return bytes(cloudpickle.dumps(function))
 
 
+class _Limited(io.BytesIO):
+    """A file of at most 4 MiB."""
+
+    def write(self, data: Any) -> int:
+        if self.tell() + memoryview(data).nbytes > 4 * 2**20:
+            raise OverflowError("the function refers to large data")
+        return super().write(data)
+
+
+def written_form(function: Callable[..., Any]) -> bytes | None:
+    """Return a function with the variables that it reads, as bytes; None if it has no such form.
+
+    Variables of an imported module are not in it.
+    """
+    import cloudpickle
+
+    file = _Limited()
+    try:
+        cloudpickle.dump(function, file)
+    except Exception:  # whatever an object raises that cannot be pickled
+        return None
+    return file.getvalue()
+
+
 @lru_cache(maxsize=8)  # for the responses of several simulators
-def _unpacked(payload: bytes) -> Callable[..., Any]:
+def unpacked(payload: bytes) -> Callable[..., Any]:
+    """Return a function from its bytes."""
     import cloudpickle
 
     return cloudpickle.loads(payload)  # type: ignore[no-any-return]
@@ -360,7 +387,7 @@ class CallSettings:
     executor: Executor | None = None  # None computes in this process
     store: Store | None = None
     on_failure: OnFailure = field(default_factory=Abort)
-    retry_failed: bool = False  # whether points that are stored as failed are computed again
+    retry_failed: bool = False  # whether points stored as failed, or NaN, are computed again
     timeout: float | None = None  # seconds for one response
     outputs: Outputs | None = SINGLE_OUTPUT  # None takes them from the first run
     columns: tuple[str, ...] = ()  # names of the numbers of a point
@@ -436,6 +463,8 @@ def respond(
         if settings.retry_failed or not isinstance(policy.final, Replace):
             is_stored[list(failed)] = False
             failed = {}
+        if settings.retry_failed:
+            is_stored &= ~is_missing(values)
         missing = np.flatnonzero(~is_stored)
     for attempt in range(policy.tries):
         is_last = attempt == policy.tries - 1
@@ -464,39 +493,105 @@ def respond(
 
 
 def _verify_store(settings: CallSettings, points: Points, tally: Tally) -> None:
-    """Compute a stored response again, once: the function or its variables may have changed."""
+    """Compute a few stored runs again, once: the function or its variables may have changed."""
     store = settings.store
     if store is None or store.verified:
         return
     keys, values = store.known()
-    columns = values if values.ndim > 1 else values[:, None]
-    stored_points, have_same_constants = points.read_keys(keys)
-    usable = np.flatnonzero(np.isfinite(columns).all(axis=1) & have_same_constants)
-    if usable.size:
-        point = stored_points.at(usable[:1])
-        for _ in range(settings.on_failure.tries):
-            [[(_, chunk)]] = chunks(settings, point, np.arange(1), True, tally)
-            if not chunk.raised:
-                break
-        response, expected = tally.aligned(chunk).ravel(), columns[usable[0]]
-        scale = np.maximum(np.abs(expected), np.median(np.abs(columns[usable]), axis=0))
+    stored_points, is_comparable = points.read_keys(keys)
+    is_comparable[list(store.failed(keys))] = False
+    if settings.retry_failed:  # these are computed again in any case
+        is_comparable &= ~is_missing(values)
+    usable = np.flatnonzero(is_comparable)
+    rows = usable[revealing_rows(values[usable])]
+    if rows.size:
+        again, raised = computed_again(settings, stored_points.at(rows), tally)
         # More than the rounding of another machine or version of a library.
-        same_number = response.size == expected.size
-        if not same_number or not (np.abs(response - expected) <= 1e-6 * scale).all():
-            text = f"nothing ({chunk.raised[0]})" if chunk.raised else _numbers_text(response)
+        changed = first_change(values[rows], again, 1e-6 * typical_size(values[usable]))
+        if changed is not None:
+            row = rows[changed]
+            text = numbers_text(again[changed])
+            remedy = "pass"
+            if changed in raised:
+                text = f"nothing ({raised[changed]})"
+            elif np.isnan(values[row]).any():
+                remedy = "after a repair pass retry_failed=True, which computes NaN again, or pass"
             raise StoreError(
                 f"{settings.name}: store: got a response that gives {text} at "
-                f"({', '.join(f'{x:.6g}' for x in keys[usable[0]])}), expected "
-                f"{_numbers_text(expected)}, which is stored in {store.path}: it is of another "
-                "function, or its variables have changed; nothing was changed: pass another "
-                "folder, or version= with a name for the response as it is now, whose runs are "
-                "then kept apart"
+                f"({', '.join(f'{x:.6g}' for x in keys[row])}), expected "
+                f"{numbers_text(values[row])}, which is stored in {store.path}: it is of another "
+                "function, or its variables have changed; nothing was changed: "
+                f"{remedy} another folder, or version= with a name for the response as it is now, "
+                "whose runs are then kept apart"
             )
     store.verified = True
 
 
-def _numbers_text(values: Floats, digits: int = 10) -> str:
-    """Return the numbers of a run, shape (m,), as a text of at most six."""
+def computed_again(
+    settings: CallSettings, points: Points, tally: Tally
+) -> tuple[Floats, dict[int, str]]:
+    """Return responses at points, (n, *event), NaN where they raised, and the reasons by row."""
+    event = () if settings.outputs is None else settings.outputs.event
+    values, waiting = np.full((len(points), *event), np.nan), np.arange(len(points))
+    raised: dict[int, str] = {}
+    for _ in range(settings.on_failure.tries):
+        raised = {}
+        for finished in chunks(settings, points, waiting, True, tally):
+            for rows, chunk in finished:
+                values = assign_rows(values, rows, tally.aligned(chunk))
+                raised.update({int(rows[i]): reason for i, reason in chunk.raised.items()})
+        waiting = np.array(sorted(raised), dtype=np.intp)
+        if not waiting.size:
+            break
+    return values, raised
+
+
+def by_output(values: NDArray[Any]) -> NDArray[Any]:
+    """Return responses, (n,) or (n, m), with a column for each output."""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
+
+
+def revealing_rows(values: Floats) -> Rows:
+    """Return rows of responses, (n,) or (n, m), at which a change of the function can show.
+
+    The largest, the middle and the smallest response, one that is NaN and one that is infinite.
+    The largest comes first, as the first run of a design may be the smallest.
+    """
+    columns = by_output(values)
+    is_finite = np.isfinite(columns).all(axis=1)
+    is_nan = np.isnan(columns).any(axis=1)
+    finite = np.flatnonzero(is_finite)
+    size = np.abs(columns[finite]).max(axis=0, initial=0.0)
+    sums = (columns[finite] / np.where(size > 0, size, 1.0)).sum(axis=1)
+    order = finite[np.argsort(sums, kind="stable")]
+    selected = [order[-1:], order[len(order) // 2 :][:1], order[:1]]
+    selected += [np.flatnonzero(kind)[:1] for kind in (is_nan, ~is_finite & ~is_nan)]
+    return np.array(list(dict.fromkeys(np.concatenate(selected).tolist())), dtype=np.intp)
+
+
+def typical_size(values: Floats) -> Any:
+    """Return the median size of finite responses, (n,) or (n, m), of each output."""
+    finite = values[np.isfinite(by_output(values)).all(axis=1)]
+    return np.median(np.abs(finite), axis=0) if len(finite) else 0.0
+
+
+def first_change(values: Floats, again: Floats, tolerance: Any) -> int | None:
+    """Return the first row in which responses differ from those computed again; None if none.
+
+    The tolerance is for small responses; that of large ones is 1e-6 of them.
+    """
+    if again.shape != values.shape:
+        return 0
+    is_same = (again == values) | (np.isnan(again) & np.isnan(values))
+    with np.errstate(invalid="ignore"):
+        is_same |= np.abs(again - values) <= np.maximum(tolerance, 1e-6 * np.abs(values))
+    rows = np.flatnonzero(~by_output(is_same).all(axis=1))
+    return int(rows[0]) if rows.size else None
+
+
+def numbers_text(values: Floats, digits: int = 10) -> str:
+    """Return the numbers of a run, () or (m,), as a text of at most six."""
+    values = np.ravel(values)
     text = ", ".join(f"{value:.{digits}g}" for value in values[:6])
     if values.size == 1:
         return text
@@ -549,7 +644,7 @@ def inputs_text(settings: CallSettings, points: Points, row: int) -> str:
     """Return the inputs of a point as a text, with their names where these are known."""
     (inputs,) = points.at(np.array([row])).keys()
     if len(settings.columns) != inputs.size or inputs.size > 12:
-        return _numbers_text(inputs, 6)
+        return numbers_text(inputs, 6)
     pairs = zip(settings.columns, inputs, strict=True)
     return f"({', '.join(f'{name} = {value:.6g}' for name, value in pairs)})"
 

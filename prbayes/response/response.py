@@ -16,18 +16,26 @@ from pytensor.graph.basic import Variable
 
 from prbayes._finding import report
 from prbayes._validate import Floats, called, executes, folder_path
-from prbayes.response.budget import budget
+from prbayes.response.budget import budget, unlimited
 from prbayes.response.call import (
     PER_SPECIMEN,
     CallSettings,
     Points,
     Tally,
     array_advice,
+    by_output,
     checked,
     column_names,
+    computed_again,
+    first_change,
+    numbers_text,
     respond,
+    revealing_rows,
     scalar,
     shapes,
+    typical_size,
+    unpacked,
+    written_form,
 )
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.executors import capacity
@@ -98,6 +106,8 @@ class Runs:
     stored: list[tuple[list[Floats], Floats]] = field(default_factory=list)
     last: tuple[list[Floats], Floats] | None = None  # inputs and responses of the last call
     is_shared: bool = False
+    # Callers that use the runs, for each of which a few were computed again.
+    users: set[str] = field(default_factory=set)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "last": None}
@@ -126,6 +136,10 @@ class Responses:
         retry_failed: bool = False,
         timeout: float | None = None,
         outputs: Outputs | None = SINGLE_OUTPUT,  # None takes those of the first run
+        caller: str = "",  # what uses the responses; by default the name
+        # Largest change of a specimen that is computed again, in standard deviations; None for a
+        # random response.
+        scatter: float | None = 0.01,
     ) -> None:
         refuse_uncallable(name, function)
         refuse_misfit(name, function, inputs.sizes, outputs)
@@ -155,12 +169,13 @@ class Responses:
             and not isinstance(function, scalar)
         )
         self.count = 0  # runs that were needed, whether computed here or found in the store
-        # Whether the response has different values at the same point; None while it is not known.
-        self.is_random: bool | None = None
+        self.caller = caller or name
+        self.scatter = scatter
         # Called with the number of runs of a call, and the seconds of one: NaN before a batch.
         self.on_start: Callable[[int, float], None] | None = None
         self.runs = Runs()
-        self._checks_batches = self.is_batched
+        self._is_checked = False
+        self._written_form = written_form(function)
         self._n_reused = 0
         columns = column_names(argument_names(inputs, function), inputs.sizes)
         self._settings = CallSettings(
@@ -170,10 +185,10 @@ class Responses:
 
     def copied(self) -> Responses:
         """Return the same function with its own counts, and the same executor and store."""
-        other = copy.copy(self)
-        other._tally = self._tally.copied()
-        other.runs = Runs(list(self.runs.stored))
-        return other
+        duplicate = copy.copy(self)
+        duplicate._tally = self._tally.copied()
+        duplicate.runs = Runs(list(self.runs.stored), users=set(self.runs.users))
+        return duplicate
 
     def share(self, other: Responses) -> None:
         """Use the runs of another one with the same response, inputs and settings."""
@@ -234,6 +249,7 @@ class Responses:
         if runs.is_shared and runs.last is not None and _equal(runs.last[0], values):
             self.count_reused(size)
             return runs.last[1].copy()
+        n_computed = self.computed
         if self.is_batched:
             if self.on_start is not None:
                 self.on_start(size, np.nan)
@@ -241,9 +257,6 @@ class Responses:
             responses = self._called(full, batch)
             if self.on_start is not None:
                 self.on_start(size, (time.perf_counter() - clock) / max(1, size))
-            if self._checks_batches and size > 1:
-                self._checks_batches = False
-                self._refuse_mixing(full, batch, responses)
         else:
             self.count += size
             responses = respond(
@@ -252,19 +265,49 @@ class Responses:
             if self.outputs is None:
                 self.outputs = self._tally.named
             responses = responses.reshape(batch + responses.shape[1:])
+        if not self._is_checked and size > 1:
+            # Where a store has some of the runs, the first ones were checked.
+            if self.computed >= n_computed + size:
+                specimens = [v.reshape(size, *v.shape[len(batch) :]) for v in full]
+                rows = responses.reshape(size, *responses.shape[len(batch) :])
+                self._refuse_state(specimens, rows)
+                self._refuse_late_change(specimens, rows)
+            self._is_checked = True
         # For the next simulator. Before there is one, only the trial at some points of the prior,
         # which all simulators make.
         is_kept = runs.is_shared or responses.size <= 64
         runs.last = ([x.copy() for x in values], responses.copy()) if is_kept else None
         return responses
 
-    def alone(self, aleatory: Sequence[Floats]) -> Floats:
-        """Compute one specimen by itself, (1, *event) by input; no run, and not in the store."""
-        values = [np.asarray(v, dtype=np.float64) for v in aleatory]
-        if self.is_batched:
-            return self._called(values, (1,), is_run=False)
-        settings = replace(self._settings, store=None)
-        return respond(settings, self._points(values, (1,)), self._tally.copied())
+    def used_by(self, caller: str) -> Responses:
+        """Return the same response for another use of its runs."""
+        duplicate = copy.copy(self)
+        duplicate.caller = caller
+        return duplicate
+
+    def refuse_change(self, points: Sequence[Floats], values: Floats, stored: Responses) -> None:
+        """Raise if stored runs differ when a few of them are computed again, once for each caller.
+
+        ``points`` are those of this response's aleatory inputs, ``values`` their runs, (n,) or
+        (n, m). With a version of the store the user answers for the runs.
+        """
+        store = stored._settings.store
+        self._is_checked |= stored._is_checked
+        if self.caller in stored.runs.users or (store is not None and store.version is not None):
+            return
+        rows = revealing_rows(values)
+        selected = [x[rows] for x in points]
+        again = self._again(selected)
+        changed = first_change(values[rows], again, _accuracy(values, self._one_system))
+        if changed is not None:
+            raise ResponseError(
+                f"{self.caller}: got {numbers_text(again[changed])} from the response of "
+                f"{stored.name} {_place(selected, changed)}, expected "
+                f"{numbers_text(values[rows[changed]])}, as in its runs: a variable that it reads "
+                "has changed since; build the model again for the response as it is now, or write "
+                "a function of its own for each condition, such as lambda x: response(x, load=2.0)"
+            )
+        stored.runs.users.add(self.caller)
 
     def count_symbolic(self, size: int) -> None:
         """Count responses that are computed in a graph."""
@@ -308,39 +351,80 @@ class Responses:
             raise ResponseError(f"{self.name}: {error}") from None
         return responses
 
-    def _refuse_mixing(
-        self, values: Sequence[Floats], batch: tuple[int, ...], responses: Floats
-    ) -> None:
-        """Raise if a specimen has another response alone than in its batch; one run, rarely two."""
-        event = responses.shape[len(batch) :]
-        rows = responses.reshape(-1, int(np.prod(event, dtype=int)))
-        finite = np.isfinite(rows).all(axis=1)
-        if finite.sum() < 2:
-            return
-        first = int(np.flatnonzero(finite)[0])
-        place = np.unravel_index(first, batch)
-        specimen = [v[place][None] for v in values]
+    def _again(self, values: Sequence[Floats]) -> Floats:
+        """Compute a few specimens again, (n, *event) by input; no runs, and not in the store.
+
+        NaN where the response raises.
+        """
+        n = len(values[0])
+        with unlimited():
+            if self.is_batched:
+                # Copies, which the function may change in place.
+                return self._called([x.copy() for x in values], (n,), is_run=False)
+            settings = replace(self._settings, outputs=self.outputs)
+            return computed_again(settings, self._points(values, (n,)), self._tally.copied())[0]
+
+    def _by_itself(self, values: Sequence[Floats], copies: int) -> Floats:
+        """Compute specimens again; where a function takes no batch of one, as several copies."""
         try:
-            # Copies, which the function may change in place.
-            single = self._called([x.copy() for x in specimen], (1,), is_run=False).ravel()
-            # A solver that steps a batch as one system differs by up to .01 spreads; a mean, a sum
-            # or another order over specimens by about one.
-            if not (np.abs(rows[first] - single) > 0.01 * rows[finite].std(axis=0)).any():
-                return
-            # A random response does not mix its specimens.
-            again = self._called([x.copy() for x in specimen], (1,), is_run=False).ravel()
-            if (np.abs(again - single) > 1e-6 * np.abs(single)).any():
-                return
-        except ResponseError as error:  # it takes no batch of one
-            self._refuse_one_size(values, batch, error)
+            return self._again(values)
+        except ResponseError:
+            n = len(values[0])
+            return self._again([np.concatenate([x] * copies) for x in values])[:n]
+
+    @property
+    def _one_system(self) -> float:
+        """By how many standard deviations a solver that steps a batch as one system differs."""
+        return 0.01 if self.is_batched else 0.0
+
+    def _refuse_state(self, specimens: Sequence[Floats], values: Floats) -> None:
+        """Raise if one of three specimens differs when it is computed again, by itself.
+
+        The last one, which depends on the most if the response has a state from specimen to
+        specimen, then one in the middle, and the first one, after all others.
+        """
+        finite = np.flatnonzero(np.isfinite(by_output(values)).all(axis=1))
+        if finite.size < 2 or (self.scatter is None and not self.is_batched):
             return
-        worst = int(np.nanargmax(np.abs(rows[first] - single)))
-        raise ResponseError(
-            f"{self.name}: the response of a specimen depends on those that it is computed with: "
-            f"got {single[worst]:.6g} by itself, and {rows[first, worst]:.6g} among {len(rows)}, "
-            "expected the same; look for a mean, a sum, a sort or another order over the axis of "
-            "specimens, or write it for one specimen, in prb.scalar"
-        )
+        rows = np.unique(finite[[0, len(finite) * 3 // 4, -1]])[::-1]
+        parts = [rows[i : i + 1] for i in range(rows.size)] if self.is_batched else [rows]
+        copies = 3 if len(values) == 2 else 2
+        for part in parts:
+            selected = [x[part] for x in specimens]
+            try:
+                again = self._by_itself(selected, copies)
+                again = np.where(np.isnan(again), values[part], again)  # it may fail by chance
+                accuracy = _accuracy(values, 0.01 if self.scatter is None else self.scatter)
+                changed = first_change(values[part], again, accuracy)
+                if changed is None:
+                    continue
+                second = self._by_itself(selected, copies)
+            except ResponseError as error:  # it takes no small batch
+                if self.is_batched:
+                    self._refuse_one_size(specimens, (len(values),), error)
+                return
+            is_random = first_change(again, second, _accuracy(values)) is not None
+            if is_random and self.scatter is None:
+                return
+            tolerance = _accuracy(values, self._one_system)
+            if not is_random and first_change(values[part], again, tolerance) is None:
+                continue
+            got, expected = again[changed], values[part[changed]]
+            if is_random:
+                raise ResponseError(
+                    f"{self.name}: got {numbers_text(expected)} and {numbers_text(got)} from the "
+                    f"response {_place(selected, changed)}, expected the same: it has scatter of "
+                    "its own, or a state from one specimen to the next; fix its random seed or "
+                    "state, model scatter as an input, such as pm.Normal.dist(0, 1), or take "
+                    "prb.ProbabilityResidual() with prb.Fresh(), for random responses"
+                )
+            raise ResponseError(
+                f"{self.name}: the response of a specimen depends on those that it is computed "
+                f"with: got {numbers_text(got, 6)} by itself, and {numbers_text(expected, 6)} "
+                f"among {len(values)}, expected the same; look for a mean, a sum, a sort or "
+                "another order over the axis of specimens, and for a state from one specimen to "
+                "the next, or write it for one specimen, in prb.scalar"
+            )
 
     def _refuse_one_size(
         self, values: Sequence[Floats], batch: tuple[int, ...], error: ResponseError
@@ -361,6 +445,43 @@ class Responses:
                 f"{few[-1]}, expected any number; {PER_SPECIMEN} ({str(error).split(';')[0]})"
             ) from None
 
+    def _refuse_late_change(self, specimens: Sequence[Floats], values: Floats) -> None:
+        """Raise if a few runs differ from those of the function when the simulator was written."""
+        is_unchanged = written_form(self.function) == self._written_form
+        if is_unchanged or self._written_form is None or self.scatter is None:
+            return
+        rows = revealing_rows(values)
+        selected = [x[rows] for x in specimens]
+        written = copy.copy(self)
+        try:
+            written.function = unpacked(self._written_form)
+            written._settings = replace(self._settings, function=written.function)
+            then = written._again(selected)
+            then = np.where(np.isnan(then), values[rows], then)
+        except Exception:  # such as of a function that was not defined yet
+            return
+        changed = first_change(values[rows], then, _accuracy(values, self._one_system))
+        if changed is not None:
+            raise ResponseError(
+                f"{self.name}: got {numbers_text(values[rows[changed]])} from the response "
+                f"{_place(selected, changed)}, expected {numbers_text(then[changed])}, which it "
+                "gave when the simulator was written: a variable that it reads has changed since, "
+                "before or in its runs, which begin at the first use; write a function without a "
+                "state, and one for each condition, such as functools.partial(response, load=2.0)"
+            )
+
+
+def _accuracy(values: Floats, share: float = 0.0) -> Any:
+    """Return how much one of the responses (n,) or (n, m) may change: a share of their spread."""
+    finite = values[np.isfinite(by_output(values)).all(axis=1)]
+    spread = finite.std(axis=0) if len(finite) else 0.0
+    return np.maximum(1e-6 * typical_size(values), share * spread)
+
+
+def _place(points: Sequence[Floats], row: int) -> str:
+    """Return the inputs of a specimen as a text."""
+    return f"at {numbers_text(np.concatenate([np.ravel(x[row]) for x in points]), 6)}"
+
 
 def _equal(arrays: Sequence[Floats], others: Sequence[Floats]) -> bool:
     pairs = zip(arrays, others, strict=True)
@@ -374,8 +495,7 @@ def deduplicated_responses(
 ) -> Floats:
     """Return the responses at points (n, *event), (n,) or (n, m), each different point once.
 
-    ``known`` has points and responses. A response that differs at four points that are computed
-    again is random, and is computed at all points.
+    ``known`` has points and responses.
     """
     n = len(points[0])
     known_points, known_values = ([x[:0] for x in points], np.empty(0)) if known is None else known
@@ -388,36 +508,12 @@ def deduplicated_responses(
     _, first, which = np.unique(keys, return_index=True, return_inverse=True)
     earliest = first[which]
     is_new = earliest[m:] == np.arange(m, m + n)
-    if is_new.all() or responses.is_random:
+    if is_new.all():
         return responses(points, [])
-
-    # Compute the new points, and up to four different ones again.
-    new, repeated = np.flatnonzero(is_new), np.flatnonzero(~is_new)
-    again = repeated[:0]
-    if responses.is_random is not False:
-        # A response that is zero or one by chance passes four once in 16 times.
-        _, place = np.unique(earliest[m:][repeated], return_index=True)
-        again = repeated[np.sort(place)[:4]]
-    rest = np.setdiff1d(repeated, again)
-    selected = np.concatenate([new, again])
-    computed = responses([x[selected] for x in points], []) if selected.size else known_values[:0]
-    event = computed.shape[1:]
-    values = np.full((m + n, *event), np.nan)
-    values[:m] = known_values.reshape(m, *event)
-    values[m + new] = computed[: new.size]
-    second = computed[new.size :]
-    if again.size:
-        # Equal up to rounding, by output, as units may differ.
-        earlier = values[earliest[m + again]]
-        finite = np.where(np.isfinite(earlier), np.abs(earlier), 0.0)
-        scale = finite.max(axis=0, initial=0.0)
-        responses.is_random = not np.allclose(
-            earlier, second, rtol=1e-6, atol=1e-6 * scale, equal_nan=True
-        )
-    if responses.is_random:
-        values[m + again] = second
-        if rest.size:
-            values[m + rest] = responses([x[rest] for x in points], [])
-        return values[m:]
-    responses.count_reused(rest.size)
+    new = np.flatnonzero(is_new)
+    computed = responses([x[new] for x in points], []) if new.size else known_values[:0]
+    values = np.full((m + n, *computed.shape[1:]), np.nan)
+    values[:m] = known_values.reshape(m, *computed.shape[1:])
+    values[m + new] = computed
+    responses.count_reused(n - new.size)
     return values[earliest[m:]]

@@ -182,6 +182,8 @@ def predict(
         store=store,
         version=version,
         outputs=known_outputs(sources, response),
+        caller="prb.predict",
+        scatter=known_scatter(sources, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
     simulator = serving(sources, responses) if stored else None
@@ -396,6 +398,14 @@ def known_outputs(
     """Return the outputs of a response that is a simulator's; None if only a run shows them."""
     nodes = (node for node in simulators if node.responses.function is response)
     return next((node.outputs for node in nodes), None)
+
+
+def known_scatter(
+    simulators: Sequence[PopulationSimulator], response: Callable[..., Any]
+) -> float | None:
+    """Return the scatter that a response may have: None, if it is random in a simulator."""
+    nodes = (node for node in simulators if node.responses.function is response)
+    return None if any(node.responses.scatter is None for node in nodes) else 0.01
 
 
 def serving(

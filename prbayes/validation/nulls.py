@@ -415,7 +415,9 @@ class JointNull(Null):
         response, *inputs = tested
         refuse_uncallable(condition.name, response)
         read = read_inputs(condition.name, inputs, self.optimum.model)
-        responses = Responses(condition.name, response, read, outputs=None)
+        responses = Responses(
+            condition.name, response, read, outputs=None, caller="prb.validation.JointNull"
+        )
         labels = set(condition.labels or ())
         # Simulators that measured these specimens come first.
         shared = [

@@ -28,10 +28,12 @@ OBSERVED = np.random.default_rng(1).normal(1.5, 0.6, 20)
 AREA = prb.AreaMetric()
 QUIET: dict[str, Any] = {"progressbar": False}
 DESIGN = prb.Reweighted(32)
-# Propagations with the number of their first runs.
+# Runs that are computed again, by themselves, to find a state or scatter.
+AGAIN = 3
+# Propagations with the number of their first runs, and of calls.
 each_propagation = pytest.mark.parametrize(
-    ("propagation", "runs"),
-    [(DESIGN, 32), (prb.Resimulated(8), 16), (prb.Fresh(8), 16)],
+    ("propagation", "runs", "calls"),
+    [(DESIGN, 32, 32 + AGAIN), (prb.Resimulated(8), 16, 16 + AGAIN), (prb.Fresh(8), 16, 16)],
     ids=["Reweighted", "Resimulated", "Fresh"],
 )
 
@@ -78,15 +80,16 @@ NO_USE: dict[str, Callable[[pm.Model], object]] = {
 
 
 @each_propagation
-def test_these_are_no_uses(propagation: Any, runs: int) -> None:
+def test_these_are_no_uses(propagation: Any, runs: int, calls: int) -> None:
     for name, look in NO_USE.items():
         response = Counted()
         model = build(response, propagation)
         look(model)
         assert response.runs == 0, name
     first_use(model)
-    first_use(model)
-    assert response.runs == runs
+    (node,) = first_use(model).values()
+    assert response.runs == calls
+    assert node.responses.computed == runs
 
 
 def test_arguments_are_checked_when_the_model_is_written() -> None:
@@ -139,9 +142,9 @@ def test_the_first_use_computes_the_runs_once(name: str, caplog: pytest.LogCaptu
     assert caplog.text.count("y: runs at first: 32, less than 1 s; for each value of") == 1
     assert "pass another number in propagation=Reweighted(n=32)" in caplog.text
     if name != "pickled":  # with a response of its own
-        assert response.runs == 32
+        assert response.runs == 32 + AGAIN
         first_use(model)
-        assert response.runs == 32
+        assert response.runs == 32 + AGAIN
 
 
 def test_clones_and_the_original_have_the_same_runs() -> None:
@@ -150,9 +153,32 @@ def test_clones_and_the_original_have_the_same_runs() -> None:
     clone, conditioned = clone_model(model), pm.do(model, {"sigma": 0.7})
     prb.set_epsilon(clone, {"y": 0.2})
     found = [next(iter(first_use(m).values())) for m in (clone, model, conditioned)]
-    assert response.runs == 32
+    assert response.runs == 32 + AGAIN
     assert [node.epsilon_value for node in found] == [0.2, 0.1, 0.1]
     assert len({id(node.bound) for node in found}) == 3
+
+
+def test_shared_runs_are_computed_again_a_few_times_for_each_simulator() -> None:
+    class Machine(Counted):
+        load = 1.0
+
+        def __call__(self, x: float) -> float:
+            return self.load * super().__call__(x)
+
+    machine = Machine()
+    response = prb.scalar(machine)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        given: dict[str, Any] = {"metric": AREA, "observed": 2 * OBSERVED, "propagation": DESIGN}
+        prb.Simulator("a", response, x, **given)
+        first_use(model)
+        prb.Simulator("b", response, x, **given)
+        first_use(model)
+        assert machine.runs == 32 + 2 * AGAIN
+        machine.load = 2.0
+        prb.Simulator("c", response, x, **given)
+        with pytest.raises(prb.response.ResponseError, match=r"^c: got .* has changed since; bui"):
+            first_use(model)
 
 
 def test_data_may_be_set_before_and_after_the_first_use() -> None:
@@ -164,7 +190,7 @@ def test_data_may_be_set_before_and_after_the_first_use() -> None:
     pm.set_data({"data": OBSERVED}, model=model)
     (node,) = first_use(model).values()
     assert node.observed.tolist() == OBSERVED.tolist()
-    assert response.runs == 32
+    assert response.runs == 32 + AGAIN
 
 
 def test_two_threads_compute_the_runs_once() -> None:
@@ -179,7 +205,7 @@ def test_two_threads_compute_the_runs_once() -> None:
     with ThreadPoolExecutor(2) as threads:
         first, second = threads.map(use, range(2))
     assert first is second
-    assert response.runs == 32
+    assert response.runs == 32 + AGAIN
 
 
 @pytest.mark.parametrize(
@@ -210,7 +236,7 @@ def test_the_line_of_a_design_comes_before_its_only_call(
 
 @each_propagation
 def test_after_an_error_the_next_use_tries_again(
-    propagation: Any, runs: int, tmp_path: Path
+    propagation: Any, runs: int, calls: int, tmp_path: Path
 ) -> None:
     file = tmp_path / "mesh"
     model = build(Counted(file), propagation)

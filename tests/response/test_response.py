@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from prbayes.response.response import (
     deduplicated_responses,
     refuse_uncallable,
 )
+from prbayes.response.store import StoreError
 
 with pm.Model() as MODEL:
     MU = pm.Normal("mu")
@@ -78,8 +80,8 @@ def test_a_point_of_a_store_is_all_that_goes_into_the_response(tmp_path: Path) -
         responses([PAIRS, XS], [SLOPES])
         return responses.computed
 
-    # One again, to see that it is the same response
-    assert [count(*ALL), count(*ALL)] == [12, 1]
+    # Three again, to see that it is the same response
+    assert [count(*ALL), count(*ALL)] == [12, 3]
     assert count(PAIR, 3.0, X, MU) == 12  # another constant is another input
     repeated = Responses("z", lambda a, b: a + 2 * b, inputs(X, X), store=tmp_path)
     np.testing.assert_array_equal(repeated([XS[0]], []), 3 * XS[0])
@@ -205,6 +207,15 @@ def call(response: Any, *batches: Any) -> None:
         responses([batch], [])
 
 
+def warm_start(x: Any) -> Any:
+    """Start from the response of the specimen before."""
+    y, last = np.empty_like(x), np.zeros(x.shape[:-1])
+    for j in range(x.shape[-1]):
+        last = 0.5 * last + 0.5 * x[..., j]
+        y[..., j] = last
+    return y
+
+
 def second_is_reversed(x: Any) -> Any:
     return np.stack([x, x[..., ::-1]], axis=-1)
 
@@ -217,10 +228,19 @@ def second_is_reversed(x: Any) -> Any:
         (lambda x: np.sort(-x), ()),
         (lambda x: np.cumsum(x, axis=-1)[..., ::-1], ()),
         (lambda x: x / np.abs(x).max(), ()),
+        (warm_start, ()),
+        (lambda x: x + 0.6 * (x - np.concatenate([x[..., :1], x[..., :-1]], axis=-1)), ()),
+        (lambda x: 0.5 * (x + x[..., :1]), ()),
+        (lambda x: np.cumsum(x, axis=-1), ()),
+        (lambda x: np.maximum.accumulate(x, axis=-1), (POINTS.reshape(2, 32)[::-1, ::-1],)),
+        (lambda x: np.gradient(x, axis=-1), (POINTS**2,)),
         (second_is_reversed, ()),
         (second_is_reversed, (np.array([0.5]), POINTS)),  # a batch of one shows nothing
     ],
-    ids=["flip", "mean", "sort", "sum", "maximum", "output", "later"],
+    ids=[
+        *("flip", "mean", "sort", "sum", "maximum", "warm start", "difference", "first", "cumsum"),
+        *("running maximum", "gradient", "output", "later"),
+    ],
 )
 def test_a_response_that_mixes_its_specimens_is_refused(response: Any, batches: Any) -> None:
     said = r"y: the response of a specimen depends on .* by itself, and .* among 64, expected"
@@ -238,16 +258,188 @@ def test_others_are_not_refused() -> None:
     call(np.exp)
     call(lambda x: np.where(x > 0, x, np.nan))
     call(lambda x: x + 1e-4 * x.mean())  # as much as a solver's steps differ
-    call(lambda x: x + rng.normal(size=x.shape))  # scatter of its own
+    Responses("y", lambda x: x + rng.normal(size=x.shape), inputs(X), scatter=None)([POINTS], [])
     call(lambda x: x * 0.0 + 2.0)
     call(of_many)
-    # It costs one run that is not counted, once.
+    # It costs three runs that are not counted, once.
     response = Counted(lambda x: x)
     responses = Responses("y", response, inputs(X))
     for _ in range(2):
         responses([POINTS], [])
     assert response.asked == [64, 64]
     assert responses.count == responses.computed == 128
+
+
+def running(step: Any) -> Any:
+    """Return a response of one specimen with a state: the specimen and the last response."""
+    state: list[float] = []
+
+    def response(x: float) -> float:
+        state[:] = [step(x, *state) if state else x]
+        return state[0]
+
+    return response
+
+
+def beside_the_first() -> Any:
+    first: list[float] = []
+
+    def response(x: float) -> float:
+        first.append(x)
+        return 0.5 * x + 0.5 * first[0]
+
+    return response
+
+
+def random_response() -> Any:
+    rng = np.random.default_rng(0)
+    return lambda x: x + rng.normal(0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("response", "message"),
+    [
+        (
+            lambda: running(lambda x, last: 0.5 * last + 0.5 * x),
+            "a state from one specimen to the next",
+        ),
+        (lambda: running(lambda x, last: last + x), "a state from one specimen to the next"),
+        (lambda: running(max), "a state from one specimen to the next"),
+        (lambda: running(min), "a state from one specimen to the next"),
+        (beside_the_first, "has changed since, before or in its runs"),
+        (random_response, "scatter of its own, .*prb.Fresh"),
+    ],
+    ids=["warm start", "sum", "maximum", "minimum", "first", "random"],
+)
+def test_a_response_of_one_specimen_with_a_state_or_scatter_is_refused(
+    response: Any, message: str
+) -> None:
+    for settings in ({}, {"on_failure": Replace()}):
+        responses = Responses("y", scalar(response()), inputs(X), **settings)
+        with pytest.raises(ResponseError, match=message):
+            responses([POINTS[[30, 9, 50, 63, 0, 20]]], [])
+
+
+def test_a_random_response_of_batches_is_refused_and_also_with_a_store(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for settings in ({}, {"store": tmp_path}):
+        with pytest.raises(ResponseError, match="scatter of its own"):
+            Responses("y", lambda x: x + rng.normal(size=x.shape), inputs(X), **settings)(
+                [POINTS], []
+            )
+    # A batch whose chunks are stored is no excuse for a mean.
+    with pytest.raises(ResponseError, match="depends on those"):
+        Responses("z", lambda x: x - x.mean(), inputs(X), store=tmp_path)([POINTS], [])
+
+
+# -- variables that change ---------------------------------------------------------------------
+
+
+class Machine:
+    """A response with an attribute."""
+
+    def __init__(self, load: float) -> None:
+        self.load = load
+
+    def __call__(self, x: Any) -> Any:
+        return self.load * x
+
+
+def changing(kind: str) -> tuple[Any, Any]:
+    """Return a response x, and a function that makes it 2 x."""
+    machine, settings, load = Machine(1.0), {"load": 1.0}, 1.0
+
+    def change() -> None:
+        nonlocal load
+        machine.load = settings["load"] = load = 2.0
+
+    responses = {
+        "attribute": machine,
+        "method": machine.__call__,
+        "scalar": scalar(machine),
+        "dictionary": lambda x: settings["load"] * x,
+        "closure": lambda x: load * x,
+        "partial": functools.partial(lambda a, x: a["load"] * x, settings),
+    }
+    return responses[kind], change
+
+
+KINDS = ["attribute", "method", "scalar", "dictionary", "closure", "partial"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_runs_of_a_function_that_has_changed_are_refused_for_another_use(kind: str) -> None:
+    response, change = changing(kind)
+    stored = Responses("y", response, inputs(X))
+    values = stored([POINTS], [])
+    stored.used_by("prb.predict").refuse_change([POINTS], values, stored)
+    change()
+    stored.used_by("prb.predict").refuse_change([POINTS], values, stored)  # no run, so no error
+    with pytest.raises(
+        ResponseError, match=r"^prb.exceedance: got 5 from the response of y at 2.5, expected 2.5"
+    ):
+        stored.used_by("prb.exceedance").refuse_change([POINTS], values, stored)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_change_between_the_simulator_and_its_first_runs_is_refused(kind: str) -> None:
+    response, change = changing(kind)
+    early, late = Responses("y", response, inputs(X)), None
+    change()
+    late = Responses("z", response, inputs(X))
+    np.testing.assert_array_equal(late([POINTS], []), 2 * POINTS)
+    with pytest.raises(ResponseError, match=r"^y: got 5 .* expected 2.5, which it gave when the"):
+        early([POINTS], [])
+
+
+def test_a_use_costs_at_most_five_runs_once_and_none_with_a_version(tmp_path: Path) -> None:
+    response = Counted(lambda x: np.where(x > 2, np.inf, np.where(x < -1.5, np.nan, x)))
+    for version, runs in ((None, [5]), ("1", [])):
+        stored = Responses("y", response, inputs(X), store=tmp_path, version=version)
+        values = stored([POINTS], [])
+        response.asked.clear()
+        for _ in range(2):
+            stored.used_by("prb.predict").refuse_change([POINTS], values, stored)
+        assert response.asked == runs
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x: np.where(x > 2, x + 1, x),
+        lambda x: np.where(x < -1.8, x - 1, x),
+        lambda x: np.where(np.abs(x - 0.25) < 0.2, 0.26, x),
+        lambda x: x + 1e-3,
+    ],
+    ids=["largest", "smallest", "middle", "all"],
+)
+def test_a_store_refuses_a_response_that_has_changed_in_a_part(change: Any, tmp_path: Path) -> None:
+    Responses("y", lambda x: x * 1.0, inputs(X), store=tmp_path)([POINTS], [])
+    with pytest.raises(StoreError, match="of another function, or its variables have changed"):
+        Responses("y", change, inputs(X), store=tmp_path)([POINTS], [])
+
+
+@pytest.mark.parametrize("wrapped", [scalar, lambda f: f], ids=["scalar", "batch"])
+def test_nan_in_a_store_is_computed_again_after_a_repair(wrapped: Any, tmp_path: Path) -> None:
+    def call(function: Any, **settings: Any) -> Any:
+        responses = Responses("y", wrapped(function), inputs(X), store=tmp_path, **settings)
+        return responses([POINTS], []), responses.computed
+
+    def broken(x: Any) -> Any:
+        return np.where(x > 1, np.nan, x)
+
+    call(broken)
+    path = re.escape(str(tmp_path / "responses.sqlite"))
+    with pytest.raises(StoreError, match=rf"gives 1\..* nan, .*{path}.*pass retry_failed=True"):
+        call(lambda x: x * 1.0)
+    missing = int((POINTS > 1).sum())
+    values, computed = call(lambda x: x * 1.0, retry_failed=True)
+    np.testing.assert_array_equal(values, POINTS)
+    assert computed == missing + 3
+    assert call(lambda x: x * 1.0) == (pytest.approx(POINTS), 3)
+    # A repair that changes other responses as well is another function.
+    with pytest.raises(StoreError, match="have changed"):
+        call(lambda x: x + 1.0, retry_failed=True)
 
 
 # -- points that repeat ------------------------------------------------------------------------
@@ -261,41 +453,28 @@ def responses_of(function: Any, n_inputs: int = 1) -> Responses:
 
 
 @pytest.mark.exact
-def test_each_different_point_is_computed_once_and_four_of_them_twice_at_first() -> None:
+def test_each_different_point_is_computed_once() -> None:
     response = Counted(lambda a, b: 10 * a + b)
     responses = responses_of(response, 2)
     rng = np.random.default_rng(0)
     points = [rng.integers(0, 3, 500), rng.integers(0, 4, 500)]
     found = deduplicated_responses(responses, points, None)
     np.testing.assert_array_equal(found, 10 * points[0] + points[1])
-    assert response.asked == [12 + 4]
+    assert response.asked == [12]
     # Known ones are not computed, and none is again.
     more = [rng.integers(0, 4, 300), rng.integers(0, 4, 300)]
     found = deduplicated_responses(responses, more, (points, found))
     np.testing.assert_array_equal(found, 10 * more[0] + more[1])
-    assert response.asked == [16, 4]
+    assert response.asked == [12, 4]
     assert responses.count == 800
-    assert responses.computed == 20
+    assert responses.computed == 16
     assert deduplicated_responses(responses, more, (more, found)) == pytest.approx(found)
-    assert response.asked == [16, 4]
+    assert response.asked == [12, 4]
     # Different points are one call with all of them.
     points = [np.arange(20), np.arange(20)]
     found = deduplicated_responses(responses, points, None)
     np.testing.assert_array_equal(found, 11 * points[0])
-    assert response.asked == [16, 4, 20]
-
-
-def test_a_response_with_scatter_of_its_own_is_computed_everywhere() -> None:
-    rng = np.random.default_rng(2)
-    response = Counted(lambda x: x + rng.normal(size=np.shape(x)))
-    responses = responses_of(response)
-    x = np.repeat([0.0, 1.0], 200)
-    found = deduplicated_responses(responses, [x], None)
-    assert sum(response.asked) == 400
-    assert np.unique(found).size == 400
-    assert np.std(found - x) == pytest.approx(1, abs=0.2)
-    deduplicated_responses(responses, [x], ([x], found))
-    assert response.asked[-1] == 400
+    assert response.asked == [12, 4, 20]
 
 
 @pytest.mark.exact
@@ -303,7 +482,6 @@ def test_failed_points_fail_again() -> None:
     responses = responses_of(lambda x: np.where(x > 1, np.nan, x))
     found = deduplicated_responses(responses, [np.array([0, 2, 2, 1, 0])], None)
     np.testing.assert_array_equal(found, [0, np.nan, np.nan, 1, 0])
-    assert responses.is_random is False
 
 
 @pytest.mark.exact
@@ -321,13 +499,21 @@ def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinemen
             propagation=propagation,
         )
     (node,) = nodes(model).values()
-    assert sum(response.asked) <= 17 + 4
+    assert response.asked == [17]
     prb.refine(model, thetas=np.full((1, 1), 2.0))
     node.reweighted.add([np.array([0.9, 0.95])])
-    assert sum(response.asked) <= 17 + 4
+    assert response.asked == [17, 3]  # those of a refinement, as variables may have changed
     np.testing.assert_array_equal(
         node.reweighted.design.sample.values, 2.0 * node.reweighted.design.runs.points[0]
     )
+
+
+def test_the_last_call_of_shared_runs_is_reused() -> None:
+    response = Counted(lambda x: 2 * x)
+    first, second = (Responses(name, response, inputs(X)) for name in "yz")
+    second.share(first)
+    np.testing.assert_array_equal(first([POINTS], []), second([POINTS], []))
+    assert response.asked == [64]
 
 
 LOAD = np.linspace(2.0, 0.5, 40)
