@@ -7,11 +7,12 @@ Manteiga and Presedo Quindimil 1993, doi:10.1007/BF02613687). No response is com
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binom
 
 from prbayes._finding import Finding
 from prbayes._stats import distribution_function
@@ -20,6 +21,8 @@ from prbayes.inference.asymptotics import single_output_parts
 from prbayes.inference.refits import MIN_CONVERGED, SamplingDistribution, refit, refit_obstacle
 from prbayes.inference.resampling import DataSets, observed_set, simulated_sets
 from prbayes.metrics.multivariate import failure_caps
+from prbayes.model.data_checks import resolution
+from prbayes.model.evaluator import Evaluator
 
 # p-value below which the data do not come from the family, by convention.
 UNLIKELY = 0.01
@@ -34,6 +37,7 @@ class FittedSets:
     sets: DataSets
     x: Floats  # (n_sets, r): of the data sets
     converged: NDArray[np.bool_]  # (n_sets,)
+    observed: DataSets  # the observed data, or these without rounding
 
     @classmethod
     def of(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> FittedSets | None:
@@ -41,24 +45,41 @@ class FittedSets:
         evaluator = sampling.evaluator
         if not sampling.stderr.size or refit_obstacle(evaluator) is not None:
             return None
-        (center,), _ = refit(sampling, observed_set(evaluator))
+        observed = observed_set(evaluator)
+        (center,), _ = refit(sampling, observed)
         sets = simulated_sets(evaluator, sampling.thetas(center), n_sets, seed)
-        return cls(sampling, center, sets, *refit(sampling, sets))
+        return cls(sampling, center, sets, *refit(sampling, sets), observed)
 
     @classmethod
     def at_theta(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> FittedSets:
         """Draw data sets at theta itself, without refits, for an optimum with the prior."""
         sets = simulated_sets(sampling.evaluator, sampling.theta, n_sets, seed)
         x = np.zeros((n_sets, sampling.stderr.size))
-        return cls(sampling, x[0], sets, x, np.ones(n_sets, dtype=bool))
+        converged = np.ones(n_sets, dtype=bool)
+        return cls(sampling, x[0], sets, x, converged, observed_set(sampling.evaluator))
+
+    def without_rounding(self) -> FittedSets | None:
+        """Return the same with tied observations spread out; None if none are tied."""
+        values = [
+            np.column_stack([spread_out(column) for column in y.reshape(len(y), -1).T])
+            for y in self.observed.values
+        ]
+        values = [v.reshape(y.shape) for v, y in zip(values, self.observed.values, strict=True)]
+        pairs = zip(values, self.observed.values, strict=True)
+        if all(np.array_equal(v, y, equal_nan=True) for v, y in pairs):
+            return None
+        observed = replace(self.observed, values=values)
+        center = self.center
+        if self.x.any():  # data sets are refitted
+            (center,), _ = refit(self.sampling, observed)
+        return replace(self, observed=observed, center=center)
 
     @property
     def p_value(self) -> float:
         """The p-value of the distance of the data from their fit; NaN if too few converged."""
         if self.converged.mean() < MIN_CONVERGED:
             return np.nan
-        evaluator = self.sampling.evaluator
-        pairs = ((self.center[None], observed_set(evaluator)), (self.x, self.sets))
+        pairs = ((self.center[None], self.observed), (self.x, self.sets))
         observed, drawn = (self._distances(x, sets) for x, sets in pairs)
         return worst_p_value(observed[0], drawn[self.converged])
 
@@ -114,10 +135,90 @@ def _fit_distances(simulated: Floats, masses: Floats, values: Floats, weights: F
     return np.asarray(np.log(np.maximum(distances, 1e-300)))
 
 
-def population_misfit(p_value: float, *, with_prior: bool) -> list[Finding]:
-    """Report data that cannot come from the population at an optimum."""
+def spread_out(values: Floats) -> Floats:
+    """Return measured values, (N,), with ties spread evenly over the step that they are rounded to.
+
+    Without a common step, over half of the way to the neighbours.
+
+    Examples
+    --------
+    >>> spread_out(np.array([1.0, 2.0, 2.0, 4.0])).round(2).tolist()
+    [1.0, 1.75, 2.25, 4.0]
+    """
+    distinct, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    is_tied = (counts > 1) & np.isfinite(distinct)
+    finite = distinct[np.isfinite(distinct)]
+    if not is_tied.any() or len(finite) < 2:
+        return values
+    step = resolution(values[np.isfinite(values)])
+    gaps = np.diff(finite)
+    below, above = np.append(gaps[0], gaps), np.append(gaps, gaps[-1])
+    if step:
+        below, above = (np.full(len(finite), step) for _ in range(2))
+    result = values.astype(float)
+    for k in np.flatnonzero(is_tied):
+        places = (np.arange(counts[k]) + 0.5) / counts[k] - 0.5
+        width = np.where(places < 0, below[k], above[k])
+        result[inverse == k] += places * width
+    return result
+
+
+def rounding(evaluator: Evaluator) -> str:
+    """Return how many measured values are ties, and their step, as a phrase; empty without ties."""
+    phrases = []
+    for node in evaluator.nodes:
+        y = node.target.observed
+        for column, label in zip(
+            y.reshape(len(y), -1).T, node.outputs.labels or ("",), strict=True
+        ):
+            values = column[np.isfinite(column)]
+            ties = len(values) - len(np.unique(values))
+            if ties:
+                step = resolution(values)
+                name = f"{node.name}[{label}]" if y.ndim > 1 else node.name
+                steps = f", all of them multiples of a step of {step:.3g}" if step else ""
+                phrases.append(f"{ties} of {len(values)} values of {name} equal others{steps}")
+    return "; ".join(phrases)
+
+
+def unpredicted_failures(evaluator: Evaluator, theta: Floats) -> list[Finding]:
+    """Report measured failures (+inf) of a population that hardly has any, (p < .01)."""
+    findings = []
+    for k, node in enumerate(evaluator.nodes):
+        y = node.target.observed
+        n, count = len(y), int(np.isposinf(y.reshape(len(y), -1)).any(axis=1).sum())
+        if not count:
+            continue
+        (values,), (weights,) = evaluator.populations(theta[None], k)
+        share = float(weights[np.isposinf(values.reshape(len(values), -1)).any(axis=1)].sum())
+        if binom.sf(count - 1, n, min(share, 1.0)) < UNLIKELY:
+            text = (
+                f"{node.name}: {count} of {n} measured values are +inf, specimens that failed, but "
+                f"the response fails at {share:.2g} of the best population: look at these values, "
+                "or return +inf where specimens fail."
+            )
+            findings.append(Finding("population-misfit", text, "choosing_metric.md#a-wrong-family"))
+    return findings
+
+
+def population_misfit(
+    p_value: float, *, with_prior: bool, ties: str = "", p_spread_out: float = np.nan
+) -> list[Finding]:
+    """Report data that cannot come from the population at an optimum.
+
+    ``ties`` is `rounding` of the data, and ``p_spread_out`` the p-value `without_rounding`.
+    """
     if not p_value < UNLIKELY:
         return []
+    if p_spread_out >= UNLIKELY:
+        text = (
+            f"The measured values are rounded, or copied: {ties}. As they are, they are farther "
+            f"from the best population than {1 - p_value:.1%} of data sets; spread out over the "
+            f"steps they are not (p = {p_spread_out:.2g}), so that nothing points to another "
+            "family. Pass values with more digits, or remove copies; prb.LogLikelihood() takes "
+            "rounded=."
+        )
+        return [Finding("rounded-data", text, "likelihood.md#rounded-data")]
     if with_prior:
         text = (
             f"The data are farther from the population at this optimum than {1 - p_value:.1%} of "
@@ -132,6 +233,8 @@ def population_misfit(p_value: float, *, with_prior: bool) -> list[Finding]:
         "or the response an error; look at prb.plot_responses, at outliers, and at other families, "
         "by prb.rank."
     )
+    if ties:
+        text += f" Rounding does not explain it ({ties})."
     return [Finding("population-misfit", text, "choosing_metric.md#a-wrong-family")]
 
 
@@ -149,7 +252,7 @@ def output_misfits(fitted: FittedSets) -> list[Finding]:
     for k, node in enumerate(evaluator.nodes):
         if len(node.outputs.labels) < 2:
             continue
-        data = _Outputs.of(fitted, observed_set(evaluator), fitted.center[None], k)
+        data = _Outputs.of(fitted, fitted.observed, fitted.center[None], k)
         drawn = _Outputs.of(fitted, fitted.sets, fitted.x, k)
         names = node.outputs.names
         outputs, pairs = [], []

@@ -82,6 +82,11 @@ class SamplingDistribution:
         shifts = (x * self.stderr) @ self.axes.T
         return np.asarray(self.theta + shifts * self.local.prior_sd)
 
+    def linear_estimates(self, sets: DataSets) -> Floats:
+        """Return minimisers of data sets, (S, r) in coordinates, to first order."""
+        shifts = first_order_shifts(self.information, self.scales, self.axes, sets)
+        return shifts / self.stderr
+
 
 def sampling_of_functions(sampling: SamplingDistribution) -> Local:
     """Return the first-order distribution with directions that are weakly identified as well.
@@ -137,8 +142,8 @@ def refit(
     suffice, in half of the time.
     """
     if not is_stored(sampling.evaluator):
-        shifts = first_order_shifts(sampling.information, sampling.scales, sampling.axes, sets)
-        return shifts / sampling.stderr, np.ones(len(shifts), dtype=bool)
+        x = sampling.linear_estimates(sets)
+        return x, np.ones(len(x), dtype=bool)
     n_sets = len(sets.weights[0])
     if start is None:
         start = np.zeros((n_sets, sampling.stderr.size))

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
+from prbayes.inference.checks.one_sided import one_sided_bounds
 from prbayes.inference.checks.population import failing_region_findings, refuse_lost_specimens
 from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
+from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import (
     Evaluator,
@@ -381,7 +383,7 @@ def _findings(
     # Three nats: a likelihood ratio of twenty.
     ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
     findings = list(failing_region_findings(evaluator, best.theta))
-    findings += prior_end_findings(ends)
+    findings += [*few_specimens(evaluator), *prior_end_findings(ends)]
     if np.isnan(best.covariance).any():
         findings.append(
             Finding(
@@ -395,7 +397,13 @@ def _findings(
     names = np.array(evaluator.hyperparameters.readable_names)
     is_direct = ~only_through_prior(evaluator)
     unidentified = names[np.isinf(np.diag(best.covariance)) & is_direct].tolist()
-    flat = [name for name in unidentified if name not in {end.name for end in ends}]
+    bounds = one_sided_bounds(
+        evaluator, best.theta, is_flat & is_direct, partial(_signed_root, objective, best)
+    )
+    bounds = [bound for bound in bounds if bound.name not in {end.name for end in ends}]
+    findings += [bound.finding for bound in bounds]
+    excluded = {end.name for end in ends} | {bound.name for bound in bounds}
+    flat = [name for name in unidentified if name not in excluded]
     if flat:
         findings.append(
             Finding(
@@ -418,6 +426,24 @@ def _findings(
             )
         )
     return findings
+
+
+def _signed_root(objective: _Objective, best: Mode, theta: Floats, i: int) -> float:
+    """Return the root of the likelihood ratio of the best mode to theta, given its i-th element."""
+    from scipy.optimize import minimize as scipy_minimize
+
+    rest = np.arange(theta.size) != i
+
+    def profile(u: Floats) -> tuple[float, Floats]:
+        place = theta.copy()
+        place[rest] += u * objective.unit[rest]
+        value, gradient = objective(place)
+        return value, gradient[rest] * objective.unit[rest]
+
+    value, _ = profile(np.zeros(theta.size - 1))
+    if theta.size > 1 and np.isfinite(value):
+        value = scipy_minimize(profile, np.zeros(theta.size - 1), jac=True, method="BFGS").fun
+    return float(np.sqrt(2 * max(value - best.value, 0.0)))
 
 
 def specimen_refit_obstacle(evaluator: Evaluator) -> str | None:

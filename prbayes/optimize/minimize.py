@@ -39,7 +39,9 @@ from prbayes.inference.checks.metric_suitability import (
     heavy_tails,
     smoothing_bias,
 )
+from prbayes.inference.checks.one_sided import bounds_by_metric
 from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
+from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.design_error import design_error
 from prbayes.inference.refits import (
     SamplingDistribution,
@@ -565,10 +567,14 @@ def optimum_findings(
     findings += design_error_findings(evaluator, design_error)
     findings += [mode.finding(evaluator) for mode in optima if mode.comparable]
     if sampling is not None:
+        findings += few_specimens(evaluator)
         ends = ends_by_metric(sampling)
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
         findings += prior_end_findings(ends, page)
         names = {end.name for end in ends}
+        bounds = [bound for bound in bounds_by_metric(sampling) if bound.name not in names]
+        findings += [bound.finding for bound in bounds]
+        names |= {bound.name for bound in bounds}
         findings += unidentified_findings(evaluator, sampling.local, names)
         findings += confounding_findings(evaluator, sampling.local)
     return tuple(findings)

@@ -342,7 +342,8 @@ def result_of(
         if settings.with_groups:
             groups = arviz_groups(evaluator, chains, settings.random_seed)
         if optimum is not None:
-            findings += optimum.findings
+            # Draws are as wide as few specimens make them, unlike standard errors.
+            findings += [f for f in optimum.findings if f.code != "few-specimens"]
             if evaluator.nodes and not is_pseudo:
                 findings += prior_conflicts(optimum, evaluator, thetas)
         elif not is_pseudo:

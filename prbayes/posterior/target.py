@@ -26,7 +26,7 @@ from prbayes._finding import Finding
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
-from prbayes.inference.refits import SamplingDistribution, refit
+from prbayes.inference.refits import SamplingDistribution, needs_refits, refit
 from prbayes.inference.resampling import (
     groups,
     observable,
@@ -157,6 +157,9 @@ class RefitLikelihoodOptions:
     radius: float = 4.0
     inflation: float = 1.5
     weakest: float = 10.0  # standard error in prior sd up to which a direction is identified
+    # The same, above which an estimate may be near an edge: there, as at a standard deviation of
+    # zero, estimates of data sets pile up.
+    weak: float = 0.5
     # Squared distance of the observed estimate from its mean, in standard deviations, at which the
     # normal distribution takes over.
     tail: float = 40.0
@@ -294,7 +297,10 @@ def refit_likelihood(
         continued = _continued(evaluator, continuation)
         start = _at_minimiser(continued, start, scales, options).theta
     sampling = _at_minimiser(continued, start, scales, options)
-    _require_inside(sampling, options)
+    inside = _moved_inside(sampling, options)
+    is_linear = inside is not None
+    if inside is not None:
+        sampling, rest = inside, []
     local = [SamplingDistribution.of(continued, x, scales, options.weakest) for x in rest]
     centers = [sampling, *(c for c in local if c.stderr.size == sampling.stderr.size)]
     # Identified directions are known from all stored responses; an eighth is enough for the rest.
@@ -302,7 +308,7 @@ def refit_likelihood(
     evaluator = coarser_evaluator(evaluator, theta)
     continued = _continued(evaluator, continuation)
     centers = [replace(center, evaluator=continued) for center in centers]
-    sampling = centers[0] = _moved_to_minimiser(centers[0])
+    sampling = centers[0] = _moved_to_minimiser(centers[0], is_linear=is_linear)
     # Prior standard deviations, or a hundred standard errors if these are less.
     errors = np.sqrt(((sampling.axes * sampling.stderr) ** 2).sum(axis=1))
     is_known = ~continuation.is_continued & (errors > 0)
@@ -329,7 +335,7 @@ def refit_likelihood(
     for i in range(options.rounds):
         if i:
             x = _posterior_points(likelihood, number)
-        drawn.append(_draw(centers, x, options, seed=i))
+        drawn.append(_draw(centers, x, options, seed=i, is_linear=is_linear))
         populations, counts, estimates = zip(*drawn, strict=True)
         joined = tuple(vstack(parts, format="csr") for parts in zip(*counts, strict=True))
         logs = _log_likelihoods(sampling, joined, np.concatenate(populations))
@@ -370,6 +376,8 @@ def _draw(
     x: Floats,
     options: RefitLikelihoodOptions,
     seed: int,
+    *,
+    is_linear: bool,
 ) -> tuple[Floats, list[csr_array], Floats]:
     """Draw and refit data sets at coordinates, (R, r); return these, counts and estimates."""
     sampling = centers[0]
@@ -389,7 +397,12 @@ def _draw(
     data, points = sets_along(evaluator, thetas, rng)
     # Populations at another optimum have their estimates near the first one.
     starts = x if len(centers) == 1 else np.zeros_like(x)
-    estimates, converged = refit(sampling, data, starts, is_rough=True)
+    if is_linear:
+        estimates = sampling.linear_estimates(data)
+        estimates -= sampling.linear_estimates(observed_set(evaluator))
+        converged = np.ones(len(estimates), dtype=bool)
+    else:
+        estimates, converged = refit(sampling, data, starts, is_rough=True)
     if converged.mean() < options.converged:
         raise ValueError(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
@@ -455,27 +468,42 @@ def _at_minimiser(
     )
 
 
-def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
+def _moved_to_minimiser(
+    sampling: SamplingDistribution, *, is_linear: bool = False
+) -> SamplingDistribution:
     """Return the sampling distribution with the minimiser for the observed responses as theta."""
-    (x,), _ = refit(sampling, observed_set(sampling.evaluator))
+    observed = observed_set(sampling.evaluator)
+    (x,) = sampling.linear_estimates(observed) if is_linear else refit(sampling, observed)[0]
     return replace(sampling, theta=sampling.thetas(x))
 
 
-def _require_inside(sampling: SamplingDistribution, options: RefitLikelihoodOptions) -> None:
-    """Raise if the data identify more at the middle of the prior than at the estimate."""
-    local = sampling.local
-    if not local.unidentified.size:
-        return
-    evaluator = sampling.evaluator
+def _moved_inside(
+    sampling: SamplingDistribution, options: RefitLikelihoodOptions
+) -> SamplingDistribution | None:
+    """Return the distribution at a point inside if the estimate is near an edge, else None.
+
+    Near an edge, as where a standard deviation is about zero, estimates pile up and have no
+    density. One linear step from a point inside has: in the variance such a step has no edge.
+    """
+    evaluator, scales, theta = sampling.evaluator, sampling.scales, sampling.theta
+    if needs_refits(evaluator):
+        return None
     median = np.median(evaluator.hyperparameters.prior_points(THETAS, 0), axis=0)
-    shift = (median - sampling.theta) / local.prior_sd
-    along = local.identified @ (local.identified.T @ shift)
-    inside = sampling.theta + (shift - along) * local.prior_sd
-    at_median = SamplingDistribution.of(evaluator, inside, sampling.scales, options.weakest)
-    if at_median.stderr.size > sampling.stderr.size:
-        names = np.array(evaluator.hyperparameters.readable_names)
-        is_flat = (local.unidentified**2).sum(axis=1) > 0.5
-        raise ValueError(_at_edge(", ".join(names[is_flat])))
+    weak = SamplingDistribution.of(evaluator, theta, scales, options.weak)
+    hidden = weak.local.unidentified
+    if not hidden.size:
+        return None
+    shift = (median - theta) / weak.local.prior_sd
+    step = hidden @ (hidden.T @ shift) * weak.local.prior_sd
+    points = theta + np.linspace(0, 1, 9)[1:, None] * step
+    at_median = SamplingDistribution.of(evaluator, points[-1], scales, options.weak)
+    if at_median.stderr.size <= weak.stderr.size:
+        return None
+    for point in points:
+        inside = SamplingDistribution.of(evaluator, point, scales, options.weak)
+        if inside.stderr.size >= at_median.stderr.size:
+            return inside
+    return at_median
 
 
 def _at_edge(subject: str) -> str:

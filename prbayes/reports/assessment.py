@@ -465,8 +465,12 @@ def _answer(m: Material) -> str:
         return f"The answer is in the table of the {kind}."
     pairs = []
     for name, (value, sd) in estimates.items():
-        estimate = f"= {plus_minus(value, sd)}" if sd < np.inf else "is not identified"
+        phrase = f"= {number(value)}, without a standard error (see the section on diagnostics)"
+        estimate = f"= {plus_minus(value, sd)}" if sd < np.inf else phrase
         pairs.append(f"{named(name, m.labels)} {estimate}")
+    diagnosis = m.diagnoses.get(label)
+    if diagnosis is not None and "width-of-epsilon" in {f.code for f in diagnosis.findings}:
+        estimator = "mean and standard deviation of draws that are as wide as epsilon makes them"
     of_result = f" of {label}" if len(results) > 1 else ""
     return f"The answer{of_result} is {', '.join(pairs)} ({estimator})."
 
@@ -524,7 +528,7 @@ def _trust(m: Material) -> str:
             f"The diagnostics found {enumerated(problems)}; "
             "see the section on diagnostics before the answer is used."
         )
-    if any(diagnosis.untested for diagnosis in diagnoses.values()):
+    if any("tests that were run" in diagnosis.all_clear for diagnosis in diagnoses.values()):
         return "The diagnostics that were run found no problem."
     return "The diagnostics found no problem."
 

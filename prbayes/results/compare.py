@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 from prbayes._display import view
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, as_json, from_json, report
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called
 from prbayes.metrics.area import AreaMetric
@@ -41,6 +42,7 @@ from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.optimize.design_refinement import temporary_first_samples
 from prbayes.optimize.optimum import Optimum, identity_in
 from prbayes.response.inputs import event_shape
+from prbayes.results.predict import width_of_epsilon
 
 # Variables by result that are no scores.
 COSTS = ("n_responses", "seconds")
@@ -86,7 +88,8 @@ def compare(
         the estimate's population by the metric's class, after the simulator's name if there are
         several. Scores are NaN where stored responses do not support the population. With the
         log-likelihood by specimen populations are emulated, and ``LogLikelihood by specimen`` is
-        minus its mean over the specimens. A notebook shows a table.
+        minus its mean over the specimens. The attribute ``findings`` names draws that are as wide
+        as epsilon makes them. A notebook shows a table.
 
     Raises
     ------
@@ -168,7 +171,16 @@ def compare(
         for key, scores in _scores(model, shared, values, metrics, is_covered=is_covered).items():
             data[key] = ("result", scores)
     coords = {"result": list(results), "hyperparameter": names}
-    attrs = {"interval": INTERVAL, **as_attributes(identity)}
+    findings = [
+        replace(finding, text=f"{label}: {finding.text}")
+        for label, result in results.items()
+        for finding in width_of_epsilon(result, naming)
+    ]
+    attrs = {
+        "interval": INTERVAL,
+        "findings": as_json(report(*findings)),
+        **as_attributes(identity),
+    }
     return Comparison(data, coords=coords, attrs=attrs)
 
 
@@ -188,7 +200,7 @@ class Comparison(xr.Dataset):  # type: ignore[no-untyped-call]
                 row = self.sel(hyperparameter=name, result=label)
                 estimate, sd, lower, upper = (f"{float(row[key]):.4g}" for key in _ESTIMATE)
                 rows.append([str(name), str(label), estimate, sd, f"{lower} to {upper}"])
-        sentences = []
+        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
         for key, scores in self.data_vars.items():
             if scores.dims == ("result",) and key not in COSTS:
                 items = scores.to_series().items()

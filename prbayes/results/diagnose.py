@@ -21,8 +21,10 @@ from prbayes.inference.goodness_of_fit import (
     FittedSets,
     output_misfits,
     population_misfit,
+    rounding,
+    unpredicted_failures,
 )
-from prbayes.inference.refits import SamplingDistribution, refit_obstacle
+from prbayes.inference.refits import SamplingDistribution, is_stored, refit_obstacle
 from prbayes.inference.resampling import SETS
 from prbayes.model.evaluator import ENOUGH, Evaluator, shortcoming
 from prbayes.model.fingerprint import Level
@@ -52,7 +54,7 @@ from prbayes.results.likelihood_checks import (
     emulator_remarks,
     separate_modes,
 )
-from prbayes.results.predict import populations_of
+from prbayes.results.predict import populations_of, width_of_epsilon
 
 # R-hat of independent draws exceeds 1 + _NOISE / (chains x draws) about once in a thousand cases:
 # the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, 1500 to 4000 sets of each.
@@ -101,7 +103,7 @@ class Diagnosis:
     @property
     def all_clear(self) -> str:
         """The sentence for a result without findings, by whether all tests were run."""
-        if self.untested:
+        if self.untested or any(r.code == "population-not-tested" for r in self.remarks):
             return "No problem was found by the tests that were run."
         return "No problem was found."
 
@@ -126,8 +128,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     answer by the stored responses of `Reweighted`. For draws they are about R-hat and effective
     sample size (by ArviZ), equal draws, and moves of `sample_smc` in its last stage. Optima on
     stored responses are refitted: can the data come from the best population (p < .01)? Notes name
-    the outputs, and the correlations of two outputs, that misfit, and tests that were not run. No
-    response is computed.
+    the outputs, and the correlations of two outputs, that misfit, and tests that were not run.
+    Responses are computed for the test under `Resimulated`, if they take less than half a minute.
 
     With the log-likelihood by specimen, the family of the population of the inputs is tested. For
     draws it reports chains in different modes, conflicts of prior and data, and specimens on which
@@ -165,7 +167,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0, 2, 4])
+    ...     data = [-3.0, -2.0, -1.0, -0.3, 0.3, 1.0, 2.0, 3.0]
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=data)
     >>> print(prb.diagnose(prb.minimize(model)))
     No problem was found.
     """
@@ -202,6 +205,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     findings = from_json(str(attrs.get("findings", "[]")))  # of the run that made the result
     if has_draws:
         checked = _check_sampler(tree, model, by_specimen=by_specimen)
+        checked += Checked(width_of_epsilon(tree, model))
         reason = "refits need an optimum; look at prb.diagnose of prb.minimize"
     else:
         checked = _check_convergence(attrs, findings)
@@ -258,13 +262,14 @@ def _not_tested(reason: str) -> Checked:
 def _check_family(optimum: Optimum) -> Checked:
     """Test whether the data can come from the best population, or report why it was not tested."""
     evaluator = optimum.evaluator
+    failures = unpredicted_failures(evaluator, optimum.theta) if is_stored(evaluator) else []
     obstacle = refit_obstacle(evaluator)
     if not optimum.converged or optimum.search.at_edge or optimum.search.at_jump:
         obstacle = "nothing is known of the sampling distribution of this optimum"
-    elif obstacle is None and evaluator.responses_per_theta:
-        obstacle = "it would take responses"
+    elif obstacle is None and _seconds_of_test(optimum) > 30:
+        obstacle = f"it would take {SETS * evaluator.responses_per_theta} responses"
     if obstacle is not None:
-        return Checked(tuple(small_simulators(evaluator))) + _not_tested(obstacle)
+        return Checked((*small_simulators(evaluator), *failures)) + _not_tested(obstacle)
     fitted: FittedSets | None
     if optimum.search.prior:
         scales = np.array(list(optimum.scales.values()))
@@ -274,12 +279,30 @@ def _check_family(optimum: Optimum) -> Checked:
         fitted = FittedSets.of(optimum.sampling(), SETS, 0)
     p_value = np.nan if fitted is None else fitted.p_value
     if fitted is None or np.isnan(p_value):
-        checked = Checked(tuple(small_simulators(evaluator)))
+        checked = Checked((*small_simulators(evaluator), *failures))
         return checked + _not_tested("the data are uninformative, or too few refits converge")
-    misfits = tuple(output_misfits(fitted)) if p_value < UNLIKELY else ()
-    misfit = population_misfit(p_value, with_prior=optimum.search.prior)
-    biases = *small_simulators(evaluator, refits=True), *refit_bias(fitted)
+    misfits: tuple[Finding, ...] = ()
+    ties, p_spread_out = "", np.nan
+    if p_value < UNLIKELY:
+        ties = rounding(evaluator)
+        exact = fitted.without_rounding() if ties else None
+        if exact is not None:
+            p_spread_out = exact.p_value
+        if not p_spread_out >= UNLIKELY and is_stored(evaluator):
+            misfits = tuple(output_misfits(fitted))
+    misfit = population_misfit(
+        p_value, with_prior=optimum.search.prior, ties=ties, p_spread_out=p_spread_out
+    )
+    biases = [*small_simulators(evaluator, refits=is_stored(evaluator)), *failures]
+    if is_stored(evaluator):
+        biases += refit_bias(fitted)
     return Checked((*biases, *misfit), misfits)
+
+
+def _seconds_of_test(optimum: Optimum) -> float:
+    """Return at most how long the responses take that the test needs; none if they are stored."""
+    seconds_each = optimum.search.seconds / max(optimum.n_responses, 1)
+    return SETS * optimum.evaluator.responses_per_theta * seconds_each
 
 
 # -- responses -------------------------------------------------------------------------------
@@ -397,17 +420,7 @@ def _check_sampler(tree: xr.DataTree, model: pm.Model | None, *, by_specimen: bo
     if not modes and posterior.sizes["draw"] >= 4:
         findings += _convergence(variables)
     findings += [*_repeated_draws(variables), *_particles_stuck(tree)]
-    remarks: tuple[Finding, ...] = ()
-    is_adjusted = posterior.attrs.get("adjustment", "none") != "none"
-    is_bootstrap = "converged" in posterior.attrs  # without an epsilon
-    if not (by_specimen or is_adjusted or is_bootstrap):
-        text = (
-            "The draws are those of exp(-discrepancy / epsilon), as wide as epsilon makes them; "
-            "prb.sample draws the posterior given the estimate."
-        )
-        page = "choose.md#epsilon-and-the-width-of-the-posterior"
-        remarks = (Finding("width-of-epsilon", text, page),)
-    return Checked(tuple(findings), remarks)
+    return Checked(tuple(findings))
 
 
 def _convergence(posterior: xr.Dataset) -> list[Finding]:

@@ -33,7 +33,7 @@ from prbayes.model.fingerprint import (
 )
 from prbayes.model.locking import locked
 from prbayes.model.parameters import finite_draws
-from prbayes.model.random_variable import Node
+from prbayes.model.random_variable import Node, has_default_epsilon, simulators
 from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.importance import new_specimens
@@ -172,8 +172,8 @@ def predict(
     model = model_of(result, model, "prb.predict")
     points, coords = populations_of(result, model, n_draws, "prb.predict")
     inputs_read = read_inputs(label, inputs, model)
-    simulators = population_simulators(model)
-    n_stored = sum(s.responses.count for s in simulators)
+    sources = population_simulators(model)
+    n_stored = sum(s.responses.count for s in sources)
     responses = Responses(
         label,
         response,
@@ -181,18 +181,18 @@ def predict(
         executor=executor,
         store=store,
         version=version,
-        outputs=known_outputs(simulators, response),
+        outputs=known_outputs(sources, response),
         caller="prb.predict",
-        scatter=known_scatter(simulators, response),
+        scatter=known_scatter(sources, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
-    simulator = serving(simulators, responses) if stored else None
+    simulator = serving(sources, responses) if stored else None
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, np.random.default_rng(seed))
     if max_lost is None:
-        max_lost = max((s.max_lost for s in simulators), default=MAX_LOST)
+        max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
     missing = _check_responses(label, drawn, max_lost)
-    n_computed = responses.count - n_stored + sum(s.responses.count for s in simulators)
+    n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
         "responses": n_computed,
@@ -200,7 +200,7 @@ def predict(
         "nan": missing,
         "specimens_id": _digest(*drawn.specimens),
         "random_seed": str(seed),
-        "findings": as_json(findings_of(response)),
+        "findings": as_json((*findings_of(response), *report(*width_of_epsilon(result, model)))),
         **_calibration_attributes(result, model),
         **as_attributes(identity_in(result) or identity_of(model)),
         **versions(),
@@ -269,6 +269,34 @@ def populations_of(
         points = {name: np.asarray(values[name], dtype=np.float64)[None] for name in names}
         return points, {"chain": np.arange(1), "draw": np.arange(1)}
     return finite_draws(values, names), {dim: np.asarray(values[dim]) for dim in ("chain", "draw")}
+
+
+def width_of_epsilon(result: Any, model: pm.Model | None) -> tuple[Finding, ...]:
+    """Report draws that are as wide as epsilon makes them, by whatever sampler.
+
+    Not those of a bootstrap, nor of log-likelihoods with their default epsilon.
+    """
+    groups = result.children if isinstance(result, xr.DataTree) else {}
+    attrs = result["posterior"].attrs if "posterior" in groups else {}
+    is_adjusted = attrs.get("adjustment", "none") != "none"
+    is_bootstrap = "converged" in attrs  # without an epsilon
+    if "posterior" not in groups or is_adjusted or is_bootstrap:
+        return ()
+    has_epsilon = False
+    if model is not None:
+        has_epsilon = not all(
+            has_default_epsilon(simulator) and not simulator.target.metric.distance
+            for simulator in simulators(model).values()
+        )
+    elif "calibration" in groups and "is_likelihood" in result["calibration"]:
+        has_epsilon = not bool(result["calibration"]["is_likelihood"].all())
+    if not has_epsilon:
+        return ()
+    text = (
+        "The draws are those of exp(-discrepancy / epsilon): their width is that of epsilon, not "
+        "of the number of specimens; prb.sample draws the posterior given the estimate."
+    )
+    return (Finding("width-of-epsilon", text, "choose.md#epsilon-and-the-width-of-the-posterior"),)
 
 
 # -- responses -------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Goodness of fit: size and power for families, and which outputs and correlations misfit."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from prbayes.inference.goodness_of_fit import (
     _fit_distances,
     output_misfits,
     population_misfit,
+    spread_out,
+    unpredicted_failures,
     worst_p_value,
 )
 from prbayes.inference.refits import SamplingDistribution
@@ -121,22 +124,82 @@ def test_distances_of_a_fit_leave_out_points_without_a_finite_response() -> None
     np.testing.assert_allclose(_fit_distances(simulated, masses[None], *data), [expected])
 
 
+def test_cheap_responses_are_computed_for_the_test() -> None:
+    """At most 200 data sets of 256 responses."""
+    wrong, right = (
+        of_family("kl", family, 0, propagation=prb.Resimulated(256))
+        for family in ("bimodal", "normal")
+    )
+    (finding,) = prb.diagnose(wrong).findings
+    assert finding.code == "population-misfit"
+    diagnosis = prb.diagnose(right)
+    assert str(diagnosis) == "No problem was found."
+
+
 def test_where_it_is_not_looked_at_a_line_says_why() -> None:
     found = of_family("kl", "normal", 0, propagation=prb.Resimulated(256))
+    slow_search = replace(found.search, seconds=1.0 * found.n_responses)
+    slow_optimum = replace(found, search=slow_search)
     before = found.evaluator.n_responses
-    diagnosis = prb.diagnose(found)
+    diagnosis = prb.diagnose(slow_optimum)
     assert found.evaluator.n_responses == before
     assert diagnosis.ok
-    said = "No problem was found.\nWhether the inputs have the right family was not looked at: "
-    assert str(diagnosis).startswith(f"{said}it would take responses")
+    said = "No problem was found by the tests that were run.\nWhether the inputs have the right "
+    assert str(diagnosis).startswith(f"{said}family was not looked at: it would take 51200 resp")
     keywords = {"model": found.model, "optimum": found, "progressbar": False}
-    plain = prb.sample_smc(60, chains=2, adjustment=None, **keywords)
-    width, note = prb.diagnose(plain).notes
-    assert "as wide as epsilon makes them" in width
-    assert "refits need an optimum; look at prb.diagnose of prb.minimize" in note
+    plain = prb.diagnose(prb.sample_smc(60, chains=2, adjustment=None, **keywords))
+    assert "width-of-epsilon" in [finding.code for finding in plain.findings]
+    assert "refits need an optimum; look at prb.diagnose of prb.minimize" in plain.notes[0]
     (note,) = prb.diagnose(found.to_datatree()).notes
     assert "refits need the model; pass the Optimum itself" in note
     assert prb.diagnose(of_family("pr", "normal", 0)).notes == ()
+
+
+# -- ties and failures --
+
+
+def test_ties_are_spread_over_their_steps() -> None:
+    exact = np.random.default_rng(0).normal(10, 2, 200)
+    spread = spread_out(exact.round(0))
+    assert np.unique(spread).size == 200
+    np.testing.assert_allclose(np.sort(spread), np.sort(exact), atol=1.0)
+    np.testing.assert_array_equal(spread.round(6).round(0), exact.round(0))
+    # Without a step, as of three significant digits, over half of the way to the neighbours.
+    assert spread_out(np.array([1.0, 1.1, 1.1, 2.7183])).round(4).tolist() == [
+        1.0, 1.075, 1.5046, 2.7183,
+    ]  # fmt: skip
+    for same_values in (exact, np.full(3, 2.0), np.array([1.0, np.inf, np.inf, 3.0])):
+        np.testing.assert_array_equal(spread_out(same_values), same_values)
+
+
+@pytest.mark.parametrize(
+    ("family", "step", "code", "words"),
+    [
+        ("normal", 0.7, "rounded-data", "45 of 50 values of y equal others, all of them multipl"),
+        ("bimodal", 0.35, "population-misfit", "Rounding does not explain it (4"),
+        ("bimodal", 1e-9, "population-misfit", "the inputs probably have another family"),
+    ],
+)
+def test_rounding_is_named_before_another_family(
+    family: str, step: float, code: str, words: str
+) -> None:
+    exact = FAMILIES[family](np.random.default_rng([7, 0, 50]), 50)
+    (finding,) = prb.diagnose(optimum("kl", np.round(exact / step) * step)).findings
+    assert finding.code == code
+    assert words in finding.text
+    assert ("another family, or" in finding.text) == (code == "population-misfit")
+
+
+def test_a_failed_specimen_of_a_population_that_never_fails_is_named() -> None:
+    exact = FAMILIES["normal"](np.random.default_rng(0), 25)
+    evaluator = optimum("area", exact).evaluator
+    assert not unpredicted_failures(evaluator, np.zeros(2))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        data = {"observed": np.append(exact, np.inf), "propagation": R256}
+        prb.Simulator("y", same, x, metric=METRICS["area"], **data)
+    (finding,) = unpredicted_failures(Evaluator.of(model), np.zeros(2))
+    assert "y: 1 of 26 measured values are +inf" in finding.text
 
 
 def test_why_it_is_not_looked_at_with_other_terms() -> None:

@@ -285,13 +285,6 @@ def test_an_estimate_at_an_edge_is_refused() -> None:
         refit_likelihood(optimum.evaluator, edge)
     with pytest.raises(ValueError, match="estimates of synthetic data sets at an edge"):
         mean_likelihood(reach=0.5)
-    # Known scatter of .5 exceeds that of the data: the standard deviation of inputs is zero.
-    with pm.Model() as model:
-        sigma = pm.HalfNormal("sigma", 1)
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.math.sqrt(sigma**2 + SD**2))
-        simulate(x, observed=1 + 0.5 * (Y12 - Y12.mean()))
-    with pytest.raises(ValueError, match="got sigma at an edge"):
-        likelihood_of(model)
 
 
 def test_the_extended_density_of_normal_estimates() -> None:

@@ -19,6 +19,7 @@ import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.model.evaluator import Evaluator
 from prbayes.optimize.convergence import Result
+from prbayes.posterior.results import Chains
 from prbayes.posterior.smc import _lost_findings
 from prbayes.propagation.base import DesignError
 from prbayes.results.diagnose import _NOISE, _failure_findings
@@ -71,7 +72,7 @@ def test_results_without_a_problem(tmp_path: Path) -> None:
     model, idata = sampled()
     for diagnosis in (prb.diagnose(idata), prb.diagnose(idata, model=model)):
         assert diagnosis.ok
-        assert str(diagnosis).startswith("No problem was found.")
+        assert str(diagnosis).startswith("No problem was found by the tests that were run.")
     idata.to_netcdf(tmp_path / "tree.nc")
     with xr.open_datatree(tmp_path / "tree.nc") as loaded:
         assert prb.diagnose(loaded).ok
@@ -91,7 +92,7 @@ def test_chains_that_disagree() -> None:
     assert "chains-disagree" in codes(normal_tree([0, 0, 0, 0.5], 2000), model)
     # Few chains or draws have no findings.
     for means, draws in (([0, 0, 0, 0.1], 100), ([0.0], 500), ([0.0, 0.0], 3), ([0.0] * 4, 50)):
-        assert prb.diagnose(normal_tree(means, draws), model=model).ok
+        assert codes(normal_tree(means, draws), model) == ["width-of-epsilon"]
     del tree["posterior"]["sigma"]
     with pytest.raises(KeyError, match=r"got a result without \['sigma'\]"):
         prb.diagnose(tree, model=model)
@@ -274,7 +275,8 @@ def test_an_answer_is_refused_if_most_draws_lose_too_much(
     model = one_mean(prb.Resimulated(16), np.positive, epsilon=0.1)
     lost = np.where(np.arange(50) < 50 * of_draws, 0.3, 0.0).reshape(1, 50, 1)
     with pytest.raises(DesignError, match=r"got 30\.0% of the") if is_refused else nullcontext():
-        (finding,) = _lost_findings(Evaluator.of(model), lost, {})
+        chains = Chains(np.zeros((1, 50, 1)), {}, xr.Dataset(), lost=lost)
+        (finding,) = _lost_findings(Evaluator.of(model), chains)
         assert "y: lost mass: of 40% of the draws more than max_lost = 5.0%" in finding.text
 
 

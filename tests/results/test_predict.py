@@ -16,6 +16,7 @@ import prbayes as prb
 from prbayes.model.random_variable import nodes
 from prbayes.propagation.base import DesignError
 from prbayes.response.failures import ResponseError
+from prbayes.results.predict import width_of_epsilon
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 MEANS = np.array([[0.8, 1.0, 1.1], [0.9, 1.0, 1.2]])  # of two chains with three draws
@@ -332,6 +333,28 @@ def test_names_of_a_function_of_one_specimen_are_kept(workers: int) -> None:
     other_keys = prb.scalar(lambda x: {"a": x, "b": x} if x > 1 else {"a": x, "c": x})
     with pytest.raises(ResponseError, match=r"keys \['a', '[bc]'\]"):
         predict(other_keys)
+
+
+def test_draws_as_wide_as_epsilon_are_named_by_any_sampler() -> None:
+    def model_of(metric: prb.Metric) -> pm.Model:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+            prb.Simulator("y", np.positive, x, metric=metric, observed=np.arange(9.0))
+        return model
+
+    by_distance, by_likelihood = (
+        model_of(metric)
+        for metric in (prb.KullbackLeibler(), prb.LogLikelihood(density=prb.GaussianKDE()))
+    )
+    draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((2, 9)))})
+
+    def codes(model: pm.Model | None, **attrs: Any) -> list[str]:
+        tree = xr.DataTree.from_dict({"posterior": draws.assign_attrs(attrs)})
+        return [finding.code for finding in width_of_epsilon(tree, model)]
+
+    assert codes(by_distance) == codes(by_distance, adjustment="none") == ["width-of-epsilon"]
+    assert codes(by_distance, adjustment="estimate") == codes(by_distance, converged=1.0) == []
+    assert codes(by_likelihood) == codes(model_of(prb.LogLikelihood())) == codes(None) == []
 
 
 def test_labels_of_the_response_are_those_of_the_prediction() -> None:

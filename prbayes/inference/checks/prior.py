@@ -46,8 +46,8 @@ def elements_at_prior_ends(
     """Return the ``flat`` elements, (d,), that the data push to an end of their prior.
 
     With the element at the median of its prior, the objective is higher than at theta by more than
-    ``rise``, whatever the other elements. A lower end at zero without an upper end is not one: that
-    is a population without scatter.
+    ``rise``, whatever the other elements, and at the end itself it is not higher. A lower end at
+    zero without an upper end is not one: that is a population without scatter.
     """
     from scipy.optimize import minimize as scipy_minimize
 
@@ -78,6 +78,10 @@ def elements_at_prior_ends(
             "fatol": 0.01 * rise,
             "xatol": 1e-2,
         }
+        at_end = theta.copy()
+        at_end[i] += np.copysign(10 * hyperparameters.prior_sd[i], below[i] - 0.5)
+        if objective(at_end) > objective(theta) + 1e-3 * rise:
+            continue  # a minimum before the end
         limit, lowest = objective(theta) + rise, along(origin)
         # Infinite where no design reaches.
         if origin.size and limit < lowest < np.inf:

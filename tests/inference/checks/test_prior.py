@@ -78,6 +78,12 @@ def test_the_middle_of_a_prior_is_no_end_and_nor_is_a_population_without_scatter
     assert not ends(model(2.85 + 0.3 * LEVELS), -6.0, np.log(1.8))
 
 
+def test_a_minimum_before_the_end_is_not_pushed() -> None:
+    """A prior that ends .04 beyond the mean of the data allows what they ask for."""
+    near_end = np.log(0.96 / 0.04)
+    assert not ends(model(0.96 + 0.3 * LEVELS), near_end, np.log(0.3))
+
+
 def test_two_that_only_stand_for_each_other_are_not_pushed() -> None:
     with pm.Model() as problem:
         x, z = (pm.Normal.dist(pm.Uniform(name, 0, 1), 0.3) for name in "ab")

@@ -1,0 +1,82 @@
+"""Checks of the number of specimens: too few for standard errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.stats import chi2, norm, t
+
+from prbayes._finding import Finding
+from prbayes._stats import INTERVAL
+from prbayes.model.evaluator import Evaluator
+
+
+def elements_above(evaluator: Evaluator) -> NDArray[np.bool_]:
+    """Return which elements of theta enter the population of each simulator, (K, d)."""
+    hyperparameters = evaluator.hyperparameters
+    prior_sd = hyperparameters.prior_sd
+    thetas = hyperparameters.initial + np.vstack([0 * prior_sd, np.diag(prior_sd)])
+    enters = np.zeros((len(evaluator.simulators), hyperparameters.size), dtype=bool)
+    for k, row in enumerate(enters):
+        flat = [parent.reshape(len(thetas), -1) for parent in evaluator.parents(thetas, k)]
+        row |= np.any([(f[1:] != f[0]).any(axis=1) for f in flat], axis=0)
+    return enters
+
+
+def interval_ratios(n: float) -> tuple[float, float]:
+    """Return how much wider than their standard errors intervals of n normal specimens are.
+
+    Of the mean and of the standard deviation, under Jeffreys' prior: by Student's t and chi-squared
+    distributions with n - 1 degrees of freedom, relative to normal intervals around the maximum of
+    the likelihood.
+
+    Examples
+    --------
+    >>> [round(ratio, 1) for ratio in interval_ratios(3)]
+    [2.1, 3.4]
+    >>> [round(ratio, 2) for ratio in interval_ratios(1e6)]
+    [1.0, 1.0]
+    """
+    upper = (1 + INTERVAL) / 2
+    z = float(norm.ppf(upper))
+    # The maximum of the likelihood divides the squares by n.
+    mean = np.sqrt(n / (n - 1)) * t.ppf(upper, n - 1) / z
+    longest, shortest = (np.sqrt(n / chi2.ppf(p, n - 1)) for p in (1 - upper, upper))
+    return float(mean), float((longest - shortest) / (2 * z / np.sqrt(2 * n)))
+
+
+def few_specimens(evaluator: Evaluator, enough: int = 8) -> list[Finding]:
+    """Report hyperparameters that follow from so few specimens that standard errors are too small.
+
+    Simulators with an element of theta in common count together.
+    """
+    enters = elements_above(evaluator)
+    enters = enters[:, enters.any(axis=0)]
+    _, groups = connected_components(enters @ enters.T)
+    counts = []
+    for group in np.unique(groups):
+        members = [evaluator.simulators[k] for k in np.flatnonzero(groups == group)]
+        labels = [member.specimens for member in members if member.specimens is not None]
+        count = sum(member.n_specimens for member in members)
+        if len(labels) == len(members):  # specimens in common count once
+            count = float(np.unique(np.concatenate(labels)).size)
+        counts.append(count)
+    n = min(counts, default=enough)
+    if not n < enough:
+        return []
+    fewest = np.flatnonzero(groups == np.argmin(counts))
+    names = ", ".join(evaluator.simulators[k].name for k in fewest)
+    text = f"{names}: got {n:.3g} specimen{'s' * (n != 1)}, expected at least {enough}: "
+    if n < 2:
+        text += "one specimen says nothing of a spread, and standard errors are no measure of it; "
+    else:
+        mean, spread = interval_ratios(n)
+        text += (
+            "standard errors are those of many specimens. Where the spread is estimated too, "
+            f"{INTERVAL:.0%} intervals of a normal population's mean are at least {mean:.1f} times "
+            f"as wide as standard errors make them, and those of its spread {spread:.1f} times; "
+        )
+    text += "report intervals of prb.sample, not the optimum's."
+    page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
+    return [Finding("few-specimens", text, page)]

@@ -1,0 +1,87 @@
+"""Few specimens: of all simulators together, and of each."""
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from four_metrics import same
+from scipy.stats import norm
+
+import prbayes as prb
+from prbayes.inference.checks.sample_size import few_specimens, interval_ratios
+from prbayes.model.evaluator import Evaluator
+
+LOG_LIKELIHOOD = prb.LogLikelihood(density=prb.GaussianKDE())
+N = 40
+INPUTS = 0.3 + norm.ppf((np.arange(N) + 0.5) / N)
+
+
+def test_intervals_of_two_specimens_are_those_of_a_cauchy_distribution() -> None:
+    mean, spread = interval_ratios(2)
+    z = norm.ppf(0.945)
+    assert mean == pytest.approx(np.sqrt(2) * np.tan(np.pi * 0.445) / z)
+    # The square of a standard normal number: sd / s is sqrt(2) over its size.
+    ends = np.sqrt(2) / np.abs(norm.ppf([0.5 + 0.055 / 2, 0.5 + 0.945 / 2]))
+    assert spread == pytest.approx((ends[0] - ends[1]) / z)
+
+
+def warned(model: pm.Model) -> str:
+    """Return the text of the finding, empty without one."""
+    findings = few_specimens(Evaluator.of(model))
+    assert {finding.code for finding in findings} <= {"few-specimens"}
+    return findings[0].text if findings else ""
+
+
+@pytest.mark.parametrize("metric", [prb.AreaMetric(), LOG_LIKELIHOOD, prb.LogLikelihood()])
+def test_fewer_than_eight_specimens_are_reported_with_the_price(metric: prb.Metric) -> None:
+    def model(observed: Any, **keywords: Any) -> pm.Model:
+        with pm.Model() as result:
+            x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sd", 1))
+            prb.Simulator("y", same, x, metric=metric, observed=observed, **keywords)
+        return result
+
+    assert "y: got 3 specimens" in warned(model(INPUTS[:3]))
+    assert "are at least 2.1 times as wide as standard errors make them" in warned(model([0, 1, 3]))
+    assert "its spread 3.4 times" in warned(model(INPUTS[:3]))
+    assert "y: got 7 specimens" in warned(model(INPUTS[:7]))
+    assert not warned(model(INPUTS[:8]))
+
+
+def test_specimens_count_where_simulators_share_hyperparameters() -> None:
+    def model(is_shared: bool, **keywords: Any) -> pm.Model:
+        with pm.Model() as result:
+            spread = pm.HalfNormal("sd", 1)
+            for k in range(3):
+                scale = spread if is_shared else pm.HalfNormal(f"sd{k}", 1)
+                x = pm.Normal.dist(pm.Normal(f"mu{k}", 0, 2), scale)
+                given = {"metric": prb.AreaMetric(), "observed": INPUTS[: 4 + 4 * (k > 0)]}
+                prb.Simulator(f"y{k}", same, x, **given, **keywords)
+        return result
+
+    assert not warned(model(True))
+    assert warned(model(False)).startswith("y0: got 4 specimens")
+
+
+def test_readings_of_one_specimen_and_weights_do_not_count_as_specimens() -> None:
+    def model(**keywords: Any) -> pm.Model:
+        with pm.Model() as result:
+            x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sd", 1))
+            prb.Simulator("y", same, x, metric=prb.AreaMetric(), observed=INPUTS[:12], **keywords)
+        return result
+
+    assert "got 4 specimens" in warned(model(specimens=np.repeat(np.arange(4), 3)))
+    assert "got 2 specimens" in warned(model(weights=np.repeat([1.0, 0.0], [2, 10])))
+    assert "got 1 specimen, expected at least 8: one" in warned(model(specimens=np.zeros(12, int)))
+
+
+def test_draws_do_not_repeat_the_warning_of_their_optimum() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        given = {"metric": prb.KullbackLeibler(), "propagation": prb.Reweighted(64)}
+        prb.Simulator("y", same, x, observed=INPUTS[::10], **given)
+    optimum = prb.minimize(model, starts=0)
+    assert [finding.code for finding in optimum.findings] == ["few-specimens"]
+    assert not prb.diagnose(optimum).ok
+    draws = prb.sample(50, chains=1, model=model, optimum=optimum)
+    assert "few-specimens" not in {finding.code for finding in prb.diagnose(draws).findings}
