@@ -457,7 +457,8 @@ def test_stored_failures_are_replaced_by_the_present_value_or_tried_again(tmp_pa
 
 
 def test_a_copy_of_a_response_has_failures_of_its_own() -> None:
-    found = responses(model(prb.scalar(fails_above_two), on_failure=Replace(np.inf)))
+    settings = {"on_failure": Replace(np.inf), "max_lost": 0.9}
+    found = responses(model(prb.scalar(fails_above_two), **settings))
     other = found.copied()
     other([np.array([5.0])], [])
     assert len(other.failed) == len(found.failed) + 1
