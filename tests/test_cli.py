@@ -29,7 +29,7 @@ def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 @cache
 def calibrated() -> tuple[pm.Model, Any, prb.Optimum]:
-    observed = [0.0, 1.0, 2.0, 4.0, 5.0]
+    observed = np.linspace(-1.0, 6.0, 10)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
         prb.Simulator("y", double, x, metric=prb.AreaMetric(), observed=observed)

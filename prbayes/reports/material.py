@@ -78,9 +78,16 @@ class Material:
 
     @property
     def has_problems(self) -> bool:
-        """Whether a diagnosis found a problem."""
+        """Whether a diagnosis found a problem.
+
+        Specimens that are too few for the standard errors of an optimum are none beside draws.
+        """
+        accepted = {"few-specimens"} if self.posteriors else set()
         return any(
-            diagnosis is not None and not diagnosis.ok for diagnosis in self.diagnoses.values()
+            finding.code not in accepted
+            for diagnosis in self.diagnoses.values()
+            if diagnosis is not None
+            for finding in diagnosis.findings
         )
 
     @property

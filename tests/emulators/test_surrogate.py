@@ -82,10 +82,10 @@ def test_executors_give_the_same_and_a_store_computes_nothing_twice(tmp_path: Pa
     np.testing.assert_array_equal(other.responses, plain.responses)
     assert threading.main_thread().name not in names
     folder = tmp_path / "runs"
-    # One stored run is computed again, unless there is a version.
-    assert [prb.Surrogate.fit(bent, BOX, n, store=folder).n_runs for n in (32, 48)] == [32, 17]
+    # Three stored runs are computed again, unless there is a version.
+    assert [prb.Surrogate.fit(bent, BOX, n, store=folder).n_runs for n in (32, 48)] == [32, 19]
     again = prb.Surrogate.fit(bent, BOX, 48, store=folder, model=prb.surrogate.Polynomial(3))
-    assert again.n_runs == 1
+    assert again.n_runs == 3
     with pytest.raises(prb.response.StoreError, match="its variables have changed"):
         prb.Surrogate.fit(lambda x, y: 2 * bent(x, y), BOX, 48, store=folder)
     for n_runs in (32, 0):

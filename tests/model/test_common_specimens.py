@@ -397,8 +397,8 @@ def test_other_data_sets_are_of_specimens(make: Callable[[], pm.Model]) -> None:
             {},
         ),
         ("gross_errors: got 0.1, and False in a", {"metric": metric(gross_errors=0.1)}, {}),
-        ("weights: got weights of a", {}, {"weights": [1, 2, 3]}),
-        ("weights: got weights of b", {"weights": [1, 2, 3]}, {}),
+        ("weights: got weights of a", {}, {"weights": [1.0, 2.0, 3.0]}),
+        ("weights: got weights of b", {"weights": [1.0, 2.0, 3.0]}, {}),
         ("propagation: got Resimulated", {"propagation": prb.Resimulated(64)}, {}),
         ("got 'p', which a has too with AreaMetric", {}, {"metric": prb.AreaMetric()}),
         (

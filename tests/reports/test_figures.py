@@ -95,7 +95,10 @@ def test_each_illustration_gets_its_arguments(calls: Calls, calibrated: Any) -> 
     assert calls == {"validity": (({"early": test, "late": test},), {})}
 
 
-def test_a_report_computes_no_response(calls: Calls, section: Any) -> None:
+def test_a_report_computes_no_response(
+    calls: Calls, section: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tests of the family compute responses only where these are cheap."""
     count = 0
 
     def response(x: Any) -> Any:
@@ -111,6 +114,7 @@ def test_a_report_computes_no_response(calls: Calls, section: Any) -> None:
         )
     optimum = prb.minimize(model)
     before = count, optimum.evaluator.n_responses
+    monkeypatch.setattr("prbayes.results.diagnose._seconds_of_test", lambda _: 31.0)
     made = prb.Report("x", model=model, optimum=optimum)
     assert (count, optimum.evaluator.n_responses) == before
     assert "responses" not in calls
