@@ -97,9 +97,11 @@ def check_failing_region(
     measured there, so that the response should not fail. Raises DesignError if the share of such
     specimens is above ``max_lost``. Nothing is checked on fewer than 32 finite runs.
     """
+    if not responses.size or not points:  # a user's own propagation may store none
+        return
     values = responses.reshape(len(responses), -1)
     is_finite = np.isfinite(values).all(axis=1)
-    if is_finite.all() or is_finite.sum() < 32 or not points:
+    if is_finite.all() or is_finite.sum() < 32:
         return
     inputs = np.hstack([x.reshape(len(values), -1) for x in points])
     scores = rankdata(inputs, axis=0)
