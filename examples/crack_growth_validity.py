@@ -48,9 +48,12 @@ def reading(t):
 
 
 def ratio(early, late):
-    """Logarithm of the growth between two readings over the growth before the first."""
+    """Logarithm of the growth between two readings over the growth before the first.
+
+    Less growth than .005 inch is not seen.
+    """
     with np.errstate(all="ignore"):
-        grown = np.log((late - early) / np.maximum(early - DATA.notch_inch, 0.005))
+        grown = np.log(np.maximum(late - early, 0.005) / np.maximum(early - DATA.notch_inch, 0.005))
     return np.where(np.isfinite(late), grown, np.inf)
 
 
