@@ -19,11 +19,14 @@ from numpy.typing import NDArray
 from prbayes._progress import progress
 from prbayes._stats import ENVELOPED, envelope
 from prbayes._validate import AT_ONCE, Floats, called, positive_integer, positive_number, share
-from prbayes.inference.refits import refit
+from prbayes.inference.refits import SamplingDistribution, refit
 from prbayes.inference.resampling import groups, sets_at, simulated_points, specimens
+from prbayes.model.evaluator import shortcomings
 from prbayes.model.fingerprint import Level, require_same
 from prbayes.model.random_variable import Node
 from prbayes.optimize.optimum import Optimum, require_refits
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.reweighted import PoorEmulatorError, designs_restored
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results.predict import data_digest, in_order, serving, specimen_names
@@ -349,13 +352,35 @@ class JointNull(Null):
         return judge_by_replicates([self._u_values(case)], case, statistic, alpha)
 
     def _u_values(self, case: Case) -> Floats:
-        """Draw specimens, recalibrate the model, and return u-values of their responses, (r, n)."""
+        """Return u-values of the replicates, (r, n)."""
         require_same(
             case.identity, self.optimum.search.identity, "JointNull: predicted", Level.OPTIMUM
         )
-        evaluator, theta = self.optimum.evaluator, self.optimum.theta
+        evaluator = self.optimum.evaluator
         sampling = self.optimum.sampling()
-        tested = [self._tested(case, condition) for condition in case.conditions]
+        bounds = evaluator.reweighted.values()
+        with designs_restored(bounds):
+            try:
+                tested = [self._tested(case, condition) for condition in case.conditions]
+            except PoorEmulatorError as error:
+                # All responses at the same points: those of the runs.
+                for bound in bounds:
+                    bound.design = bound.design.runs_alone()
+                short = shortcomings(evaluator, self.optimum.theta[None])
+                if short:
+                    reasons = "; ".join(f"{name}: {reason}" for name, reason in short.items())
+                    raise DesignError(
+                        f"JointNull: {error}; its runs alone do not support the calibrated "
+                        f"population ({reasons})"
+                    ) from error
+                tested = [self._tested(case, condition) for condition in case.conditions]
+            return self._replicates(case, sampling, tested)
+
+    def _replicates(
+        self, case: Case, sampling: SamplingDistribution, tested: list[_Tested]
+    ) -> Floats:
+        """Draw specimens, recalibrate the model, and test their responses, (r, n)."""
+        evaluator, theta = self.optimum.evaluator, self.optimum.theta
         rng_of_ties = case.rng(1)
         numbers, n_new = _validated_counts(evaluator.nodes, tested)
         populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
