@@ -100,18 +100,21 @@ def check_failing_region(
     if not responses.size or not points:  # a user's own propagation may store none
         return
     values = responses.reshape(len(responses), -1)
-    is_finite = np.isfinite(values).all(axis=1)
-    if is_finite.all() or is_finite.sum() < 32:
+    is_finite = np.isfinite(values)
+    if is_finite.all():
         return
     inputs = np.hstack([x.reshape(len(values), -1) for x in points])
     scores = rankdata(inputs, axis=0)
     _, neighbours = cKDTree(scores).query(scores, k=4 * inputs.shape[1] + 5)
-    is_beside = (~is_finite[neighbours[:, 1:]]).mean(axis=1)[is_finite] >= 0.4
     columns = observed.reshape(len(observed), -1)
     is_apart = np.zeros(columns.shape, dtype=bool)
     for j, column in enumerate(columns.T):
-        order = np.argsort(values[is_finite, j], kind="stable")
-        outputs, beside = values[is_finite, j][order], is_beside[order]
+        usable = is_finite[:, j]
+        if usable.all() or usable.sum() < 32:
+            continue
+        order = np.argsort(values[usable, j], kind="stable")
+        is_beside = (~usable[neighbours[:, 1:]]).mean(axis=1)[usable] >= 0.4
+        outputs, beside = values[usable, j][order], is_beside[order]
         right = np.clip(np.searchsorted(outputs, column), 1, outputs.size - 1)
         nearest = right - (column - outputs[right - 1] < outputs[right] - column)
         first = np.clip(nearest - 4, 0, outputs.size - 9)
@@ -127,8 +130,8 @@ def check_failing_region(
     text = (
         f"{name}: got {count} of {len(columns)} observed responses where no run has a finite "
         f"response, such as {', '.join(f'{value:.4g}' for value in some)}: specimens were measured "
-        f"where {(~is_finite).sum()} of {len(values)} runs fail, so that the population cannot be "
-        "estimated there"
+        f"where {(~is_finite.all(axis=1)).sum()} of {len(values)} runs fail, so that the "
+        "population cannot be estimated there"
     )
     if count > max_lost * len(columns):
         raise DesignError(f"{text}; repair the response, or pass a larger max_lost")

@@ -169,7 +169,7 @@ def test_a_calibration_through_a_surrogate_agrees_with_one_without() -> None:
 @pytest.mark.long
 def test_reweighted_refuses_an_answer_that_rests_on_points_outside() -> None:
     narrow = prb.Surrogate.fit(growth, {"x": (-1.5, 1.0)}, 24)
-    with pytest.raises(DesignError, match="lost mass"):
+    with pytest.raises(DesignError, match=r"lost mass|no run has a finite response"):
         prb.minimize(model_of(lambda x: narrow))
 
 

@@ -227,8 +227,7 @@ def test_an_optimum_that_the_prior_holds_away_from_the_data_is_reported() -> Non
     text = "the prior, which is part of its objective, and the data contr"
     assert text in str(prb.diagnose(with_prior(3.0)))
     agreeing = prb.diagnose(with_prior(0.0))
-    assert agreeing.ok
-    assert agreeing.notes == ()
+    assert text not in str(agreeing)
 
 
 def test_where_nothing_is_known_nothing_is_said() -> None:

@@ -158,7 +158,7 @@ def test_a_ridge_of_four_hyperparameters_is_one_mode(codes: list[str]) -> None:
         x = pm.Normal.dist(first + second, pm.math.sqrt((sd**2).sum()))
         prb.Simulator("y", line, x, observed=line(X))
     optimum = fit(model)
-    assert codes == ["not-identified"]
+    assert codes[-1] == "not-identified"
     assert optimum.local_optima == ()
 
 

@@ -26,7 +26,13 @@ DRAWS = 60
 # PyMC draws no value of these, or asks for a package that tests do not install.
 _UNDRAWN = ("CustomDist, without draws", "Flat", "HalfFlat", "PolyaGamma")
 # Stacked in the cases along the axis that a vector would have.
-_SCALAR_ONLY = ("Categorical", "Mixture, of a share", "NormalMixture")
+# A truncated distribution by draws alone is refused as a vector.
+_SCALAR_ONLY = (
+    "Categorical",
+    "Mixture, of a share",
+    "NormalMixture",
+    "Truncated, without distribution function",
+)
 # PyMC has no density, or estimates it from draws.
 _WITHOUT_DENSITY = (
     "CustomDist, by draws alone",
