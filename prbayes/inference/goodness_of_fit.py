@@ -212,9 +212,9 @@ def population_misfit(
         return []
     if p_spread_out >= UNLIKELY:
         text = (
-            f"The measured values are rounded, or copied: {ties}. As they are, they are farther "
-            f"from the best population than {1 - p_value:.1%} of data sets; spread out over the "
-            f"steps they are not (p = {p_spread_out:.2g}), so that nothing points to another "
+            f"The measured values are rounded, or copied: {ties}. They are farther from the "
+            f"best population than {1 - p_value:.1%} of data sets. Spread evenly over the rounding "
+            f"steps they are not (p = {p_spread_out:.2g}): there is no sign of another "
             "family. Pass values with more digits, or remove copies; prb.LogLikelihood() takes "
             "rounded=."
         )

@@ -29,7 +29,7 @@ from prbayes.optimize.convergence import (
     stored_overlap,
 )
 from prbayes.optimize.objective import Ridge
-from prbayes.propagation.base import DesignError
+from prbayes.propagation.base import DesignError, refuse_lost_share
 from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import designs_restored
 
@@ -415,12 +415,5 @@ def refuse(
 def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
     """Raise if too much of a population, by simulator without a design, has no response."""
     for node in evaluator.nodes:
-        share = lost.get(node.name, 0.0)
-        limit = node.bound.max_lost
-        if node.reweighted is None and share > limit:
-            raise DesignError(
-                f"{node.name}: lost mass: got {share:.1%} of the population without a response "
-                f"(NaN) at the answer, expected at most max_lost = {limit:.1%}: it would rest on "
-                "the specimens that have one; repair the response, return +inf for specimens that "
-                "fail, or pass a larger max_lost to the propagation"
-            )
+        if node.reweighted is None:
+            refuse_lost_share(node.name, lost.get(node.name, 0.0), node.bound.max_lost)

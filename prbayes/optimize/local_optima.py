@@ -15,7 +15,7 @@ from prbayes.numerics.batched_minimisers import descend
 from prbayes.optimize.convergence import Fit
 from prbayes.optimize.design_refinement import FEW_SETS, noise_floors, refine_at
 from prbayes.optimize.objective import Ridge
-from prbayes.optimize.optimum import place
+from prbayes.optimize.optimum import point_text
 
 # Share of the noise floor that is about the difference of the discrepancy between the fit of the
 # data and the truth.
@@ -42,8 +42,8 @@ class LocalOptimum:
         """Report that the data could as well come from here."""
         return Finding(
             "second-mode",
-            f"The data could as well come from {place(evaluator, self.theta)}: another optimum, or "
-            "mirror solution, whose discrepancy differs by no more than sampling noise; state a "
+            f"The data could as well come from {point_text(evaluator, self.theta)}: another optimum, "
+            "or mirror solution, whose discrepancy differs by no more than sampling noise; state a "
             "prior that excludes one, or report both.",
             "optimum_or_abc.md#two-answers",
         )

@@ -42,8 +42,8 @@ from prbayes.optimize.optimum import (
     SearchRecord,
     local_optimum,
     n_computed,
-    place,
     point_and_stderr,
+    point_text,
     require_sampling,
 )
 from prbayes.propagation.specimen_emulation import specimen_roots
@@ -419,7 +419,7 @@ def _findings(
         findings.append(
             Finding(
                 "second-mode",
-                f"A second optimum at {place(evaluator, mode.theta)} has {weight:.0%} of the "
+                f"A second optimum at {point_text(evaluator, mode.theta)} has {weight:.0%} of the "
                 "posterior's mass; NUTS chains may stay in the mode where they start; "
                 "prb.sample_smc samples both.",
                 "likelihood.md#several-modes",

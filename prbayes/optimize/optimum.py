@@ -419,7 +419,7 @@ def point_at(evaluator: Evaluator, theta: Floats) -> dict[str, Any]:
     return {name: _number(value[0]) for name, value in values.items()}
 
 
-def place(evaluator: Evaluator, theta: Floats) -> str:
+def point_text(evaluator: Evaluator, theta: Floats) -> str:
     """Return the free variables at theta in words, without constants."""
     hyperparameters = evaluator.hyperparameters
     # Beside a second point, so that constants can be recognised.

@@ -170,7 +170,7 @@ def unknown_error_findings(stderr: Mapping[str, Any], obstacle: str | None) -> l
     names = [name for name, errors in stderr.items() if np.isnan(errors).any()]
     if not names:
         return []
-    reason = obstacle or "the optimum is at the end of a support, where nothing moves them"
+    reason = obstacle or "the optimum is at the end of a support, where derivatives do not exist"
     text = (
         f"The standard errors of {', '.join(names)} are not known (NaN): {reason}; or take the "
         "uncertainty from prb.sample_smc."
@@ -216,8 +216,8 @@ def elements_at_edge(
     unchanged = max(1e-5, tolerance) * size
     at_edge = []
     for i in np.flatnonzero((changes_further < unchanged) & (changes_back > unchanged)):
-        # Far out the population is one number, to the last digit: what counts is the last point on
-        # the way back with the same discrepancy.
+        # Far out the population is one number, to the last digit. The comparison uses the last
+        # point from theta to there whose discrepancy is unchanged.
         way = theta + np.linspace(0, 1, 101)[:, None] * (back[i] - theta)
         is_same = np.abs(evaluator.total(way, scales) - center) < unchanged
         last = way[np.logical_and.accumulate(is_same)][-1]

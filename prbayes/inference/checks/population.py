@@ -26,7 +26,7 @@ from prbayes._validate import Floats
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_preparation import prepared
-from prbayes.propagation.base import DesignError
+from prbayes.propagation.base import refuse_lost_share
 from prbayes.response.distributions import PopulationSampler
 
 
@@ -210,14 +210,8 @@ def lost_mass_shift(evaluator: Evaluator, theta: Floats, scales: Floats, stderr:
 def refuse_lost_specimens(evaluator: Evaluator, theta: Floats, specimens: int = 4096) -> None:
     """Raise if too much of a population has no response (NaN): it is not known from the rest."""
     for simulator, share in _failing_shares(evaluator, theta, specimens):
-        if prepared(simulator.likelihood).share is not None and share > simulator.max_lost:
-            raise DesignError(
-                f"{simulator.name}: lost mass: got {share:.1%} of the population without a "
-                f"response (NaN) at the answer, expected at most max_lost = "
-                f"{simulator.max_lost:.1%}: it would rest on the specimens that have one; repair "
-                "the response, return +inf for specimens that fail, or pass "
-                "propagation=prb.Reweighted(n, max_lost=...)"
-            )
+        if prepared(simulator.likelihood).share is not None:
+            refuse_lost_share(simulator.name, share, simulator.max_lost)
 
 
 def _failing_shares(
