@@ -147,8 +147,9 @@ class Information:
             narrow = _stencil_around(self.evaluator, self.k, self.theta, 1e-3, is_wide=False)
             # Of several outputs a failed one is at the end of its scale, and does not jump.
             is_known = ~np.isnan(narrow.values) if target.event else np.isfinite(narrow.values)
-            # Unless a point gains or loses its response within the step.
-            if bound.stored or (is_known == is_known[0]).all():
+            # Unless points fail: the edge of their region passes none within a narrow step, and
+            # the population without them would not change its share of failures.
+            if bound.stored or is_known.all():
                 return narrow
         # For step functions: distribution functions, jumps, moving supports.
         share = 0.05 * self.widened
