@@ -411,9 +411,12 @@ def create(path: Path) -> None:
         part.unlink(missing_ok=True)
 
 
+_PART_NAME = 40  # characters of a file's name in that of its part: names have 255 bytes
+
+
 def _part_of(path: Path) -> Path:
     """Return the path of an unfinished file, another one in each process."""
-    return path.with_name(f"{path.name[:40]}.{uuid.uuid4().hex}.part")
+    return path.with_name(f"{path.name[:_PART_NAME]}.{uuid.uuid4().hex}.part")
 
 
 def replace_files(contents: Mapping[Path, bytes], name: str) -> None:
@@ -445,6 +448,38 @@ def replace_files(contents: Mapping[Path, bytes], name: str) -> None:
     finally:
         for part in parts:
             part.unlink(missing_ok=True)
+
+
+@contextmanager
+def only_writer(path: Path, name: str) -> Iterator[None]:
+    """Lock a file until the block or the process ends; remove what killed writers of it left.
+
+    Raises `StoreError` if it is locked, or cannot be written.
+    """
+    from filelock import FileLock, Timeout
+
+    target = path.resolve()
+    if not target.parent.is_dir():
+        raise StoreError(f"{name}: got {path}, whose folder does not exist, expected one that does")
+    if not os.access(target.parent, os.W_OK):
+        raise StoreError(f"{name}: got {path}, expected a folder with the right to write there")
+    lock = FileLock(target.with_name(f"{target.name}.lock"), timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise StoreError(
+            f"{name}: got {path}, which another run is writing to, expected one run at a time; "
+            "wait for its end, or pass another path"
+        ) from error
+    try:
+        # The names of parts are cut, so those of long names may belong to another file.
+        if len(target.name) < _PART_NAME:
+            for part in target.parent.glob("*.part"):
+                if re.fullmatch(re.escape(target.name) + r"\.[0-9a-f]{32}\.part", part.name):
+                    part.unlink(missing_ok=True)
+        yield
+    finally:
+        lock.release()
 
 
 def connect(path: Path, mode: str = "rw") -> sqlite3.Connection:
