@@ -411,12 +411,9 @@ def create(path: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-_PART_NAME = 40  # characters of a file's name in that of its part: names have 255 bytes
-
-
 def _part_of(path: Path) -> Path:
     """Return the path of an unfinished file, another one in each process."""
-    return path.with_name(f"{path.name[:_PART_NAME]}.{uuid.uuid4().hex}.part")
+    return path.with_name(f"{path.name[:40]}.{uuid.uuid4().hex}.part")
 
 
 def replace_files(contents: Mapping[Path, bytes], name: str) -> None:
@@ -472,8 +469,8 @@ def only_writer(path: Path, name: str) -> Iterator[None]:
             "wait for its end, or pass another path"
         ) from error
     try:
-        # The names of parts are cut, so those of long names may belong to another file.
-        if len(target.name) < _PART_NAME:
+        # `_part_of` cuts long names, and their parts may belong to another file.
+        if len(target.name) < 40:
             for part in target.parent.glob("*.part"):
                 if re.fullmatch(re.escape(target.name) + r"\.[0-9a-f]{32}\.part", part.name):
                     part.unlink(missing_ok=True)
