@@ -472,9 +472,7 @@ class Responses:
             )
 
 
-def refuse_other_runs(
-    settings: CallSettings, points: Points, values: Floats, tally: Tally
-) -> None:
+def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, tally: Tally) -> None:
     """Raise if a few of the runs, (n,) or (n, m), differ when they are computed again.
 
     They do if the response has scatter, or depends on other specimens; see `revealing_rows`.
