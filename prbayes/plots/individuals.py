@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, share
 from prbayes.model.parameters import element_name
-from prbayes.plots.canvas import BLUE, GREY, INK, Canvas, Panel, named, refuse_look
+from prbayes.plots.canvas import BLUE, GREY, INK, Canvas, Panel, named, refuse_labels, refuse_look
 
 
 def plot_individuals(
@@ -64,32 +64,35 @@ def plot_individuals(
     refuse_look(labels, pc_kwargs)
     share(prob, "prob")
     groups = individuals.children if isinstance(individuals, xr.DataTree) else {}
-    if not {"posterior", "posterior_predictive", "observed_data"} <= set(groups):
+    draws = groups["posterior"].to_dataset() if "posterior" in groups else xr.Dataset()
+    has_specimens = any(str(dim).startswith("specimen") for dim in draws.dims)
+    if not has_specimens or not {"posterior_predictive", "observed_data"} <= set(groups):
         raise TypeError(
             f"individuals: got {called(individuals)}, expected the DataTree that prb.individuals "
             "returns"
         )
-    inputs = _elements(individuals["posterior"].to_dataset())
+    inputs = _elements(draws)
     observed = individuals["observed_data"].to_dataset()
     replicates = individuals["posterior_predictive"].to_dataset()
     curves = [str(name) for name, y in observed.data_vars.items() if y[0].size > 6]
     readings = _elements(observed.drop_vars(curves))
     replicated = _elements(replicates.drop_vars(curves))
+    conditions = individuals["constant_data"].data_vars if "constant_data" in groups else {}
+    refuse_labels(labels, [*inputs, *readings, *curves, *map(str, conditions), "specimen"])
     canvas = Canvas([*inputs, *readings, *curves], size=(4.6, 3.9), pc_kwargs=pc_kwargs)
-    for name, draws in inputs.items():
+    for name, values in inputs.items():
         panel = canvas.panels[name]
-        mean = draws.mean(axis=0)
+        mean = values.mean(axis=0)
         order = np.argsort(mean, kind="stable")
         places = np.arange(len(order))
         text = f"{prob:.0%} of the draws of a specimen"
-        _intervals(panel, "interval", places, draws[:, order], prob, text)
+        _intervals(panel, "interval", places, values[:, order], prob, text)
         panel.points("mean", (places, mean[order]), BLUE, size=14, legend="their mean")
         panel.axes(x="specimens in ascending order", y=named(name, labels))
-    known = individuals["constant_data"].data_vars if "constant_data" in groups else {}
     for name, y in readings.items():
         panel = canvas.panels[name]
-        conditions = {str(key): x.values for key, x in known.items() if x.size == y.size}
-        x_name, x = next(iter(conditions.items()), ("specimen", np.arange(y.size)))
+        of_rows = {str(key): x.values for key, x in conditions.items() if x.size == y.size}
+        x_name, x = next(iter(of_rows.items()), ("specimen", np.arange(y.size)))
         _intervals(panel, "replicates", x, replicated[name], prob, f"{prob:.0%} of replicates")
         median = np.nanmedian(replicated[name], axis=0)
         panel.points("median", (x, median), GREY, size=10, legend="their median")
