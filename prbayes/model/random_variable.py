@@ -216,14 +216,14 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
             responses.on_start = None
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
-            found = check_failing_region(
+            findings = check_failing_region(
                 simulator.name,
                 target.observed,
                 bound.first_points,
                 bound.first_responses,
                 bound.max_lost,
             )
-            bound.findings = report(*found)
+            bound.findings = report(*findings)
             node = Node(
                 simulator.name,
                 bound.target,

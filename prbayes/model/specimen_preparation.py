@@ -141,9 +141,13 @@ class Runs:
             refuse_unused_inputs(likelihood.name, z, values, _coordinate_names(likelihood))
             self.first = values
             if not any(m.metric.error is not None or m.gross_errors for m in measurements):
-                most = max(getattr(m.propagation, "max_lost", MAX_LOST) for m in measurements)
-                readings = likelihood.readings.values
-                self.findings = check_failing_region(likelihood.name, readings, [z], values, most)
+                self.findings = check_failing_region(
+                    likelihood.name,
+                    likelihood.readings.values,
+                    [z],
+                    values,
+                    max(getattr(m.propagation, "max_lost", MAX_LOST) for m in measurements),
+                )
         return values
 
 
