@@ -167,10 +167,8 @@ class RankedBasis(Basis):
     @cached_property
     def _integrals(self) -> list[_Integral]:
         """The observed side of each projection."""
-        return [
-            _Integral.of(*(array[k] for array in self.arrays), self.observed_weights[k])
-            for k in range(len(self.observed_weights))
-        ]
+        rows = zip(*self.arrays, self.observed_weights, strict=True)
+        return [_Integral.of(*row) for row in rows]
 
     def rows(self, index: Any) -> Self:
         """Return the ranks for some of several data sets."""

@@ -214,8 +214,8 @@ def uniform_envelope(n: int, alpha: float) -> tuple[Floats, Floats]:
     steps = np.diff(ranks, prepend=0, append=n + 1)
     ends = np.cumsum(rng.standard_gamma(steps, (ENVELOPED, steps.size)), axis=1)
     lower, upper = envelope(ends[:, :-1] / ends[:, -1:], alpha)
-    every = np.arange(1, n + 1)
-    return np.interp(every, ranks, lower), np.interp(every, ranks, upper)
+    numbers = np.arange(1, n + 1)
+    return np.interp(numbers, ranks, lower), np.interp(numbers, ranks, upper)
 
 
 @dataclass(frozen=True)
