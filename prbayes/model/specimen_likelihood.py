@@ -299,11 +299,12 @@ def draw_inputs(
         log_share = np.log(np.reshape(gross_share, (-1, 1)))
         probability = np.exp(log_share + likelihood.stacked.log_gross - logs)
     for group, rows in likelihood.by_group:
-        parents = parent_values(values, likelihood.inputs, group)
+        parents = likelihood.parents(values, group, rows)
+        by_point = likelihood.inputs.for_points(parents, log_a.shape[1])
         x = [variable.get_value(borrow=True)[rows] for variable in shared]
         flat = [v.reshape(-1, *v.shape[2:]) for v in x]
         for k in range(size):
-            density = likelihood.density.at([parent[k : k + 1] for parent in parents], flat)
+            density = likelihood.density.at([parent[k : k + 1] for parent in by_point], flat)
             log_weights = density(slice(None)).reshape(log_a[rows].shape) + log_a[rows]
             if not likelihood.error_is_known:
                 log_weights += _readings_log_density(likelihood, errors[k], np)[rows]

@@ -193,7 +193,8 @@ class PopulationDensity:
         if previous is not points[0]:
             form = ExponentialForm.of(self.inputs.aleatory, points)
             # At an end of a support PyMC's density may be finite, or infinite.
-            if form is not None and not form.is_inside.all():
+            # Points of specimens with covariates have several populations.
+            if form is not None and (self.inputs.covariates or not form.is_inside.all()):
                 form = None
             self._form = points[0], form
         if form is not None:
