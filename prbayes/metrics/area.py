@@ -42,8 +42,9 @@ class AreaMetric(Metric):
     .. math:: g_N(p) = \int_0^p P(K < N q) - P(K > N q)\,dq, \quad K \sim \mathrm{Bin}(N, q).
 
     It is a strictly proper scoring rule, positive unless the functions are equal: for one specimen
-    the continuous ranked probability score [2]_, for many the area. A simulator alone, a direct
-    call and the area test have the area itself.
+    the continuous ranked probability score [2]_, for many the area. Relative weights count as their
+    effective number, by which most of the bias goes. A simulator alone, a direct call and the area
+    test have the area itself.
 
     References
     ----------
@@ -98,8 +99,7 @@ class AreaDiscrepancy(Discrepancy):
         heights = xp.abs(gap)
         if self.specimens:
             below = xp.cumsum(xp.maximum(steps, 0.0), axis=-1)[..., :-1]
-            table = correction_table(self.specimens)
-            heights = heights + interpolated(table, below - gap, xp) - interpolated(table, below, xp)
+            heights = _heights(below, below - gap, correction_table(self.specimens), xp)
         # Intervals without an end have the length zero.
         is_finite = xp.abs(pooled[..., 1:]) < np.inf
         upper = xp.where(is_finite, pooled[..., 1:], 0.0)
@@ -193,7 +193,7 @@ class RankedBasis(Basis):
         return replace(self, observed_weights=tuple(w[index] for w in self.observed_weights))
 
 
-def with_unbiased_areas(target: Any) -> Discrepancy:
+def with_unbiased_areas(target: Discrepancy) -> Discrepancy:
     """Return a discrepancy whose areas, of few specimens, have no bias in a sum of several.
 
     Observed weights count as their effective number. It is the same object without areas.
@@ -204,11 +204,12 @@ def with_unbiased_areas(target: Any) -> Discrepancy:
     parts = target.parts
     if parts[0].target is target:
         return target
-    targets = [with_unbiased_areas(part.target) for part in parts]
-    pairs = list(zip(parts, targets, strict=True))
-    if all(part.target is inner for part, inner in pairs):
+    areas = [with_unbiased_areas(part.target) for part in parts]
+    pairs = list(zip(parts, areas, strict=True))
+    if all(part.target is area for part, area in pairs):
         return target
-    return replace(target, members=tuple(replace(part, target=inner) for part, inner in pairs))
+    members: Any = {"members": tuple(replace(part, target=area) for part, area in pairs)}
+    return replace(target, **members)
 
 
 @lru_cache(maxsize=256)
@@ -225,10 +226,11 @@ def correction_table(n: int) -> Floats:
 
     def integral(q: Floats) -> Floats:
         """Integral of P(K > k), an incomplete beta function, from 0 to q."""
-        return q * betainc(k + 1, n - k, q) - (k + 1) / (n + 1) * betainc(k + 2, n - k, q)
+        mean = (k + 1) / (n + 1)
+        return np.asarray(q * betainc(k + 1, n - k, q) - mean * betainc(k + 2, n - k, q))
 
     pieces = np.diff(q) - 2 * (integral(q[1:]) - integral(q[:-1]))
-    return np.interp(levels, q, np.append(0.0, np.cumsum(pieces)))
+    return np.asarray(np.interp(levels, q, np.append(0.0, np.cumsum(pieces))))
 
 
 def bias_and_density(n: int, p: Floats) -> tuple[Floats, Floats]:
