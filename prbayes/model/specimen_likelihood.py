@@ -271,7 +271,53 @@ def logsumexp_finite(terms: Any) -> TensorVariable:
     return pt.switch(is_empty, -np.inf, log_total)
 
 
-# Draws of readings.
+# Draws.
+
+
+def draw_inputs(
+    likelihood: SpecimenLikelihood, rng: np.random.Generator, values: Mapping[str, Floats]
+) -> tuple[list[Floats], Floats | None]:
+    """Draw the inputs of each specimen given its readings, (P, S, *event) by input.
+
+    Also return the probability that the readings have a gross error, (P, S), None where the model
+    has no gross errors: the inputs are then those of any specimen. Values are those of the model's
+    variables by name, (P, *shape).
+    """
+    shared, shared_log_a = arrays(likelihood)
+    log_a = shared_log_a.get_value(borrow=True)
+    errors = _errors(likelihood, values)
+    size, n = len(errors), len(log_a)
+    inputs = [np.empty((size, n, *v.get_value(borrow=True).shape[2:])) for v in shared]
+    probability = None
+    gross_share = _gross_share(likelihood.measurements[0], values)
+    if gross_share is not False:
+        weights = likelihood.measurements[0].weights
+        logs = log_likelihoods(likelihood, values) / (1.0 if weights is None else weights)
+        log_share = np.log(np.reshape(gross_share, (-1, 1)))
+        probability = np.exp(log_share + likelihood.stacked.log_gross - logs)
+    for group, rows in likelihood.by_group:
+        parents = parent_values(values, likelihood.inputs, group)
+        x = [variable.get_value(borrow=True)[rows] for variable in shared]
+        flat = [v.reshape(-1, *v.shape[2:]) for v in x]
+        for k in range(size):
+            density = likelihood.density.at([parent[k : k + 1] for parent in parents], flat)
+            log_weights = density(slice(None)).reshape(log_a[rows].shape) + log_a[rows]
+            if not likelihood.error_is_known:
+                log_weights += _readings_log_density(likelihood, errors[k], np)[rows]
+            log_weights = np.where(np.isnan(log_weights), -np.inf, log_weights)
+            totals = np.cumsum(np.exp(log_weights - log_weights.max(axis=1, keepdims=True)), axis=1)
+            limits = totals[:, -1:] * rng.random((len(rows), 1))
+            chosen = (totals < limits).sum(axis=1)
+            for drawn, points in zip(inputs, x, strict=True):
+                drawn[k, rows] = points[np.arange(len(rows)), chosen]
+        if probability is not None:
+            is_gross = rng.random((size, len(rows))) < probability[:, rows]
+            population, _ = likelihood.density.sampler(parents, len(rows), rng)
+            for drawn, unknown in zip(inputs, population, strict=True):
+                part = drawn[:, rows]
+                part[is_gross] = unknown[is_gross]
+                drawn[:, rows] = part
+    return inputs, probability
 
 
 def draw_readings(
