@@ -235,7 +235,7 @@ def test_size_of_all_checks() -> None:
 def test_texts_of_findings() -> None:
     rng = np.random.default_rng(4)
     (step,) = data_findings(rounded(rng.normal(10, 1, 50), 0.5), labels=["length"])
-    assert step.text.startswith("length: got 50 values that are all multiples of a step of 0.5 ")
+    assert step.text.startswith("length: got values that are all multiples of a step of 0.5 ")
     assert step.text.endswith("pass rounded=0.5.")
     y = np.minimum(rng.normal(10, 1, 30), 10.5)
     (end,) = data_findings(y)
