@@ -418,7 +418,7 @@ def refuse(
     if not short:
         return
     name, reason = next(iter(short.items()))
-    others = f" (and {len(short) - 1} more)" if len(short) > 1 else ""
+    suffix = f" (and {len(short) - 1} more)" if len(short) > 1 else ""
     runs = evaluator.reweighted[name].n_runs
     if unidentified:
         cause = (
@@ -430,7 +430,7 @@ def refuse(
         cause = "the design does not support the answer"
         advice = "narrow the priors, or pass a larger prb.Reweighted(n)"
     raise DesignError(
-        f"{name}{others}: {cause}: {advice}, or use prb.Resimulated(n), which has no design; got "
+        f"{name}{suffix}: {cause}: {advice}, or use prb.Resimulated(n), which has no design; got "
         f"{runs} runs, {reason}"
     )
 
