@@ -136,6 +136,8 @@ class MixtureSampler:
         parents = [c[population] for c in components]
         try:
             points = list(self._quantiles(*parents, *uniforms))
+            if any(np.isnan(x).any() for x in points):
+                raise TypeError("an inverse distribution function without a number")
         except TypeError:  # a distribution without inverse distribution function
             rng = np.random.default_rng(seed)
             draws, _ = PopulationSampler(self.inputs)(parents, 1, rng)
