@@ -235,6 +235,25 @@ def measurement_error() -> Iterator[Row]:
         yield [label, text, f"{value:g}", *moments, held, sets]
 
 
+def data_sheets() -> Iterator[Row]:
+    """Yield the coverage of intervals from data sheets."""
+    table = summary("data_sheets")
+    sheets = {
+        "mean sd": "mean, standard deviation",
+        "extremes": "smallest, largest",
+        "mean sd extremes": "these four",
+        "quartiles": "quartiles",
+        "all": "all seven",
+    }
+    for (kind, label), name in product(sheets.items(), ("mu", "sigma")):
+        cells = [
+            f"{100 * table[f'{population}, {n}, {kind}'][name]:.0f}"
+            for population in ("normal", "Gumbel", "gamma")
+            for n in (5, 20, 100)
+        ]
+        yield [label, {"mu": "mean", "sigma": "standard deviation"}[name], *cells]
+
+
 def sizes() -> Iterator[Row]:
     """Yield the area test's size."""
     table = summary("validity")
@@ -617,6 +636,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "partial pooling": partial_pooling,
     "small groups": small_groups,
     "measurement error": measurement_error,
+    "data sheets": data_sheets,
     "gross errors": gross_errors,
     "readings, coverage": readings_coverage,
     "metric prices": metric_prices,

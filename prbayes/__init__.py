@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from prbayes.metrics.divergence import ProbabilityResidual as ProbabilityResidual
     from prbayes.metrics.likelihood import LogLikelihood as LogLikelihood
     from prbayes.metrics.multivariate import Joint as Joint
+    from prbayes.metrics.summary import Summary as Summary
     from prbayes.model.cost import cost as cost
     from prbayes.model.random_variable import abc_distance as abc_distance
     from prbayes.model.simulator import Simulator as Simulator
@@ -83,6 +84,7 @@ _NAMES = {
     "metrics.divergence": ("KullbackLeibler", "ProbabilityResidual"),
     "metrics.likelihood": ("LogLikelihood",),
     "metrics.multivariate": ("Joint",),
+    "metrics.summary": ("Summary",),
     "model.cost": ("cost",),
     "model.random_variable": ("abc_distance",),
     "model.simulator": ("Simulator",),

@@ -222,6 +222,8 @@ class Information:
     def sampling_covariance(self) -> Floats:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
         target = self.node.target
+        if target.metric.exact_likelihood:
+            return self.hessian / target.n_effective  # the information equality
         if not is_additive(target) or dependent([self.node]):
             sets = self.data_sets
             gradients = self.gradients(sets.values[self.k], sets.weights[self.k])

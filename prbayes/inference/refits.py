@@ -506,10 +506,18 @@ def sampling_obstacle(evaluator: Evaluator) -> str | None:
 
 def refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why the model cannot be calibrated to other data sets, or None."""
-    obstacle = sampling_obstacle(evaluator)
+    obstacle = sampling_obstacle(evaluator) or summary_obstacle(evaluator)
     if obstacle is None and evaluator.other_terms:
         return "the model has likelihood terms or potentials besides its simulators"
     return obstacle
+
+
+def summary_obstacle(evaluator: Evaluator) -> str | None:
+    """Return that a simulator has statistics instead of specimens, or None."""
+    for node in evaluator.nodes:
+        if node.metric.exact_likelihood:
+            return f"{node.name} has a prb.Summary, and no specimens to resample"
+    return None
 
 
 def needs_refits(evaluator: Evaluator) -> bool:

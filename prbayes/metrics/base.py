@@ -199,6 +199,15 @@ class Discrepancy(ABC):
         return float(1 / (self.weights**2).sum())
 
     @property
+    def n_drawn(self) -> int:
+        """Number of specimens of a replicate of the observed values."""
+        return round(self.n_effective) if self.metric.exact_likelihood else len(self.observed)
+
+    def replicate(self, specimens: Floats) -> Floats:
+        """Return what is observed of specimens, (..., n_drawn, *event): their responses."""
+        return specimens
+
+    @property
     @abstractmethod
     def scale(self) -> float:
         """A typical size of the discrepancy, positive, in its own units.
@@ -384,11 +393,15 @@ class Metric(ABC):
     distance : bool
         Whether equal samples have a discrepancy of zero, so that its size between a population and
         data drawn from it is sampling noise. Only a likelihood may have another value.
+    exact_likelihood : bool
+        Whether N times the discrepancy is minus the log-likelihood of statistics of unknown
+        specimens, as of a `Summary`: there are no specimens to resample.
     """
 
     minimum: ClassVar[Minimum] = Minimum.UNKNOWN
     likelihood: ClassVar[bool] = False
     distance: ClassVar[bool] = True
+    exact_likelihood: ClassVar[bool] = False
     symbolic: ClassVar[bool] = True
     counts_failures: ClassVar[bool] = False
     tail_responses: ClassVar[int] = 0

@@ -421,7 +421,8 @@ class SimulatorRV(ObservedRV):
             )
         *params, size = arguments
         bound = computed(self.simulator).bound
-        event = bound.target.event
+        target = bound.target
+        event = target.event
         ndims = [parent.type.ndim for parent in bound.inputs.parents]
         batch, params = broadcast_batch(params, ndims)
         values = np.empty((*(batch if size is None else size), *event))
@@ -429,9 +430,13 @@ class SimulatorRV(ObservedRV):
         for index in np.ndindex(batch):
             places = tuple(slice(None) if n == 1 else i for i, n in zip(index, batch, strict=True))
             shape = values[places].shape
-            n_specimens = int(np.prod(shape, dtype=int)) // int(np.prod(event, dtype=int))
+            size_of_one = len(target.observed) * int(np.prod(event, dtype=int))
+            n_specimens = int(np.prod(shape, dtype=int)) * target.n_drawn // size_of_one
             parents = [param[index] for param in params]
-            values[places] = bound.draw(rng, n_specimens, parents).reshape(shape)
+            drawn = bound.draw(rng, n_specimens, parents)
+            if target.metric.exact_likelihood:
+                drawn = target.replicate(drawn.reshape(-1, target.n_drawn))
+            values[places] = drawn.reshape(shape)
         return values
 
 

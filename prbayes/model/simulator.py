@@ -29,6 +29,7 @@ from prbayes._validate import (
 )
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.summary import Summary, SummaryLikelihood
 from prbayes.model.data_checks import warn_duplicates
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
@@ -115,8 +116,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         Comparison of simulated and observed responses. By default `LogLikelihood`, the
         log-likelihood by specimen, for a deterministic response of continuous inputs: it needs
         about a hundred runs, and no epsilon.
-    observed : array_like, shape (N,) or (N, m), DataFrame, DataArray, mapping or pymc.Data
-        Measured responses, of at least two specimens. Several outputs of a specimen, (N, m), need a
+    observed : array_like, shape (N,) or (N, m), DataFrame, DataArray, mapping, pymc.Data or Summary
+        Measured responses, of at least two specimens, or a `Summary` of those of one output. Several outputs of a specimen, (N, m), need a
         metric that compares them together, such as `Joint`: an array, a DataFrame whose columns are
         outputs, a DataArray with specimens first, or a mapping of arrays. NaN is an output that was
         not measured, +inf a specimen that failed. After ``pymc.set_data`` or ``pymc.observe`` the
@@ -193,6 +194,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         )
     refuse_uncallable(name, response)
     arguments = read_inputs(name, inputs, model)
+    if isinstance(observed, Summary):
+        unused = {"metric": metric, "epsilon": epsilon, "weights": weights, "dims": dims}
+        _refuse_beside_summary(name, arguments, unused | {"specimens": specimens}, propagation)
+        metric, observed = SummaryLikelihood(observed), observed.values
     for rv in simulators(model):
         if rv in arguments.parents:
             raise TypeError(
@@ -261,6 +266,25 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         variables.append(_add_simulator(model, specification, place, data, dims))
     share_bandwidths(model)
     return tuple(variables) if arguments.groups is not None else variables[0]
+
+
+def _refuse_beside_summary(
+    name: str, inputs: Inputs, unused: dict[str, Any], propagation: Propagation | None
+) -> None:
+    """Raise for arguments that a data sheet, without single specimens, has no use for."""
+    given = [f"{argument}=" for argument, value in unused.items() if value is not None]
+    given += ["groups"] if inputs.groups is not None else []
+    if given:
+        raise TypeError(
+            f"{name}: observed: got a prb.Summary and {', '.join(given)}, expected the Summary "
+            "alone: it has no single specimens, and its likelihood needs no scale; leave "
+            f"{', '.join(given)} out, or write a simulator for each data sheet"
+        )
+    if isinstance(propagation, Propagation) and propagation.is_random:
+        raise TypeError(
+            f"{name}: propagation: got {called(propagation)}, whose likelihood would be random, "
+            "expected prb.Reweighted(n) or prb.Resimulated(n) for a prb.Summary"
+        )
 
 
 # The log-likelihood by specimen.
@@ -599,7 +623,8 @@ def _prepared_metric(
         )
     try:
         if np.ndim(observed) != 2:
-            observed = observed_sample(observed, minimum=2, failures=metric.counts_failures)
+            least = 1 if metric.exact_likelihood else 2
+            observed = observed_sample(observed, minimum=least, failures=metric.counts_failures)
         elif len(observed) < 2:
             raise ValueError(
                 f"observed: got {len(observed)} specimen(s), expected at least 2 of them"

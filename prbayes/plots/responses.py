@@ -187,9 +187,13 @@ class _Drawing:
         """Draw the distribution of one output: data first, then the populations."""
         panel = self.panel
         observed, weights = output.measured()
+        is_sheet = output.node.metric.exact_likelihood  # statistics, which have no distribution
         grid = np.linspace(*limits, GRID_POINTS)
         curves_of = distribution_function if ecdf else smooth_densities
-        if ecdf:
+        if is_sheet:
+            top = 0.0
+            panel.points("rug", (observed, 0.0), INK, marker="|", size=60, legend="data sheet")
+        elif ecdf:
             top = 1.0
             stairs = staircase(observed, weights, *limits)
             panel.line("measured", stairs, INK, width=1.4, legend="measured")
@@ -212,7 +216,8 @@ class _Drawing:
         panel.axes(
             x=self.text,
             y="share of specimens" if ecdf else "density",
-            title=f"{observed.size} measured values" + (f", {failed} failed" if failed else ""),
+            title=f"{observed.size} {'statistics' if is_sheet else 'measured values'}"
+            + (f", {failed} failed" if failed else ""),
             xlim=limits,
             ylim=ylim,
         )

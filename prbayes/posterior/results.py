@@ -301,7 +301,7 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
     responses = {}
     for k in stored:
         node = evaluator.nodes[k]
-        n, event = len(node.target.observed), node.target.event
+        n, event = node.target.n_drawn, node.target.event
         drawn = np.full((len(rows), n, *event), np.nan)
         step = max(1, IN_CACHE // node.bound.n_points)
         for first in range(0, len(rows), step):
@@ -316,7 +316,7 @@ def _stored_responses(evaluator: Evaluator, thetas: Floats, rng: np.random.Gener
                 if row[-1] > 0:
                     uniform = rng.random(n) * row[-1]
                     drawn[place] = points[np.searchsorted(row, uniform, side="right")]
-        responses[node.name] = drawn.reshape(*leading, n, *event)
+        responses[node.name] = node.target.replicate(drawn.reshape(*leading, n, *event))
     return labelled_responses(evaluator, responses, leading).assign_coords(draw=thinned)
 
 

@@ -17,6 +17,7 @@ from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
+from prbayes.inference.refits import summary_obstacle
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
@@ -114,7 +115,8 @@ def simulation_based_calibration(
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator.of(model)
-    obstacle = None if evaluator.nodes else simulation_obstacle(evaluator)
+    obstacle_of = summary_obstacle if evaluator.nodes else simulation_obstacle
+    obstacle = obstacle_of(evaluator)
     if obstacle is not None:
         raise ValueError(
             f"simulation_based_calibration: {obstacle}, and data sets cannot be drawn; "

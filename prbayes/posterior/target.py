@@ -74,8 +74,18 @@ def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
 
 
 def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
-    """Return the posterior given the metrics' own estimate, by scores or refits, or raise."""
+    """Return the posterior given the metrics' own estimate, by scores or refits, or raise.
+
+    The log-density of data sheets is a likelihood itself.
+    """
     require_density(evaluator)
+    if evaluator.nodes[0].metric.exact_likelihood:
+
+        def log_likelihood(thetas: Floats) -> Floats:
+            return evaluator(thetas).log_likelihood(evaluator.epsilon)
+
+        prior_sd = evaluator.hyperparameters.prior_sd
+        return Target(evaluator, log_likelihood, optima_of(optimum, evaluator), prior_sd)
     is_mean = score_obstacle(evaluator) is None
     likelihood_of = estimate_likelihood if is_mean else refit_likelihood
     return _target_of(likelihood_of(evaluator, optimum))
@@ -93,6 +103,15 @@ def _target_of(likelihood: EstimateLikelihood | RefitLikelihood) -> Target:
 
 def require_density(evaluator: Evaluator) -> None:
     """Raise if the density of the metrics' estimate is not known."""
+    sheets = [node.name for node in evaluator.nodes if node.metric.exact_likelihood]
+    if len(sheets) == len(evaluator.nodes):
+        return
+    if sheets:
+        raise ValueError(
+            f"{sheets[0]}: observed: got a prb.Summary in a model with a metric of distributions, "
+            "expected prb.LogLikelihood() for the specimens of other simulators: leave their "
+            "metric= out, or use prb.sample_smc with adjustment=None"
+        )
     obstacle = score_obstacle(evaluator)
     for node in evaluator.nodes:
         if node.bound.random:

@@ -329,7 +329,8 @@ def _observed(
     """Return the measured responses, and their columns, by simulator."""
     if model is not None:
         simulators = population_simulators(model)
-        observed = {simulator.name: simulator.observed for simulator in simulators}
+        sampled = [s for s in simulators if not s.metric.exact_likelihood]  # no data sheets
+        observed = {simulator.name: simulator.observed for simulator in sampled}
         return observed, {simulator.name: simulator.outputs for simulator in simulators}
     observed, outputs = {}, {}
     tree = next((tree for tree in results.values() if "observed_data" in tree), None)

@@ -278,7 +278,10 @@ def _scores(
                 default = _METRICS[:-1]
             if simulator.observed.ndim > 1:
                 default = [Joint(metric) for metric in default]  # the same in all directions
-            for metric in default if metrics is None else metrics:
+            chosen = default if metrics is None else metrics
+            if simulator.metric.exact_likelihood:  # of statistics, not of specimens
+                chosen = [simulator.metric]
+            for metric in chosen:
                 target = metric.against(simulator.observed, simulator.weights)
                 if simulator.is_emulated:
                     responses, weights = evaluator.populations(thetas, k)
