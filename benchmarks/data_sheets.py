@@ -1,10 +1,10 @@
 """Coverage of intervals from data sheets: statistics of n specimens under location-scale populations.
 
-Responses are mu + sigma e, where e is normal, of Gumbel's or a gamma distribution (of shape
-3), all with mean zero and variance one. A
-sheet has statistics of n specimens at mu = 0 and sigma = 1. With a flat prior of mu and log sigma,
-intervals of the exact posterior contain the truth in 89% of all sheets. The posterior is computed on
-a grid, from the package's likelihood with quadrature weights of stored responses.
+Responses are mu + sigma e, where e is normal, of Gumbel's or a gamma distribution (of shape 3), with
+mean zero and variance one. A sheet has statistics of n specimens at mu = 0 and sigma = 1. With a flat
+prior of mu and log sigma, intervals of the exact posterior contain the truth in 89% of all sheets.
+The posterior is computed on a grid, from the package's likelihood with quadrature weights of stored
+responses.
 
     OMP_NUM_THREADS=1 uv run python -m benchmarks.data_sheets [--data-sets 1000] [--cells "normal*"]
 """

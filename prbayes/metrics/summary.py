@@ -6,9 +6,9 @@ divide the other specimens into strata of :math:`n_j` each, with population shar
 .. math:: p(z_1, \dots, z_I | \theta) \propto \prod_i f(z_i) \prod_j P_j^{n_j}.       (1)
 
 Given the order statistics, the specimens of a stratum are independent draws from the population
-between its ends. Mean and variance of their sum A, and of the sum of squares W about the mean of all
-specimens, follow from the first four moments of each stratum. A is nearly normal, and the cube root
-of W as well (Wilson and Hilferty 1931, doi:10.1073/pnas.17.12.684):
+between its ends. Mean and variance of their sum A, and of the sum of squares W about the mean of
+all specimens, follow from the first four moments of each stratum. A is nearly normal, and the cube
+root of W as well (Wilson and Hilferty 1931, doi:10.1073/pnas.17.12.684):
 
 .. math:: W / E W \sim M \chi^2_\nu / \nu, \quad (\chi^2_\nu / \nu)^{1/3} \sim
     N(1 - 2 / (9 \nu), 2 / (9 \nu)).                                                   (2)

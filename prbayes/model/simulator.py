@@ -117,12 +117,13 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         log-likelihood by specimen, for a deterministic response of continuous inputs: it needs
         about a hundred runs, and no epsilon.
     observed : array_like, shape (N,) or (N, m), DataFrame, DataArray, mapping, pymc.Data or Summary
-        Measured responses, of at least two specimens, or a `Summary` of those of one output. Several outputs of a specimen, (N, m), need a
-        metric that compares them together, such as `Joint`: an array, a DataFrame whose columns are
-        outputs, a DataArray with specimens first, or a mapping of arrays. NaN is an output that was
-        not measured, +inf a specimen that failed. After ``pymc.set_data`` or ``pymc.observe`` the
-        metric is prepared against the new values, and no response is computed. Include the group of
-        each specimen where inputs depend on `prbayes.response.group`.
+        Measured responses, of at least two specimens, or a `Summary` of those of one output.
+        Several outputs of a specimen, (N, m), need a metric that compares them together, such as
+        `Joint`: an array, a DataFrame whose columns are outputs, a DataArray with specimens first,
+        or a mapping of arrays. NaN is an output that was not measured, +inf a specimen that failed.
+        After ``pymc.set_data`` or ``pymc.observe`` the metric is prepared against the new values,
+        and no response is computed. Include the group of each specimen where inputs depend on
+        `prbayes.response.group`.
     epsilon : float, optional
         Scale of the discrepancy. By default 1/N for metrics on the scale of a likelihood, with the
         effective number N of specimens; unset for other metrics, until `calibrate_epsilon` and

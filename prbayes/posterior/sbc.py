@@ -15,9 +15,9 @@ import xarray as xr
 from prbayes._finding import Finding, report
 from prbayes._progress import progress, shown
 from prbayes._validate import Floats, Seed, executes, flag, positive_integer, seed_number
+from prbayes.inference.refits import summary_obstacle
 from prbayes.inference.resampling import fresh_data
 from prbayes.model.description import labelled, versions
-from prbayes.inference.refits import summary_obstacle
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
 from prbayes.model.parameters import split_elements
