@@ -42,6 +42,7 @@ class Measurement:
     propagation: Propagation
     outputs: Outputs
     groups: NDArray[np.intp] | None = None  # (N,): index of each specimen's group
+    conditions: Floats | None = None  # (N, C): inputs that are known for each specimen
     # Model variables of the measurement: ``error`` and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 
@@ -89,19 +90,20 @@ class Measurement:
                 f"{self.name}: observed: got shape {values.shape}, expected "
                 f"{('N', *self.event)}, as when the simulator was made"
             )
-        is_plain = self.groups is None and self.weights is None and self.specimens is None
+        by_row = (self.groups, self.weights, self.specimens, self.conditions)
+        is_plain = all(values is None for values in by_row)
         if len(values) != len(self.observed) and not is_plain:
             raise ValueError(
                 f"{self.name}: observed: got {len(values)} specimens, expected "
-                f"{len(self.observed)}, as many as there are groups, weights= or specimens=; build "
-                "the model again with those of the new ones"
+                f"{len(self.observed)}, as many as there are groups, conditions, weights= or "
+                "specimens=; build the model again with those of the new ones"
             )
         return replace(self, observed=values)
 
 
 @dataclass(frozen=True, eq=False)
 class StackedReadings:
-    """Readings of S specimens in M outputs, those of all simulators."""
+    """Readings of S specimens in M outputs: those of all simulators, then exact conditions."""
 
     readings: Readings  # repeated readings of an output by their weighted mean, with its error
     scale: Floats  # (S, M): standard deviation of their error, in units of an unknown error
@@ -110,12 +112,21 @@ class StackedReadings:
     groups: NDArray[np.intp] | None  # (S,)
     # (S,): log-density of a gross error, uniform over twice the range of each output.
     log_gross: Floats
+    conditions: Floats | None  # (S, C)
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement]) -> StackedReadings:
         """Stack the readings of simulators; raise if those of a specimen cannot be combined."""
         numbers, size = _validated_counts(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
+        conditions = _specimen_conditions(measurements, numbers, size)
+        if conditions is not None:
+            inputs = measurements[0].inputs
+            ops = [inputs.aleatory[place].owner.op for place in inputs.conditions]
+            columns = [op.coordinates(x) for op, x in zip(ops, conditions.T, strict=True)]
+            zero = np.zeros(conditions.shape)
+            exact = Readings.exact(np.stack(columns, axis=1))
+            parts.append((exact, zero, Repeats(zero, zero, zero)))
         readings, scales, repeats = zip(*parts, strict=True)
         log_gross = np.zeros(size)
         for measurement, index in zip(measurements, numbers, strict=True):
@@ -130,6 +141,7 @@ class StackedReadings:
             tuple(numbers),
             _specimen_groups(measurements, numbers, size),
             log_gross,
+            conditions,
         )
 
 
@@ -197,6 +209,29 @@ def _specimen_groups(
     return result
 
 
+def _specimen_conditions(
+    measurements: Sequence[Measurement], numbers: Sequence[NDArray[np.intp]], size: int
+) -> Floats | None:
+    """Return the conditions of each specimen, (S, C), None without one."""
+    result: Floats | None = None
+    for measurement, index in zip(measurements, numbers, strict=True):
+        if measurement.conditions is None:
+            continue
+        if result is None:
+            result = np.full((size, measurement.conditions.shape[1]), np.nan)
+        is_new = np.isnan(result[index])
+        result[index] = np.where(is_new, measurement.conditions, result[index])
+        is_other = (result[index] != measurement.conditions).any(axis=1)
+        if is_other.any():
+            label = np.asarray(measurement.specimens).tolist()[int(np.argmax(is_other))]
+            raise ValueError(
+                f"{measurement.name}: specimens: got the label {label!r} with two values of a "
+                "condition, expected one for each specimen; write labels that are different, or "
+                "pass readings under several conditions as outputs"
+            )
+    return result
+
+
 @dataclass(frozen=True, eq=False)
 class SpecimenLikelihood:
     """Data and settings of a log-likelihood of specimens, measured by one simulator or several."""
@@ -210,7 +245,8 @@ class SpecimenLikelihood:
 
     def __getstate__(self) -> dict[str, Any]:
         """Replace the weak reference to the model, which has no pickle, by the model."""
-        cache = {key: value for key, value in self.cache.items() if key != "hyperparameters"}
+        derived = ("hyperparameters", "reading density")
+        cache = {key: value for key, value in self.cache.items() if key not in derived}
         model = None if self.model is None else self.model()
         return {**vars(self), "model": model, "cache": cache}
 

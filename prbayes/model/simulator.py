@@ -29,6 +29,7 @@ from prbayes._validate import (
 )
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.model.conditions import condition_values, observed_at_conditions
 from prbayes.model.data_checks import warn_duplicates
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
@@ -197,8 +198,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             )
     for parent in arguments.parents:
         refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
+    observed, metric = observed_at_conditions(name, observed, metric, inputs)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
+    n_rows = len(values) if rows is None else np.size(weights)
     weights = weights if rows is None else None
     metric = LogLikelihood() if metric is None else metric
     by_specimen = isinstance(metric, Metric) and metric.by_specimen
@@ -220,13 +223,15 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         settings.check_likelihood(name)
         partners = _with_common_specimens(name, labels, model)
         arguments = _inputs_of_partners(name, arguments, partners)
+        known = [arguments.aleatory[place] for place in arguments.conditions]
+        conditions = condition_values(name, known, n_rows, rows)
         if weights is not None:
             weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
         responses = Responses(name, response, arguments, **calls | {"scatter": 0.0})
         extras = _measurement_variables(name, model, metric, partners)
         measurement = Measurement(
             name, cast(LogLikelihood, metric), values, weights, labels, arguments, responses,
-            settings, outputs, groups, extras,
+            settings, outputs, groups, conditions, extras,
         )  # fmt: skip
         return _add_measurement(model, measurement, partners, observed, dims)
     if labels is not None:

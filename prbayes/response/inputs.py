@@ -20,6 +20,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
+from prbayes.response.condition import is_condition
 
 
 class Inputs:
@@ -42,6 +43,8 @@ class Inputs:
         self.nested = nested  # whether a ``.dist()`` depends on another one
         self.groups = groups_of("", self.parents)
         self.event_shapes = tuple(event_shape(x) for x in self.aleatory)
+        # Positions of aleatory inputs that are conditions, known for each specimen.
+        self.conditions = [i for i, x in enumerate(self.aleatory) if is_condition(x)]
         self.event_ndims = [x.type.ndim for x in (*self.aleatory, *self.epistemic)]
         # Numbers of one specimen in each argument, and those that are aleatory.
         self.sizes = []
