@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
 
 from prbayes._validate import Floats, called, real_array
@@ -18,24 +17,9 @@ from prbayes.response.condition import ReadingsCondition, is_condition
 from prbayes.response.inputs import Inputs
 
 
-def condition_values(
-    name: str, conditions: Sequence[Any], size: int, rows: NDArray[np.intp] | None
-) -> Floats | None:
-    """Return the conditions of the specimens, (N, C), None without one.
-
-    There are ``size`` observed values, and ``rows`` are those of the specimens, all by default.
-    """
-    columns = []
-    for variable in conditions:
-        values = np.array(variable.owner.op.values)
-        if len(values) != size:
-            raise ValueError(
-                f"{name}: got {len(values)} values of the condition {variable.name}, and {size} "
-                "specimens, expected one for each row of observed; put what one specimen was "
-                "measured by into one row, with NaN where an output was not measured"
-            )
-        columns.append(values if rows is None else values[rows])
-    return np.stack(columns, axis=1) if columns else None
+def stacked_values(known: Mapping[str, Floats]) -> Floats | None:
+    """Return the values of conditions, (N,) by name, as an array (N, C); None without one."""
+    return np.stack(list(known.values()), axis=1) if known else None
 
 
 def at_conditions(

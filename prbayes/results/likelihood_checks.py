@@ -29,7 +29,6 @@ from prbayes.inference.checks.population import (
 )
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.parameters import parent_values
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
@@ -139,6 +138,7 @@ def check_population(optimum: Optimum) -> Checked:
         reason = f"{len(null[0])} of {_OPTIONS.replicates} refits converged"
         return _not_tested(_FAMILY, reason)
     checked = Checked()
+    is_rounded = "rounded-data" in [finding.code for finding in optimum.findings]
     for likelihood, (z, weights), statistics in zip(likelihoods, samples, null, strict=True):
         inputs = likelihood.inputs
         labels = []
@@ -150,6 +150,10 @@ def check_population(optimum: Optimum) -> Checked:
             labels += [f"{name}[{i}]" for i in range(size)] if shape else [name]
         test = population_test(z, weights, statistics)
         misfit = population_findings(test, labels, threshold=0.05 / len(samples))
+        if misfit and is_rounded:
+            reason = f"rounded readings do not fit any; pass rounded= to {likelihood.name} first"
+            checked += _not_tested(_FAMILY, reason)
+            continue
         power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
         text = f"{likelihood.name}: the test of the population found no misfit. {power}"
         checked += Checked(misfit, () if misfit else (Finding("population-tested", text),))
@@ -165,8 +169,9 @@ def _population_obstacle(optimum: Optimum) -> str:
         return obstacle
     if optimum.search.prior:
         return "the prior was part of the optimum"
-    if not optimum.converged or not np.isfinite(optimum.covariance).all():
-        return "nothing is known of the sampling distribution of this optimum"
+    unknown = _without_sampling(optimum)
+    if unknown:
+        return unknown
     for likelihood in evaluator.likelihoods:
         outputs = likelihood.readings.values.shape[1]
         if likelihood.coordinates.size > outputs:
@@ -175,6 +180,21 @@ def _population_obstacle(optimum: Optimum) -> str:
                 f"({likelihood.coordinates.size}), with which the test has no power"
             )
     return ""
+
+
+def _without_sampling(optimum: Optimum) -> str:
+    """Return why the sampling distribution of an optimum is not known, empty if it is."""
+    if not optimum.converged:
+        return "the optimum did not converge; pass another start= to prb.minimize"
+    has_error = np.isfinite(np.diag(optimum.covariance))
+    if has_error.all():
+        return ""
+    names = np.array(optimum.evaluator.hyperparameters.readable_names)[~has_error]
+    fixed = ", ".join(dict.fromkeys(name.partition("[")[0] for name in names.tolist()))
+    return (
+        f"the optimum has no standard error of {', '.join(names)}, and data sets cannot be "
+        f"refitted; fix {fixed} with pm.do at likely values, and pass the optimum of that model"
+    )
 
 
 def score_function(inputs: Inputs) -> Any:
@@ -187,11 +207,13 @@ def score_function(inputs: Inputs) -> Any:
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     graphs, points = [], []
-    for dist in dists:
-        x = pt.tensor(dtype="float64", shape=(None,) * (dist.type.ndim + 1))
+    for dist, shape in zip(dists, inputs.event_shapes, strict=True):
+        x = pt.tensor(dtype="float64", shape=(None,) * (len(shape) + 1))
         points.append(x)
         if isinstance(dist.owner.op, MVNORMAL):
             mean, covariance = dist.owner.op.dist_params(dist.owner)
+            if covariance.type.ndim > 2:  # that differs between specimens
+                return None
             root = pt.linalg.cholesky(covariance)
             graphs.append(pt.linalg.solve_triangular(root, (x - mean).T, lower=True).T)
             continue
@@ -224,8 +246,8 @@ def scored_specimens(
         z = np.empty((*log_a.shape, inputs.dimensions - len(inputs.conditions)))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
-            parents = parent_values(at_theta, inputs, place)
             size = log_a[rows].size
+            parents = likelihood.parents(at_theta, place, np.repeat(rows, log_a.shape[1]))
             flat = [x[rows].reshape(size, *x.shape[2:]) for x in points]
             values, (log_p,) = (function(*parents, *flat) for function in functions)
             columns = []
@@ -334,9 +356,9 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
 def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
     """Report hyperparameters whose prior pulls the posterior away from the data; draws (k, d)."""
     evaluator = optimum.evaluator
-    if not (optimum.converged and np.isfinite(optimum.covariance).all()):
-        reason = "nothing is known of the sampling distribution of the optimum"
-        return _not_tested(_CONFLICT, reason)
+    unknown = _without_sampling(optimum)
+    if unknown:
+        return _not_tested(_CONFLICT, unknown)
     if any(mode["comparable"] for mode in optimum.local_optima):
         return _not_tested(_CONFLICT, "the likelihood has several modes")
     names = evaluator.hyperparameters.names
@@ -405,7 +427,7 @@ def _complete_covariance(
     n = _OPTIONS.specimens
     for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
         for place, rows in likelihood.by_group:
-            parents = parent_values(values, likelihood.inputs, place)
+            parents = likelihood.parents(values, place, np.resize(rows, n))
             specimens, _ = sampler([parent[:1] for parent in parents], n, rng)
             (log_p,) = log_density(*parents, *[x[0] for x in specimens])
             with np.errstate(invalid="ignore"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -18,8 +18,16 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._finding import Finding, as_json, report
 from prbayes._progress import shown
 from prbayes._stats import reached
-from prbayes._validate import Floats, Seed, flag, plain_text, positive_integer, seed_number
-from prbayes.model.conditions import at_conditions, condition_values
+from prbayes._validate import (
+    Floats,
+    Seed,
+    finite_number,
+    flag,
+    plain_text,
+    positive_integer,
+    seed_number,
+)
+from prbayes.model.conditions import at_conditions, stacked_values
 from prbayes.model.description import versions
 from prbayes.model.emulated import (
     EmulatedResponse,
@@ -40,7 +48,7 @@ from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.importance import new_specimens
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
-from prbayes.response.condition import is_condition
+from prbayes.response.condition import is_condition, known_covariates
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.failures import Abort, ResponseError
@@ -59,6 +67,7 @@ def predict(
     n_draws: int = 400,
     stored: bool = True,
     max_lost: float | None = None,
+    at: Mapping[str, float] | None = None,
     name: str | None = None,
     executor: Executor | None = None,
     store: str | PathLike[str] | None = None,
@@ -102,6 +111,9 @@ def predict(
     max_lost : float, optional
         Largest share of the predicted responses that may be NaN; by default what the model's
         simulators allow, the largest.
+    at : dict, optional
+        The value of each covariate, by the name of its `prbayes.response.condition`, where inputs
+        depend on one.
     name : str, optional
         Of the result; by default that of the function.
     executor : concurrent.futures.Executor, optional
@@ -199,6 +211,9 @@ def predict(
     )
     seed = None if random_seed is None else seed_number(random_seed)
     simulator = serving(sources, responses) if stored else None
+    size = len(next(iter(points.values())))
+    values = _covariates(label, inputs_read, at, has_runs=simulator is not None)
+    points |= {covariate: np.full((size, 1), value) for covariate, value in values.items()}
     with shown(progressbar):
         rng = np.random.default_rng(seed)
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
@@ -241,6 +256,29 @@ def _labelled(
         dims=("chain", "draw", *group_coords, "sample", *output_coords),
         coords={**coords, **group_coords, "sample": np.arange(n_samples), **output_coords},
     )
+
+
+def _covariates(
+    label: str, inputs: Inputs, at: Mapping[str, float] | None, *, has_runs: bool
+) -> dict[str, float]:
+    """Return the value of each covariate by name, which is near those of runs if there are any."""
+    names = [str(covariate.name) for covariate in inputs.covariates]
+    given = {} if at is None else at
+    if not isinstance(given, Mapping) or set(given) != set(names):
+        raise ValueError(
+            f"{label}: at: got {at!r}, expected a value of each covariate of the inputs, {names}; "
+            "pass at={'hardness': 250.0}, for example"
+        )
+    values = {name: finite_number(given[name], f"{label}: at: {name}") for name in names}
+    for name, covariate in zip(names, inputs.covariates, strict=True):
+        low, high = (float(end.eval()) for end in covariate.owner.op.dist_params(covariate.owner))
+        if has_runs and not low <= values[name] <= high:
+            raise ValueError(
+                f"{label}: at: {name}: got {values[name]}, expected a value between {low:.4g} and "
+                f"{high:.4g}, where the response has runs; pass stored=False, which computes it at "
+                "new specimens"
+            )
+    return values
 
 
 # -- populations -----------------------------------------------------------------------------------
@@ -413,7 +451,8 @@ def with_known_conditions(
                     f"{high:.4g}, the range of the runs; pass stored=False, which computes the "
                     "response of new specimens"
                 )
-    return changed, condition_values(label, list(known.values()), size, None)
+    values = known_covariates(label, list(known.values()), size, None)
+    return changed, stacked_values(values)
 
 
 def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
