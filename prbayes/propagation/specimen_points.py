@@ -152,9 +152,10 @@ def _at_likely_error(
     gap: float,
     seed: int,
 ) -> _Components:
-    """Return components fitted at the likeliest scale of an unknown error, if it is below one.
+    """Return components fitted at the largest plausible scale of an unknown error, at most one.
 
-    Points around components of a larger error are too far apart.
+    Points around components of a larger error are too far apart. A scale is plausible if a fitted
+    population has a likelihood of at most 4 nats below the best.
     """
     for _ in range(2):
         sample = sampler.draw(components, 64, (seed, 10))
@@ -163,7 +164,7 @@ def _at_likely_error(
             at_scale = sampler.with_error(sample, scale)
             normal = fit_normal(at_scale.z, at_scale.log_a)
             totals.append(float(_log_likelihoods(at_scale, [normal]).sum()))
-        scale = scales[int(np.argmax(totals))]
+        scale = max(s for s, total in zip(scales, totals, strict=True) if total > max(totals) - 4)
         if scale >= 1:
             break
         misfit = roots.misfit / scale**2
