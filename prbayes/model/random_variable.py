@@ -136,10 +136,7 @@ class Node:
             target = self.metric.against(values, target.weights if is_same_size else None)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
-        dimensions = bound.inputs.dimensions
-        changed = self.comparing(
-            target.metric.with_design(target, bound.first_responses, dimensions)
-        )
+        changed = self.comparing(target.metric.for_inputs(target, bound.inputs.dimensions))
         if has_default_epsilon(self):
             changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
         return changed
@@ -212,8 +209,7 @@ def computed(simulator: AnySimulator) -> Node:
             with shown(simulator.progressbar):
                 bound = propagation.bind(simulator.name, responses.inputs, target, responses)
                 check_constant(simulator.name, bound.first_responses, outputs.names)
-                dimensions = bound.inputs.dimensions
-                bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
+                bound.target = target.metric.for_inputs(target, bound.inputs.dimensions)
             responses.on_start = None
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
             check_failing_region(
