@@ -458,7 +458,18 @@ def building(terms: str) -> Iterator[None]:
 def _log_density(
     op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
-    """Return the log-density of the observed data: a graph of the parents and of epsilon."""
+    """Return the log-density of the observed data: a graph of the parents and of epsilon.
+
+    Empty for `pymc.compute_log_likelihood`: no part of it belongs to one specimen.
+    """
+    if pm.compute_log_likelihood.__code__ in [frame.f_code for frame, _ in walk_stack(None)]:
+        text = (
+            f"{op.simulator.name}: its log-likelihood is empty, as a metric has one number for all "
+            "specimens and az.loo needs one for each; use "
+            "prb.cross_validate, prb.rank, or a simulator without metric=."
+        )
+        report(Finding("no-log-likelihood", text, "pymc_and_arviz.md#arviz"))
+        return pt.zeros(0)
     (value,) = values
     data = known_value(value)
     node = computed(op.simulator)

@@ -6,7 +6,7 @@ covered, and the unit of Monte Carlo errors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -27,7 +27,7 @@ from prbayes.model.data_checks import (
     unreached,
 )
 from prbayes.model.measurement import SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, log_posterior, parent_values
+from prbayes.model.parameters import Hyperparameters, log_posterior
 from prbayes.model.random_variable import log_first_runs
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
@@ -211,6 +211,18 @@ def _data_findings(likelihood: SpecimenLikelihood, *, several_roots: bool) -> tu
     return tuple(findings)
 
 
+def log_shares(
+    likelihood: SpecimenLikelihood, values: Mapping[str, Floats], share: ResponseShare
+) -> Floats:
+    """Return log S of the population of each specimen, (P, S), at values by name, (P, *shape)."""
+    result = np.empty((len(next(iter(values.values()))), len(likelihood.readings)))
+    for group, rows in likelihood.by_context:
+        parents = likelihood.parents(values, group, rows[:1])
+        log_share = share.of_populations(likelihood.density, parents, likelihood.coordinates)
+        result[:, rows] = log_share[:, None]
+    return result
+
+
 @dataclass(frozen=True, eq=False)
 class Populations:
     """Populations of a model's hyperparameters, evaluated at points of its specimens."""
@@ -236,8 +248,9 @@ class Populations:
         x = likelihood.coordinates.inputs(z)
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
         values = self.hyperparameters.constrained(thetas)
-        for group, rows in likelihood.by_group:
-            parents = parent_values(values, likelihood.inputs, group)
+        contexts = likelihood.by_group if smoothing is None else likelihood.by_context
+        for group, rows in contexts:
+            parents = likelihood.parents(values, group, rows)
             if smoothing is None:
                 points = WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], weights[rows])
                 result[:, rows] = likelihood.density.log_likelihoods(parents, points)
@@ -258,15 +271,8 @@ class Populations:
 
     def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
-        likelihood = self.likelihood
-        result = np.zeros(len(thetas))
         values = self.hyperparameters.constrained(thetas)
-        for group, rows in likelihood.by_group:
-            parents = parent_values(values, likelihood.inputs, group)
-            result += len(rows) * share.of_populations(
-                likelihood.density, parents, likelihood.coordinates
-            )
-        return result
+        return log_shares(self.likelihood, values, share).sum(axis=1)
 
     def _normal_log_density(
         self, parents: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
@@ -368,8 +374,10 @@ class PopulationDraws:
         rng = np.random.default_rng([0, 3])
         parts = []
         values = populations.hyperparameters.constrained(self.thetas)
-        for group, _ in likelihood.by_group:
-            parents = parent_values(values, likelihood.inputs, group)
+        for group, rows in likelihood.by_group:
+            if likelihood.inputs.covariates:
+                rows = rng.choice(rows, (len(self.thetas), n_of_each))
+            parents = likelihood.parents(values, group, rows)
             inputs, _ = likelihood.density.sampler(parents, n_of_each, rng)
             z = likelihood.coordinates.of(inputs, 2)
             parts.append(z.reshape(-1, z.shape[-1]))

@@ -570,9 +570,12 @@ def optimum_findings(
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
         findings += prior_end_findings(ends, page)
         names = {end.name for end in ends}
-        bounds = [bound for bound in bounds_by_metric(sampling) if bound.name not in names]
-        findings += [bound.finding for bound in bounds]
-        names |= {bound.name for bound in bounds}
-        findings += unidentified_findings(evaluator, sampling.local, names)
+        bounds = bounds_by_metric(sampling)
+        if bounds is not None:
+            findings += [bound.finding for bound in bounds if bound.name not in names]
+            names |= {bound.name for bound in bounds}
+        findings += unidentified_findings(
+            evaluator, sampling.local, names, has_bounds=bounds is not None
+        )
         findings += confounding_findings(evaluator, sampling.local)
     return tuple(findings)

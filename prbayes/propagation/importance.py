@@ -193,7 +193,7 @@ def new_specimens(
         shift = rng.random((k, 1, *points.shape[1:]))
         shifted.append(inside((points[order] + shift) % 1))
     function = compile_batched([*symbols, *uniforms], [*placed, *epistemic])
-    values = function(*parents, *shifted)
+    values = function(*inputs.for_specimens(parents, n), *shifted)
     aleatory = values[: len(placed)]
     return aleatory, [v[:, None] for v in values[len(placed) :]]
 

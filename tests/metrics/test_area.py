@@ -35,6 +35,25 @@ def test_stored_values_with_ties_infinities_and_nan_give_the_same_area(draw: Dra
     np.testing.assert_allclose(stored(x, w), expected, rtol=1e-11)
 
 
+@pytest.mark.parametrize("digits", [0, 8])
+def test_many_observed_values_give_the_same_area(digits: int) -> None:
+    rng = np.random.default_rng(3)
+    z, x = rng.normal(1, 2, 2000), rng.normal(0, 3, 20).round(digits)
+    z[:1000] = z[:1000].round(digits)
+    z[-1] = x[3] = INF
+    x[4] = NAN
+    weights = rng.dirichlet(np.ones(20), (2, 3))
+    weights[..., 4] = 0
+    for u in (None, rng.dirichlet(np.ones(2000))):
+        d = AreaMetric().against(z, u)
+        basis = d.basis(x)
+        # Summed between simulated values, and between all values.
+        assert basis.arrays[-1].size > 16 * x.size
+        values = np.broadcast_to(np.where(np.isnan(x), INF, x), weights.shape)
+        expected = d.of(values, weights)
+        np.testing.assert_allclose(d.outer(*basis.features(weights), xp=np), expected, rtol=1e-11)
+
+
 def test_area_of_symbolic_values_and_weights(draw: Draw) -> None:
     x, w, z, u = draw(8)
     x[3] = INF
