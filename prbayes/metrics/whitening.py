@@ -102,19 +102,21 @@ def principal_components(
     variances, axes = np.linalg.eigh(scatter)
     variances = np.maximum(variances[::-1], np.finfo(float).tiny)
     # White noise starts below the largest variance that it has by chance (Marchenko and Pastur). Of
-    # its components the most typical come first: those that vary most have too large a variance.
-    after = np.arange(m - 1, 0, -1)
-    noise = np.cumsum(variances[:0:-1])[::-1] / after  # the mean variance of those after each
-    is_noise = variances[:-1] <= noise * (1 + np.sqrt((after + 1) * (w @ w))) ** 2
-    first = int(np.argmax(np.append(is_noise, True)))
-    atypical = np.abs(np.log(variances[first:] / variances[first:].mean()))
+    # its components the most typical are compared: those that vary most have too large a variance.
+    # The largest one precedes them where there is room, as it may be no noise.
+    most = max(1, min(m, MOST_OUTPUTS, n // 5)) if number is None else min(number, m)
+    remaining = np.arange(m, 0, -1)
+    means = np.cumsum(variances[::-1])[::-1] / remaining
+    is_noise = variances <= means * (1 + np.sqrt(remaining * (w @ w))) ** 2  # so is the last
+    first = int(np.argmax(is_noise))
+    first += most - first > 1
+    atypical = np.abs(np.log(variances[first:] / means[first]))
     order = np.concatenate([np.arange(first), first + np.argsort(atypical)])
     variances, axes = variances[order], axes[:, ::-1][:, order]
     explained = np.cumsum(variances) / variances.sum()
     if number is None:
         is_sufficient = explained >= 1 - LEFT_OUT
-        sufficient = int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m
-        number = min(sufficient, max(1, min(m, MOST_OUTPUTS, n // 5)))
+        number = min(int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m, most)
     # Signs that do not depend on the algorithm.
     largest = np.abs(axes).argmax(axis=0)
     axes = (axes * np.sign(axes[largest, np.arange(m)]))[:, :number]
