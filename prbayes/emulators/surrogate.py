@@ -40,7 +40,12 @@ from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, is_missing
-from prbayes.response.response import check_call_settings, refuse_misfit, refuse_uncallable
+from prbayes.response.response import (
+    check_call_settings,
+    refuse_misfit,
+    refuse_other_runs,
+    refuse_uncallable,
+)
 from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
@@ -262,7 +267,8 @@ class Surrogate:
             If an argument is not as described, or n is too small for the surface; before the
             response is computed.
         ResponseError
-            If the response raises, or too few points remain.
+            If the response raises, too few points remain, or three to five runs that are computed
+            again differ from the first ones.
 
         Examples
         --------
@@ -309,6 +315,8 @@ class Surrogate:
         with shown(progressbar):
             _learn_names(settings, runs, tally)
             responses = respond(settings, runs, tally)
+            if tally.computed >= n:  # stored runs are checked as they are read
+                refuse_other_runs(settings, runs, responses, tally)
         usable = _usable(responses)
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 

@@ -6,16 +6,18 @@ specimen emulates the response over inputs and conditions, and takes the value o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
+from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import plain_text, real_array
+from prbayes._validate import Floats, plain_text, real_array
 
 
 class ConditionRV(UniformRV):  # type: ignore[misc]
@@ -80,6 +82,61 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
     _, variable = op(low - margin, high + margin, rng=rng, return_next_rng=True)
     variable.name = name
     return variable
+
+
+def known_covariates(
+    name: str, covariates: Sequence[Any], size: int, rows: NDArray[np.intp] | None
+) -> dict[str, Floats]:
+    """Return the covariates of the specimens, (N,), by name, from those of the observed rows.
+
+    With frequencies, ``rows`` are those of the specimens.
+    """
+    result: dict[str, Floats] = {}
+    for variable in covariates:
+        label = str(variable.name)
+        values = np.array(variable.owner.op.values)
+        if label in result:
+            raise ValueError(
+                f"{name}: inputs: got two calls of prb.response.condition({label!r}, ...), "
+                "expected one; call it once, and use what it returns for all inputs"
+            )
+        if len(values) != size:
+            raise ValueError(
+                f"{name}: inputs: got {len(values)} values of {label}, expected {size}, one for "
+                "each observed specimen"
+            )
+        result[label] = values if rows is None else values[rows]
+    return result
+
+
+def refuse_covariates(name: str, covariates: Sequence[Any]) -> None:
+    """Raise where a metric compares one population with the specimens of many."""
+    if covariates:
+        raise TypeError(
+            f"{name}: inputs: got a population that depends on {covariates[0].name}, expected one "
+            "population, as a metric compares distributions; use metric=prb.LogLikelihood(), or "
+            "prb.response.group for few different values"
+        )
+
+
+def refuse_vectors_of_specimens(
+    name: str, aleatory: Sequence[Any], parents: Sequence[Variable], size: int
+) -> None:
+    """Raise where an input is a vector with an element for each specimen, as in PyMC."""
+    for x in aleatory:
+        batch = x.type.ndim - getattr(x.owner.op, "ndim_supp", 0)
+        if is_condition(x) or batch != 1:
+            continue
+        for v in ancestors(x.owner.inputs, blockers=parents):
+            data: Any = v.get_value() if hasattr(v, "get_value") else getattr(v, "data", None)
+            if np.shape(data) == (size,) and np.ptp(data) > 0:
+                label = v.name or "hardness"
+                raise TypeError(
+                    f"{name}: inputs: got {x.name or 'a .dist()'} with parameters from an array of "
+                    f"{size} values, as many as there are specimens, expected the distribution of "
+                    f"one specimen; write {label} = prb.response.condition({label!r}, values), and "
+                    f"x = pm.LogNormal.dist(a + b * {label}, sigma)"
+                )
 
 
 def is_condition(variable: Variable) -> bool:

@@ -11,7 +11,6 @@ import xarray as xr
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood, specimen_labels
-from prbayes.model.parameters import parent_values
 from prbayes.model.specimen_likelihood import draw_inputs, draw_readings, specimen_likelihoods
 from prbayes.optimize.optimum import Optimum
 from prbayes.response.condition import is_condition
@@ -142,8 +141,8 @@ def _population_sd(
 ) -> list[Floats]:
     """Return the standard deviation of each input in the populations, (*event), over all groups."""
     parts: list[list[Floats]] = []
-    for group, _ in likelihood.by_group:
-        parents = parent_values(points, likelihood.inputs, group)
+    for group, rows in likelihood.by_group:
+        parents = likelihood.parents(points, group, rows)
         drawn, _ = likelihood.density.sampler(parents, 256, rng)
         parts.append([values.var(axis=1).mean(axis=0) for values in drawn])
     return [np.sqrt(np.mean(variances, axis=0)) for variances in zip(*parts, strict=True)]
