@@ -69,7 +69,7 @@ def fleet(cell: str, number: int) -> dict[str, Any]:
     row["runs"] = sum(runs)
     for i in range(n_inputs):
         for name, truth in ((f"mean_{i}", mean[:, i]), (f"spread_{i}", spread[:, i])):
-            draws = tree["posterior"][name].values[0]
+            draws = tree["posterior"].to_dataset()[name].values[0]
             low, high = np.quantile(draws, [0.055, 0.945], axis=0)
             row[name] = float(np.mean((low <= truth) & (truth <= high)))
     products = tree["products"].to_dataset()

@@ -41,10 +41,8 @@ from prbayes.response.inputs import model_on_context
 from prbayes.validation.area_test import area_test
 from prbayes.validation.nulls import PosteriorNull
 
-# Products of one job of an executor.
-_CHUNK = 25
-# Draws of the posterior, and specimens of each, that a validity test compares with measured ones.
-_POPULATIONS, _SPECIMENS, _REPLICATES = 100, 50, 999
+# Specimens of each population that a validity test compares with measured ones.
+_SPECIMENS = 50
 
 
 @locked
@@ -146,7 +144,7 @@ def calibrate_each(
     fleet = Fleet(evaluator, observed, further, settings, alpha)
     if evaluator.likelihoods:
         fleet = replace(fleet, likelihood=_common_likelihood(evaluator, observed))
-    jobs = [names[first : first + _CHUNK] for first in range(0, len(names), _CHUNK)]
+    jobs = [names[first : first + 25] for first in range(0, len(names), 25)]
     with shown(progressbar), progress("products", len(names)) as advance:
         if executor is None:
             parts = [fleet.calibrated(job, lambda: advance(1, "")) for job in jobs]
@@ -254,7 +252,7 @@ class Fleet:
                 return Calibration(values, pareto_k, finding=finding)
             test = area_test(
                 self.further[name], self._predicted(evaluator, values), alpha=self.alpha,
-                null=PosteriorNull(_REPLICATES), progressbar=False,
+                null=PosteriorNull(999), progressbar=False,
             )  # fmt: skip
         areas = (test.statistic, test.critical_value, test.p_value)
         return Calibration(values, pareto_k, areas, finding)
@@ -291,7 +289,7 @@ class Fleet:
 
     def _predicted(self, evaluator: Evaluator, values: Mapping[str, Floats]) -> xr.DataArray:
         """Return responses of the calibrated populations, (1, draws, samples, ...)."""
-        rows = np.linspace(0, self.settings.draws - 1, _POPULATIONS).astype(np.intp)
+        rows = np.linspace(0, self.settings.draws - 1, 100).astype(np.intp)
         thinned = {name: value[rows] for name, value in values.items()}
         rng = np.random.default_rng(self.settings.random_seed)
         if evaluator.likelihoods:
