@@ -89,8 +89,8 @@ def check_failing_region(
     responses: Floats,
     max_lost: float,
     apart: float = 6.0,
-) -> None:
-    """Report observed values in gaps of the finite responses beside failing runs.
+) -> tuple[Finding, ...]:
+    """Return a finding of observed values in gaps of the finite responses beside failing runs.
 
     A value is in such a gap if it is ``apart`` times the local spacing away from the nearest finite
     response of the output, and 40 % of the 4 d + 4 runs around that run fail. Specimens were
@@ -98,11 +98,11 @@ def check_failing_region(
     specimens is above ``max_lost``. Nothing is checked on fewer than 32 finite runs.
     """
     if not responses.size or not points:  # a user's own propagation may store none
-        return
+        return ()
     values = responses.reshape(len(responses), -1)
     is_finite = np.isfinite(values)
     if is_finite.all():
-        return
+        return ()
     inputs = np.hstack([x.reshape(len(values), -1) for x in points])
     scores = rankdata(inputs, axis=0)
     _, neighbours = cKDTree(scores).query(scores, k=4 * inputs.shape[1] + 5)
@@ -125,7 +125,7 @@ def check_failing_region(
         is_apart[:, j] &= np.isfinite(column)
     count = int(is_apart.any(axis=1).sum())
     if not count:
-        return
+        return ()
     some = np.unique(columns[is_apart])[:3]
     text = (
         f"{name}: got {count} of {len(columns)} observed responses where no run has a finite "
@@ -135,9 +135,8 @@ def check_failing_region(
     )
     if count > max_lost * len(columns):
         raise DesignError(f"{text}; repair the response, or pass a larger max_lost")
-    report(
-        Finding("failing-data", f"{text}; repair the response.", "expensive.md#when-a-run-fails")
-    )
+    page = "expensive.md#when-a-run-fails"
+    return (Finding("failing-data", f"{text}; repair the response.", page),)
 
 
 def warn_duplicates(name: str, observed: Floats) -> None:
@@ -337,6 +336,7 @@ def data_findings(
     counted = np.ones(len(y), dtype=bool)
     counted[copies] = np.isfinite(y[copies]).sum(axis=1) < 2
     findings: list[Finding] = []
+    rounded_outputs: list[tuple[str, float, float]] = []  # label, step and its share
     steps = np.zeros(m)
     exact = y.copy()  # NaN at a limit, where specimens are equal by censoring
     for j, (label, stated) in enumerate(zip(labels, np.broadcast_to(rounded, m), strict=True)):
@@ -346,12 +346,7 @@ def data_findings(
         steps[j] = step = float(resolution(values) if np.isnan(stated) else stated)
         share = step / values.std(ddof=1) if step else 0.0
         if np.isnan(stated) and share > largest_step:
-            text = (
-                f"{label}: got {len(values)} values that are all multiples of a step of {step:.4g} "
-                f"({share:.3g} standard deviations), expected exact values, or a step of at most "
-                f"{largest_step:g} standard deviations; pass rounded={step:.4g}."
-            )
-            findings.append(Finding("rounded-data", text, "likelihood.md#rounded-data"))
+            rounded_outputs.append((label, step, share))
         sample = y[counted & np.isfinite(y[:, j]), j]
         counts, p_values = count_at_ends(sample, step, options.draws, options.seed)
         ends = {
@@ -367,6 +362,16 @@ def data_findings(
                 )
                 findings.append(Finding("censored-data", text, "likelihood.md#censored-data"))
                 exact[np.abs(y[:, j] - limit) <= step / 2, j] = np.nan
+    if rounded_outputs:
+        names, all_steps, shares = zip(*rounded_outputs, strict=True)
+        listed = ", ".join(f"{step:.4g}" for step in dict.fromkeys(all_steps))
+        argument = listed if len(set(all_steps)) == 1 else "the step of each output"
+        text = (
+            f"{', '.join(names)}: got values that are all multiples of a step of {listed} (up to "
+            f"{max(shares):.3g} standard deviations), expected exact values, or a step of at most "
+            f"{largest_step:g} standard deviations; pass rounded={argument}."
+        )
+        findings.insert(0, Finding("rounded-data", text, "likelihood.md#rounded-data"))
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:
         groups = identical_specimens(exact)
         listed = "; ".join(" and ".join(map(str, group)) for group in groups[:3])
@@ -428,8 +433,8 @@ def unreached(outputs: Floats, readings: Readings) -> str:
     if 2 * count <= len(readings):
         return ""
     return (
-        f". The readings of {count} of {len(readings)} specimens are outside the range of all "
-        "runs over the priors: check the response, the priors and the units, or pass "
+        f"the readings of {count} of {len(readings)} specimens are outside the range of all runs "
+        "over the priors: check the response, the priors and the units, or pass "
         "prb.LogLikelihood(error=...)"
     )
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats
+from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_numbers
@@ -234,6 +235,8 @@ class Evaluator:
 
     def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
         """Return an evaluator of the same model with other prepared metrics, by simulator."""
+        if len(targets) > 1:
+            targets = [with_unbiased_areas(target) for target in targets]
         pairs = zip(self.nodes, targets, strict=True)
         changed = tuple(replace(node, target=target) for node, target in pairs)
         return replace(self, nodes=changed, has_graph=False)

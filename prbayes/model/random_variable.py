@@ -39,6 +39,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
+from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.density import with_common_bandwidths
 from prbayes.model.data_checks import check_constant, check_failing_region, warn_out_of_range
@@ -216,13 +217,14 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
             responses.on_start = None
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
-            check_failing_region(
+            findings = check_failing_region(
                 simulator.name,
                 target.observed,
                 bound.first_points,
                 bound.first_responses,
                 bound.max_lost,
             )
+            bound.findings = report(*findings)
             node = Node(
                 simulator.name,
                 bound.target,
@@ -628,7 +630,10 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
 def common_targets(
     simulators: Sequence[AnySimulator], targets: Sequence[Discrepancy]
 ) -> list[Discrepancy]:
-    """Return the prepared metrics of simulators, where those of one response share a bandwidth."""
+    """Return the prepared metrics of simulators, of which several are added.
+
+    Those of one response share a bandwidth, and areas have no bias.
+    """
     responses, conditions = [], []
     for simulator in simulators:
         calls, group = simulator.responses, simulator.group
@@ -636,7 +641,8 @@ def common_targets(
         of_condition = (s.group == group and s.responses.same_as(calls) for s in simulators)
         responses.append(next(k for k, is_same in enumerate(of_response) if is_same))
         conditions.append(next(k for k, is_same in enumerate(of_condition) if is_same))
-    return with_common_bandwidths(targets, responses, conditions)
+    result = with_common_bandwidths(targets, responses, conditions)
+    return [with_unbiased_areas(target) for target in result] if len(result) > 1 else result
 
 
 def share_bandwidths(model: pm.Model) -> None:

@@ -18,6 +18,7 @@ from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.model.data_checks import (
+    check_failing_region,
     data_findings,
     emulator_findings,
     misfit_findings,
@@ -30,7 +31,7 @@ from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import Hyperparameters, log_posterior
 from prbayes.model.random_variable import log_first_runs
 from prbayes.numerics.points import sobol
-from prbayes.propagation.base import DesignError
+from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare, response_share
@@ -110,11 +111,13 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if refined is not emulation and not _is_partial(likelihood):
             # Specimens beside the failing region have points on its right side now.
             refined, points, findings = _emulate(runs, populations, refined)
-        return Preparation(refined, points, report(*findings), share)
+        return Preparation(refined, points, report(*runs.findings, *findings), share)
     except DesignError as error:
         cause = "" if runs.first is None else unreached(runs.first, likelihood.readings)
-        findings = _data_findings(likelihood, several_roots=False)
-        raise DesignError(". ".join([f"{error}{cause}", *map(str, findings)])) from None
+        if not cause:
+            data = _data_findings(likelihood, several_roots=False)
+            cause = "".join(finding.text.removesuffix(".") for finding in data[:1])
+        raise DesignError(f"{cause}. Therefore: {error}" if cause else str(error)) from None
     finally:
         for response in responses:
             response.on_start = None
@@ -126,18 +129,27 @@ class Runs:
 
     likelihood: SpecimenLikelihood
     first: Floats | None = None  # (n, M): outputs of the first runs
+    findings: tuple[Finding, ...] = ()  # about the first runs
 
     def __call__(self, z: Floats) -> Floats:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
         likelihood = self.likelihood
-        responses = [m.responses for m in likelihood.measurements]
+        measurements = likelihood.measurements
         inputs = likelihood.coordinates.inputs(z)
-        parts = [response(inputs, []).reshape(len(z), -1) for response in responses]
+        parts = [m.responses(inputs, []).reshape(len(z), -1) for m in measurements]
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and self.first is None:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             refuse_unused_inputs(likelihood.name, z, values, _coordinate_names(likelihood))
             self.first = values
+            if not any(m.metric.error is not None or m.gross_errors for m in measurements):
+                self.findings = check_failing_region(
+                    likelihood.name,
+                    likelihood.readings.values,
+                    [z],
+                    values,
+                    max(getattr(m.propagation, "max_lost", MAX_LOST) for m in measurements),
+                )
         return values
 
 

@@ -39,7 +39,7 @@ from prbayes.inference.checks.metric_suitability import (
     heavy_tails,
     smoothing_bias,
 )
-from prbayes.inference.checks.one_sided import bounds_by_metric
+from prbayes.inference.checks.one_sided import bound_findings, bounds_by_metric
 from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.design_error import design_error
@@ -485,7 +485,7 @@ def _report(
         at_jump = tuple(evaluator.nodes[k].name for k in jumping_simulators(fit.sampling))
         if at_edge or at_jump:
             fit, optima = replace(fit, sampling=None), []
-    details = [fit.details, problem.record.details]
+    details = ["" if fit.result.converged else fit.details, problem.record.details]
     if stopped:
         details.append(f"{stopped} before the minimisation was finished.")
     else:
@@ -510,6 +510,7 @@ def _report(
     refuse_lost(evaluator, {name: numbers["lost_mass"] for name, numbers in support.items()})
     local = None if fit.sampling is None else fit.sampling.local
     unknown = [] if at_edge or at_jump else [*optimum.stderr.items()]
+    first = [finding for node in evaluator.nodes for finding in node.bound.findings]  # are logged
     findings = report(
         *breakdown_findings(at_edge, at_jump),
         *unknown_error_findings(dict(unknown), sampling_obstacle(evaluator)),
@@ -522,6 +523,7 @@ def _report(
         local_optimum(evaluator, mode.theta, mode.value, comparable=mode.comparable)
         for mode in optima
     )
+    findings = (*first, *findings)
     return replace(
         optimum, design_error=fit.design_error, local_optima=local_optima, findings=findings
     )
@@ -574,7 +576,7 @@ def optimum_findings(
         names = {end.name for end in ends}
         bounds = bounds_by_metric(sampling)
         if bounds is not None:
-            findings += [bound.finding for bound in bounds if bound.name not in names]
+            findings += bound_findings([b for b in bounds if b.name not in names])
             names |= {bound.name for bound in bounds}
         findings += unidentified_findings(
             evaluator, sampling.local, names, has_bounds=bounds is not None

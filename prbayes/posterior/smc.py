@@ -349,9 +349,11 @@ def result_of(
             findings += [f for f in optimum.findings if f.code != "few-specimens"]
             if evaluator.nodes and not is_pseudo:
                 findings += prior_conflicts(optimum, evaluator, thetas)
-        elif not is_pseudo:
-            for likelihood in evaluator.likelihoods:
-                findings += prepared(likelihood).findings
+        else:
+            findings += [f for node in evaluator.nodes for f in node.bound.findings]
+            if not is_pseudo:
+                for likelihood in evaluator.likelihoods:
+                    findings += prepared(likelihood).findings
         attrs = {
             "n_responses": evaluator.n_responses - n_before,
             "seconds": time.perf_counter() - clock,

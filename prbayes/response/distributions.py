@@ -127,6 +127,12 @@ def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None
             )
 
 
+def _scalar_if_infinite(end: TensorVariable) -> Any:
+    """Return a scalar for an infinite end of a vector, which PyMC takes for a finite one."""
+    value = pt.get_underlying_scalar_constant_value(end, raise_not_constant=False)
+    return pt.constant(value) if not isinstance(value, Variable) and np.isinf(value) else end
+
+
 def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     """Return the inverse distribution function of ``dist`` at u, (n, *event), or raise."""
     op = dist.owner.op
@@ -137,6 +143,9 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
         return mean + z @ pt.linalg.cholesky(covariance).T
+    if isinstance(op, type(pm.TruncatedNormal.rv_op)):
+        mean, sd, *ends = op.dist_params(dist.owner)
+        return pm.TruncatedNormal.icdf(u, mean, sd, *map(_scalar_if_infinite, ends))
     try:
         return pm.icdf(dist, u, warn_rvs=False)
     except NotImplementedError:

@@ -235,7 +235,7 @@ def test_size_of_all_checks() -> None:
 def test_texts_of_findings() -> None:
     rng = np.random.default_rng(4)
     (step,) = data_findings(rounded(rng.normal(10, 1, 50), 0.5), labels=["length"])
-    assert step.text.startswith("length: got 50 values that are all multiples of a step of 0.5 ")
+    assert step.text.startswith("length: got values that are all multiples of a step of 0.5 ")
     assert step.text.endswith("pass rounded=0.5.")
     y = np.minimum(rng.normal(10, 1, 30), 10.5)
     (end,) = data_findings(y)
@@ -267,9 +267,9 @@ def test_missing_values_are_left_out() -> None:
     y[:, 2] = np.nan
     assert codes(y) == []
     y[:, 1] = rounded(y[:, 1], 0.5)
-    assert data_findings(y)[0].text.startswith("observed[1]: got 40 values")
+    assert data_findings(y)[0].text.startswith("observed[1]: got values that are all")
     y[0, 1] = np.inf  # a specimen that failed
-    assert data_findings(y)[0].text.startswith("observed[1]: got 39 values")
+    assert data_findings(y)[0].text.startswith("observed[1]: got values that are all")
     for n in (1, 2, 3):
         assert data_findings(np.arange(n) ** 0.5) == ()
         assert data_findings(np.full((n, 2), np.nan)) == ()
