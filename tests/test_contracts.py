@@ -296,8 +296,8 @@ def test_a_subclass_of_the_uniform_distribution_has_its_density_and_draws() -> N
     class ConditionRV(UniformRV):  # type: ignore[misc]
         __props__ = (*UniformRV.__props__, "label")
 
-        def __init__(self, label: str) -> None:
-            super().__init__()
+        def __init__(self, label: str, **keywords: Any) -> None:
+            super().__init__(**keywords)
             self.label = label
 
     _, variable = ConditionRV("load")(
