@@ -42,7 +42,12 @@ from prbayes._validate import Floats, called
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.density import with_common_bandwidths
-from prbayes.model.data_checks import check_constant, check_failing_region, warn_out_of_range
+from prbayes.model.data_checks import (
+    check_constant,
+    check_failing_region,
+    duplicate_findings,
+    warn_out_of_range,
+)
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
@@ -221,6 +226,8 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.max_lost,
             )
             bound.findings = report(*findings)
+            if simulator.specimens is None:  # reported where the simulator was written
+                bound.findings += duplicate_findings(simulator.name, target.observed)
             node = Node(
                 simulator.name,
                 bound.target,
