@@ -139,8 +139,8 @@ def check_failing_region(
     return (Finding("failing-data", f"{text}; repair the response.", page),)
 
 
-def warn_duplicates(name: str, observed: Floats) -> None:
-    """Warn if each specimen without a label occurs at least twice.
+def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
+    """Return a finding if each specimen without a label occurs at least twice.
 
     Counts, and readings on a scale of few steps, have duplicates by chance.
     """
@@ -148,15 +148,15 @@ def warn_duplicates(name: str, observed: Floats) -> None:
     distinct, counts = np.unique(rows, axis=0, return_counts=True)
     # Of six specimens, duplicates of all are no chance.
     if len(rows) < 6 or counts.min() < 2 or all(map(_has_few_steps, rows.T)):
-        return
-    report(
+        return ()
+    return (
         Finding(
             "duplicated-data",
             f"{name}: got {len(rows)} observed values of which only {len(distinct)} are "
             "different, each at least twice: if these are repeated readings of a specimen, say "
             "so by specimens=, and leave out what is there twice by mistake; else every "
             "specimen counts, and the uncertainty is too small.",
-        )
+        ),
     )
 
 

@@ -16,9 +16,9 @@ from prbayes.model.data_checks import (
     check_constant,
     count_at_ends,
     data_findings,
+    duplicate_findings,
     identical_specimens,
     resolution,
-    warn_duplicates,
     warn_out_of_range,
 )
 from prbayes.propagation.base import DesignError
@@ -336,12 +336,9 @@ def test_data_around_few_or_many_responses_are_not_reported(
 @pytest.mark.parametrize(
     "values", [MEASURED[:, 0], MEASURED, MEASURED[:, 0].round(3), 0.001 * np.arange(20) ** 2]
 )
-def test_duplicates_of_all_specimens_are_reported(
-    values: Floats, logged: pytest.LogCaptureFixture
-) -> None:
-    warn_duplicates("y", np.concatenate([values, values[::-1]]))
-    (record,) = logged.records
-    assert "y: got 40 observed values of which only 20 are different" in record.message
+def test_duplicates_of_all_specimens_are_reported(values: Floats) -> None:
+    (finding,) = duplicate_findings("y", np.concatenate([values, values[::-1]]))
+    assert "y: got 40 observed values of which only 20 are different" in finding.text
 
 
 @pytest.mark.parametrize(
@@ -358,6 +355,5 @@ def test_duplicates_of_all_specimens_are_reported(
     ],
     ids=["once", "some", "counts", "other counts", "hundreds", "rounded", "equal", "few"],
 )
-def test_ties_by_chance_are_no_duplicates(values: Floats, logged: pytest.LogCaptureFixture) -> None:
-    warn_duplicates("y", np.asarray(values, dtype=float))
-    assert not logged.records
+def test_ties_by_chance_are_no_duplicates(values: Floats) -> None:
+    assert not duplicate_findings("y", np.asarray(values, dtype=float))
