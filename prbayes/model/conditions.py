@@ -17,9 +17,9 @@ from prbayes.response.condition import ReadingsCondition, is_condition
 from prbayes.response.inputs import Inputs
 
 
-def stacked_values(known: Mapping[str, Floats]) -> Floats | None:
+def stacked_values(values: Mapping[str, Floats]) -> Floats | None:
     """Return the values of conditions, (N,) by name, as an array (N, C); None without one."""
-    return np.stack(list(known.values()), axis=1) if known else None
+    return np.stack(list(values.values()), axis=1) if values else None
 
 
 def at_conditions(
@@ -42,10 +42,10 @@ def observed_at_conditions(
     Refuses conditions of specimens with a metric of distributions.
     """
     vectors = [x for x in inputs if isinstance(x, ReadingsCondition)]
-    known = [*vectors, *(x for x in inputs if isinstance(x, Variable) and is_condition(x))]
-    if known and isinstance(metric, Metric) and not metric.by_specimen:
+    conditions = [*vectors, *(x for x in inputs if isinstance(x, Variable) and is_condition(x))]
+    if conditions and isinstance(metric, Metric) and not metric.by_specimen:
         raise TypeError(
-            f"{name}: metric: got {called(metric)} with the condition {known[0].name} of each "
+            f"{name}: metric: got {called(metric)} with the condition {conditions[0].name} of each "
             "specimen, expected prb.LogLikelihood(): a metric of distributions compares specimens "
             "under the same conditions; leave metric= out, or write a simulator for each condition"
         )

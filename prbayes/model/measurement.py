@@ -124,10 +124,11 @@ class StackedReadings:
         numbers, size = _validated_counts(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
         conditions = None
-        known = [first.inputs.aleatory[place] for place in first.inputs.conditions]
-        if known:
-            conditions, coordinates = np.empty((size, len(known))), np.empty((size, len(known)))
-            for k, variable in enumerate(known):
+        variables = [first.inputs.aleatory[place] for place in first.inputs.conditions]
+        if variables:
+            conditions = np.empty((size, len(variables)))
+            coordinates = np.empty(conditions.shape)
+            for k, variable in enumerate(variables):
                 of_rows = [np.asarray(m.conditions)[:, k] for m in measurements]
                 kind = f"values of {variable.name}"
                 conditions[:, k] = _by_specimen(kind, measurements, of_rows, numbers, size)

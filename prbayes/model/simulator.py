@@ -230,8 +230,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         settings.check_likelihood(name)
         partners = _with_common_specimens(name, labels, model)
         arguments = _inputs_of_partners(name, arguments, partners)
-        known = [arguments.aleatory[place] for place in arguments.conditions]
-        conditions = stacked_values(known_covariates(name, known, size, rows))
+        inputs_of_specimens = [arguments.aleatory[place] for place in arguments.conditions]
+        conditions = stacked_values(known_covariates(name, inputs_of_specimens, size, rows))
         if weights is not None:
             weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
         responses = Responses(name, response, arguments, **calls | {"scatter": 0.0})

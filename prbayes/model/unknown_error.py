@@ -21,10 +21,6 @@ from prbayes.metrics.readings import Readings
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.propagation.specimen_points import SpecimenPoints
 
-# Largest variance of the emulator's error in squares of the largest plausible error: a density
-# changes by less than 1e-4 nats where the error is an eighth of this one.
-_NEGLIGIBLE = 1e-6
-
 
 @dataclass(frozen=True, eq=False)
 class ReadingDensity:
@@ -52,40 +48,43 @@ class ReadingDensity:
         sums, constant = [], np.zeros((len(readings), 1))
         first = 0
         for m in likelihood.measurements:
-            columns = np.arange(first, first + m.rows.shape[1])
-            first += len(columns)
+            of_simulator = np.arange(first, first + m.rows.shape[1])
+            first += len(of_simulator)
             if "error" not in m.extras or m.extras["error"].type.ndim:
                 continue
-            is_measured = readings.is_measured[:, columns]
-            unit = np.where(is_measured, scale[:, columns], 1.0)
-            relative = (emulator_error[columns] / unit) ** 2
-            is_plain = (readings.step[:, columns] == 0) & ~readings.is_relative[:, columns]
-            is_plain &= ~readings.is_censored[:, columns]
-            is_plain &= relative <= _NEGLIGIBLE * (readings.error[:, columns] / unit) ** 2
+            is_measured = readings.is_measured[:, of_simulator]
+            unit = np.where(is_measured, scale[:, of_simulator], 1.0)
+            relative = (emulator_error[of_simulator] / unit) ** 2
+            is_plain = (readings.step[:, of_simulator] == 0) & ~readings.is_relative[
+                :, of_simulator
+            ]
+            is_plain &= ~readings.is_censored[:, of_simulator]
+            # A density changes by less than 1e-4 nats at an eighth of the largest plausible error.
+            is_plain &= relative <= 1e-6 * (readings.error[:, of_simulator] / unit) ** 2
             if not is_plain[is_measured].all():
                 continue
-            measured = np.where(is_measured, readings.values[:, columns], 0.0)
+            measured = np.where(is_measured, readings.values[:, of_simulator], 0.0)
             inverse = np.where(is_measured, 1 / unit, 0.0)
             squares = np.zeros(outputs.shape[:2])
-            for column, y, c in zip(columns, measured.T, inverse.T, strict=True):
+            for column, y, c in zip(of_simulator, measured.T, inverse.T, strict=True):
                 squares += ((y[:, None] - outputs[:, :, column]) * c[:, None]) ** 2
             count = is_measured.sum(axis=1, keepdims=True).astype(float)
             constant -= np.log(unit).sum(axis=1, keepdims=True)
-            sums.append((int(columns[0]), squares, count, float(relative[is_measured].mean())))
-            is_missing[:, columns] = True
-        variance, chosen = emulator_error**2, None
+            sums.append((int(of_simulator[0]), squares, count, float(relative[is_measured].mean())))
+            is_missing[:, of_simulator] = True
+        variance, columns = emulator_error**2, None
         size = int((~is_missing).sum(axis=1).max())
         if size < outputs.shape[-1]:
-            chosen = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
-            is_outside = np.take_along_axis(is_missing, chosen, axis=1)
-            readings = readings.at_columns(chosen)
+            columns = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
+            is_outside = np.take_along_axis(is_missing, columns, axis=1)
+            readings = readings.at_columns(columns)
             readings = replace(readings, values=np.where(is_outside, np.nan, readings.values))
-            outputs = np.take_along_axis(outputs, chosen[:, None], axis=2)
-            scale, variance = np.take_along_axis(scale, chosen, 1), variance[chosen][:, None]
+            outputs = np.take_along_axis(outputs, columns[:, None], axis=2)
+            scale, variance = np.take_along_axis(scale, columns, 1), variance[columns][:, None]
         unit = scale[:, None]
         if readings.is_relative.any():
             unit = unit * np.where(readings.is_relative[:, None], np.abs(outputs), 1.0)
-        return cls(readings, outputs, unit, variance, chosen, sums, constant)
+        return cls(readings, outputs, unit, variance, columns, sums, constant)
 
     def __call__(self, error: Any, xp: Any) -> Any:
         """Return the log-density, (S, K), as an array or a graph."""

@@ -134,13 +134,13 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
 
 def _vector(name: str, array: Floats, caller: str) -> TensorVariable:
     """Return the different values of specimens with several values, (N, T), as a constant."""
-    is_given = ~np.isnan(array)
-    if np.isinf(array).any() or not is_given.any(axis=1).all():
+    is_number = ~np.isnan(array)
+    if np.isinf(array).any() or not is_number.any(axis=1).all():
         raise ValueError(
             f"{caller}: values: got infinite values, or a row without a number, expected finite "
             "numbers for each specimen, filled up with NaN"
         )
-    distinct, inverse = np.unique(array[is_given], return_inverse=True)
+    distinct, inverse = np.unique(array[is_number], return_inverse=True)
     if len(distinct) > MOST_OUTPUTS:
         raise ValueError(
             f"{caller}: values: got {len(distinct)} different values, expected at most "
@@ -148,7 +148,7 @@ def _vector(name: str, array: Floats, caller: str) -> TensorVariable:
             "np.round(values, 1)"
         )
     columns = np.full(array.shape, -1)
-    columns[is_given] = inverse
+    columns[is_number] = inverse
     for row, of_row in enumerate(columns):
         places = of_row[of_row >= 0]
         if len(np.unique(places)) < len(places):

@@ -425,13 +425,15 @@ def with_known_conditions(
     stored: bool,
 ) -> tuple[list[Any], Floats | None]:
     """Return inputs with the model's own conditions, and the values of those given, (N, C)."""
-    own = {
+    of_model = {
         str(s.inputs.aleatory[place].name): s.inputs.aleatory[place]
         for s in simulators
         for place in s.inputs.conditions
     }
-    known = {str(x.name): x for x in inputs if isinstance(x, TensorVariable) and is_condition(x)}
-    sizes = {name: len(x.owner.op.values) for name, x in known.items()}
+    conditions = {
+        str(x.name): x for x in inputs if isinstance(x, TensorVariable) and is_condition(x)
+    }
+    sizes = {name: len(x.owner.op.values) for name, x in conditions.items()}
     if len(set(sizes.values())) > 1:
         raise ValueError(
             f"{label}: got conditions of {sizes} specimens, expected one value of each condition "
@@ -439,11 +441,12 @@ def with_known_conditions(
         )
     size = next(iter(sizes.values()), 0)
     changed = [
-        own.get(str(x.name), x) if any(x is y for y in known.values()) else x for x in inputs
+        of_model.get(str(x.name), x) if any(x is y for y in conditions.values()) else x
+        for x in inputs
     ]
     if stored:
-        for name, x in known.items():
-            low, high = own[name].owner.op.range if name in own else (-np.inf, np.inf)
+        for name, x in conditions.items():
+            low, high = of_model[name].owner.op.range if name in of_model else (-np.inf, np.inf)
             outside = [v for v in x.owner.op.values if not low <= v <= high]
             if outside:
                 raise ValueError(
@@ -451,7 +454,7 @@ def with_known_conditions(
                     f"{high:.4g}, the range of the runs; pass stored=False, which computes the "
                     "response of new specimens"
                 )
-    values = known_covariates(label, list(known.values()), size, None)
+    values = known_covariates(label, list(conditions.values()), size, None)
     return changed, stacked_values(values)
 
 
