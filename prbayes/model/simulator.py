@@ -27,6 +27,7 @@ from prbayes._validate import (
     sample_labels,
     sample_weights,
 )
+from prbayes.emulators.runs import Runs
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.data_checks import warn_duplicates
@@ -62,7 +63,7 @@ from prbayes.response.inputs import (
     read_inputs,
 )
 from prbayes.response.outputs import Outputs, in_order_of, read_observed
-from prbayes.response.response import Responses, refuse_uncallable
+from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
 
 # Settings of a propagation for calls of the response.
 _CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", "timeout")
@@ -188,6 +189,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         )
     refuse_uncallable(name, response)
     arguments = read_inputs(name, inputs, model)
+    if isinstance(response, Runs):
+        refuse_misfit(name, response, arguments.sizes)
+        response.refuse_inputs(name, arguments)
     for rv in simulators(model):
         if rv in arguments.parents:
             raise TypeError(
@@ -404,6 +408,13 @@ def _joint_likelihood(
                 f"{name}: propagation: got {called(measurement.propagation)}, and "
                 f"{called(m.propagation)} in {m.name}, which has the same specimens, "
                 "expected the same kind in both"
+            )
+        if isinstance(m.responses.function, Runs) != likelihood.has_table or (
+            likelihood.has_table and not isinstance(measurement.responses.function, Runs)
+        ):
+            raise ValueError(
+                f"{name}: response: got a table of runs beside a function in {m.name}, which has "
+                "the same specimens, expected the same kind in both; make a table of both"
             )
         if m.gross_errors != measurement.gross_errors:
             raise ValueError(

@@ -1,0 +1,219 @@
+"""Log-likelihood by specimen from a table of runs, without a fresh run.
+
+The surface through the table takes the place of the emulator. Beyond the ranges of the runs it is
+continued linearly, so that a table which ends within the populations of the data is recognised: it
+is refused, and nothing is answered from the continuation. The error of the surface is twice the
+cross-validated error at the runs near the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from prbayes._validate import Floats
+from prbayes.emulators.runs import Continued, LeftOut, Runs
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.propagation.base import MAX_LOST, DesignError
+from prbayes.propagation.fibre_points import fibre_points
+from prbayes.propagation.roots import Roots
+from prbayes.propagation.specimen_emulation import (
+    Coordinates,
+    DifferencedResponse,
+    Emulation,
+    EmulationProblem,
+    all_roots,
+    near_readings,
+    narrowing,
+    shift_by_misfit,
+    specimen_roots,
+)
+from prbayes.propagation.specimen_points import SpecimenPoints, draw_points
+from prbayes.response.budget import unlimited
+from prbayes.response.response import Responses
+
+
+class Draws(Protocol):
+    """Draws of populations."""
+
+    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
+        """Return log p(y_i | theta), (S, N)."""
+
+    def specimens(self) -> Floats:
+        """Return coordinates of specimens, (n, d)."""
+
+
+@dataclass(frozen=True, eq=False)
+class OfTables:
+    """A function of tables: coordinates (k, d) -> a number for each output of all, (k, M)."""
+
+    coordinates: Coordinates
+    responses: tuple[Responses, ...]
+
+    @classmethod
+    def of(cls, likelihood: SpecimenLikelihood, kind: Callable[[Runs], Any]) -> OfTables:
+        """Return a function of the table of each simulator."""
+        responses = []
+        for m in likelihood.measurements:
+            function, outputs = kind(m.responses.function), m.responses.outputs
+            responses.append(Responses(m.name, function, m.responses.inputs, outputs=outputs))
+        return cls(likelihood.coordinates, tuple(responses))
+
+    def __call__(self, z: Floats) -> Floats:
+        """Return values by output; no run is counted."""
+        inputs = self.coordinates.inputs(z)
+        with unlimited():
+            parts = [response(inputs, []).reshape(len(z), -1) for response in self.responses]
+        return np.concatenate(parts, axis=1)
+
+
+def points_of_tables(
+    problem: EmulationProblem,
+    likelihood: SpecimenLikelihood,
+    prior_specimens: Callable[[], Floats],
+    posterior: Callable[..., Any],
+) -> tuple[Emulation, SpecimenPoints, Roots | None]:
+    """Return the surface of tables, points of the specimens, and roots if readings identify them.
+
+    Raises DesignError if the runs do not cover the populations of the data, or the surface is too
+    inaccurate there.
+    """
+    readings, options = problem.readings, problem.options
+    emulation, ranges = _surface(problem, likelihood)
+    present = readings.is_measured | readings.is_censored
+    roots = None
+    if (present.sum(axis=1) < likelihood.coordinates.size).any():
+        emulation, points = fibre_points(
+            problem, emulation.box, prior_specimens(), posterior, emulation
+        )
+    else:
+        roots = specimen_roots(emulation, readings, options)
+        roots = all_roots(emulation, readings, options, roots, problem.seed)
+        points = draw_points(
+            emulation, readings, roots, options, error_is_known=likelihood.error_is_known
+        )
+    draws: Draws = posterior(points.z, points.log_a)
+    specimens = draws.specimens()
+    _require_cover(likelihood, points, draws, specimens, ranges)
+    inside = specimens[((specimens >= ranges[0]) & (specimens <= ranges[1])).all(axis=1)][:1024]
+    jacobian = emulation.surface(inside)[1]
+    rows = np.isfinite(jacobian).all(axis=(1, 2))  # not beside failed runs
+    misfit = OfTables.of(likelihood, LeftOut)(inside[rows])
+    bias = shift_by_misfit(problem, emulation.error, misfit, jacobian[rows], inside[rows])
+    if roots is not None:
+        bias = max(bias, narrowing(emulation, readings, roots))
+    emulation = replace(emulation, bias=bias, box=ranges)
+    _require_accurate(likelihood, problem, emulation)
+    return emulation, points, roots
+
+
+def _surface(
+    problem: EmulationProblem, likelihood: SpecimenLikelihood
+) -> tuple[Emulation, Floats]:
+    """Return the surface through the runs, with a wider box of the search, and their ranges."""
+    coordinates, bounds = likelihood.coordinates, likelihood.coordinates.bounds
+    runs, lows, highs = [], [], []
+    for m in likelihood.measurements:
+        table: Runs = m.responses.function
+        domain = table.surrogate.domain
+        places = [m.responses.inputs.arguments.index(a) for a in range(len(m.inputs.aleatory))]
+        values = domain.arguments(table.points)
+        runs.append(coordinates.of([values[place] for place in places], 1))
+        lows.append(coordinates.of([domain.inputs[place].low for place in places], 0))
+        highs.append(coordinates.of([domain.inputs[place].high for place in places], 0))
+    low, high = np.max(lows, axis=0), np.min(highs, axis=0)
+    # An input with a logarithmic coordinate may be negative in the table.
+    low = np.where(np.isfinite(low), low, bounds[0])
+    ranges = np.stack([low, high])
+    box = np.stack([np.maximum(bounds[0], low - (high - low) / 2), bounds[1]])
+    box[1] = np.minimum(bounds[1], high + (high - low) / 2)
+    if (box[0] >= box[1]).any():
+        names = _columns(likelihood)
+        prior = _as_inputs(coordinates, bounds)
+        table_ends = _as_inputs(coordinates, ranges)
+        j = int(np.argmax(box[0] >= box[1]))
+        raise DesignError(
+            f"{likelihood.name}: got runs with {names[j]} from {table_ends[0, j]:.4g} to "
+            f"{table_ends[1, j]:.4g}, and a prior of {prior[0, j]:.4g} to {prior[1, j]:.4g}, "
+            "expected ranges that overlap; check the units, and the order of the inputs"
+        )
+    z = np.unique(np.concatenate(runs), axis=0)
+    z = z[np.isfinite(z).all(axis=1)]
+    y = problem.run(z)
+    is_near = near_readings(y, problem.readings)
+    residuals = OfTables.of(likelihood, LeftOut)(z)[is_near]
+    error = 2 * np.sqrt((residuals**2).mean(axis=0))
+    error = np.maximum(error, problem.options.floor * problem.readings.spread())
+    # The noise of a process in double precision is far below its change over a thousandth.
+    surface = DifferencedResponse(OfTables.of(likelihood, Continued), step=1e-3)
+    whole = np.stack([np.full(len(low), -np.inf), np.full(len(low), np.inf)])
+    return Emulation(z, y, box, surface, error, np.inf, whole), ranges
+
+
+def _require_cover(
+    likelihood: SpecimenLikelihood,
+    points: SpecimenPoints,
+    draws: Draws,
+    specimens: Floats,
+    ranges: Floats,
+) -> None:
+    """Raise if the likelihood of a specimen, or 5 % of that of all, is from outside the ranges."""
+    slack = 1e-9 * (ranges[1] - ranges[0])
+    is_inside = ((points.z >= ranges[0] - slack) & (points.z <= ranges[1] + slack)).all(axis=-1)
+    whole = draws.log_likelihoods(points.z, points.log_a)
+    inside = draws.log_likelihoods(points.z, np.where(is_inside, points.log_a, -np.inf))
+    with np.errstate(invalid="ignore"):
+        shares = np.nan_to_num(np.exp(inside - whole), nan=1.0).mean(axis=0)
+    outside = 1 - shares
+    if outside.max() <= 0.5 and outside.mean() <= MAX_LOST:
+        return
+    coordinates = likelihood.coordinates
+    ends = _as_inputs(coordinates, ranges)
+    asked = np.quantile(_as_inputs(coordinates, specimens), [0.005, 0.995], axis=0)
+    parts = [
+        f"{name} from {low:.4g} to {high:.4g}, where the runs have {least:.4g} to {most:.4g}"
+        for name, low, high, least, most in zip(_columns(likelihood), *asked, *ends, strict=True)
+        if low < least or high > most
+    ]
+    raise DesignError(
+        f"{likelihood.name}: got runs that do not cover the populations of the data: the inputs "
+        f"of {int((outside > 0.5).sum())} of {len(outside)} specimens are outside their ranges, "
+        f"expected none: about {'; '.join(parts) or 'the corners of the ranges'}; "
+        "prb.propose_runs(model) returns a table of runs to add"
+    )
+
+
+def _require_accurate(
+    likelihood: SpecimenLikelihood, problem: EmulationProblem, emulation: Emulation
+) -> None:
+    """Raise if the error of the surface is as large as the scatter, or shifts populations."""
+    share = float((emulation.error / problem.readings.robust_spread()).max())
+    if emulation.bias <= problem.options.bias and share < 1:
+        return
+    raise DesignError(
+        f"{likelihood.name}: got a surface through {len(emulation.z)} runs with a cross-validated "
+        f"error of {share / 2:.2g} standard deviations of the readings, which would shift a mean "
+        f"or standard deviation of an input by {emulation.bias:.2g} posterior standard deviations, "
+        f"expected at most {problem.options.bias}; prb.propose_runs(model) returns a table of runs "
+        "to add near the specimens"
+    )
+
+
+def _columns(likelihood: SpecimenLikelihood) -> list[str]:
+    """Return the name of each aleatory number, as in the table."""
+    m = likelihood.measurements[0]
+    names: list[str] = []
+    table: Runs = m.responses.function
+    for a in range(len(m.inputs.aleatory)):
+        r = table.surrogate.domain.inputs[m.responses.inputs.arguments.index(a)]
+        names += [r.name] if not r.event else [f"{r.name}[{i}]" for i in range(r.size)]
+    return names
+
+
+def _as_inputs(coordinates: Coordinates, z: Floats) -> Floats:
+    """Return the inputs of coordinates in columns, (k, d)."""
+    parts: Sequence[Floats] = coordinates.inputs(z)
+    return np.concatenate([x.reshape(len(z), -1) for x in parts], axis=1)
