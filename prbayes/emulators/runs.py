@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
@@ -66,8 +66,12 @@ class Runs:
     array([1.64,  nan])
     """
 
+    # What to do where the response is NaN.
+    remedy = "add the runs that prb.propose_runs(model) returns"
+
     def __init__(self, inputs: Any, responses: Any) -> None:
-        self.surrogate = Surrogate.from_runs(inputs, responses)
+        # Without the warning of points outside the ranges: a large share of them is refused.
+        self.surrogate = replace(Surrogate.from_runs(inputs, responses), _warned=[True])
 
     @classmethod
     def read_csv(
@@ -161,6 +165,20 @@ class Runs:
             return list(named.names)
         m = self.responses.size // len(self)
         return ["response"] if m == 1 else [f"response[{i}]" for i in range(m)]
+
+    def error_beside(self, observed: Floats) -> float:
+        """Return the largest root mean square error of an output beside data (N,) or (N, m).
+
+        In standard deviations of the data, at the runs within their range or half of it away.
+        """
+        data = np.where(np.isfinite(observed), observed, np.nan).reshape(len(observed), -1)
+        low, high, sd = np.nanmin(data, axis=0), np.nanmax(data, axis=0), np.nanstd(data, axis=0)
+        values, margin = self.responses.reshape(len(self), -1), (high - low) / 2
+        is_near = ((values >= low - margin) & (values <= high + margin)).all(axis=1)
+        rows = is_near if is_near.sum() >= 8 else np.isfinite(values).all(axis=1)
+        residuals = self.error.residuals.reshape(values.shape)[rows]
+        rms = np.sqrt((residuals**2).mean(axis=0))
+        return float((rms / np.where(sd > 0, sd, np.inf)).max())
 
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Outputs | None) -> None:
         """Raise if inputs of these sizes, or the observed outputs, are not those of the table."""

@@ -637,9 +637,7 @@ def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
         )
 
 
-def _refuse_unfit(
-    name: str, responses: Floats, needed: int, *, has_coarse: bool = False
-) -> None:
+def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool = False) -> None:
     """Raise if too few runs have a response, or several outputs would follow a coarse one."""
     n_usable = _usable(responses).sum()
     if n_usable < needed:

@@ -69,9 +69,7 @@ def propose_runs(
         *((m.responses, m.observed) for m in measurements_of(model).values()),
         *((s.responses, s.target.observed) for s in simulators(model).values()),
     ]
-    tables = list(
-        dict.fromkeys(r.function for r, _ in used if isinstance(r.function, Runs))
-    )
+    tables = list(dict.fromkeys(r.function for r, _ in used if isinstance(r.function, Runs)))
     if runs is None:
         if len(tables) != 1:
             raise ValueError(
@@ -101,7 +99,12 @@ def propose_runs(
 
 
 def _near_data(
-    model: pm.Model, responses: Responses, runs: Runs, observed: Floats, seed: int, of_each: int = 16
+    model: pm.Model,
+    responses: Responses,
+    runs: Runs,
+    observed: Floats,
+    seed: int,
+    of_each: int = 16,
 ) -> Floats:
     """Return inputs, (k, d), of specimens of the prior with responses near each measured one."""
     inputs, name = responses.inputs, responses.name

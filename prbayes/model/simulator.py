@@ -409,12 +409,12 @@ def _joint_likelihood(
                 f"{called(m.propagation)} in {m.name}, which has the same specimens, "
                 "expected the same kind in both"
             )
-        if isinstance(m.responses.function, Runs) != likelihood.has_table or (
-            likelihood.has_table and not isinstance(measurement.responses.function, Runs)
-        ):
+        functions = m.responses.function, measurement.responses.function
+        if isinstance(functions[0], Runs) != isinstance(functions[1], Runs):
             raise ValueError(
-                f"{name}: response: got a table of runs beside a function in {m.name}, which has "
-                "the same specimens, expected the same kind in both; make a table of both"
+                f"{name}: response: got a table of runs in one, and a function in the other, of "
+                f"it and {m.name}, which has the same specimens, expected the same kind in both; "
+                "make a table of both"
             )
         if m.gross_errors != measurement.gross_errors:
             raise ValueError(

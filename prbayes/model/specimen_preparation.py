@@ -7,7 +7,7 @@ covered, and the unit of Monte Carlo errors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -29,7 +29,7 @@ from prbayes.model.data_checks import (
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.parameters import Hyperparameters, log_posterior, parent_values
 from prbayes.model.random_variable import log_first_runs
-from prbayes.model.table_likelihood import points_of_tables
+from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre_points import fibre_points
@@ -106,14 +106,18 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     runs = Runs(likelihood)
     try:
         emulation, points, findings = _emulate(runs, populations, likelihood.shared_emulation)
+        problem = _problem(runs)
+        if likelihood.has_table:  # a call of the surface is no run
+            problem = replace(problem, run=OfTables.of(likelihood, lambda table: table))
         refined, share = response_share(
-            _problem(runs),
+            problem,
             emulation,
             populations.prior_specimens,
             lambda share: populations.posterior(points.z, points.log_a, share=share),
         )
-        is_solved = likelihood.has_table or _is_partial(likelihood)
-        if refined is not emulation and not is_solved:
+        if likelihood.has_table:
+            refined = emulation
+        if refined is not emulation and not _is_partial(likelihood):
             # Specimens beside the failing region have points on its right side now.
             refined, points, findings = _emulate(runs, populations, refined)
         return Preparation(refined, points, report(*findings), share)
@@ -202,7 +206,10 @@ def _emulate(
 
 
 def _findings(
-    likelihood: SpecimenLikelihood, emulation: Emulation, points: SpecimenPoints, roots: Roots | None
+    likelihood: SpecimenLikelihood,
+    emulation: Emulation,
+    points: SpecimenPoints,
+    roots: Roots | None,
 ) -> list[Finding]:
     """Return findings of the data, and of the emulator at the roots of the specimens, if any."""
     if roots is None:

@@ -110,9 +110,7 @@ def points_of_tables(
     return emulation, points, roots
 
 
-def _surface(
-    problem: EmulationProblem, likelihood: SpecimenLikelihood
-) -> tuple[Emulation, Floats]:
+def _surface(problem: EmulationProblem, likelihood: SpecimenLikelihood) -> tuple[Emulation, Floats]:
     """Return the surface through the runs, with a wider box of the search, and their ranges."""
     coordinates, bounds = likelihood.coordinates, likelihood.coordinates.bounds
     runs, lows, highs = [], [], []

@@ -19,6 +19,7 @@ from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import Floats, Seed, flag, plain_text, positive_integer, seed_number
 from prbayes.model.description import versions
+from prbayes.emulators.runs import Runs
 from prbayes.model.emulated import (
     EmulatedResponse,
     PopulationSimulator,
@@ -186,12 +187,14 @@ def predict(
         scatter=known_scatter(sources, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
-    simulator = serving(sources, responses) if stored else None
+    # A table costs no run, and is NaN outside its ranges.
+    is_served = stored and not isinstance(response, Runs)
+    simulator = serving(sources, responses) if is_served else None
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, np.random.default_rng(seed))
     if max_lost is None:
         max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
-    missing = _check_responses(label, drawn, max_lost)
+    missing = _check_responses(label, drawn, max_lost, responses.remedy)
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
@@ -355,7 +358,7 @@ def _predicted(
     return replace(results[0], values=values, specimens=specimens)
 
 
-def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
+def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str) -> int:
     """Report a rough emulator; return and report the number of NaN, or raise if it is large."""
     values, error = drawn.values, drawn.error
     is_nan = is_missing(values.reshape(-1, *values.shape[2:]))
@@ -369,7 +372,7 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
         raise DesignError(
             f"{label}: lost mass: got {missing / is_nan.size:.1%} NaN among the predicted "
             f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
-            "the specimens that have a response; repair it, return +inf for specimens that fail, "
+            f"the specimens that have a response; {remedy}, return +inf for specimens that fail, "
             "or pass a larger max_lost"
         )
     if missing:
