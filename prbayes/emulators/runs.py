@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from os import PathLike
 from typing import Any
 
@@ -83,7 +83,7 @@ class Runs:
         delimiter: str = ",",
         decimal: str = ".",
     ) -> Runs:
-        """Read a text file whose first line has the names of the columns.
+        r"""Read a text file whose first line has the names of the columns.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class Runs:
         --------
         >>> import pathlib, tempfile, prbayes as prb
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "runs.csv"
-        >>> _ = path.write_text("load,sag\\n" + "".join(f"{k},{k * k}\\n" for k in range(1, 12)))
+        >>> _ = path.write_text("load,sag\n" + "".join(f"{k},{k * k}\n" for k in range(1, 12)))
         >>> prb.Runs.read_csv(path, ["load"], ["sag"]).ranges
         {'load': (1.0, 11.0)}
         """
@@ -249,46 +249,3 @@ class Runs:
             ends = [f"{finite.min():.6g}", f"{finite.max():.6g}"]
             rows.append([name, *ends, f"{rms:.3g}", f"{relative:.2g} sd"])
         return heading, ["", "lowest", "highest", "left-out error", "relative"], rows
-
-
-@dataclass(frozen=True, eq=False)
-class Continued:
-    """The surface of a table, continued linearly from the nearest point of the ranges."""
-
-    runs: Runs
-
-    def __call__(self, *inputs: ArrayLike) -> Any:
-        """Return the response, (...) or (..., m); NaN beside failed runs."""
-        surrogate, step = self.runs.surrogate, 1e-3
-        domain = surrogate.domain
-        columns, batch = domain.columns(inputs)
-        unit = domain.scaled(columns)
-        inner = np.clip(unit, step, 1 - step)
-        values = surrogate._at(domain.at(inner))
-        rows = np.flatnonzero(domain.outside(columns).any(axis=1))
-        away = unit[rows] - inner[rows]
-        for j, shift in enumerate(step * np.eye(unit.shape[1])):
-            ends = [surrogate._at(domain.at(inner[rows] + s * shift)) for s in (1, -1)]
-            slope = (ends[0] - ends[1]) / (2 * step)
-            values[rows] += slope * away[:, j].reshape(-1, *[1] * (slope.ndim - 1))
-        return labelled(surrogate, values, batch)
-
-
-@dataclass(frozen=True, eq=False)
-class LeftOut:
-    """The cross-validation residual of the nearest run."""
-
-    runs: Runs
-
-    def __call__(self, *inputs: ArrayLike) -> Any:
-        """Return residuals, (...) or (..., m)."""
-        surrogate = self.runs.surrogate
-        columns, batch = surrogate.domain.columns(inputs)
-        residuals = surrogate._surface.nearby(surrogate.error.residuals, columns)[:, 0]
-        return labelled(surrogate, residuals, batch)
-
-
-def labelled(surrogate: Surrogate, values: Floats, batch: tuple[int, ...]) -> Any:
-    """Return values of rows in the shape of a batch, with the labels of the outputs."""
-    values = values.reshape((*batch, *surrogate.responses.shape[1:]))
-    return values if surrogate._named is None else surrogate._named.by_key(values)

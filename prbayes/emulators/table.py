@@ -13,9 +13,6 @@ from prbayes._validate import Floats, file_path, plain_text, real_array
 from prbayes.emulators.ranges import Range, Ranges
 from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
-# Most runs of a table: the time of a surface grows with their cube.
-_MOST = 4000
-
 
 def read_table(
     caller: str, inputs: Any, responses: Any
@@ -48,7 +45,9 @@ def read_table(
                 "input that varies between them; leave the column out"
             )
         ranges.append(Range(name, low, high))
-    outputs = _columns(f"{caller}: responses", in_order_of(responses, inputs, caller))
+    if not isinstance(inputs, Mapping) and not isinstance(responses, Mapping):
+        responses = in_order_of(responses, inputs, caller)
+    outputs = _columns(f"{caller}: responses", responses)
     parts, labels = [], []
     for name, column in outputs:
         _refuse_length(f"{caller}: responses{name and f': {name}'}", column, n)
@@ -162,9 +161,9 @@ def _refuse_runs(caller: str, points: Floats, values: Floats) -> None:
             f"{caller}: got {usable} runs with a response for {d} input(s), expected at least "
             f"{least}; add runs, or leave inputs out that do not matter"
         )
-    if n > _MOST:
+    if n > 4000:  # the time of a surface grows with their cube
         raise ValueError(
-            f"{caller}: got {n} runs, expected at most {_MOST}; pass a sample of the rows"
+            f"{caller}: got {n} runs, expected at most 4000; pass a sample of the rows"
         )
     if np.isneginf(values).any():
         raise ValueError(

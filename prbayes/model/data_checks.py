@@ -89,6 +89,7 @@ def check_failing_region(
     responses: Floats,
     max_lost: float,
     apart: float = 6.0,
+    remedy: str = "repair the response",
 ) -> None:
     """Report observed values in gaps of the finite responses beside failing runs.
 
@@ -134,10 +135,8 @@ def check_failing_region(
         "population cannot be estimated there"
     )
     if count > max_lost * len(columns):
-        raise DesignError(f"{text}; repair the response, or pass a larger max_lost")
-    report(
-        Finding("failing-data", f"{text}; repair the response.", "expensive.md#when-a-run-fails")
-    )
+        raise DesignError(f"{text}; {remedy}, or pass a larger max_lost")
+    report(Finding("failing-data", f"{text}; {remedy}.", "expensive.md#when-a-run-fails"))
 
 
 def warn_duplicates(name: str, observed: Floats) -> None:

@@ -66,8 +66,8 @@ class EmulatedResponse:
     def __call__(self, inputs: Sequence[Floats]) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
 
-        Beyond the runs' range an input has the response at the end of the range, or NaN. Where the nearest
-        run has no finite response, the response is that of the run.
+        Beyond the runs' range an input has the response at the end of the range, or NaN. Where
+        the nearest run has no finite response, the response is that of the run.
         """
         z = self.coordinates.of(inputs, 1)
         inside = np.clip(z, self.z.min(axis=0), self.z.max(axis=0))

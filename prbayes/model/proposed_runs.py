@@ -8,8 +8,9 @@ import numpy as np
 import pymc as pm
 
 from prbayes._validate import Floats, Seed, positive_integer, seed_number
+from prbayes.emulators.continued import Continued
 from prbayes.emulators.ranges import predictive_inputs
-from prbayes.emulators.runs import Continued, Runs
+from prbayes.emulators.runs import Runs
 from prbayes.model.random_variable import simulators
 from prbayes.model.specimen_likelihood import measurements_of
 from prbayes.numerics.points import farthest_rows
@@ -20,8 +21,8 @@ from prbayes.response.response import Responses
 
 def propose_runs(
     model: pm.Model | None = None,
-    n: int | None = None,
     *,
+    n: int | None = None,
     runs: Runs | None = None,
     random_seed: Seed = 0,
 ) -> Any:
@@ -82,13 +83,11 @@ def propose_runs(
     domain = runs.surrogate.domain
     n = max(4 * domain.dimensions, -(-len(runs) // 4)) if n is None else n
     positive_integer(n, "propose_runs: n")
-    pool = np.concatenate(
-        [_near_data(model, r, runs, data, seed) for r, data in used if r.function is runs]
-    )
+    pools = [_near_data(model, r, runs, data, seed) for r, data in used if r.function is runs]
+    pool = np.unique(np.concatenate(pools), axis=0)
     is_outside = domain.outside(pool).any(axis=1)
     if is_outside.mean() > 0.01:
         pool = pool[is_outside]
-    pool = np.unique(pool, axis=0)
     scaled, at_runs = domain.scaled(pool), domain.scaled(runs.points)
     unit = np.where(scaled.std(axis=0) > 0, scaled.std(axis=0), 1.0)
     squares = np.min([(((scaled - x) / unit) ** 2).sum(axis=1) for x in at_runs], axis=0)
@@ -124,4 +123,7 @@ def _near_data(
         squares = np.nansum(((values - reading) / unit) ** 2, axis=1)
         squares[np.isnan(values).any(axis=1)] = np.inf
         rows.append(np.argpartition(squares, of_each)[:of_each])
-    return np.asarray(columns[np.unique(rows)])
+    near = columns[np.unique(rows)]
+    # A quarter farther beyond the ranges, so that specimens at the end are inside them.
+    inside = np.clip(near, runs.surrogate.domain.low, runs.surrogate.domain.high)
+    return np.clip(near + 0.25 * (near - inside), columns.min(axis=0), columns.max(axis=0))

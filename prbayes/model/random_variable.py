@@ -222,6 +222,7 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.first_points,
                 bound.first_responses,
                 bound.max_lost,
+                remedy=simulator.responses.remedy,
             )
             node = Node(
                 simulator.name,

@@ -88,12 +88,13 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     ----------
     name : str
         Name of the node.
-    response : callable
-        ``response(*inputs)``, a NumPy-style function. Each input is an array of any leading batch
-        shape; a multivariate input has its event axis last. The function returns an array of the
-        batch shape, in units of the observed values; for m outputs of a specimen an array with them
-        in a last axis, or a mapping of arrays with the keys of ``observed``. Labels of a DataArray
-        or DataFrame are matched to those of ``observed``. NaN, or a masked number, is a point
+    response : callable or Runs
+        A table of runs, or ``response(*inputs)``, a NumPy-style function. Each input is an array of
+        any leading batch shape; a multivariate input has its event axis last. The function returns
+        an array of the batch shape, in units of the observed values; for m outputs of a specimen an
+        array with them in a last axis, or a mapping of arrays with the keys of ``observed``. Labels
+        of a DataArray or DataFrame are matched to those of ``observed``. NaN, or a masked number,
+        is a point
         without response, +inf a specimen that failed; -inf is refused. The response of a specimen
         depends on the inputs of that specimen alone: three of the first ones are computed again, by
         themselves, and a difference is refused, and so is a function that takes one number of
@@ -187,20 +188,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             f"prb.Simulator: name: got {name!r}, which is in the model already, expected a new "
             "name; to run this again, run `with pm.Model():` and all below it again"
         )
-    refuse_uncallable(name, response)
-    arguments = read_inputs(name, inputs, model)
-    if isinstance(response, Runs):
-        refuse_misfit(name, response, arguments.sizes)
-        response.refuse_inputs(name, arguments)
-    for rv in simulators(model):
-        if rv in arguments.parents:
-            raise TypeError(
-                f"{name}: got inputs that depend on the simulator {rv.name}, expected "
-                "hyperparameters; let one response call the other, or return the outputs of both "
-                "from one response, with prb.Joint(metric)"
-            )
-    for parent in arguments.parents:
-        refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
+    arguments = _read_arguments(name, response, inputs, model)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
     weights = weights if rows is None else None
@@ -256,6 +244,27 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         variables.append(_add_simulator(model, specification, place, data, dims))
     share_bandwidths(model)
     return tuple(variables) if arguments.groups is not None else variables[0]
+
+
+def _read_arguments(
+    name: str, response: Callable[..., Any], inputs: Sequence[Any], model: pm.Model
+) -> Inputs:
+    """Return the inputs of a response; raise if they are not as described."""
+    refuse_uncallable(name, response)
+    arguments = read_inputs(name, inputs, model)
+    if isinstance(response, Runs):
+        refuse_misfit(name, response, arguments.sizes)
+        response.refuse_inputs(name, arguments)
+    for rv in simulators(model):
+        if rv in arguments.parents:
+            raise TypeError(
+                f"{name}: got inputs that depend on the simulator {rv.name}, expected "
+                "hyperparameters; let one response call the other, or return the outputs of both "
+                "from one response, with prb.Joint(metric)"
+            )
+    for parent in arguments.parents:
+        refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
+    return arguments
 
 
 # The log-likelihood by specimen.

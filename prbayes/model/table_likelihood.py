@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
 from prbayes._validate import Floats
-from prbayes.emulators.runs import Continued, LeftOut, Runs
-from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.emulators.continued import Continued, LeftOut
+from prbayes.emulators.runs import Runs
+from prbayes.model.measurement import Measurement, SpecimenLikelihood
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.roots import Roots
@@ -26,8 +27,8 @@ from prbayes.propagation.specimen_emulation import (
     Emulation,
     EmulationProblem,
     all_roots,
-    near_readings,
     narrowing,
+    near_readings,
     shift_by_misfit,
     specimen_roots,
 )
@@ -58,7 +59,7 @@ class OfTables:
         """Return a function of the table of each simulator."""
         responses = []
         for m in likelihood.measurements:
-            function, outputs = kind(m.responses.function), m.responses.outputs
+            function, outputs = kind(_table(m)), m.responses.outputs
             responses.append(Responses(m.name, function, m.responses.inputs, outputs=outputs))
         return cls(likelihood.coordinates, tuple(responses))
 
@@ -92,22 +93,42 @@ def points_of_tables(
     else:
         roots = specimen_roots(emulation, readings, options)
         roots = all_roots(emulation, readings, options, roots, problem.seed)
+        emulation = _with_bias(problem, likelihood, emulation, roots.z, ranges)
+        if len(roots.z):
+            bias = max(emulation.bias, narrowing(emulation, readings, roots))
+            emulation = replace(emulation, bias=bias)
+        _require_accurate(likelihood, problem, emulation)
         points = draw_points(
             emulation, readings, roots, options, error_is_known=likelihood.error_is_known
         )
     draws: Draws = posterior(points.z, points.log_a)
     specimens = draws.specimens()
     _require_cover(likelihood, points, draws, specimens, ranges)
-    inside = specimens[((specimens >= ranges[0]) & (specimens <= ranges[1])).all(axis=1)][:1024]
+    if roots is None:
+        emulation = _with_bias(problem, likelihood, emulation, specimens[:1024], ranges)
+        _require_accurate(likelihood, problem, emulation)
+    return replace(emulation, box=ranges), points, roots
+
+
+def _with_bias(
+    problem: EmulationProblem,
+    likelihood: SpecimenLikelihood,
+    emulation: Emulation,
+    z: Floats,
+    ranges: Floats,
+) -> Emulation:
+    """Return the emulation with the bias of left-out errors at coordinates within the ranges.
+
+    Zero without any: the table is refused then, as it does not cover the specimens.
+    """
+    inside = z[((z >= ranges[0]) & (z <= ranges[1])).all(axis=1)]
     jacobian = emulation.surface(inside)[1]
     rows = np.isfinite(jacobian).all(axis=(1, 2))  # not beside failed runs
+    if rows.sum() < 2:
+        return replace(emulation, bias=0.0)
     misfit = OfTables.of(likelihood, LeftOut)(inside[rows])
     bias = shift_by_misfit(problem, emulation.error, misfit, jacobian[rows], inside[rows])
-    if roots is not None:
-        bias = max(bias, narrowing(emulation, readings, roots))
-    emulation = replace(emulation, bias=bias, box=ranges)
-    _require_accurate(likelihood, problem, emulation)
-    return emulation, points, roots
+    return replace(emulation, bias=bias)
 
 
 def _surface(problem: EmulationProblem, likelihood: SpecimenLikelihood) -> tuple[Emulation, Floats]:
@@ -115,7 +136,7 @@ def _surface(problem: EmulationProblem, likelihood: SpecimenLikelihood) -> tuple
     coordinates, bounds = likelihood.coordinates, likelihood.coordinates.bounds
     runs, lows, highs = [], [], []
     for m in likelihood.measurements:
-        table: Runs = m.responses.function
+        table = _table(m)
         domain = table.surrogate.domain
         places = [m.responses.inputs.arguments.index(a) for a in range(len(m.inputs.aleatory))]
         values = domain.arguments(table.points)
@@ -191,20 +212,25 @@ def _require_accurate(
     share = float((emulation.error / problem.readings.robust_spread()).max())
     if emulation.bias <= problem.options.bias and share < 1:
         return
+    shift = f"{emulation.bias:.2g}" if emulation.bias < 100 else "100 and more"
     raise DesignError(
         f"{likelihood.name}: got a surface through {len(emulation.z)} runs with a cross-validated "
         f"error of {share / 2:.2g} standard deviations of the readings, which would shift a mean "
-        f"or standard deviation of an input by {emulation.bias:.2g} posterior standard deviations, "
+        f"or standard deviation of an input by {shift} posterior standard deviations, "
         f"expected at most {problem.options.bias}; prb.propose_runs(model) returns a table of runs "
         "to add near the specimens"
     )
+
+
+def _table(measurement: Measurement) -> Runs:
+    return cast(Runs, measurement.responses.function)
 
 
 def _columns(likelihood: SpecimenLikelihood) -> list[str]:
     """Return the name of each aleatory number, as in the table."""
     m = likelihood.measurements[0]
     names: list[str] = []
-    table: Runs = m.responses.function
+    table = _table(m)
     for a in range(len(m.inputs.aleatory)):
         r = table.surrogate.domain.inputs[m.responses.inputs.arguments.index(a)]
         names += [r.name] if not r.event else [f"{r.name}[{i}]" for i in range(r.size)]

@@ -101,8 +101,8 @@ def fibre_points(
 
     The middle 99 % of the prior predictive population lies within [-1, 1] in each coordinate.
     ``posterior`` maps points (N, K, d), their numbers (N, K), and None or a covariance by which
-    populations are smoothed, to draws. A ``surface`` gets no runs. Raise DesignError if the emulator is too inaccurate, or
-    `most_points` are not enough.
+    populations are smoothed, to draws. A ``surface`` gets no runs. Raise DesignError if the
+    emulator is too inaccurate, or `most_points` are not enough.
     """
     readings, options, seed = problem.readings, problem.options, problem.seed
     d = bounds.shape[1]

@@ -18,8 +18,8 @@ from prbayes._finding import Finding, as_json, report
 from prbayes._progress import shown
 from prbayes._stats import reached
 from prbayes._validate import Floats, Seed, flag, plain_text, positive_integer, seed_number
-from prbayes.model.description import versions
 from prbayes.emulators.runs import Runs
+from prbayes.model.description import versions
 from prbayes.model.emulated import (
     EmulatedResponse,
     PopulationSimulator,
