@@ -14,7 +14,7 @@ from prbayes._display import view
 from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate
-from prbayes.emulators.table import read_csv
+from prbayes.emulators.table import read_csv, read_table
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 
@@ -41,6 +41,7 @@ class Runs:
     ----------
     inputs : tuple of str
         Names of the inputs; x1, x2, ... without names.
+    outputs : tuple of str
     points : ndarray, shape (n, d)
     responses : ndarray, shape (n,) or (n, m)
     surrogate : Surrogate
@@ -71,7 +72,9 @@ class Runs:
 
     def __init__(self, inputs: Any, responses: Any) -> None:
         # Without the warning of points outside the ranges: a large share of them is refused.
-        self.surrogate = replace(Surrogate.from_runs(inputs, responses), _warned=[True])
+        table = read_table("Runs", inputs, responses)
+        self.surrogate = replace(Surrogate.of_table("Runs", table), _warned=[True])
+        self.outputs = table.outputs
 
     @classmethod
     def read_csv(
@@ -147,7 +150,7 @@ class Runs:
         import pandas as pd
 
         values = self.responses.reshape(len(self), -1)
-        columns = [*self.columns, *self._outputs]
+        columns = [*self.columns, *self.outputs]
         return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)
 
     @property
@@ -157,14 +160,6 @@ class Runs:
         for r in self.surrogate.domain.inputs:
             names += [r.name] if not r.event else [f"{r.name}[{i}]" for i in range(r.size)]
         return names
-
-    @property
-    def _outputs(self) -> list[str]:
-        named = self.surrogate._named
-        if named is not None:
-            return list(named.names)
-        m = self.responses.size // len(self)
-        return ["response"] if m == 1 else [f"response[{i}]" for i in range(m)]
 
     def error_beside(self, observed: Floats) -> float:
         """Return the largest root mean square error of an output beside data (N,) or (N, m).
@@ -188,11 +183,11 @@ class Runs:
                 f"{name}: response: got inputs of {list(sizes)} numbers for a table of runs of "
                 f"{', '.join(self.columns)}, expected {expected}, in the order of its columns"
             )
-        m, table = 1 if outputs is None else max(1, len(outputs.labels)), len(self._outputs)
+        m, table = 1 if outputs is None else max(1, len(outputs.labels)), len(self.outputs)
         if outputs is not None and m != table:
             raise ValueError(
                 f"{name}: observed: got {m} output(s) for a table of runs with "
-                f"{', '.join(self._outputs)}, expected {table}; make prb.Runs of those measured"
+                f"{', '.join(self.outputs)}, expected {table}; make prb.Runs of those measured"
             )
 
     def refuse_inputs(self, name: str, inputs: Inputs) -> None:
@@ -241,7 +236,7 @@ class Runs:
             for name, low, high in zip(self.columns, domain.low, domain.high, strict=True)
         ]
         numbers = zip(
-            self._outputs, values.T, np.atleast_1d(error.rms), np.atleast_1d(error.relative),
+            self.outputs, values.T, np.atleast_1d(error.rms), np.atleast_1d(error.relative),
             strict=True,
         )  # fmt: skip
         for name, column, rms, relative in numbers:

@@ -41,7 +41,7 @@ from prbayes.emulators.surfaces import (
     fit_multifidelity,
     fitted,
 )
-from prbayes.emulators.table import read_table
+from prbayes.emulators.table import Table, read_table
 from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
@@ -379,9 +379,22 @@ class Surrogate:
         >>> prb.Surrogate.from_runs({"x": x}, np.sin(x))(1.0).round(3)
         np.float64(0.841)
         """
-        name = "Runs" if model is None else "Surrogate.from_runs"
+        name = "Surrogate.from_runs"
+        table = read_table(name, inputs, responses)
+        return cls.of_table(name, table, model, outside, random_seed)
+
+    @classmethod
+    def of_table(
+        cls,
+        name: str,
+        table: Table,
+        model: Any = None,
+        outside: OnFailure | None = None,
+        random_seed: Seed = 0,
+    ) -> Surrogate:
+        """Fit a surface to the runs of a table; arguments as for `from_runs`."""
         outside = Replace() if outside is None else outside
-        domain, design, values, named = read_table(name, inputs, responses)
+        domain, design, values = table.domain, table.points, table.responses
         seed = seed_number(random_seed, f"{name}: random_seed")
         models = CANDIDATES if model is None else (model,)
         for candidate in models:
@@ -398,7 +411,7 @@ class Surrogate:
         return cls(
             *(domain, design, values, models[best], outside, 0),
             error=CrossValidation(residuals, spread),
-            _named=named,
+            _named=table.labels,
             _surface=FittedSurface.of(models[best], domain, design, values, None, joined=False),
         )
 

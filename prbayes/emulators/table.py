@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
@@ -14,13 +15,24 @@ from prbayes.emulators.ranges import Range, Ranges
 from prbayes.response.outputs import Outputs, in_order_of, is_missing
 
 
-def read_table(
-    caller: str, inputs: Any, responses: Any
-) -> tuple[Ranges, Floats, Floats, Outputs | None]:
-    """Return ranges, points (n, columns), responses (n,) or (n, m), and names of the outputs.
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Runs, and the names of their outputs."""
 
-    Raises TypeError or ValueError at the first cell that is not as expected.
-    """
+    domain: Ranges
+    points: Floats  # (n, columns)
+    responses: Floats  # (n,) or (n, m)
+    outputs: tuple[str, ...]  # "response" of one without a name, "response[0]" of several
+
+    @property
+    def labels(self) -> Outputs | None:
+        """Labels of several outputs that have names."""
+        is_named = self.responses.ndim > 1 and not self.outputs[0].startswith("response[")
+        return Outputs(self.outputs) if is_named else None
+
+
+def read_table(caller: str, inputs: Any, responses: Any) -> Table:
+    """Read runs; raise TypeError or ValueError at the first cell that is not as expected."""
     named = _columns(f"{caller}: inputs", inputs)
     names = [name or f"x{i}" for i, (name, _) in enumerate(named, 1)]
     if len(set(names)) < len(names):
@@ -58,10 +70,10 @@ def read_table(
     points = np.concatenate([column.reshape(n, -1) for _, column in named], axis=1)
     domain = Ranges(tuple(ranges))
     _refuse_runs(caller, points, values)
-    if values.shape[1] == 1:
-        return domain, points, values[:, 0], None
-    has_names = all(labels) and len(set(labels)) == len(labels)
-    return domain, points, values, Outputs(tuple(labels)) if has_names else None
+    m = values.shape[1]
+    if not all(labels) or len(set(labels)) < m:
+        labels = ["response"] if m == 1 else [f"response[{i}]" for i in range(m)]
+    return Table(domain, points, values[:, 0] if m == 1 else values, tuple(labels))
 
 
 def read_csv(
@@ -148,7 +160,9 @@ def _columns(label: str, values: Any) -> list[tuple[str, Floats]]:
 
 def _refuse_length(label: str, column: Floats, n: int) -> None:
     if len(column) != n:
-        raise ValueError(f"{label}: got {len(column)} values, expected {n}, one for each run")
+        raise ValueError(
+            f"{label}: got {len(column)} values, expected {n}, one for each run of the inputs"
+        )
 
 
 def _refuse_runs(caller: str, points: Floats, values: Floats) -> None:
@@ -158,7 +172,7 @@ def _refuse_runs(caller: str, points: Floats, values: Floats) -> None:
     least = max(8, 4 * d)
     if usable < least:
         raise ValueError(
-            f"{caller}: got {usable} runs with a response for {d} input(s), expected at least "
+            f"{caller}: got {usable} runs with responses for {d} input(s), expected at least "
             f"{least}; add runs, or leave inputs out that do not matter"
         )
     if n > 4000:  # the time of a surface grows with their cube

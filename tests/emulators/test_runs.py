@@ -33,7 +33,7 @@ def test_the_surface_has_its_cross_validated_error_and_is_nan_outside(runs: prb.
     assert np.isnan(runs([-0.1, np.nan, 0.5], [1.5, 1.5, 2.1])).all()
     assert "48 runs, 0 of them without response" in repr(runs)
     assert runs.inputs == ("x", "y")
-    assert list(runs.to_dataframe()) == ["x", "y", "response"]
+    assert list(runs.to_dataframe()) == ["x", "y", "sag"]
 
 
 def test_all_kinds_of_tables_are_read_alike(tmp_path: Path, runs: prb.Runs) -> None:
@@ -79,8 +79,8 @@ def test_the_first_bad_cell_is_named(tmp_path: Path) -> None:
     bad: list[tuple[Any, Any, str]] = [
         ({"x": X[:, 0], "y": np.ones(48)}, X[:, 1], "y: got 1 in all 48 runs"),
         (X[[0, 1, 2, 0, *range(4, 48)]], X[:, 1], "rows 0 and 3 .* with equal inputs"),
-        (X[:7], X[:7, 1], "got 7 runs with a response for 2 .*at least 8"),
-        (X, np.where(X[:, 0] < 0.9, np.nan, 1.0), "got 4 runs with a response"),
+        (X[:7], X[:7, 1], "got 7 runs with responses for 2 .*at least 8"),
+        (X, np.where(X[:, 0] < 0.9, np.nan, 1.0), "got 4 runs with responses"),
         (X, X[:9, 0], "got 9 values, expected 48"),
         (X, np.full(48, -np.inf), "got -inf|got 0 runs"),
         (np.tile(X, (100, 1)) + np.arange(100).repeat(48)[:, None], np.ones(4800), "at most 4000"),
