@@ -125,8 +125,8 @@ def summary(rows: list[Any]) -> dict[str, Any]:
         widths = [np.abs(np.divide(r[n][1], r["function"][1]) - 1).max() for r in used]
         figures[n] = {
             "refused": len(rows) - len(used),
-            "mean": round(float(max(shifts, default=np.nan)), 3),
-            "sd": round(float(max(widths, default=np.nan)), 3),
+            "mean": round(float(max(shifts)), 3) if shifts else None,
+            "sd": round(float(max(widths)), 3) if widths else None,
         }
     return figures
 

@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from prbayes.results.compare import compare as compare
     from prbayes.results.diagnose import Diagnosis as Diagnosis
     from prbayes.results.diagnose import diagnose as diagnose
+    from prbayes.results.individuals import individuals as individuals
     from prbayes.results.predict import predict as predict
     from prbayes.validation.area_test import area_test as area_test
     from prbayes.validation.cross_validation import cross_validate as cross_validate
@@ -113,6 +114,7 @@ _NAMES = {
     "response.umbridge": ("umbridge",),
     "results.compare": ("compare",),
     "results.diagnose": ("Diagnosis", "diagnose"),
+    "results.individuals": ("individuals",),
     "results.predict": ("predict",),
     "validation.area_test": ("area_test",),
     "validation.cross_validation": ("cross_validate", "rank"),

@@ -106,6 +106,9 @@ predicted = Later(
 results = Later(lambda: {"optimum": optimum(), "posterior": posterior()})
 comparison = Later(lambda: prb.compare(results(), model=model()))
 validity = Later(validity_test)
+by_specimen = Later(lambda: simulated(metric=prb.LogLikelihood(), propagation=prb.Reweighted(64)))
+at_optimum = Later(lambda: prb.minimize(by_specimen(), starts=0, **QUIET))
+specimens = Later(lambda: prb.individuals(at_optimum(), n_draws=20))
 surrogate = Later(lambda: prb.Surrogate.fit(np.square, {"x": (0, 1)}, 20, **QUIET))
 
 
@@ -319,6 +322,11 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "Reweighted": Row(max_points=(3,), emulator=(3, "a"), timeout=WITHOUT_PROCESSES),
     "Resimulated": Row(n=(1,), points=("halton",), timeout=WITHOUT_PROCESSES),
     "Fresh": Row(timeout=WITHOUT_PROCESSES),
+    "response.condition": Row(
+        {"name": "load", "values": [1.0, 2.0]},
+        name=("",),
+        values=(1.0, [1.0], [1.0, np.nan], [1.0, 1.0], ["a", "b"], None),
+    ),
     "response.group": Row(
         call=group,
         dim=("", "batch", ["supplier"]),
@@ -563,6 +571,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         alt=("",),
         level=(1, 9, 2.5),
     ),
+    "plots.plot_individuals": Row({"individuals": specimens}, individuals=(posterior, comparison)),
     "plots.plot_prediction": Row(
         observed=("a", None, [], np.ones((3, 2)), {"a": [1.0]}),
         predicted=(3, None, np.ones((2, 3)), {"a": 3}),
@@ -570,6 +579,11 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "plots.plot_sensitivity": Row(
         table=(*(xr.Dataset(), xr.Dataset({"first": 1.0, "total": 1.0}), comparison, posterior),),
+    ),
+    "individuals": Row(
+        {"result": at_optimum, "model": by_specimen},
+        result=(None, 3, "result", xr.DataTree(), []),
+        own="result",
     ),
     "plot_landscape": Row(
         pair=(("mu", "zz"), ("mu", "mu"), (), {3}),

@@ -593,6 +593,11 @@ INNER = {
         "pytensor.tensor.subtensor.Subtensor",
         "pytensor.tensor.variable.TensorVariable",
     },
+    "response.condition": {
+        "pytensor.graph.basic.Variable",
+        "pytensor.tensor.random.basic.UniformRV",
+        "pytensor.tensor.variable.TensorVariable",
+    },
     "response.distributions": {
         "pymc.distributions.multivariate.MvNormal",
         "pymc.distributions.multivariate.MvStudentT",

@@ -30,7 +30,7 @@ from prbayes.propagation.importance import new_specimens, through_inverses
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import compiled_log_density
-from prbayes.response.inputs import Inputs, read_inputs, refuse_groups
+from prbayes.response.inputs import Inputs, read_inputs, refuse_several_populations
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses
 from prbayes.results.predict import (
@@ -88,7 +88,7 @@ class Populations:
         """Return a response with its inputs."""
         name = str(getattr(response, "__name__", type(response).__name__))
         sorted_inputs = read_inputs(name, inputs, self.evaluator.model)
-        refuse_groups(f"{self.caller}: {name}", sorted_inputs.parents)
+        refuse_several_populations(f"{self.caller}: {name}", sorted_inputs.parents)
         simulators = self.evaluator.simulators
         outputs = known_outputs(simulators, response)
         scatter = known_scatter(simulators, response)

@@ -46,7 +46,12 @@ from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, is_missing
-from prbayes.response.response import check_call_settings, refuse_misfit, refuse_uncallable
+from prbayes.response.response import (
+    check_call_settings,
+    refuse_misfit,
+    refuse_other_runs,
+    refuse_uncallable,
+)
 from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
@@ -268,7 +273,8 @@ class Surrogate:
             If an argument is not as described, or n is too small for the surface; before the
             response is computed.
         ResponseError
-            If the response raises, or too few points remain.
+            If the response raises, too few points remain, or three to five runs that are computed
+            again differ from the first ones.
 
         Examples
         --------
@@ -315,6 +321,8 @@ class Surrogate:
         with shown(progressbar):
             _learn_names(settings, runs, tally)
             responses = respond(settings, runs, tally)
+            if tally.computed >= n:  # stored runs are checked as they are read
+                refuse_other_runs(settings, runs, responses, tally)
         usable = _usable(responses)
         _refuse_unfit(name, responses, n_needed, has_coarse=coarse is not None)
 
@@ -362,7 +370,8 @@ class Surrogate:
         inputs, responses
             As for `Runs`.
         model : object, optional
-            As for `fit`; by default the better one of two kinds of `GaussianProcess`.
+            As for `fit`; by default the best one of two kinds of `GaussianProcess` and
+            quintic splines.
         outside : OnFailure, optional
         random_seed : int, sequence of int, numpy.random.Generator or None
             Of the parts that cross-validation leaves out.
@@ -396,7 +405,8 @@ class Surrogate:
         outside = Replace() if outside is None else outside
         domain, design, values = table.domain, table.points, table.responses
         seed = seed_number(random_seed, f"{name}: random_seed")
-        models = CANDIDATES if model is None else (model,)
+        # Splines are better where responses of scattered runs differ by powers of ten.
+        models = (*CANDIDATES, RadialBasis("quintic")) if model is None else (model,)
         for candidate in models:
             refuse_wrong_surface(name, candidate, outside)
         usable = _usable(values)
@@ -405,7 +415,9 @@ class Surrogate:
         spread = _spread(y)
         unit = np.where(np.asarray(spread) > 0, spread, 1.0)
         left_out = [cross_validated(candidate, x, y, seed) for candidate in models]
-        best = int(np.argmin([((residuals / unit) ** 2).sum() for residuals in left_out]))
+        # The largest residuals are those of the most extreme runs.
+        errors = [np.quantile(np.abs(r / unit), 0.9, axis=0).sum() for r in left_out]
+        best = int(np.argmin(errors))
         residuals = np.full(values.shape, np.nan)
         residuals[usable] = left_out[best]
         return cls(

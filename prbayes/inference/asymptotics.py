@@ -9,7 +9,7 @@ Directions that the data do not identify are left out, and have names.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,7 @@ from prbayes.inference.resampling import (
     simulated_sets,
     thinned,
 )
+from prbayes.metrics.area import bias_and_density
 from prbayes.metrics.base import Discrepancy, Minimum, Part, is_additive
 from prbayes.metrics.density import DensityDiscrepancy, is_differentiable
 from prbayes.model.evaluator import Evaluator
@@ -48,13 +49,16 @@ def single_output_parts(target: Discrepancy) -> list[Part]:
 class LinearArea:
     """The area metric of data sets, with distribution functions that are linear in theta.
 
-    At theta + delta it is the sum over intervals of |gaps + delta @ slopes| lengths.
+    At theta + delta it is the sum over intervals of |gaps + delta @ slopes| lengths, less that of
+    the correction at simulated + delta @ slopes.
     """
 
     # (n_sets, m): simulated less observed distribution function on each interval between knots.
     gaps: Floats
     slopes: Floats  # (d, m): derivatives of the simulated one
     lengths: Floats  # (m,): of the intervals
+    simulated: Floats  # (m,): the simulated one
+    specimens: int  # of the correction for few specimens, or zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +151,9 @@ class Information:
             narrow = _stencil_around(self.evaluator, self.k, self.theta, 1e-3, is_wide=False)
             # Of several outputs a failed one is at the end of its scale, and does not jump.
             is_known = ~np.isnan(narrow.values) if target.event else np.isfinite(narrow.values)
-            # Unless a point gains or loses its response within the step.
-            if bound.stored or (is_known == is_known[0]).all():
+            # Unless points fail: the edge of their region passes none within a narrow step, and
+            # the population without them would not change its share of failures.
+            if bound.stored or is_known.all():
                 return narrow
         # For step functions: distribution functions, jumps, moving supports.
         share = 0.05 * self.widened
@@ -282,7 +287,9 @@ class Information:
             derivatives = slopes(simulated[: 1 + 2 * around.step.size], around.step).T
             # An interval between knots has the values at its left end.
             lengths = part.share * np.diff(knots)
-            areas.append(LinearArea(gaps[:, :-1], derivatives[:, :-1], lengths))
+            n = getattr(part.target, "specimens", 0)  # a metric of the user has no correction
+            levels = simulated[0, :-1]
+            areas.append(LinearArea(gaps[:, :-1], derivatives[:, :-1], lengths, levels, n))
         return areas
 
 
@@ -362,9 +369,14 @@ def first_order_shifts(
             curvature += directions.T @ item.hessian @ directions / scale
         else:
             for area in item.areas(sets):
-                areas.append(
-                    LinearArea(area.gaps, directions.T @ area.slopes, area.lengths / scale)
-                )
+                along, lengths = directions.T @ area.slopes, area.lengths / scale
+                if not area.specimens:
+                    areas.append(replace(area, slopes=along, lengths=lengths))
+                    continue
+                # Its mean over data sets is smooth.
+                expected, density = bias_and_density(area.specimens, area.simulated)
+                force -= (lengths * (np.sign(area.gaps) - expected)) @ along.T
+                curvature += (lengths * density * along) @ along.T
     shifts = np.zeros_like(force)
     # Without an area one solution is exact.
     for _ in range(30 if areas else 1):

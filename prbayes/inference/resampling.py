@@ -48,14 +48,19 @@ def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[NDArray[np.int
     An observation without a label is a specimen of its own.
     """
     numbers: dict[object, int] = {}
+    total = 0
     by_simulator = []
-    for k, node in enumerate(nodes):
-        labels: list[object] = [(k, i) for i in range(len(node.observed))]
-        if node.specimens is not None:
-            labels = list(node.specimens.tolist())
-        rows = [numbers.setdefault(label, len(numbers)) for label in labels]
-        by_simulator.append(np.array(rows, dtype=np.intp))
-    return by_simulator, len(numbers)
+    for node in nodes:
+        if node.specimens is None:
+            rows = np.arange(total, total + len(node.observed))
+            total += rows.size
+        else:
+            labels = node.specimens.tolist()
+            for label in labels:
+                total += numbers.setdefault(label, total) == total
+            rows = np.array([numbers[label] for label in labels], dtype=np.intp)
+        by_simulator.append(rows)
+    return by_simulator, total
 
 
 def dependent(nodes: Sequence[Node]) -> bool:
@@ -68,8 +73,8 @@ def groups(nodes: Sequence[Node]) -> list[list[int]]:
     """Return indices of simulators, in groups that share specimens, even through a third one."""
     from scipy.sparse.csgraph import connected_components
 
-    if not nodes:
-        return []
+    if all(node.specimens is None for node in nodes):
+        return [[k] for k in range(len(nodes))]
     numbers, total = specimens(nodes)
     measures = np.array([np.isin(np.arange(total), number) for number in numbers])
     _, group = connected_components(measures @ measures.T)
@@ -135,8 +140,38 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
         thinned(*evaluator.populations(theta[None], k), node)
         for k, node in enumerate(evaluator.nodes)
     ]
+    if (counted := _counted_sets(evaluator, populations, n_sets, seed)) is not None:
+        return counted
     points = simulated_points(evaluator, populations, n_sets, seed)
     return sets_at(evaluator, [values[0] for values, _ in populations], points)
+
+
+def _counted_sets(
+    evaluator: Evaluator, populations: list[tuple[Floats, Floats]], n_sets: int, seed: int
+) -> DataSets | None:
+    """Draw how often each point occurs, or return None if that takes longer, or is not enough.
+
+    More specimens than points would be drawn one by one, if all count alike.
+    """
+    nodes = evaluator.nodes
+    n_points = sum(values.shape[1] for values, _ in populations)
+    if specimens(nodes)[1] <= n_points or not all(map(_is_countable, nodes)):
+        return None
+    rng = np.random.default_rng([seed, 3])
+    values, weights = [], []
+    for node, (responses, masses) in zip(nodes, populations, strict=True):
+        is_observable = observable(responses[0], node.target)
+        mass = masses[0][is_observable]
+        counts = rng.multinomial(len(node.observed), mass / mass.sum(), size=n_sets)
+        values.append(responses[0][is_observable])
+        weights.append(counts / len(node.observed))
+    return DataSets(values, weights)
+
+
+def _is_countable(node: Node) -> bool:
+    """Return whether the observations are different specimens, measured alike."""
+    is_alike = np.ptp(node.target.weights) == 0 and not np.isnan(node.observed).any()
+    return node.specimens is None and bool(is_alike)
 
 
 def sets_along(

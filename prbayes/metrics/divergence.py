@@ -24,7 +24,8 @@ class ProbabilityResidual(Metric):
 
     With a `GaussianKDE` the integral form, :math:`S \int (p - q)^2 dz`, one bandwidth for both
     sides; it equals a squared maximum mean discrepancy with a Gaussian kernel of bandwidth
-    :math:`\sqrt 2 h`, so its minimiser is right for every bandwidth. With a `Histogram` the sum
+    :math:`\sqrt 2 h`, so its minimiser is right for every bandwidth. This does not hold for mass
+    beyond the grid, which counts as one tight cluster on either side. With a `Histogram` the sum
     form, :math:`S \sum (p_i - q_i)^2` over densities in bins. The scale factor is :math:`S =
     C^{-\lfloor \log_{10} \max q \rfloor}`.
 

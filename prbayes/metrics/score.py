@@ -78,6 +78,17 @@ class ShiftedResponses:
         """Equal weights of the responses, (M,)."""
         return np.full(len(self.responses), 1 / len(self.responses))
 
+    @property
+    def spread(self) -> Floats:
+        """Root mean squares of the derivatives, in standard deviations of the responses, (d,)."""
+        steps = self.steps.reshape(-1, *[1] * self.responses.ndim)
+        slopes = (self.upper - self.lower) / (2 * steps)
+        finite = np.where(np.isfinite(self.responses), self.responses, np.nan)
+        scale = np.nanstd(finite, axis=0)
+        relative = np.where(np.isfinite(slopes), slopes, 0.0) / np.where(scale > 0, scale, 1.0)
+        squares = np.mean(relative**2, axis=1)
+        return np.asarray(np.sqrt(squares.reshape(len(steps), -1).sum(axis=1)))
+
     def neighbours(
         self, part: Part, options: ScoreOptions
     ) -> tuple[list[Floats], list[Floats], Floats]:

@@ -90,8 +90,8 @@ def check_failing_region(
     max_lost: float,
     apart: float = 6.0,
     remedy: str = "repair the response",
-) -> None:
-    """Report observed values in gaps of the finite responses beside failing runs.
+) -> tuple[Finding, ...]:
+    """Return a finding of observed values in gaps of the finite responses beside failing runs.
 
     A value is in such a gap if it is ``apart`` times the local spacing away from the nearest finite
     response of the output, and 40 % of the 4 d + 4 runs around that run fail. Specimens were
@@ -99,11 +99,11 @@ def check_failing_region(
     specimens is above ``max_lost``. Nothing is checked on fewer than 32 finite runs.
     """
     if not responses.size or not points:  # a user's own propagation may store none
-        return
+        return ()
     values = responses.reshape(len(responses), -1)
     is_finite = np.isfinite(values)
     if is_finite.all():
-        return
+        return ()
     inputs = np.hstack([x.reshape(len(values), -1) for x in points])
     scores = rankdata(inputs, axis=0)
     _, neighbours = cKDTree(scores).query(scores, k=4 * inputs.shape[1] + 5)
@@ -126,7 +126,7 @@ def check_failing_region(
         is_apart[:, j] &= np.isfinite(column)
     count = int(is_apart.any(axis=1).sum())
     if not count:
-        return
+        return ()
     some = np.unique(columns[is_apart])[:3]
     text = (
         f"{name}: got {count} of {len(columns)} observed responses where no run has a finite "
@@ -136,7 +136,8 @@ def check_failing_region(
     )
     if count > max_lost * len(columns):
         raise DesignError(f"{text}; {remedy}, or pass a larger max_lost")
-    report(Finding("failing-data", f"{text}; {remedy}.", "expensive.md#when-a-run-fails"))
+    page = "expensive.md#when-a-run-fails"
+    return (Finding("failing-data", f"{text}; {remedy}.", page),)
 
 
 def warn_duplicates(name: str, observed: Floats) -> None:

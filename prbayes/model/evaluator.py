@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from pytensor.graph.traversal import ancestors
 
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats
+from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import EmulatedSimulator, PopulationSimulator, emulated_simulators
-from prbayes.model.measurement import Measurement, SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, parent_values
+from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_numbers
+from prbayes.model.parameters import Hyperparameters
 from prbayes.model.random_variable import (
     Node,
     ObservedRV,
@@ -40,7 +41,7 @@ from prbayes.propagation.importance import SIZES
 from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.budget import budget
 from prbayes.response.compile import compiled, interpreted, ninf_for_invalid
-from prbayes.response.inputs import is_group
+from prbayes.response.inputs import is_known
 
 # Points of a design from which on samplers start with an eighth of them.
 _LARGE = SIZES.first
@@ -234,6 +235,8 @@ class Evaluator:
 
     def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
         """Return an evaluator of the same model with other prepared metrics, by simulator."""
+        if len(targets) > 1:
+            targets = [with_unbiased_areas(target) for target in targets]
         pairs = zip(self.nodes, targets, strict=True)
         changed = tuple(replace(node, target=target) for node, target in pairs)
         return replace(self, nodes=changed, has_graph=False)
@@ -266,7 +269,8 @@ class Evaluator:
         if k >= len(self.nodes):
             simulator = self.emulated[k - len(self.nodes)]
             values = self.hyperparameters.constrained(thetas)
-            return parent_values(values, simulator.inputs, simulator.place)
+            numbers = specimen_numbers(simulator.likelihood, simulator.measurement)
+            return simulator.likelihood.parents(values, simulator.place, numbers[simulator.rows])
         key = ("parents", *(node.name for node in self.nodes))
         if key not in self.functions:
             params = _simulator_params(self)
@@ -348,7 +352,7 @@ def only_through_prior(evaluator: Evaluator) -> NDArray[np.bool_]:
     free = set(model.free_RVs)
     params = [p for group in _simulator_params(evaluator) for p in group]
     for likelihood in evaluator.likelihoods:
-        params += [model[str(v.name)] for v in likelihood.variables() if not is_group(v)]
+        params += [model[str(v.name)] for v in likelihood.variables() if not is_known(v)]
     direct = {v for v in ancestors(params, blockers=free) if v in free}
     joined = free & set(ancestors(list(direct)))
     # A variable comes after those that it depends on.

@@ -137,7 +137,7 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
 
 def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
     observed, weights, labels = simulator.observed, simulator.weights, simulator.specimens
-    groups = None
+    known: tuple[Any, ...] = ()
     fields: dict[str, Any] = {}
     if isinstance(simulator, Node):
         bound = simulator.bound
@@ -157,10 +157,10 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
             "points": _points(simulator),
         }
     else:
-        groups = simulator.groups
+        known = simulator.groups, *simulator.covariates.values()
     return SimulatorIdentity(
         name=simulator.name,
-        data=_digest(observed, groups),
+        data=_digest(observed, *known),
         weights=_digest(weights),
         specimens=_digest(repr([] if labels is None else labels.tolist())),
         inputs=_inputs(simulator.inputs),

@@ -19,7 +19,7 @@ from prbayes._validate import Floats
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
-from prbayes.model.parameters import Hyperparameters
+from prbayes.model.parameters import Hyperparameters, parent_values
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.specimen_emulation import Coordinates, Emulation, PointOptions
@@ -43,6 +43,8 @@ class Measurement:
     propagation: Propagation
     outputs: Outputs
     groups: NDArray[np.intp] | None = None  # (N,): index of each specimen's group
+    # By name, (N,): conditions on which the population of a specimen depends.
+    covariates: Mapping[str, Floats] = field(default_factory=dict)
     # Model variables of the measurement: ``error`` and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 
@@ -91,11 +93,11 @@ class Measurement:
                 f"{('N', *self.event)}, as when the simulator was made"
             )
         is_plain = self.groups is None and self.weights is None and self.specimens is None
-        if len(values) != len(self.observed) and not is_plain:
+        if len(values) != len(self.observed) and (self.covariates or not is_plain):
             raise ValueError(
                 f"{self.name}: observed: got {len(values)} specimens, expected "
-                f"{len(self.observed)}, as many as there are groups, weights= or specimens=; build "
-                "the model again with those of the new ones"
+                f"{len(self.observed)}, as many as there are groups, conditions, weights= or "
+                "specimens=; build the model again with those of the new ones"
             )
         return replace(self, observed=values)
 
@@ -109,6 +111,7 @@ class StackedReadings:
     repeats: Repeats | None  # None if no output of a specimen was read repeatedly
     numbers: tuple[NDArray[np.intp], ...]  # (N,) by simulator: specimen of each row
     groups: NDArray[np.intp] | None  # (S,)
+    covariates: Floats  # (C, S)
     # (S,): log-density of a gross error, uniform over twice the range of each output.
     log_gross: Floats
 
@@ -118,6 +121,15 @@ class StackedReadings:
         numbers, size = _validated_counts(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
         readings, scales, repeats = zip(*parts, strict=True)
+        first = measurements[0]
+        groups = None
+        if first.groups is not None:
+            of_rows = [np.asarray(m.groups) for m in measurements]
+            groups = _by_specimen("groups", measurements, of_rows, numbers, size).astype(np.intp)
+        covariates = np.empty((len(first.covariates), size))
+        for covariate, name in zip(covariates, first.covariates, strict=True):
+            of_rows = [m.covariates[name] for m in measurements]
+            covariate[:] = _by_specimen(f"values of {name}", measurements, of_rows, numbers, size)
         log_gross = np.zeros(size)
         for measurement, index in zip(measurements, numbers, strict=True):
             width = 2 * np.ptp(measurement.range, axis=0)
@@ -129,7 +141,8 @@ class StackedReadings:
             np.concatenate(scales, axis=1),
             side_by_side(repeats) if any(part.count.any() for part in repeats) else None,
             tuple(numbers),
-            _specimen_groups(measurements, numbers, size),
+            groups,
+            covariates,
             log_gross,
         )
 
@@ -177,23 +190,24 @@ def _averaged(
     return averaged(readings, measurement.scale, numbers, count)
 
 
-def _specimen_groups(
-    measurements: Sequence[Measurement], numbers: Sequence[NDArray[np.intp]], size: int
-) -> NDArray[np.intp] | None:
-    """Return the group of each specimen, None without groups."""
-    result = np.full(size, -1, dtype=np.intp)
-    for measurement, index in zip(measurements, numbers, strict=True):
-        groups = measurement.groups
-        if groups is None:
-            return None
-        conflicts = (result[index] >= 0) & (result[index] != groups)
-        result[index] = groups
-        conflicts |= result[index] != groups
+def _by_specimen(
+    kind: str,
+    measurements: Sequence[Measurement],
+    values: Sequence[NDArray[Any]],
+    numbers: Sequence[NDArray[np.intp]],
+    size: int,
+) -> Floats:
+    """Return a number of each specimen, (S,), from those of the rows of each simulator, (N,)."""
+    result = np.full(size, np.nan)
+    for measurement, of_rows, index in zip(measurements, values, numbers, strict=True):
+        conflicts = ~np.isnan(result[index]) & (result[index] != of_rows)
+        result[index] = of_rows
+        conflicts |= result[index] != of_rows
         if conflicts.any():
             label = np.asarray(measurement.specimens).tolist()[int(np.argmax(conflicts))]
             raise ValueError(
-                f"{measurement.name}: specimens: got the label {label!r} in two groups, expected "
-                "each specimen in one group; write labels that are different"
+                f"{measurement.name}: specimens: got the label {label!r} with two {kind}, expected "
+                "one for each specimen; write labels that are different"
             )
     return result
 
@@ -281,6 +295,27 @@ class SpecimenLikelihood:
         if groups is None:
             return [(None, np.arange(len(self.readings)))]
         return [(group, np.flatnonzero(groups == group)) for group in np.unique(groups).tolist()]
+
+    @property
+    def by_context(self) -> list[tuple[int | None, NDArray[np.intp]]]:
+        """The group, and the specimens, of each combination of group and covariates."""
+        contexts: list[tuple[int | None, NDArray[np.intp]]] = []
+        for group, rows in self.by_group:
+            covariates = self.stacked.covariates[:, rows]
+            _, number = np.unique(covariates, axis=1, return_inverse=True)
+            contexts += [(group, rows[number == k]) for k in range(number.max() + 1)]
+        return contexts
+
+    def parents(
+        self, values: Mapping[str, Floats], group: int | None, specimens: NDArray[np.intp]
+    ) -> list[Floats]:
+        """Return the parents of the inputs of specimens in a group, (P, *shape).
+
+        Values are those of the model's variables by name, (P, *shape). The covariates of specimens,
+        (n,) or (P, n), have shape (P, n).
+        """
+        covariates = list(self.stacked.covariates[:, specimens])
+        return parent_values(values, self.inputs, group, covariates)
 
     @property
     def hyperparameters(self) -> Hyperparameters:

@@ -29,6 +29,7 @@ from prbayes.response.compile import (
     ninf_for_invalid,
     with_leading_axis,
 )
+from prbayes.response.condition import is_condition
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import Inputs, event_shape, is_group
 
@@ -293,16 +294,27 @@ def fixed_points(hyperparameters: Hyperparameters, size: int) -> tuple[Floats, N
     return np.where(np.isfinite(thetas), thetas, hyperparameters.initial), order
 
 
-def parent_values(values: Mapping[str, Floats], inputs: Inputs, group: int | None) -> list[Floats]:
+def parent_values(
+    values: Mapping[str, Floats],
+    inputs: Inputs,
+    group: int | None,
+    covariates: Sequence[Floats] = (),
+) -> list[Floats]:
     """Return the parents of inputs, in the group with this index, shapes (P, *shape).
 
-    Values are those of the model's variables by name, (P, *shape).
+    Values are those of the model's variables by name, (P, *shape). Covariates, each (n,) or (P, n),
+    are those of n specimens; their shape is (P, n).
     """
     size = len(next(iter(values.values())))
-    return [
-        np.full(size, group) if is_group(parent) else values[str(parent.name)]
-        for parent in inputs.parents
-    ]
+    remaining = iter(covariates)
+    result = []
+    for parent in inputs.parents:
+        if is_condition(parent):
+            of_specimens = next(remaining)
+            result.append(np.broadcast_to(of_specimens, (size, of_specimens.shape[-1])))
+        else:
+            result.append(np.full(size, group) if is_group(parent) else values[str(parent.name)])
+    return result
 
 
 # Names.

@@ -39,6 +39,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._validate import Floats, called
+from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.density import with_common_bandwidths
 from prbayes.model.data_checks import check_constant, check_failing_region, warn_out_of_range
@@ -216,7 +217,7 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
             responses.on_start = None
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
-            check_failing_region(
+            findings = check_failing_region(
                 simulator.name,
                 target.observed,
                 bound.first_points,
@@ -224,6 +225,7 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.max_lost,
                 remedy=simulator.responses.remedy,
             )
+            bound.findings = report(*findings)
             node = Node(
                 simulator.name,
                 bound.target,
@@ -463,7 +465,18 @@ def building(terms: str) -> Iterator[None]:
 def _log_density(
     op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
-    """Return the log-density of the observed data: a graph of the parents and of epsilon."""
+    """Return the log-density of the observed data: a graph of the parents and of epsilon.
+
+    Empty for `pymc.compute_log_likelihood`: no part of it belongs to one specimen.
+    """
+    if pm.compute_log_likelihood.__code__ in [frame.f_code for frame, _ in walk_stack(None)]:
+        text = (
+            f"{op.simulator.name}: its log-likelihood is empty, as a metric has one number for all "
+            "specimens and az.loo needs one for each; use "
+            "prb.cross_validate, prb.rank, or a simulator without metric=."
+        )
+        report(Finding("no-log-likelihood", text, "pymc_and_arviz.md#arviz"))
+        return pt.zeros(0)
     (value,) = values
     data = known_value(value)
     node = computed(op.simulator)
@@ -618,7 +631,10 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
 def common_targets(
     simulators: Sequence[AnySimulator], targets: Sequence[Discrepancy]
 ) -> list[Discrepancy]:
-    """Return the prepared metrics of simulators, where those of one response share a bandwidth."""
+    """Return the prepared metrics of simulators, of which several are added.
+
+    Those of one response share a bandwidth, and areas have no bias.
+    """
     responses, conditions = [], []
     for simulator in simulators:
         calls, group = simulator.responses, simulator.group
@@ -626,7 +642,8 @@ def common_targets(
         of_condition = (s.group == group and s.responses.same_as(calls) for s in simulators)
         responses.append(next(k for k, is_same in enumerate(of_response) if is_same))
         conditions.append(next(k for k, is_same in enumerate(of_condition) if is_same))
-    return with_common_bandwidths(targets, responses, conditions)
+    result = with_common_bandwidths(targets, responses, conditions)
+    return [with_unbiased_areas(target) for target in result] if len(result) > 1 else result
 
 
 def share_bandwidths(model: pm.Model) -> None:

@@ -53,6 +53,11 @@ from prbayes.model.specimen_likelihood import (
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compile import PLAIN
+from prbayes.response.condition import (
+    known_covariates,
+    refuse_covariates,
+    refuse_vectors_of_specimens,
+)
 from prbayes.response.distributions import refuse_without_density
 from prbayes.response.inputs import (
     Groups,
@@ -191,6 +196,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     arguments = _read_arguments(name, response, inputs, model)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
+    refuse_vectors_of_specimens(name, arguments.aleatory, arguments.parents, len(values))
+    size = len(values) if rows is None else len(np.asarray(weights))
     weights = weights if rows is None else None
     metric = LogLikelihood() if metric is None else metric
     by_specimen = isinstance(metric, Metric) and metric.by_specimen
@@ -198,6 +205,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         _refuse_by_specimen(name, arguments, epsilon, propagation)
         values = checked_specimens(name, values)
     else:
+        refuse_covariates(name, arguments.covariates)
         target = _prepared_metric(name, metric, values, weights)
     settings = Reweighted() if propagation is None else propagation
     if not isinstance(settings, Propagation):
@@ -215,10 +223,11 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         if weights is not None:
             weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
         responses = Responses(name, response, arguments, **calls | {"scatter": 0.0})
+        covariates = known_covariates(name, arguments.covariates, size, rows)
         extras = _measurement_variables(name, model, metric, partners)
         measurement = Measurement(
             name, cast(LogLikelihood, metric), values, weights, labels, arguments, responses,
-            settings, outputs, groups, extras,
+            settings, outputs, groups, covariates, extras,
         )  # fmt: skip
         return _add_measurement(model, measurement, partners, observed, dims)
     if labels is not None:
@@ -317,7 +326,7 @@ def _add_measurement(
     dims: str | Sequence[str] | None,
 ) -> TensorVariable:
     """Add an observed variable whose log-density is the log-likelihood by specimen."""
-    name = measurement.name
+    name, inputs = measurement.name, measurement.inputs
     likelihood = _joint_likelihood(measurement, partners, model)
     joined = [rv for rv, joint in specimen_likelihoods(model).items() if joint in partners]
     names = tuple(m.name for m in likelihood.measurements)
@@ -329,8 +338,9 @@ def _add_measurement(
         )
     if dims is not None:
         dims = _checked_dims(name, dims, measurement.observed.shape, model)
-    groups = measurement.groups
-    params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables(names)]
+    known = {v: pt.constant(measurement.covariates[str(v.name)]) for v in inputs.covariates}
+    known |= {v: pt.constant(measurement.groups) for v in filter(is_group, inputs.parents)}
+    params = [known.get(v, v) for v in likelihood.variables(names)]
     params += joined
     signature = rv_signature([p.type.ndim for p in params], len(measurement.event))
     operation = SpecimenRV(signature=signature, reference=weakref.ref(likelihood), simulators=names)

@@ -21,7 +21,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.logprob.abstract import ValuedRV, _logprob
 from pytensor.graph.basic import Constant
-from pytensor.graph.replace import graph_replace, vectorize_graph
+from pytensor.graph.replace import graph_replace
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
@@ -33,7 +33,6 @@ from prbayes.model.measurement import (
     output_columns,
     specimen_numbers,
 )
-from prbayes.model.parameters import parent_values
 from prbayes.model.random_variable import (
     TERMS,
     ObservedRV,
@@ -42,11 +41,11 @@ from prbayes.model.random_variable import (
     require_data,
     simulators,
 )
-from prbayes.model.specimen_preparation import prepared
+from prbayes.model.specimen_preparation import log_shares, prepared
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare
 from prbayes.response.distributions import log_density
-from prbayes.response.inputs import is_group
+from prbayes.response.inputs import is_group, is_known
 
 
 def arrays(likelihood: SpecimenLikelihood) -> tuple[list[Any], Any]:
@@ -91,14 +90,13 @@ def log_likelihoods(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]
     result = np.empty((len(errors), len(likelihood.readings)))
     groups = zip(likelihood.by_group, _points_by_group(likelihood), strict=True)
     for (group, rows), points in groups:
-        parents = parent_values(values, likelihood.inputs, group)
+        parents = likelihood.parents(values, group, rows)
         if likelihood.error_is_known:
             result[:, rows] = likelihood.density.log_likelihoods(parents, points)
         else:
             result[:, rows] = _with_unknown_error(likelihood, errors, parents, points, rows)
-        if share is not None:
-            log_share = share.of_populations(likelihood.density, parents, likelihood.coordinates)
-            result[:, rows] -= log_share[:, None]
+    if share is not None:
+        result -= log_shares(likelihood, values, share)
     if repeats is not None:
         result += [repeats.log_density(error, np) for error in errors]
     gross_share = _gross_share(likelihood.measurements[0], values)
@@ -125,7 +123,7 @@ def monte_carlo_error(likelihood: SpecimenLikelihood, values: Mapping[str, Float
     if not likelihood.error_is_known:
         return variance
     for group, rows in likelihood.by_group:
-        parents = parent_values(values, likelihood.inputs, group)
+        parents = likelihood.parents(values, group, rows)
         logs = []
         for part in (slice(half), slice(half, None)):
             of_half = [v[rows, part] for v in x]
@@ -180,11 +178,8 @@ def log_likelihood_graph(
     share = prepared(likelihood).share
     stacked = likelihood.stacked
     n, count = len(likelihood.readings), log_a.shape[1]
-    symbols = likelihood.inputs.placeholders()
-    values = {s: params[r] for s, r in zip(symbols, likelihood.inputs.parents, strict=True)}
-    groups = np.zeros(n, dtype=np.intp) if stacked.groups is None else stacked.groups
     flat = [x.reshape((n * count, *x.shape[2:]), ndim=x.ndim - 1) for x in points]
-    log_p = _log_density(likelihood, values, flat, pt.repeat(pt.as_tensor(groups), count))
+    log_p = _log_density(likelihood, params, flat, pt.repeat(pt.arange(n), count))
     terms = log_p.reshape((n, count)) + log_a
     errors = []  # (M,): the unknown error of each output, one where it is known
     for m in likelihood.measurements:
@@ -195,7 +190,7 @@ def log_likelihood_graph(
         terms = terms + _readings_log_density(likelihood, error, pt)
     result = logsumexp_finite(terms)
     if share is not None:
-        result = result - _log_share(likelihood, values, share)[groups]
+        result = result - _log_share(likelihood, params, share)
     if stacked.repeats is not None:
         result = result + stacked.repeats.log_density(error, pt)
     gross_share = likelihood.measurements[0].gross_errors
@@ -208,40 +203,48 @@ def log_likelihood_graph(
 
 
 def _log_density(
-    likelihood: SpecimenLikelihood, values: dict[Any, Any], points: Sequence[Any], groups: Any
+    likelihood: SpecimenLikelihood, params: Mapping[Any, Any], points: Sequence[Any], specimens: Any
 ) -> Any:
-    """Return the log-density of points, (n, *event) by input, in populations of groups (n,).
+    """Return the log-density of points, (n, *event), in the populations of specimens (n,).
 
-    Values are by the placeholders of the inputs' parents.
+    Values of the inputs' parents are by variable.
     """
-    inputs = likelihood.inputs
-    symbols = list(values)
+    inputs, stacked = likelihood.inputs, likelihood.stacked
+    known = dict(zip(inputs.covariates, stacked.covariates, strict=True))
+    known |= dict.fromkeys(filter(is_group, inputs.parents), stacked.groups)
+    # Vectors of groups and covariates make vectors of the distributions' parameters.
+    vectors = {parent: pt.as_tensor(values)[specimens] for parent, values in known.items()}
+    symbols = [vectors.get(parent, parent).type() for parent in inputs.parents]
     dists, _ = inputs.rebuilt(symbols)
-    if likelihood.stacked.groups is not None:
-        # A vector of groups in place of one makes vectors of the distributions' parameters.
-        (group,) = (s for s, r in zip(symbols, inputs.parents, strict=True) if is_group(r))
-        dists = vectorize_graph(dists, {group: groups})
-        values = {symbol: value for symbol, value in values.items() if symbol is not group}
     log_p = log_density(inputs, dists, points)
     # After the densities are built: PyMC may clone parameters that are random.
+    values = {
+        symbol: vectors.get(parent, params.get(parent))
+        for symbol, parent in zip(symbols, inputs.parents, strict=True)
+    }
     (log_p,) = graph_replace([log_p], values, strict=False)
     return log_p
 
 
-def _log_share(likelihood: SpecimenLikelihood, values: dict[Any, Any], share: ResponseShare) -> Any:
-    """Return the graph of log S, the log share with a response, of the groups, (G,)."""
-    stacked, coordinates = likelihood.stacked, likelihood.coordinates
-    size = 1 if stacked.groups is None else int(stacked.groups.max()) + 1
+def _log_share(
+    likelihood: SpecimenLikelihood, params: Mapping[Any, Any], share: ResponseShare
+) -> Any:
+    """Return the graph of log S, the log share with a response, by specimen, (S,)."""
+    coordinates, contexts = likelihood.coordinates, [rows for _, rows in likelihood.by_context]
+    size = len(contexts)
+    context = np.empty(len(likelihood.readings), dtype=np.intp)
+    for k, rows in enumerate(contexts):
+        context[rows] = k
     points = [pytensor.shared(np.concatenate([x] * size)) for x in coordinates.inputs(share.z)]
-    groups = np.repeat(np.arange(size), len(share.z))
+    specimens = np.repeat([rows[0] for rows in contexts], len(share.z))
     log_b = share.log_b + coordinates.log_jacobian(share.z)
-    log_p = _log_density(likelihood, values, points, pt.as_tensor(groups))
+    log_p = _log_density(likelihood, params, points, pt.as_tensor(specimens))
     terms = log_p.reshape((size, len(share.z))) + pytensor.shared(log_b)
     inside = logsumexp_finite(terms[:, : share.with_response])
     outside = logsumexp_finite(terms[:, share.with_response :])
     is_unknown = pt.isinf(inside)
     log_ratio = outside - pt.switch(is_unknown, 0.0, inside)
-    return pt.switch(is_unknown, 0.0, -pt.softplus(log_ratio))
+    return pt.switch(is_unknown, 0.0, -pt.softplus(log_ratio))[context]
 
 
 def _readings_log_density(likelihood: SpecimenLikelihood, error: Any, xp: Any) -> Any:
@@ -271,7 +274,54 @@ def logsumexp_finite(terms: Any) -> TensorVariable:
     return pt.switch(is_empty, -np.inf, log_total)
 
 
-# Draws of readings.
+# Draws.
+
+
+def draw_inputs(
+    likelihood: SpecimenLikelihood, rng: np.random.Generator, values: Mapping[str, Floats]
+) -> tuple[list[Floats], Floats | None]:
+    """Draw the inputs of each specimen given its readings, (P, S, *event) by input.
+
+    Also return the probability that the readings have a gross error, (P, S), None where the model
+    has no gross errors: the inputs are then those of any specimen. Values are those of the model's
+    variables by name, (P, *shape).
+    """
+    shared, shared_log_a = arrays(likelihood)
+    log_a = shared_log_a.get_value(borrow=True)
+    errors = _errors(likelihood, values)
+    size, n = len(errors), len(log_a)
+    inputs = [np.empty((size, n, *v.get_value(borrow=True).shape[2:])) for v in shared]
+    probability = None
+    gross_share = _gross_share(likelihood.measurements[0], values)
+    if gross_share is not False:
+        weights = likelihood.measurements[0].weights
+        logs = log_likelihoods(likelihood, values) / (1.0 if weights is None else weights)
+        log_share = np.log(np.reshape(gross_share, (-1, 1)))
+        probability = np.exp(log_share + likelihood.stacked.log_gross - logs)
+    for group, rows in likelihood.by_group:
+        parents = likelihood.parents(values, group, rows)
+        by_point = likelihood.inputs.for_points(parents, log_a.shape[1])
+        x = [variable.get_value(borrow=True)[rows] for variable in shared]
+        flat = [v.reshape(-1, *v.shape[2:]) for v in x]
+        for k in range(size):
+            density = likelihood.density.at([parent[k : k + 1] for parent in by_point], flat)
+            log_weights = density(slice(None)).reshape(log_a[rows].shape) + log_a[rows]
+            if not likelihood.error_is_known:
+                log_weights += _readings_log_density(likelihood, errors[k], np)[rows]
+            log_weights = np.where(np.isnan(log_weights), -np.inf, log_weights)
+            totals = np.cumsum(np.exp(log_weights - log_weights.max(axis=1, keepdims=True)), axis=1)
+            limits = totals[:, -1:] * rng.random((len(rows), 1))
+            chosen = (totals < limits).sum(axis=1)
+            for drawn, points in zip(inputs, x, strict=True):
+                drawn[k, rows] = points[np.arange(len(rows)), chosen]
+        if probability is not None:
+            is_gross = rng.random((size, len(rows))) < probability[:, rows]
+            population, _ = likelihood.density.sampler(parents, len(rows), rng)
+            for drawn, unknown in zip(inputs, population, strict=True):
+                part = drawn[:, rows]
+                part[is_gross] = unknown[is_gross]
+                drawn[:, rows] = part
+    return inputs, probability
 
 
 def draw_readings(
@@ -283,27 +333,29 @@ def draw_readings(
 ) -> Floats:
     """Draw the emulated readings of n specimens of each population, (P, n), (P, n, m) or (P, n, M).
 
-    Values are those of the model's variables by name, (P, *shape). Specimens are of the groups of
-    the observed ones. Readings are those of one simulator, or the outputs of all. If n is the
-    number of a simulator's rows, repeated readings have common inputs. NaN in a population of which
-    next to nothing has a response.
+    Values are those of the model's variables by name, (P, *shape). Specimens have groups and
+    covariates of the observed ones. Readings are those of one simulator, or the outputs of all. If
+    n is the number of a simulator's rows, repeated readings have common inputs. NaN in a population
+    of which next to nothing has a response.
     """
     emulation, size = prepared(likelihood).emulation, len(next(iter(values.values())))
-    groups = likelihood.stacked.groups if measurement is None else measurement.groups
+    numbers = np.arange(len(likelihood.readings))
+    if measurement is not None:
+        numbers = specimen_numbers(likelihood, measurement)
+    like = np.resize(numbers, n)  # observed specimens with the same group and covariates
     by_group: list[tuple[Any, Any]] = [(None, np.arange(n))]
-    if groups is not None:
-        groups = np.resize(groups, n)
+    if likelihood.stacked.groups is not None:
+        groups = likelihood.stacked.groups[like]
         by_group = [(group, np.flatnonzero(groups == group)) for group in np.unique(groups)]
     specimens: Any = slice(None)
     if measurement is not None and n == len(measurement.observed):
-        numbers = specimen_numbers(likelihood, measurement)
         _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
         specimens = first[inverse]
 
     def draw_outputs() -> Floats:
         inputs: list[Floats] = []
         for group, columns in by_group:
-            parents = parent_values(values, likelihood.inputs, group)
+            parents = likelihood.parents(values, group, like[columns])
             drawn, _ = likelihood.density.sampler(parents, len(columns), rng)
             inputs = inputs or [np.empty((size, n, *x.shape[2:])) for x in drawn]
             for whole, part in zip(inputs, drawn, strict=True):
@@ -390,7 +442,7 @@ class SpecimenRV(ObservedRV):
         measurement = self.simulator
         # Readings of other simulators, the last parameters, are not part of the population.
         pairs = zip(self.variables, params, strict=False)
-        parents = {parent: param for parent, param in pairs if not is_group(parent)}
+        parents = {parent: param for parent, param in pairs if not is_known(parent)}
         leading = [
             param.shape[: param.ndim - parent.type.ndim] for parent, param in parents.items()
         ]
@@ -419,7 +471,7 @@ def _log_density_of_vector(
         return pt.zeros(0)
     variables = op.variables
     parents = {
-        v: p if is_group(v) else p[(0,) * (p.ndim - v.type.ndim)]
+        v: p if is_known(v) else p[(0,) * (p.ndim - v.type.ndim)]
         for v, p in zip(variables, params, strict=False)
     }
     measurements: Sequence[Measurement] = op.measurements

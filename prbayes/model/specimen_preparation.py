@@ -6,7 +6,7 @@ covered, and the unit of Monte Carlo errors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -18,6 +18,7 @@ from prbayes._finding import Finding, report
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.model.data_checks import (
+    check_failing_region,
     data_findings,
     emulator_findings,
     misfit_findings,
@@ -27,11 +28,11 @@ from prbayes.model.data_checks import (
     unreached,
 )
 from prbayes.model.measurement import SpecimenLikelihood
-from prbayes.model.parameters import Hyperparameters, log_posterior, parent_values
+from prbayes.model.parameters import Hyperparameters, log_posterior
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
-from prbayes.propagation.base import DesignError
+from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare, response_share
@@ -120,8 +121,10 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if refined is not emulation and not _is_partial(likelihood):
             # Specimens beside the failing region have points on its right side now.
             refined, points, findings = _emulate(runs, populations, refined)
-        return Preparation(refined, points, report(*findings), share)
+        return Preparation(refined, points, report(*runs.findings, *findings), share)
     except DesignError as error:
+        if likelihood.has_table:
+            raise
         cause = "" if runs.first is None else unreached(runs.first, likelihood.readings)
         findings = _data_findings(likelihood, several_roots=False)
         raise DesignError(". ".join([f"{error}{cause}", *map(str, findings)])) from None
@@ -136,18 +139,27 @@ class Runs:
 
     likelihood: SpecimenLikelihood
     first: Floats | None = None  # (n, M): outputs of the first runs
+    findings: tuple[Finding, ...] = ()  # about the first runs
 
     def __call__(self, z: Floats) -> Floats:
         """Return outputs of runs, (n, d) -> (n, M): NaN without response, +inf for a failure."""
         likelihood = self.likelihood
-        responses = [m.responses for m in likelihood.measurements]
+        measurements = likelihood.measurements
         inputs = likelihood.coordinates.inputs(z)
-        parts = [response(inputs, []).reshape(len(z), -1) for response in responses]
+        parts = [m.responses(inputs, []).reshape(len(z), -1) for m in measurements]
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and self.first is None:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             refuse_unused_inputs(likelihood.name, z, values, _coordinate_names(likelihood))
             self.first = values
+            if not any(m.metric.error is not None or m.gross_errors for m in measurements):
+                self.findings = check_failing_region(
+                    likelihood.name,
+                    likelihood.readings.values,
+                    [z],
+                    values,
+                    max(getattr(m.propagation, "max_lost", MAX_LOST) for m in measurements),
+                )
         return values
 
 
@@ -238,6 +250,18 @@ def _data_findings(likelihood: SpecimenLikelihood, *, several_roots: bool) -> tu
     return tuple(findings)
 
 
+def log_shares(
+    likelihood: SpecimenLikelihood, values: Mapping[str, Floats], share: ResponseShare
+) -> Floats:
+    """Return log S of the population of each specimen, (P, S), at values by name, (P, *shape)."""
+    result = np.empty((len(next(iter(values.values()))), len(likelihood.readings)))
+    for group, rows in likelihood.by_context:
+        parents = likelihood.parents(values, group, rows[:1])
+        log_share = share.of_populations(likelihood.density, parents, likelihood.coordinates)
+        result[:, rows] = log_share[:, None]
+    return result
+
+
 @dataclass(frozen=True, eq=False)
 class Populations:
     """Populations of a model's hyperparameters, evaluated at points of its specimens."""
@@ -263,8 +287,9 @@ class Populations:
         x = likelihood.coordinates.inputs(z)
         weights = log_a if smoothing is not None else log_a + likelihood.coordinates.log_jacobian(z)
         values = self.hyperparameters.constrained(thetas)
-        for group, rows in likelihood.by_group:
-            parents = parent_values(values, likelihood.inputs, group)
+        contexts = likelihood.by_group if smoothing is None else likelihood.by_context
+        for group, rows in contexts:
+            parents = likelihood.parents(values, group, rows)
             if smoothing is None:
                 points = WeightedPoints.of(likelihood.inputs, [v[rows] for v in x], weights[rows])
                 result[:, rows] = likelihood.density.log_likelihoods(parents, points)
@@ -285,15 +310,8 @@ class Populations:
 
     def log_share(self, thetas: Floats, share: ResponseShare) -> Floats:
         """Return log S of the population of each specimen, summed over the specimens, (S,)."""
-        likelihood = self.likelihood
-        result = np.zeros(len(thetas))
         values = self.hyperparameters.constrained(thetas)
-        for group, rows in likelihood.by_group:
-            parents = parent_values(values, likelihood.inputs, group)
-            result += len(rows) * share.of_populations(
-                likelihood.density, parents, likelihood.coordinates
-            )
-        return result
+        return log_shares(self.likelihood, values, share).sum(axis=1)
 
     def _normal_log_density(
         self, parents: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
@@ -395,8 +413,10 @@ class PopulationDraws:
         rng = np.random.default_rng([0, 3])
         parts = []
         values = populations.hyperparameters.constrained(self.thetas)
-        for group, _ in likelihood.by_group:
-            parents = parent_values(values, likelihood.inputs, group)
+        for group, rows in likelihood.by_group:
+            if likelihood.inputs.covariates:
+                rows = rng.choice(rows, (len(self.thetas), n_of_each))
+            parents = likelihood.parents(values, group, rows)
             inputs, _ = likelihood.density.sampler(parents, n_of_each, rng)
             z = likelihood.coordinates.of(inputs, 2)
             parts.append(z.reshape(-1, z.shape[-1]))

@@ -3,7 +3,7 @@
 The surface through the table takes the place of the emulator. Beyond the ranges of the runs it is
 continued linearly, so that a table which ends within the populations of the data is recognised: it
 is refused, and nothing is answered from the continuation. The error of the surface is twice the
-cross-validated error at the runs near the data.
+cross-validated error at the runs nearest to the roots of the specimens.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._validate import Floats
 from prbayes.emulators.continued import Continued, LeftOut
@@ -27,7 +28,6 @@ from prbayes.propagation.specimen_emulation import (
     Emulation,
     EmulationProblem,
     all_roots,
-    narrowing,
     near_readings,
     shift_by_misfit,
     specimen_roots,
@@ -92,11 +92,13 @@ def points_of_tables(
         )
     else:
         roots = specimen_roots(emulation, readings, options)
+        inside = roots.z[_is_inside(roots.z, ranges)]
+        if len(inside) >= 4:
+            error = _error(problem, OfTables.of(likelihood, LeftOut)(inside))
+            emulation = replace(emulation, error=error)
+            roots = specimen_roots(emulation, readings, options)
         roots = all_roots(emulation, readings, options, roots, problem.seed)
         emulation = _with_bias(problem, likelihood, emulation, roots.z, ranges)
-        if len(roots.z):
-            bias = max(emulation.bias, narrowing(emulation, readings, roots))
-            emulation = replace(emulation, bias=bias)
         _require_accurate(likelihood, problem, emulation)
         points = draw_points(
             emulation, readings, roots, options, error_is_known=likelihood.error_is_known
@@ -121,14 +123,18 @@ def _with_bias(
 
     Zero without any: the table is refused then, as it does not cover the specimens.
     """
-    inside = z[((z >= ranges[0]) & (z <= ranges[1])).all(axis=1)]
+    inside = z[_is_inside(z, ranges)]
     jacobian = emulation.surface(inside)[1]
     rows = np.isfinite(jacobian).all(axis=(1, 2))  # not beside failed runs
     if rows.sum() < 2:
         return replace(emulation, bias=0.0)
     misfit = OfTables.of(likelihood, LeftOut)(inside[rows])
     bias = shift_by_misfit(problem, emulation.error, misfit, jacobian[rows], inside[rows])
-    return replace(emulation, bias=bias)
+    # The error of the comparison, if it is too large, narrows the population by half its share of
+    # the variance. Beside a turning point its linear form for each root would be far too large.
+    share = float((emulation.error / problem.readings.robust_spread()).max())
+    narrowing = np.sqrt(len(problem.readings) / 2) * share**2
+    return replace(emulation, bias=max(bias, narrowing))
 
 
 def _surface(problem: EmulationProblem, likelihood: SpecimenLikelihood) -> tuple[Emulation, Floats]:
@@ -162,14 +168,24 @@ def _surface(problem: EmulationProblem, likelihood: SpecimenLikelihood) -> tuple
     z = np.unique(np.concatenate(runs), axis=0)
     z = z[np.isfinite(z).all(axis=1)]
     y = problem.run(z)
-    is_near = near_readings(y, problem.readings)
-    residuals = OfTables.of(likelihood, LeftOut)(z)[is_near]
-    error = 2 * np.sqrt((residuals**2).mean(axis=0))
-    error = np.maximum(error, problem.options.floor * problem.readings.spread())
+    residuals = OfTables.of(likelihood, LeftOut)(z[near_readings(y, problem.readings)])
+    error = _error(problem, residuals)
     # The noise of a process in double precision is far below its change over a thousandth.
     surface = DifferencedResponse(OfTables.of(likelihood, Continued), step=1e-3)
     whole = np.stack([np.full(len(low), -np.inf), np.full(len(low), np.inf)])
     return Emulation(z, y, box, surface, error, np.inf, whole), ranges
+
+
+def _error(problem: EmulationProblem, residuals: Floats) -> Floats:
+    """Return the error of the surface by output, (m,), from left-out residuals (n, m)."""
+    error = 2 * np.sqrt((residuals**2).mean(axis=0))
+    return np.asarray(np.maximum(error, problem.options.floor * problem.readings.spread()))
+
+
+def _is_inside(z: Floats, ranges: Floats) -> NDArray[np.bool_]:
+    """Return which coordinates (..., d) are within the ranges of the runs, up to rounding."""
+    slack = 1e-9 * (ranges[1] - ranges[0])
+    return np.asarray(((z >= ranges[0] - slack) & (z <= ranges[1] + slack)).all(axis=-1))
 
 
 def _require_cover(
@@ -180,8 +196,7 @@ def _require_cover(
     ranges: Floats,
 ) -> None:
     """Raise if the likelihood of a specimen, or 5 % of that of all, is from outside the ranges."""
-    slack = 1e-9 * (ranges[1] - ranges[0])
-    is_inside = ((points.z >= ranges[0] - slack) & (points.z <= ranges[1] + slack)).all(axis=-1)
+    is_inside = _is_inside(points.z, ranges)
     whole = draws.log_likelihoods(points.z, points.log_a)
     inside = draws.log_likelihoods(points.z, np.where(is_inside, points.log_a, -np.inf))
     with np.errstate(invalid="ignore"):

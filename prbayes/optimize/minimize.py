@@ -510,6 +510,7 @@ def _report(
     refuse_lost(evaluator, {name: numbers["lost_mass"] for name, numbers in support.items()})
     local = None if fit.sampling is None else fit.sampling.local
     unknown = [] if at_edge or at_jump else [*optimum.stderr.items()]
+    first = [finding for node in evaluator.nodes for finding in node.bound.findings]  # are logged
     findings = report(
         *breakdown_findings(at_edge, at_jump),
         *unknown_error_findings(dict(unknown), sampling_obstacle(evaluator)),
@@ -522,6 +523,7 @@ def _report(
         local_optimum(evaluator, mode.theta, mode.value, comparable=mode.comparable)
         for mode in optima
     )
+    findings = (*first, *findings)
     return replace(
         optimum, design_error=fit.design_error, local_optima=local_optima, findings=findings
     )
@@ -572,9 +574,12 @@ def optimum_findings(
         page = "optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something"
         findings += prior_end_findings(ends, page)
         names = {end.name for end in ends}
-        bounds = [bound for bound in bounds_by_metric(sampling) if bound.name not in names]
-        findings += [bound.finding for bound in bounds]
-        names |= {bound.name for bound in bounds}
-        findings += unidentified_findings(evaluator, sampling.local, names)
+        bounds = bounds_by_metric(sampling)
+        if bounds is not None:
+            findings += [bound.finding for bound in bounds if bound.name not in names]
+            names |= {bound.name for bound in bounds}
+        findings += unidentified_findings(
+            evaluator, sampling.local, names, has_bounds=bounds is not None
+        )
         findings += confounding_findings(evaluator, sampling.local)
     return tuple(findings)

@@ -207,7 +207,7 @@ class Optimum:
     discrepancy : float
         The minimised sum of d_k / s_k; with one simulator, its discrepancy.
     discrepancies : dict
-        Discrepancy by simulator.
+        Discrepancy by simulator; of several with `AreaMetric` as in its notes.
     scales : dict
         The s_k by simulator.
     n_responses : int

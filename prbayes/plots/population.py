@@ -267,7 +267,7 @@ def _values(draws: Any, margin: Margin) -> Floats:
 
 def _exact(inputs: Inputs, margin: Margin, parents: list[Floats], grid: Floats) -> Floats | None:
     """Return the densities, shape (P, g), or None where PyMC has no density of one element."""
-    if inputs.nested:
+    if inputs.nested or inputs.covariates:
         return None
     symbols = inputs.placeholders()
     dists, *_ = inputs.rebuilt(symbols)

@@ -20,6 +20,7 @@ from prbayes.inference.asymptotics import (
 )
 from prbayes.inference.refits import simplex_refits, simulator_obstacle
 from prbayes.inference.resampling import DataSets, groups
+from prbayes.metrics.area import correction_table, interpolated
 from prbayes.metrics.base import Minimum, is_likelihood
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.fingerprint import Identity, identity_of, require_same
@@ -217,7 +218,8 @@ def _by_coverage(information: Information) -> float | None:
     for area in information.areas(information.data_sets):
         change = thetas @ area.slopes
         rows = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
-        distances = distances + np.array(rows)
+        levels = interpolated(correction_table(area.specimens), area.simulated + change)
+        distances = distances + np.array(rows) - (levels * area.lengths).sum(axis=-1)
     log_proposal = -0.5 * (z**2).sum(axis=-1)
     # Coverage grows with epsilon.
     low, high = (information.noise_floor * factor for factor in (1e-3, 10.0))

@@ -347,10 +347,6 @@ class Checkpoint:
         self.digest = b""  # of the file as this run has read or written it last
         if self.path.exists():
             self._read()
-        elif not self.path.parent.is_dir():
-            raise StoreError(
-                f"checkpoint: got {self.path}, whose folder does not exist, expected one that does"
-            )
         if self.settings.get("entropy", "") is None:
             self.settings["entropy"] = str(np.random.SeedSequence().entropy)
 

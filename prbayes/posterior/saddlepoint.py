@@ -314,19 +314,19 @@ def _derivatives(
 
 def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
     """Return the estimate, (d,), or a point towards the middle of the prior if it is at an edge."""
-    is_stored = [node.bound.stored for node in evaluator.nodes]
-    if not all(is_stored):
-        return theta
     hyperparameters = evaluator.hyperparameters
     direction = np.median(hyperparameters.prior_points(256, 0), axis=0) - theta
     is_far = np.abs(direction) > options.distance * hyperparameters.prior_sd
     direction[~is_far] = 0
+    if not is_far.any() and not evaluator.reweighted:
+        return theta
     for fraction in np.linspace(0, 1, 33):
         point = theta + fraction * direction
         spread = _likelihood_spread(evaluator, point, options)
         is_at_edge = is_far & (spread < options.smallest_spread * spread.max())
         support = evaluator.support(point[None])
-        effective = np.min([design["weight_ess"] for design in support.values()])
+        sizes = [design["weight_ess"] for design in support.values()]
+        effective = np.min(sizes, initial=np.inf)
         if not is_at_edge.any() and effective >= options.effective_responses:
             return point
     return theta
@@ -335,11 +335,13 @@ def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihood
 def _likelihood_spread(
     evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions
 ) -> Floats:
-    """Return standard deviations of the derivatives of log weights, in units of the prior, (d,)."""
+    """Return changes of the populations over a prior standard deviation, (d,).
+
+    Of log weights, or of responses in units of their standard deviation.
+    """
     variance = np.zeros(len(theta))
     for k in range(len(evaluator.nodes)):
         population = _derivatives(evaluator, k, theta, options)
-        assert isinstance(population, WeightSlopes)
         variance += population.spread**2
     return np.asarray(np.sqrt(variance) * evaluator.hyperparameters.prior_sd)
 

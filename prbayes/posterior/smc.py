@@ -6,7 +6,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any, Literal
@@ -54,6 +54,7 @@ from prbayes.posterior.target import estimate_target, prior_conflicts, require_d
 from prbayes.propagation.base import Missing, discrepancy_error
 from prbayes.response.budget import BudgetError, limited, unlimited
 from prbayes.response.inputs import model_on_context
+from prbayes.response.store import only_writer
 
 _log = logging.getLogger("prbayes")
 
@@ -168,7 +169,7 @@ def sample_smc(
     DesignError
         If a design does not support the posterior after refinement.
     StoreError
-        If the checkpoint is damaged, or belongs to another run.
+        If the checkpoint is damaged, belongs to another run, or is in use by one.
     BudgetError
         If a budget is spent before a chain is finished.
 
@@ -194,8 +195,9 @@ def sample_smc(
     require_adjustment(adjustment)
     flag(refine, "refine")
     share(threshold, "threshold")
+    lock: AbstractContextManager[None] = nullcontext()
     if checkpoint is not None:
-        file_path(checkpoint, "checkpoint")
+        lock = only_writer(file_path(checkpoint, "checkpoint"), "checkpoint")
     if max_stages is not None:
         positive_integer(max_stages, "max_stages")
     names, keywords = require_selection(var_names, idata_kwargs, model)
@@ -219,6 +221,7 @@ def sample_smc(
     )
     stages = () if checkpoint is None else (f"all finished stages ({checkpoint})",)
     with (
+        lock,
         shown(progressbar),
         explained(model, "prb.sample_smc", *stages),
         limited(max_seconds, max_runs),
@@ -346,9 +349,11 @@ def result_of(
             findings += [f for f in optimum.findings if f.code != "few-specimens"]
             if evaluator.nodes and not is_pseudo:
                 findings += prior_conflicts(optimum, evaluator, thetas)
-        elif not is_pseudo:
-            for likelihood in evaluator.likelihoods:
-                findings += prepared(likelihood).findings
+        else:
+            findings += [f for node in evaluator.nodes for f in node.bound.findings]
+            if not is_pseudo:
+                for likelihood in evaluator.likelihoods:
+                    findings += prepared(likelihood).findings
         attrs = {
             "n_responses": evaluator.n_responses - n_before,
             "seconds": time.perf_counter() - clock,

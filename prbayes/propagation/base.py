@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
+from prbayes._finding import Finding
 from prbayes._validate import Floats, flag, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.response.budget import RunCost
@@ -119,6 +120,7 @@ class Bound(ABC):
     # Whether points are inside the population's support at some thetas and outside at others.
     support_moves: bool = False
     max_lost: float = MAX_LOST  # largest share, at an answer, of points without response
+    findings: tuple[Finding, ...] = ()  # about the data and the first responses
     # Seed of the sampler at work, and evaluations since it began, which determine random draws.
     stream: int = 0
     draws: int = 0

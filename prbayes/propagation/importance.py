@@ -136,6 +136,8 @@ class MixtureSampler:
         parents = [c[population] for c in components]
         try:
             points = list(self._quantiles(*parents, *uniforms))
+            if any(np.isnan(x).any() for x in points):
+                raise TypeError("an inverse distribution function without a number")
         except TypeError:  # a distribution without inverse distribution function
             rng = np.random.default_rng(seed)
             draws, _ = PopulationSampler(self.inputs)(parents, 1, rng)
@@ -193,7 +195,7 @@ def new_specimens(
         shift = rng.random((k, 1, *points.shape[1:]))
         shifted.append(inside((points[order] + shift) % 1))
     function = compile_batched([*symbols, *uniforms], [*placed, *epistemic])
-    values = function(*parents, *shifted)
+    values = function(*inputs.for_specimens(parents, n), *shifted)
     aleatory = values[: len(placed)]
     return aleatory, [v[:, None] for v in values[len(placed) :]]
 

@@ -163,8 +163,8 @@ class WeightedPoints:
 
     @classmethod
     def of(cls, inputs: Inputs, x: Sequence[Floats], log_a: Floats) -> WeightedPoints:
-        """Return the points with their form, if the inputs have one."""
-        if inputs.nested or not log_a.size:
+        """Return the points with their form, if they have one population, and the inputs a form."""
+        if inputs.nested or (inputs.covariates and len(log_a) > 1) or not log_a.size:
             return cls(x, log_a, None)
         flat = [v.swapaxes(0, 1).reshape(log_a.size, *v.shape[2:]) for v in x]
         return cls(x, log_a, ExponentialForm.of(inputs.aleatory, flat))
@@ -193,7 +193,8 @@ class PopulationDensity:
         if previous is not points[0]:
             form = ExponentialForm.of(self.inputs.aleatory, points)
             # At an end of a support PyMC's density may be finite, or infinite.
-            if form is not None and not form.is_inside.all():
+            # Points of specimens with covariates have several populations.
+            if form is not None and (self.inputs.covariates or not form.is_inside.all()):
                 form = None
             self._form = points[0], form
         if form is not None:
@@ -216,13 +217,17 @@ class PopulationDensity:
 
     @one_thread()
     def log_likelihoods(self, parents: Sequence[Floats], points: WeightedPoints) -> Floats:
-        """Return log p(y_i | theta), (S, N), of populations at parents, shapes (S, *shape)."""
+        """Return log p(y_i | theta), (S, N), of populations at parents, shapes (S, *shape).
+
+        Covariates are those of the specimens, (S, N).
+        """
         form, log_a = points.form, points.log_a
         n, count = log_a.shape
         if form is None:
             return self._by_graph(parents, points)
+        at_each = self.inputs.for_points(parents, len(form.anchors[0]))
         with np.errstate(all="ignore"):
-            (at_anchors,) = self._log_density(*parents, *form.anchors)
+            (at_anchors,) = self._log_density(*at_each, *form.anchors)
         natural, is_rounded = form.natural_parameters(at_anchors)
         # A is a statistic whose parameter is one; -inf in a product may become NaN.
         base = np.where(form.is_inside, log_a.T.ravel(), -np.inf)
@@ -255,8 +260,9 @@ class PopulationDensity:
         step = max(1, IN_CACHE // log_a.size)
         for first in range(0, len(result), step):
             block = slice(first, first + step)
+            of_block = self.inputs.for_points([parent[block] for parent in parents], count)
             with np.errstate(all="ignore"):
-                (logs,) = self._log_density(*(parent[block] for parent in parents), *flat)
+                (logs,) = self._log_density(*of_block, *flat)
             logs = np.where(np.isnan(logs), -np.inf, logs)
             result[block] = log_sum_exp(logs.reshape(-1, n, count) + log_a)
         return result

@@ -214,8 +214,8 @@ def emulate(
         enough = (batch >= 2 or previous is not None) and emulation.covers(roots.z)
         if enough and emulation.bias <= options.bias:
             # Zero for the response itself, which no run improves.
-            lost_width = 0.0 if emulation.bias == 0 else narrowing(emulation, readings, roots)
-            if lost_width <= options.bias:
+            narrowing = 0.0 if emulation.bias == 0 else _narrowing(emulation, readings, roots)
+            if narrowing <= options.bias:
                 break
         count = max(n // 2, options.fresh)
         fresh = spread_out(roots.z, emulation.box, count, options.fresh, rng)
@@ -247,7 +247,7 @@ def require_accurate(emulation: Emulation, problem: EmulationProblem) -> None:
         )
 
 
-def narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
+def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
     """Return by how much the error of the emulator could narrow the population of an input.
 
     The comparison allows an error covariance C of a root; the part of it that the runs have

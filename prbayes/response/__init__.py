@@ -1,6 +1,7 @@
 """The user's response: inputs, calls, failures and storage."""
 
 from prbayes.response.budget import BudgetError, Cost
+from prbayes.response.condition import condition
 from prbayes.response.discrepancy import Additive, Multiplicative
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.inputs import group
@@ -17,5 +18,6 @@ __all__ = [
     "Retry",
     "Store",
     "StoreError",
+    "condition",
     "group",
 ]

@@ -30,6 +30,11 @@ class Budget:
     computed: int = 0  # responses; those found in a store cost nothing
     spent: str = ""  # why the budget is spent, as a clause; final once it is set
 
+    @property
+    def is_limited(self) -> bool:
+        """Whether there is a limit."""
+        return self.max_seconds is not None or self.max_runs is not None
+
     def check(self) -> None:
         """Raise if the budget is spent."""
         seconds = time.perf_counter() - self.start

@@ -19,6 +19,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
 from prbayes.response.compile import PLAIN, compile_batched, interpreted, with_leading_axis
+from prbayes.response.condition import is_condition
 from prbayes.response.inputs import Inputs, event_shape, is_random, quiet_logp
 
 # Operations of distributions, for `isinstance`.
@@ -126,6 +127,12 @@ def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None
             )
 
 
+def _scalar_if_infinite(end: TensorVariable) -> Any:
+    """Return a scalar for an infinite end of a vector, which PyMC takes for a finite one."""
+    value = pt.get_underlying_scalar_constant_value(end, raise_not_constant=False)
+    return pt.constant(value) if not isinstance(value, Variable) and np.isinf(value) else end
+
+
 def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     """Return the inverse distribution function of ``dist`` at u, (n, *event), or raise."""
     op = dist.owner.op
@@ -136,6 +143,9 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
         return mean + z @ pt.linalg.cholesky(covariance).T
+    if isinstance(op, type(pm.TruncatedNormal.rv_op)):
+        mean, sd, *ends = op.dist_params(dist.owner)
+        return pm.TruncatedNormal.icdf(u, mean, sd, *map(_scalar_if_infinite, ends))
     try:
         return pm.icdf(dist, u, warn_rvs=False)
     except NotImplementedError:
@@ -282,10 +292,13 @@ class PopulationSampler:
     @interpreted()
     def __init__(self, inputs: Inputs) -> None:
         self._names = ", ".join(str(x.owner.op) for x in inputs.aleatory)
-        symbols = inputs.placeholders()
+        self._inputs = inputs
+        symbols = [parent.type() for parent in inputs.parents]
         aleatory, epistemic = inputs.rebuilt(symbols)
         n = pt.iscalar("n")
-        batched = with_leading_axis(symbols)
+        covariates = {s for s, r in zip(symbols, inputs.parents, strict=True) if is_condition(r)}
+        # Covariates are those of each specimen.
+        batched = with_leading_axis([pt.dvector() if s in covariates else s for s in symbols])
         common = epistemic
 
         # n specimens of each theta. Distributions that depend on no parent are not batched by their
@@ -293,6 +306,9 @@ class PopulationSampler:
         size = (batched[0].shape[0], n)
         per_specimen: dict[Variable, Variable] = {}
         for symbol, batch in zip(symbols, batched, strict=True):
+            if symbol in covariates:
+                per_specimen[symbol] = batch
+                continue
             shape = [batch.shape[i] for i in range(1, batch.ndim)]
             per_specimen[symbol] = pt.broadcast_to(batch[:, None], (*size, *shape))
         for v in filter(is_random, ancestors(aleatory)):
@@ -304,7 +320,9 @@ class PopulationSampler:
             specimens = vectorize_graph(aleatory, per_specimen)
             if epistemic:
                 common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True)))
-        except (NotImplementedError, ValueError, MissingInputError):
+        except (NotImplementedError, ValueError, MissingInputError) as error:
+            if covariates:
+                raise self.refusal(error) from None
             # Not vectorized by PyTensor: one population at a time.
             self._is_batched, batched = False, symbols
             # Resized before the parents are replaced, since PyMC resizes a CustomDist with its
@@ -345,10 +363,12 @@ class PopulationSampler:
     ) -> tuple[list[Floats], list[Floats]]:
         """Draw n specimens from each of k populations, at parents (k, *shape).
 
+        Covariates, (k, m), are those of specimens, repeated in turn.
         Aleatory inputs are (k, n, *event), epistemic ones (k, 1, *event), or (*event) without
         parents.
         """
         _seed(self._function, rng)
+        params = self._inputs.for_specimens(params, n)
         try:
             if self._is_batched:
                 values = list(self._function(n, *params))

@@ -13,13 +13,14 @@ import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.graph.basic import Variable
-from pytensor.graph.replace import graph_replace
+from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
+from prbayes.response.condition import is_condition
 
 
 class Inputs:
@@ -41,6 +42,8 @@ class Inputs:
         self.parents = tuple(parents)  # model variables that the inputs depend on
         self.nested = nested  # whether a ``.dist()`` depends on another one
         self.groups = groups_of("", self.parents)
+        # Conditions in the parameters of a ``.dist()``.
+        self.covariates = tuple(filter(is_condition, self.parents))
         self.event_shapes = tuple(event_shape(x) for x in self.aleatory)
         self.event_ndims = [x.type.ndim for x in (*self.aleatory, *self.epistemic)]
         # Numbers of one specimen in each argument, and those that are aleatory.
@@ -80,14 +83,41 @@ class Inputs:
         return Inputs(arguments, reference.aleatory, reference.parents, self.nested)
 
     def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
-        """Return the aleatory and epistemic inputs with the parents replaced by ``params``."""
+        """Return the aleatory and epistemic inputs with the parents replaced by ``params``.
+
+        With vectors of covariates, (n,), the distributions are those of n points.
+        """
         # In two steps, because params may themselves depend on the parents.
-        symbols = self.placeholders()
+        symbols = [r.type() for r in self.parents]
+        values = dict(zip(symbols, map(pt.as_tensor, params), strict=True))
+        vectors = {s: v for s, v in values.items() if v.type.ndim > s.type.ndim}
         new: Any = [*self.aleatory, *self.epistemic]
-        for old, to in ((self.parents, symbols), (symbols, params)):
-            swap = {a: pt.as_tensor(b) for a, b in zip(old, to, strict=True)}
-            new = graph_replace(new, swap, strict=False)
-        return new[: len(self.aleatory)], new[len(self.aleatory) :]
+        new = graph_replace(new, dict(zip(self.parents, symbols, strict=True)), strict=False)
+        if vectors:
+            new = vectorize_graph(new, vectors)
+        new = graph_replace(
+            new, {s: v for s, v in values.items() if s not in vectors}, strict=False
+        )
+        # A condition that is an input as well stays one.
+        aleatory = [x if is_condition(x) else v for x, v in zip(self.aleatory, new, strict=False)]
+        return aleatory, new[len(self.aleatory) :]
+
+    def for_specimens(self, params: Sequence[Any], n: int) -> list[Any]:
+        """Return values of the parents, (k, *shape), with covariates of n specimens, (k, n).
+
+        Given covariates, (k,) or (k, m), are repeated in turn.
+        """
+        return [
+            p.reshape(len(p), -1)[:, np.arange(n) % (p.size // len(p))] if is_condition(r) else p
+            for r, p in zip(self.parents, params, strict=True)
+        ]
+
+    def for_points(self, params: Sequence[Any], count: int) -> list[Any]:
+        """Return values of the parents with covariates of points, as many of each specimen."""
+        return [
+            np.repeat(p, count, axis=1) if is_condition(r) else p
+            for r, p in zip(self.parents, params, strict=True)
+        ]
 
     def fill(self, aleatory: Sequence[Any], epistemic: Sequence[Any]) -> list[Any]:
         """Return the response's arguments from values for the aleatory and the epistemic inputs."""
@@ -105,8 +135,8 @@ class Inputs:
         return [p[(0,) * (p.ndim - r.type.ndim)] for p, r in zip(params, self.parents, strict=True)]
 
     def placeholders(self) -> list[TensorVariable]:
-        """Return a new symbol for each parent."""
-        return [r.type(name=r.name) for r in self.parents]
+        """Return a new symbol for each parent: a vector for a covariate, by point."""
+        return [(pt.dvector if is_condition(r) else r.type)(name=r.name) for r in self.parents]
 
 
 # -- reading ---------------------------------------------------------------------------------------
@@ -144,12 +174,18 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             array.setflags(write=False)
             arguments.append(array if array.ndim else float(array))
             continue
-        model_variables.update(filter(is_group, _ancestry([x], model_variables)))
-        ancestry = _ancestry([x], model_variables)
-        parents.update(dict.fromkeys([v for v in ancestry if v in model_variables]))
-        latent = [v for v in ancestry if v not in model_variables and is_random(v)]
+        # A condition is an input itself, or a covariate of other ones.
+        ends = model_variables - {x}
+        if not is_condition(x):
+            known = list(filter(is_known, _ancestry([x], model_variables)))
+            _refuse_named_expressions(label, known, model)
+            model_variables.update(known)
+            ends = model_variables
+        ancestry = _ancestry([x], ends)
+        parents.update(dict.fromkeys([v for v in ancestry if v in ends]))
+        latent = [v for v in ancestry if v not in ends and is_random(v)]
         _refuse_foreign_variables(x, ancestry, latent, label)
-        if x in model_variables or not latent:
+        if x in ends or not latent:
             arguments.append(x)
             continue
         if not is_random(x):
@@ -169,7 +205,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             "varies between specimens; pass a distribution made with `.dist()`, such as "
             "pm.Normal.dist(mu, sigma)"
         )
-    if all(map(is_group, parents)):  # also if there are none
+    if all(map(is_known, parents)):  # also if there are none
         raise ValueError(
             f"{name}: got inputs that depend on no variable of the model, expected hyperparameters "
             "to calibrate; give the `.dist()` parameters that are model variables, such as "
@@ -185,6 +221,18 @@ def _ancestry(variables: Sequence[Variable], ends: Set[Variable] = frozenset()) 
         return None if variable in ends or variable.owner is None else variable.owner.inputs
 
     return list(walk(variables, parents))
+
+
+def _refuse_named_expressions(label: str, known: Sequence[Variable], model: pm.Model) -> None:
+    """Refuse a `pymc.Deterministic` of what is known of each specimen: it has no single value."""
+    for variable in known:
+        for expression in model.deterministics:
+            if variable in ancestors([expression]):
+                raise TypeError(
+                    f"{label}: got pm.Deterministic({expression.name!r}, ...) of {variable.name}, "
+                    "expected an expression without a name, since it differs between specimens; "
+                    "leave pm.Deterministic out"
+                )
 
 
 def _has_marginal_density(x: TensorVariable, parts: set[Variable]) -> bool:
@@ -422,6 +470,11 @@ def is_group(variable: Variable) -> bool:
     return variable.owner is not None and getattr(variable.owner.op, "is_group", False)
 
 
+def is_known(variable: Variable) -> bool:
+    """Return whether a variable is known of each specimen: its group or a condition."""
+    return is_group(variable) or is_condition(variable)
+
+
 def groups_of(name: str, parents: Iterable[Variable]) -> Groups | None:
     """Return the groups among parents of inputs, None if there are none; refuse several."""
     ops = [variable.owner.op for variable in parents if is_group(variable)]
@@ -436,14 +489,21 @@ def groups_of(name: str, parents: Iterable[Variable]) -> Groups | None:
     return Groups(ops[0].dim, ops[0].labels)
 
 
-def refuse_groups(name: str, parents: Iterable[Variable]) -> None:
-    """Raise if inputs of one population depend on the group of a specimen."""
+def refuse_several_populations(name: str, parents: Iterable[Variable]) -> None:
+    """Raise if inputs of one population depend on the group or a covariate of a specimen."""
     groups = groups_of(name, parents)
     if groups is not None:
         raise TypeError(
             f"{name}: inputs: got one that depends on prb.response.group({groups.dim!r}), expected "
             "inputs of one population; prb.predict has a population for each of "
             f"{groups.names}, whose responses can be compared"
+        )
+    covariates = [str(v.name) for v in parents if is_condition(v)]
+    if covariates:
+        raise TypeError(
+            f"{name}: inputs: got one that depends on prb.response.condition({covariates[0]!r}), "
+            "expected inputs of one population; prb.predict(..., at={"
+            f"{covariates[0]!r}: value}}) has the responses of a population"
         )
 
 

@@ -28,6 +28,7 @@ from prbayes.response.call import (
     column_names,
     computed_again,
     first_change,
+    inputs_text,
     numbers_text,
     respond,
     revealing_rows,
@@ -474,6 +475,27 @@ class Responses:
                 "before or in its runs, which begin at the first use; write a function without a "
                 "state, and one for each condition, such as functools.partial(response, load=2.0)"
             )
+
+
+def refuse_other_runs(settings: CallSettings, points: Points, values: Floats, tally: Tally) -> None:
+    """Raise if a few of the runs, (n,) or (n, m), differ when they are computed again.
+
+    They do if the response has scatter, or depends on other specimens; see `revealing_rows`.
+    """
+    rows = revealing_rows(values)
+    with unlimited():
+        again, _ = computed_again(settings, points.at(rows), tally.copied())
+    again = np.where(np.isnan(again), values[rows], again)  # it may fail by chance
+    share = 0.0 if isinstance(settings.function, scalar) else 0.01
+    changed = first_change(values[rows], again, _accuracy(values, share))
+    if changed is not None:
+        where = inputs_text(settings, points, int(rows[changed]))
+        raise ResponseError(
+            f"{settings.name}: got {numbers_text(values[rows[changed]])} and "
+            f"{numbers_text(again[changed])} from the response with inputs {where}, expected the "
+            "same: it has scatter of its own, or depends on the specimens that it is computed "
+            "with; fix its random seed or state, or write it for one specimen, in prb.scalar"
+        )
 
 
 def _accuracy(values: Floats, share: float = 0.0) -> Any:

@@ -447,6 +447,38 @@ def replace_files(contents: Mapping[Path, bytes], name: str) -> None:
             part.unlink(missing_ok=True)
 
 
+@contextmanager
+def only_writer(path: Path, name: str) -> Iterator[None]:
+    """Lock a file until the block or the process ends; remove what killed writers of it left.
+
+    Raises `StoreError` if it is locked, or cannot be written.
+    """
+    from filelock import FileLock, Timeout
+
+    target = path.resolve()
+    if not target.parent.is_dir():
+        raise StoreError(f"{name}: got {path}, whose folder does not exist, expected one that does")
+    if not os.access(target.parent, os.W_OK):
+        raise StoreError(f"{name}: got {path}, expected a folder with the right to write there")
+    lock = FileLock(target.with_name(f"{target.name}.lock"), timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise StoreError(
+            f"{name}: got {path}, which another run is writing to, expected one run at a time; "
+            "wait for its end, or pass another path"
+        ) from error
+    try:
+        # `_part_of` cuts long names, and their parts may belong to another file.
+        if len(target.name) < 40:
+            for part in target.parent.glob("*.part"):
+                if re.fullmatch(re.escape(target.name) + r"\.[0-9a-f]{32}\.part", part.name):
+                    part.unlink(missing_ok=True)
+        yield
+    finally:
+        lock.release()
+
+
 def connect(path: Path, mode: str = "rw") -> sqlite3.Connection:
     """Return a connection that does not trust the contents of the file."""
     connection = sqlite3.connect(

@@ -296,7 +296,7 @@ def _check_family(optimum: Optimum) -> Checked:
     misfit = population_misfit(
         p_value, with_prior=optimum.search.prior, ties=ties, p_spread_out=p_spread_out
     )
-    biases = [*small_simulators(evaluator, refits=is_stored(evaluator)), *failures]
+    biases = [*small_simulators(evaluator), *failures]
     if is_stored(evaluator):
         biases += refit_bias(fitted)
     return Checked((*biases, *misfit), misfits)

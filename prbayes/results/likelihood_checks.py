@@ -30,7 +30,6 @@ from prbayes.inference.checks.population import (
 )
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.parameters import parent_values
 from prbayes.model.specimen_likelihood import arrays
 from prbayes.model.specimen_preparation import prepared
 from prbayes.numerics.derivatives import cross, slopes
@@ -207,11 +206,13 @@ def score_function(inputs: Inputs) -> Any:
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     graphs, points = [], []
-    for dist in dists:
-        x = pt.tensor(dtype="float64", shape=(None,) * (dist.type.ndim + 1))
+    for dist, shape in zip(dists, inputs.event_shapes, strict=True):
+        x = pt.tensor(dtype="float64", shape=(None,) * (len(shape) + 1))
         points.append(x)
         if isinstance(dist.owner.op, MVNORMAL):
             mean, covariance = dist.owner.op.dist_params(dist.owner)
+            if covariance.type.ndim > 2:  # that differs between specimens
+                return None
             root = pt.linalg.cholesky(covariance)
             graphs.append(pt.linalg.solve_triangular(root, (x - mean).T, lower=True).T)
             continue
@@ -242,8 +243,8 @@ def scored_specimens(
         z = np.empty((*log_a.shape, likelihood.coordinates.size))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
-            parents = parent_values(at_theta, inputs, place)
             size = log_a[rows].size
+            parents = likelihood.parents(at_theta, place, np.repeat(rows, log_a.shape[1]))
             flat = [x[rows].reshape(size, *x.shape[2:]) for x in points]
             values, (log_p,) = (function(*parents, *flat) for function in functions)
             columns = []
@@ -421,7 +422,7 @@ def _complete_covariance(
     n = _OPTIONS.specimens
     for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
         for place, rows in likelihood.by_group:
-            parents = parent_values(values, likelihood.inputs, place)
+            parents = likelihood.parents(values, place, np.resize(rows, n))
             specimens, _ = sampler([parent[:1] for parent in parents], n, rng)
             (log_p,) = log_density(*parents, *[x[0] for x in specimens])
             with np.errstate(invalid="ignore"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -17,7 +17,15 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._finding import Finding, as_json, report
 from prbayes._progress import shown
 from prbayes._stats import reached
-from prbayes._validate import Floats, Seed, flag, plain_text, positive_integer, seed_number
+from prbayes._validate import (
+    Floats,
+    Seed,
+    finite_number,
+    flag,
+    plain_text,
+    positive_integer,
+    seed_number,
+)
 from prbayes.emulators.runs import Runs
 from prbayes.model.description import versions
 from prbayes.model.emulated import (
@@ -41,7 +49,7 @@ from prbayes.propagation.importance import new_specimens
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
 from prbayes.response.discrepancy import findings_of
 from prbayes.response.failures import Abort, ResponseError
-from prbayes.response.inputs import is_group, model_on_context, read_inputs
+from prbayes.response.inputs import Inputs, is_group, model_on_context, read_inputs
 from prbayes.response.outputs import Outputs, is_missing
 from prbayes.response.response import Responses, check_call_settings, refuse_uncallable
 
@@ -56,6 +64,7 @@ def predict(
     n_draws: int = 400,
     stored: bool = True,
     max_lost: float | None = None,
+    at: Mapping[str, float] | None = None,
     name: str | None = None,
     executor: Executor | None = None,
     store: str | PathLike[str] | None = None,
@@ -97,6 +106,9 @@ def predict(
     max_lost : float, optional
         Largest share of the predicted responses that may be NaN; by default what the model's
         simulators allow, the largest.
+    at : dict, optional
+        The value of each covariate, by the name of its `prbayes.response.condition`, where inputs
+        depend on one.
     name : str, optional
         Of the result; by default that of the function.
     executor : concurrent.futures.Executor, optional
@@ -190,6 +202,9 @@ def predict(
     # A table costs no run, and is NaN outside its ranges.
     is_served = stored and not isinstance(response, Runs)
     simulator = serving(sources, responses) if is_served else None
+    size = len(next(iter(points.values())))
+    values = _covariates(label, inputs_read, at, has_runs=simulator is not None)
+    points |= {covariate: np.full((size, 1), value) for covariate, value in values.items()}
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, np.random.default_rng(seed))
     if max_lost is None:
@@ -228,6 +243,29 @@ def _labelled(
         dims=("chain", "draw", *group_coords, "sample", *output_coords),
         coords={**coords, **group_coords, "sample": np.arange(n_samples), **output_coords},
     )
+
+
+def _covariates(
+    label: str, inputs: Inputs, at: Mapping[str, float] | None, *, has_runs: bool
+) -> dict[str, float]:
+    """Return the value of each covariate by name, which is near those of runs if there are any."""
+    names = [str(covariate.name) for covariate in inputs.covariates]
+    given = {} if at is None else at
+    if not isinstance(given, Mapping) or set(given) != set(names):
+        raise ValueError(
+            f"{label}: at: got {at!r}, expected a value of each covariate of the inputs, {names}; "
+            "pass at={'hardness': 250.0}, for example"
+        )
+    values = {name: finite_number(given[name], f"{label}: at: {name}") for name in names}
+    for name, covariate in zip(names, inputs.covariates, strict=True):
+        low, high = (float(end.eval()) for end in covariate.owner.op.dist_params(covariate.owner))
+        if has_runs and not low <= values[name] <= high:
+            raise ValueError(
+                f"{label}: at: {name}: got {values[name]}, expected a value between {low:.4g} and "
+                f"{high:.4g}, where the response has runs; pass stored=False, which computes it at "
+                "new specimens"
+            )
+    return values
 
 
 # -- populations -----------------------------------------------------------------------------------

@@ -200,6 +200,24 @@ def _area_quantiles(n: int) -> tuple[Floats, Floats]:
     return logs, np.array(at_n)
 
 
+def uniform_envelope(n: int, alpha: float) -> tuple[Floats, Floats]:
+    """Return the envelope of n sorted uniform numbers, (n,) each.
+
+    For many numbers it is simulated at 2000 ranks, closer together near the ends, and linear
+    between them. Gaps between uniform order statistics are Gamma variables over their sum.
+    """
+    rng = np.random.default_rng(0)
+    places = np.sin(np.linspace(0, np.pi / 2, 2000)) ** 2
+    ranks = np.unique(np.rint(1 + (n - 1) * places))
+    if n <= 2 * places.size:
+        return envelope(rng.random((ENVELOPED, n)), alpha)
+    steps = np.diff(ranks, prepend=0, append=n + 1)
+    ends = np.cumsum(rng.standard_gamma(steps, (ENVELOPED, steps.size)), axis=1)
+    lower, upper = envelope(ends[:, :-1] / ends[:, -1:], alpha)
+    numbers = np.arange(1, n + 1)
+    return np.interp(numbers, ranks, lower), np.interp(numbers, ranks, upper)
+
+
 @dataclass(frozen=True)
 class ExactModel(Null):
     """The predicted population is taken as exact.
@@ -262,8 +280,7 @@ class ExactModel(Null):
                     "observed ones, expected at least 10 times as many, so that the population is "
                     "known exactly; pass a larger n_samples"
                 )
-        uniform = np.random.default_rng(0).random((ENVELOPED, case.size))
-        lower, upper = envelope(uniform, alpha)
+        lower, upper = uniform_envelope(case.size, alpha)
         return Judgement(
             p_value=self.p_value(statistic, case.size),
             critical_value=self.critical_value(case.size, alpha),

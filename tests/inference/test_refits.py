@@ -297,6 +297,29 @@ def two(name: str) -> tuple[Evaluator, DataSets]:
     return evaluator, reweighted_sets(evaluator, 3)
 
 
+def test_standard_errors_of_few_specimens_each_are_those_of_refits() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        for k in range(4):
+            prb.Simulator(
+                f"y{k}",
+                same,
+                x,
+                metric=AREA,
+                observed=np.arange(4.0),
+                propagation=prb.Reweighted(128),
+            )
+    sampling = sampling_at(model, 0.0, -0.7, scales=np.ones(4))
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 200)
+    x, converged = refit(sampling, sets, is_rough=True)
+    assert converged.mean() > 0.95
+    # In standard errors.
+    low, middle, high = np.quantile(x, [0.055, 0.5, 0.945], axis=0)
+    np.testing.assert_allclose((high - low) / 3.2, 1, atol=0.2)
+    np.testing.assert_allclose(middle, 0, atol=0.3)
+    np.testing.assert_allclose(sampling.linear_estimates(sets).std(axis=0), 1, rtol=0.02)
+
+
 def by_itself(evaluator: Evaluator, sets: DataSets, b: int, k: int) -> Floats:
     """Return the scaled discrepancies of a simulator from a data set."""
     target = evaluator.nodes[k].target.with_observed(sets.values[k], sets.weights[k][b])

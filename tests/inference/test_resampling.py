@@ -13,6 +13,7 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.resampling import (
     DataSets,
+    _counted_sets,
     aligned,
     dependent,
     fresh_data,
@@ -140,6 +141,29 @@ def test_simulated_sets_are_samples_of_the_population() -> None:
     ):
         (mean,) = means(simulated_sets(evaluator, TRUTH, 2000))
         np.testing.assert_allclose(mean.std(), 0.5 * scatter, rtol=4 * 0.016)
+
+
+def test_more_specimens_than_points_are_counted() -> None:
+    n = 1000
+    evaluator = build(AREA, np.random.default_rng(2).normal(1.0, 0.5, n))
+    sets = simulated_sets(evaluator, TRUTH, 2000)
+    values, (mass,) = evaluator.populations(TRUTH[None], 0)
+    np.testing.assert_array_equal(sets.values[0], values[0])
+    counts = sets.weights[0] * n
+    np.testing.assert_allclose(counts.sum(axis=1), n)
+    np.testing.assert_allclose(counts, counts.round(), atol=1e-9)
+    # Mean and variance of a multinomial count; five standard errors of 2000 sets, of 256 points.
+    error = (n * mass * (1 - mass) / 2000) ** 0.5
+    assert (np.abs(counts.mean(axis=0) - n * mass) <= 5 * error + 1e-12).all()
+    likely = n * mass > 3
+    variance = (n * mass * (1 - mass))[likely]
+    np.testing.assert_allclose(counts.var(axis=0)[likely], variance, rtol=5 * (2.5 / 2000) ** 0.5)
+    again = simulated_sets(evaluator, TRUTH, 2000, seed=1)
+    assert (again.weights[0] != sets.weights[0]).any()
+    # Weights, labels, and outputs that are not measured need the single specimens.
+    for keywords in ({"weights": np.arange(1.0, n + 1)}, {"specimens": np.arange(n) // 2}):
+        other = build(AREA, evaluator.nodes[0].observed, **keywords)
+        assert _counted_sets(other, [(values, mass[None])], 10, 0) is None
 
 
 def test_shared_specimens_are_drawn_together() -> None:

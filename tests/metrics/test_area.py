@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from scipy.stats import binom, norm
 
+import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.area import (
+    AreaDiscrepancy,
+    AreaMetric,
+    bias_and_density,
+    correction_table,
+    with_unbiased_areas,
+)
 from prbayes.metrics.base import Minimum
+from prbayes.metrics.correlation import MarginalCorrelation
+from prbayes.metrics.multivariate import Joint
+from prbayes.model.evaluator import Evaluator
 
 INF, NAN = np.inf, np.nan
 PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")
@@ -33,6 +46,28 @@ def test_stored_values_with_ties_infinities_and_nan_give_the_same_area(draw: Dra
     np.testing.assert_allclose(stored(x, w), expected, rtol=1e-11)
     x[4] = NAN
     np.testing.assert_allclose(stored(x, w), expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("digits", [0, 8])
+def test_many_observed_values_give_the_same_area(digits: int) -> None:
+    rng = np.random.default_rng(3)
+    z, x = rng.normal(1, 2, 2000), rng.normal(0, 3, 20).round(digits)
+    z[:1000] = z[:1000].round(digits)
+    z[-1] = x[3] = INF
+    x[4] = NAN
+    weights = rng.dirichlet(np.ones(20), (2, 3))
+    weights[..., 4] = 0
+    for u in (None, rng.dirichlet(np.ones(2000))):
+        d = AreaMetric().against(z, u)
+        basis = d.basis(x)
+        # Summed between simulated values, and between all values.
+        assert basis.arrays[-1].size > 16 * x.size
+        values = np.broadcast_to(np.where(np.isnan(x), INF, x), weights.shape)
+        expected = d.of(values, weights)
+        np.testing.assert_allclose(d.outer(*basis.features(weights), xp=np), expected, rtol=1e-11)
+        corrected = with_unbiased_areas(d)
+        stored = corrected.outer(*corrected.basis(x).features(weights), xp=np)
+        np.testing.assert_allclose(stored, corrected.of(values, weights), rtol=1e-11)
 
 
 def test_area_of_symbolic_values_and_weights(draw: Draw) -> None:
@@ -77,3 +112,123 @@ def test_scale_is_the_mean_absolute_deviation_or_one() -> None:
     assert found == pytest.approx([2, 2.5])
     assert AreaMetric().against(np.full(6, 0.1)).scale == 1
     assert AreaMetric.minimum is Minimum.ABSOLUTE
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 30])
+def test_the_correction_is_the_integral_of_the_bias_of_an_area(n: int) -> None:
+    table = correction_table(n)
+    levels = np.linspace(0, 1, table.size)
+    np.testing.assert_allclose(table, table[::-1], atol=1e-14)
+    np.testing.assert_allclose(table[[0, -1]], 0, atol=1e-14)
+    middle = (levels[1:] + levels[:-1]) / 2
+    bias, density = bias_and_density(n, middle)
+    k = np.arange(n + 1)[:, None]
+    mean_sign = (binom.pmf(k, n, middle) * np.sign(middle - k / n)).sum(axis=0)
+    np.testing.assert_allclose(bias, mean_sign, atol=1e-12)
+    is_smooth = np.floor(n * levels[:-1]) == np.ceil(n * levels[1:]) - 1  # no step of K / n
+    slope = np.diff(table) / np.diff(levels)
+    np.testing.assert_allclose(slope[is_smooth], bias[is_smooth], atol=1e-4)
+    # The curvature: K follows the population, and the steps stay.
+    e = 1e-5
+    moved = [
+        (binom.pmf(k, n, q) * np.sign(middle - k / n)).sum(axis=0) for q in (middle - e, middle + e)
+    ]
+    np.testing.assert_allclose(density, (moved[0] - moved[1]) / (2 * e), rtol=1e-4, atol=1e-6)
+    if n == 1:  # the continuous ranked probability score
+        np.testing.assert_allclose(table, levels * (1 - levels), atol=1e-14)
+    # A strictly proper scoring rule.
+    score = np.abs(levels - k / n) - table
+    for p in (0.03, 0.25, 0.6):
+        expected = (binom.pmf(k, n, p) * score).sum(axis=0)
+        assert levels[expected.argmin()] == pytest.approx(p, abs=2e-3)
+
+
+def test_a_corrected_area_is_positive_and_the_same_stored_and_symbolic(draw: Draw) -> None:
+    x, w, z, _ = draw(3)
+    z = z[:4]
+    x[3] = INF
+    plain = AreaMetric().against(z)
+    d = with_unbiased_areas(plain)
+    assert d(z) == pytest.approx(0, abs=1e-15)
+    assert 0 < d(x, w) < plain(x, w) == AreaMetric()(x, z, weights=w)
+    basis = d.basis(x)
+    rows = np.random.default_rng(0).dirichlet(np.ones(x.size), (2, 3))
+    stored = d.outer(*basis.features(rows), xp=np)
+    np.testing.assert_allclose(stored, d(x, rows), rtol=1e-11)
+    v, y = pt.vector("v"), pt.vector("y")
+    graph = d.outer(*basis.features(v, pt), xp=pt)
+    direct = d.outer(*d.features(y, v, pt), xp=pt)
+    outputs = [graph, direct, pytensor.grad(graph, v)]
+    a, b, slope = pytensor.function([y, v], outputs, mode=PYTHON)(x, w)
+    np.testing.assert_allclose([a, b], d(x, w), rtol=1e-11)
+    e = 1e-7 * np.eye(x.size)
+    up, down = (d.outer(*basis.features(w + s * e), xp=np) for s in (1, -1))
+    np.testing.assert_allclose(slope, (up - down) / 2e-7, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("lift", [Joint, MarginalCorrelation])
+def test_each_projection_is_corrected_for_the_specimens_that_have_it(lift: Any) -> None:
+    rng = np.random.default_rng(4)
+    z, x = rng.normal(size=(9, 2)), rng.normal(size=(40, 2))
+    z[:3, 1] = NAN
+    d = with_unbiased_areas(lift(AreaMetric()).against(z))
+    areas = [part.target for part in d.parts if isinstance(part.target, AreaDiscrepancy)]
+    assert {area.specimens for area in areas} == {area.observed.size for area in areas}
+    assert with_unbiased_areas(d) is d
+    resampled = d.with_observed(np.concatenate([z, z]))
+    assert [getattr(part.target, "specimens", 0) for part in resampled.parts] == [
+        getattr(part.target, "specimens", 0) for part in d.parts
+    ]
+    w = pt.vector("w")
+    weights = rng.dirichlet(np.ones(40))
+    basis = d.basis(x)
+    graph = d.outer(*basis.features(w, pt), xp=pt)
+    slope = pytensor.grad(graph, w)
+    value, gradient = pytensor.function([w], [graph, slope], mode=PYTHON)(weights)
+    assert value == pytest.approx(d(x, weights), rel=1e-10)
+    e = 1e-7 * np.eye(40)
+    up, down = (d.outer(*basis.features(weights + s * e), xp=np) for s in (1, -1))
+    np.testing.assert_allclose(gradient, (up - down) / 2e-7, rtol=1e-4, atol=1e-6)
+
+
+def test_a_spread_in_common_has_no_bias_in_a_sum_of_corrected_areas() -> None:
+    quantiles = norm.ppf((np.arange(400) + 0.5) / 400)
+    spreads = np.exp(np.linspace(-1, 1, 81))
+    logs = []
+    for seed in range(10):
+        z = np.random.default_rng(seed).normal(size=(5, 4))
+        targets = [AreaMetric().against(row) for row in z]
+        simulated = z.mean() + spreads[:, None] * quantiles
+        plain = sum(d(simulated) for d in targets)
+        corrected = sum(with_unbiased_areas(d)(simulated) for d in targets)
+        logs.append([np.log(spreads[v.argmin()] / z.std()) for v in (plain, corrected)])
+    plain_mean, mean = np.mean(logs, axis=0)
+    assert plain_mean < -0.25
+    assert mean == pytest.approx(0, abs=0.05)  # its standard error is .02
+
+
+def test_only_several_simulators_are_corrected() -> None:
+    def evaluator(n_simulators: int) -> Evaluator:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1)
+            for k in range(n_simulators):
+                settings: Any = {"observed": np.arange(3.0 + k)}
+                if k == 2:
+                    settings = {"observed": [0.0, 1.0], "weights": [3, 5]}
+                if k == 3:
+                    settings = {"observed": [0.0, 1.0, 2.0], "weights": [0.5, 0.5, 1e-9]}
+                prb.Simulator(
+                    f"y{k}", np.positive, x, metric=AreaMetric(),
+                    propagation=prb.Reweighted(16), **settings,
+                )  # fmt: skip
+        return Evaluator.of(model)
+
+    def specimens(evaluator: Evaluator) -> list[int]:
+        return [getattr(node.target, "specimens", -1) for node in evaluator.nodes]
+
+    assert specimens(evaluator(1)) == [0]
+    several = evaluator(4)
+    assert specimens(several) == [3, 4, 8, 2]
+    data = {node.name: np.arange(7.0) for node in several.nodes}
+    weights = {node.name: np.full(7, 1 / 7) for node in several.nodes}
+    assert specimens(several.observing(data, weights=weights)) == [7] * 4

@@ -460,5 +460,5 @@ def test_a_specimen_of_two_groups_is_refused() -> None:
     with pm.Model(coords={"supplier": ["Adler", "Busch"]}):
         mu = pm.Normal("mu", 0, 2, dims="supplier")
         x = pm.Normal.dist(mu[prb.response.group("supplier")], 1.0)
-        with pytest.raises(ValueError, match="got the label 1 in two groups"):
+        with pytest.raises(ValueError, match="got the label 1 with two groups"):
             prb.Simulator("y", up, x, observed=data, specimens=[1, 2, 1], metric=metric(error=0.1))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import arviz as az
 import cloudpickle
 import numpy as np
 import pymc as pm
@@ -332,6 +333,27 @@ def test_data_that_do_not_fit_labels_are_refused() -> None:
     pm.set_data({"data": np.append(OBSERVED[:19], np.nan)}, model=model)
     with pytest.raises(ValueError, match="y: observed: got"):
         prb.minimize(model)
+
+
+def test_a_metric_has_no_log_likelihood_by_specimen(caplog: pytest.LogCaptureFixture) -> None:
+    """The log-likelihoods of other variables, and the density that samplers take, remain."""
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 1)
+        y = {"metric": prb.AreaMetric(), "observed": [0.0, 1.0, 2.0], "epsilon": 0.1}
+        prb.Simulator("y", lambda x: 2 * x, pm.Normal.dist(mu, 1), **y)
+        pm.Normal("z", mu, 1, observed=[0.5, 1.0])
+    idata = az.from_dict({"posterior": {"mu": np.linspace(-0.5, 0.5, 100).reshape(2, 50)}})
+    given = {"model": model, "progressbar": False, "compile_kwargs": {"mode": PLAIN}}
+    pm.compute_log_likelihood(idata, **given)
+    assert idata["log_likelihood"]["y"].shape == (2, 50, 0)
+    with pytest.raises(ValueError, match="size 0"):
+        az.loo(idata, var_name="y")
+    record = caplog.records[-1]
+    assert getattr(record, "code", "") == "no-log-likelihood"
+    assert "use prb.cross_validate" in record.getMessage()
+    assert az.loo(idata, var_name="z").n_data_points == 2
+    density = model.compile_fn(model.logp(model["y"]), mode=PLAIN)
+    assert density({"mu": np.array(0.0)}) < 0
 
 
 def test_an_unset_epsilon_is_reported_with_the_density(caplog: pytest.LogCaptureFixture) -> None:

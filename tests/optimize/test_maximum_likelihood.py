@@ -16,7 +16,13 @@ import prbayes as prb
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
 from prbayes.model.specimen_likelihood import monte_carlo_error
-from prbayes.optimize.maximum_likelihood import Mode, mode_weights, share_mode
+from prbayes.optimize.maximum_likelihood import (
+    Mode,
+    _Objective,
+    _signed_root,
+    mode_weights,
+    share_mode,
+)
 
 N = 25
 X = np.random.default_rng(3).normal(0.8, 0.5, N)
@@ -281,3 +287,25 @@ def test_an_optimum_whose_likelihood_is_not_known_has_not_converged(
     optimum = fit(normal_model())
     assert not optimum.converged
     assert [finding.code for finding in optimum.findings] == ["narrow-population"]
+
+
+def test_the_signed_root_is_that_of_the_normal_likelihood_ratio() -> None:
+    """Profiles over the other element: N log(1 + (mu - m)^2 / s^2), N (log r - 1 + 1 / r)."""
+    optimum = normal_optimum()
+    mode = Mode(optimum.theta, optimum.discrepancy, optimum.covariance, converged=True)
+    objective = _Objective(optimum.evaluator, prior=False)
+    names = optimum.evaluator.hyperparameters.names
+    i, j = names.index("mu"), names.index("sigma_log__")
+    m, s = X.mean(), X.std()
+    for mu in (m - 0.3, m + 0.5):
+        theta = optimum.theta.copy()
+        theta[i] = mu
+        root = np.sqrt(N * np.log1p((mu - m) ** 2 / s**2))
+        assert _signed_root(objective, mode, theta, i) == pytest.approx(root, rel=1e-3)
+    for sigma in (0.6 * s, 1.7 * s):
+        theta = optimum.theta.copy()
+        theta[j] = np.log(sigma)
+        ratio = (sigma / s) ** 2
+        root = np.sqrt(N * (np.log(ratio) - 1 + 1 / ratio))
+        assert _signed_root(objective, mode, theta, j) == pytest.approx(root, rel=1e-3)
+    assert _signed_root(objective, mode, optimum.theta, i) == pytest.approx(0, abs=1e-3)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -28,7 +30,7 @@ from prbayes.posterior.kernel import (
 from prbayes.posterior.results import Chains
 from prbayes.posterior.smc import SamplingSettings, run_chains
 from prbayes.response.budget import BudgetError
-from prbayes.response.store import StoreError
+from prbayes.response.store import StoreError, only_writer
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 20)
 AREA = prb.AreaMetric()
@@ -321,6 +323,47 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
     xr.testing.assert_equal(sample(path).posterior.to_dataset(), first.posterior.to_dataset())
 
 
+HOLDER = """
+import sys
+from filelock import FileLock
+lock = FileLock(sys.argv[1])
+lock.acquire()
+print("locked", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_second_run_on_a_checkpoint_is_refused_until_the_first_ends_or_is_killed(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.nc"
+    part, others = f"run.nc.{'0' * 32}.part", f"run.nc.b.{'0' * 32}.part"
+    for name in (part, others):
+        (tmp_path / name).touch()
+    command = [sys.executable, "-c", HOLDER, f"{path}.lock"]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "locked\n"
+        with pytest.raises(StoreError, match=r"run.nc, which another run is writing to.*wait for"):
+            sample(path)
+        assert not path.exists()
+        holder.kill()
+    first = sample(path)
+    # What the killed run left is removed, what belongs to another file is not.
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.nc", others, "run.nc.lock"]
+    (tmp_path / "link.nc").symlink_to(path)
+    with (
+        only_writer(tmp_path / "link.nc", "checkpoint"),
+        pytest.raises(StoreError, match="another run is writing to"),
+    ):
+        sample(path)
+    xr.testing.assert_equal(sample(path).posterior.to_dataset(), first.posterior.to_dataset())
+    with pytest.raises(StoreError, match="whose folder does not exist"):
+        sample(tmp_path / "no" / "state.nc")
+
+
 @pytest.mark.parametrize("adjustment", [None, "estimate"])
 def test_an_interrupted_run_gives_the_draws_of_an_uninterrupted_one(
     adjustment: str | None, tmp_path: Path
@@ -359,8 +402,6 @@ def test_checkpoints_keep_arrays_and_notes(tmp_path: Path) -> None:
             Checkpoint(path, problem, changed)
     with pytest.raises(StoreError, match="belongs to another run"):
         Checkpoint(path, identity_of(vector_model()), SETTINGS)
-    with pytest.raises(StoreError, match="whose folder does not exist"):
-        Checkpoint(tmp_path / "no" / "state.nc", problem, SETTINGS)
 
 
 @pytest.mark.parametrize(

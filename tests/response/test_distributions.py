@@ -109,6 +109,19 @@ def test_quantiles(dist: Any, expected: Any) -> None:
     np.testing.assert_allclose(found, expected.ppf(u), rtol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "ends",
+    [{"lower": 0.0}, {"upper": 3.0}, {"lower": [0.0, -np.inf]}, {"lower": 0.0, "upper": [3, 2.5]}],
+    ids=str,
+)
+def test_quantiles_of_a_vector_of_truncated_normals(ends: dict[str, Any]) -> None:
+    """An infinite end of a vector is no number in PyMC's inverse distribution function."""
+    u, mu = np.array([[0.1, 0.5], [0.9, 0.3], [0.999, 0.7]]), np.array([1.0, 2.0])
+    low, high = (np.asarray(ends.get(k, e)) for k, e in (("lower", -np.inf), ("upper", np.inf)))
+    found = quantiles("y", pm.TruncatedNormal.dist(mu, 1.0, **ends), u).eval(mode=PLAIN)
+    np.testing.assert_allclose(found, stats.truncnorm.ppf(u, low - mu, high - mu, mu), rtol=1e-7)
+
+
 def test_quantiles_of_a_multivariate_normal_have_its_mean_and_covariance() -> None:
     u = stats.norm.cdf(np.vstack([np.zeros(2), np.eye(2)]))
     dist = pm.MvNormal.dist(np.array([1.0, 2.0]), COVARIANCE)

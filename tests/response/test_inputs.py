@@ -27,7 +27,7 @@ from prbayes.response.inputs import (
     is_group,
     is_random,
     read_inputs,
-    refuse_groups,
+    refuse_several_populations,
 )
 
 with pm.Model():
@@ -302,5 +302,5 @@ def test_groups_in_the_wrong_place_are_refused() -> None:
     with pytest.raises(ValueError, match=r"2 calls of .* \['supplier', 'batch'\], expected one"):
         groups_of("y", both)
     with pytest.raises(TypeError, match=r"depends on prb.response.group\('supplier'\), expected"):
-        refuse_groups("prb.sensitivity: f", both[:1])
-    refuse_groups("prb.sensitivity: f", [])
+        refuse_several_populations("prb.sensitivity: f", both[:1])
+    refuse_several_populations("prb.sensitivity: f", [])

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from scipy import stats
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
 from prbayes._stats import envelope
 from prbayes.validation.conditions import area
+from prbayes.validation.nulls import uniform_envelope
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
@@ -219,6 +221,21 @@ def test_the_envelope_contains_its_share_of_uniform_numbers() -> None:
     # Standard errors: .009 of the envelope, .005 of the share.
     assert abs(inside - 0.9) < 0.045
     np.testing.assert_allclose(lower + upper[::-1], 1, atol=0.04)
+
+
+def test_the_envelope_of_many_uniform_numbers_follows_their_order_statistics() -> None:
+    n = 50_000
+    lower, upper = uniform_envelope(n, 0.05)
+    assert lower.shape == upper.shape == (n,)
+    assert (np.diff(lower) > 0).all()
+    assert (np.diff(upper) > 0).all()
+    rank = np.arange(1, n + 1)
+    # Probabilities of order statistics beyond the bounds: alike from the first rank to the last.
+    at = np.r_[0:3, 10:n:500, n - 3 : n]
+    order = stats.beta(rank[at], n + 1 - rank[at])
+    for tail in (order.cdf(lower[at]), order.sf(upper[at])):
+        assert tail.max() < 0.02
+        assert 1e-4 < np.median(tail) < 0.01
 
 
 def test_as_many_replicates_are_inside_the_envelope_as_asked_for() -> None:

@@ -27,27 +27,37 @@ IntArray = NDArray[np.intp]
 
 
 def unidentified_findings(
-    evaluator: Evaluator, local: Local, excluded: Collection[str] = ()
+    evaluator: Evaluator,
+    local: Local,
+    excluded: Collection[str] = (),
+    *,
+    has_bounds: bool = True,
 ) -> list[Finding]:
-    """Report directions that the data identify less than the prior, without excluded names."""
+    """Report directions that the data identify less than the prior, without excluded names.
+
+    ``has_bounds``: bounds from one side were searched.
+    """
     hidden = local.unidentified
     indirect = only_through_prior(evaluator)
     if indirect.any():
         # One, or zero up to rounding for elements on which nothing depends.
         axes, strength, _ = np.linalg.svd(hidden * ~indirect[:, None], full_matrices=False)
         hidden = np.asarray(axes[:, strength > 0.5])
-    directions = unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
-    return [
-        Finding(
-            "not-identified",
-            f"The data are less informative than the prior about {direction} (in units of the "
-            "priors' standard deviations): it is not identified by them, and its posterior rests "
-            "on the prior; measure more outputs or conditions, or state prior knowledge.",
-            "optimum_or_abc.md#no-answer",
+    names = unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
+    directions = [name for name in names if name not in excluded]
+    if not directions:
+        return []
+    text = (
+        f"The data are less informative than the prior about {', '.join(directions)} (in units of "
+        "the priors' standard deviations): the posterior rests on the prior there; measure more "
+        "outputs or conditions, or state prior knowledge."
+    )
+    if not has_bounds:
+        text += (
+            " Bounds from one side were not searched, which takes many responses or refits; look "
+            "at the interval of prb.sample."
         )
-        for direction in directions
-        if direction not in excluded
-    ]
+    return [Finding("not-identified", text, "optimum_or_abc.md#no-answer")]
 
 
 def confounding_findings(evaluator: Evaluator, local: Local) -> list[Finding]:

@@ -97,17 +97,13 @@ def data_between_runs(evaluator: Evaluator, theta: Floats) -> list[Finding]:
     return findings
 
 
-def small_simulators(
-    evaluator: Evaluator, *, refits: bool = False, enough: int = 30
-) -> list[Finding]:
+def small_simulators(evaluator: Evaluator, *, enough: int = 30) -> list[Finding]:
     """Report simulators of so few specimens that the spread in common is estimated too small.
 
     Bandwidths of few data let simulators that happen to scatter little weigh most, unless they have
-    the same response and so one bandwidth. A sum of areas leaves out the scatter between their
-    means; ``refits`` measure this bias, so that it is left out. The probability residual is right.
+    the same response and so one bandwidth. The probability residual and the area are right.
     """
     nodes = evaluator.nodes
-    areas = [node.metric.minimum is Minimum.ABSOLUTE for node in nodes]
     widths = set()
     for node in nodes:
         parts = [part.target for part in node.target.parts if part.target.metric.likelihood]
@@ -117,9 +113,7 @@ def small_simulators(
             cells = getattr(parts[0], "cells", None)
             widths.add(getattr(cells, "bandwidth", node.name))
     fewest = min((len(node.observed) for node in nodes), default=enough)
-    has_area = any(areas) and not refits
-    is_biased = has_area or len(widths) > 1
-    if len(nodes) < 2 or fewest >= enough or not is_biased or dependent(nodes):
+    if len(nodes) < 2 or fewest >= enough or len(widths) < 2 or dependent(nodes):
         return []
     # Elements of theta that enter the populations of two simulators.
     hyperparameters = evaluator.hyperparameters
@@ -191,9 +185,8 @@ def refit_bias(fitted: FittedSets) -> list[Finding]:
     text = (
         f"Refits of data sets that are drawn at the optimum give a {side[0]} {name}, on average by "
         f"{abs(shift[worst]):.1f} of their standard deviations: the optimum {side[1]}estimates it, "
-        "as where several simulators have few specimens each; take the posterior of prb.sample, "
-        "which corrects for it, or prb.ProbabilityResidual(), or give one simulator all specimens "
-        "of a condition."
+        "as with few specimens for each mean or output; report the posterior of prb.sample, which "
+        "corrects for it."
     )
     return [Finding("biased-optimum", text, _ADVICE)]
 

@@ -6,6 +6,7 @@ a one-sided test: further on, the data would be an unlikely sample.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,6 +20,8 @@ from prbayes.inference.prior_continuation import ends_of_prior
 from prbayes.inference.refits import SamplingDistribution, is_stored, needs_refits
 from prbayes.inference.resampling import observed_set
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.parameters import THETAS
+from prbayes.response.budget import budget
 
 
 @dataclass(frozen=True)
@@ -56,13 +59,18 @@ def one_sided_bounds(
 
     ``statistic`` of a theta and an element is the standardised distance of the data from the
     populations there, NaN where it is not known. The sides are searched up to four standard
-    deviations of the prior from theta.
+    deviations of the prior from theta, and from the median of the prior if it is on that side.
     """
     hyperparameters = evaluator.hyperparameters
     _, lower, upper = ends_of_prior(hyperparameters, theta)
+    to_median = np.median(hyperparameters.prior_thetas(THETAS, 0), axis=0) - theta
     bounds = []
     for i in np.flatnonzero(flat).tolist():
-        limits = [_limit(hyperparameters.prior_sd[i], theta, i, statistic, s) for s in (1, -1)]
+        unit = hyperparameters.prior_sd[i]
+        limits = [
+            _limit(theta, i, statistic, sign * unit, 4.0 + max(sign * to_median[i] / unit, 0.0))
+            for sign in (1, -1)
+        ]
         if np.isnan(limits).sum() != 1:
             continue
         is_upper = not np.isnan(limits[0])
@@ -76,22 +84,24 @@ def one_sided_bounds(
 
 
 def _limit(
-    unit: float, theta: Floats, i: int, statistic: Callable[[Floats, int], float], sign: int
+    theta: Floats, i: int, statistic: Callable[[Floats, int], float], unit: float, most: float
 ) -> float:
-    """Return the i-th element at the limit on one side, NaN without one."""
+    """Return the i-th element at the limit, at most so many units away, NaN without a limit."""
     place, below = theta.copy(), (0.0, 0.0)  # distance and statistic
     highest = float(norm.ppf(0.95))
 
     def at(distance: float) -> float:
-        place[i] = theta[i] + sign * distance * unit
+        place[i] = theta[i] + distance * unit
         return statistic(place, i)
 
-    for distance in (0.25, 0.5, 1.0, 2.0, 4.0):
+    for distance in (0.25, 0.5, *np.arange(1, np.ceil(most) + 1).tolist()):
         value = at(distance)
         if value >= highest:
             break
         if np.isfinite(value):
             below = distance, value
+        elif not below[1]:
+            below = distance, 0.0
     else:
         return np.nan
     above = distance, value
@@ -103,18 +113,28 @@ def _limit(
         elif np.isfinite(value):
             below = middle, value
     middle = np.interp(highest, [below[1], above[1]], [below[0], above[0]])
-    return float(theta[i] + sign * middle * unit)
+    return float(theta[i] + middle * unit)
 
 
-def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound]:
-    """Return elements that are bounded from one side; computes no response."""
+def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | None:
+    """Return elements that are bounded from one side, None if that would take long.
+
+    Responses that are not stored are computed if they take less than half a minute.
+    """
     evaluator, scales = sampling.evaluator, sampling.scales
     is_alone = (sampling.local.unidentified**2).sum(axis=1) > 0.9
-    if not is_alone.any() or not is_stored(evaluator) or needs_refits(evaluator):
+    if not is_alone.any():
         return []
+    start = time.perf_counter()
+    (lowest,) = evaluator.total(sampling.theta[None], scales)
+    seconds = time.perf_counter() - start
+    # Some ten places, with the derivatives of the population at each.
+    n_populations = 20 * sampling.theta.size**2
+    is_long = seconds * n_populations > 30 or budget().is_limited
+    if needs_refits(evaluator) or (is_long and not is_stored(evaluator)):
+        return None
 
     noise = sum(item.noise_floor / s for item, s in zip(sampling.information, scales, strict=True))
-    (lowest,) = evaluator.total(sampling.theta[None], scales)
 
     def statistic(theta: Floats, i: int) -> float:
         (total,) = evaluator.total(theta[None], scales)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -12,36 +13,91 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._validate import Floats
+from prbayes.inference.checks.identification import unidentified_findings
 from prbayes.inference.checks.one_sided import bounds_by_metric, one_sided_bounds
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
+from prbayes.posterior.target import estimate_target
+from prbayes.response.budget import limited
 
 LEVELS = norm.ppf((np.arange(40) + 0.5) / 40)
 
 
-def known_scatter(name: str, observed: Any) -> Evaluator:
+def known_scatter(name: str, observed: Any, propagation: Any = R256) -> Evaluator:
     """Return a spread of the inputs beside a known one of .5."""
     with pm.Model() as model:
         sigma = pm.HalfNormal("sigma", 1)
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), pm.math.sqrt(sigma**2 + 0.25))
-        prb.Simulator("y", same, x, metric=METRICS[name], observed=observed, propagation=R256)
+        y = {"metric": METRICS[name], "observed": observed, "propagation": propagation}
+        prb.Simulator("y", same, x, **y)
     return Evaluator.of(model)
 
 
-@pytest.mark.parametrize("name", sorted(METRICS))
-def test_a_spread_that_may_be_zero_has_an_upper_limit(name: str) -> None:
-    evaluator = known_scatter(name, 0.5 * LEVELS)
-    theta = np.array([np.log(0.05), 0.0])
+COMPUTED = prb.Resimulated(256)
+
+
+# The last optima are collapsed: seven and four standard deviations of the prior from its median.
+@pytest.mark.parametrize(
+    ("name", "propagation", "spread"),
+    [
+        *[(name, R256, 0.05) for name in sorted(METRICS)],
+        ("pr", COMPUTED, 0.05),
+        ("pr", COMPUTED, 1e-4),
+        ("area", R256, 0.003),
+    ],
+)
+def test_a_spread_that_may_be_zero_has_an_upper_limit(
+    name: str, propagation: Any, spread: float
+) -> None:
+    evaluator = known_scatter(name, 0.5 * LEVELS, propagation)
+    theta = np.array([np.log(spread), 0.0])
     sampling = SamplingDistribution.of(evaluator, theta, np.ones(1))
-    (bound,) = bounds_by_metric(sampling)
+    (bound,) = bounds_by_metric(sampling) or []
     assert (bound.name, bound.is_upper, bound.end) == ("sigma", True, 0.0)
     # The variance of 40 normal data is .25: 95% of data sets have a larger one if that of the
     # population is above .25 / (1 - 1.645 sqrt(2 / 40)), by the normal approximation.
     exact = np.sqrt(0.25 / (1 - 1.645 * np.sqrt(2 / 40)) - 0.25)
     assert bound.limit == pytest.approx(exact, rel=0.2)
     text = bound.finding.text
-    assert "The data bound sigma from above only: got 0.05, at most 0." in text
+    assert f"The data bound sigma from above only: got {spread:.3g}, at most 0." in text
     assert "values down to 0 are compatible" in text
+
+
+def test_bounds_are_not_searched_if_they_cost_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a budget of responses, by their time, or by refits."""
+    evaluator = known_scatter("pr", 0.5 * LEVELS, COMPUTED)
+    theta = np.array([np.log(0.05), 0.0])
+    sampling = SamplingDistribution.of(evaluator, theta, np.ones(1))
+    with limited(None, 10**6):
+        assert bounds_by_metric(sampling) is None
+    clock = count(0.0, 1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr("time.perf_counter", lambda: next(clock))
+        assert bounds_by_metric(sampling) is None
+    text = "Bounds from one side were not searched"
+    (finding,) = unidentified_findings(evaluator, sampling.local, has_bounds=False)
+    assert text in finding.text
+    (finding,) = unidentified_findings(evaluator, sampling.local)
+    assert text not in finding.text
+
+
+@pytest.mark.parametrize("scatter", [0.4, 0.55])
+def test_propagations_have_the_same_posterior_near_zero(scatter: float) -> None:
+    """Of log densities on a grid, with the optimum of sigma at zero, and at .22."""
+    y = scatter * LEVELS[::2]
+    sigma, mu = np.geomspace(0.01, 4, 12), np.linspace(-0.5, 0.5, 7)
+    thetas = np.stack(np.meshgrid(np.log(sigma), mu, indexing="ij"), axis=-1).reshape(-1, 2)
+    moments = []
+    for propagation in (R256, COMPUTED):
+        evaluator = known_scatter("pr", y, propagation)
+        optimum = prb.minimize(evaluator.model, starts=0, progressbar=False)
+        target = estimate_target(optimum.evaluator, optimum)
+        logs = target.log_posterior(thetas)
+        mass = np.exp(logs - logs.max()).reshape(len(sigma), -1).sum(axis=1)
+        mass /= mass.sum()
+        mean = mass @ sigma
+        moments.append((mean, np.sqrt(mass @ (sigma - mean) ** 2)))
+    assert moments[0] == pytest.approx(moments[1], rel=0.03)
 
 
 def test_two_limits_or_none_are_no_bound() -> None:

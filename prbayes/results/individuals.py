@@ -1,0 +1,162 @@
+"""Inputs of the measured specimens themselves, with replicates of their readings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from prbayes._validate import Floats, Seed, positive_integer, seed_number
+from prbayes.model.locking import locked
+from prbayes.model.measurement import SpecimenLikelihood, specimen_labels
+from prbayes.model.specimen_likelihood import draw_inputs, draw_readings, specimen_likelihoods
+from prbayes.optimize.optimum import Optimum
+from prbayes.response.condition import is_condition
+from prbayes.response.inputs import aleatory_names
+from prbayes.response.outputs import Outputs
+from prbayes.results.predict import model_of, populations_of
+
+
+@locked
+def individuals(
+    result: Optimum | xr.DataTree,
+    *,
+    model: pm.Model | None = None,
+    n_draws: int = 400,
+    random_seed: Seed = 0,
+) -> xr.DataTree:
+    r"""Draw the inputs of each measured specimen, given its readings and the population.
+
+    Readings of a specimen that say little about an input leave it near the population's mean. The
+    shrinkage of an input is
+
+    .. math:: 1 - \frac{\operatorname{sd}_i\, E[x_i \mid y_i, \theta]}{\sigma(\theta)},
+
+    with the standard deviation of the means over the specimens, and that of the population: near
+    zero where readings identify the input, near one where they do not [1]_.
+
+    Parameters
+    ----------
+    result : Optimum or xarray.DataTree
+        From `minimize`; or with a ``posterior`` group, from `sample` or any sampler of PyMC. The
+        population of an optimum is taken as known: intervals are those of empirical Bayes.
+    model : pymc.Model, optional
+        That of the optimum, or the one on the context, by default. Its simulators have the
+        log-likelihood by specimen: metrics of distributions keep no record of a specimen.
+    n_draws : int
+        Number of populations, over all chains; the posterior's draws are thinned evenly.
+    random_seed : int, sequence of int, numpy.random.Generator or None
+
+    Returns
+    -------
+    xarray.DataTree
+        Groups of ArviZ: ``posterior`` has each input with dims (chain, draw, specimen), in its own
+        units, with the attribute ``shrinkage``, and ``gross_error``, the probability of one, where
+        the model has gross errors; ``posterior_predictive`` has replicates of the readings of each
+        specimen, of another specimen under the same condition, and ``observed_data`` the readings.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the model has no simulator with the log-likelihood by specimen, or the result is of
+        another model.
+
+    References
+    ----------
+    .. [1] Savic, R. M., and M. O. Karlsson (2009), Importance of shrinkage in empirical Bayes
+       estimates for diagnostics, AAPS J. 11, 558-569, doi:10.1208/s12248-009-9133-0.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+    ...     data = [0.0, 1.0, 2.5, 4.0, 3.0, 1.5]
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, observed=data)
+    >>> tree = prb.individuals(prb.minimize(model))
+    >>> tree["posterior"]["x"].mean(("chain", "draw")).values.round(2)
+    array([0.  , 0.5 , 1.25, 2.  , 1.5 , 0.75])
+    """
+    positive_integer(n_draws, "n_draws")
+    model = model_of(result, model, "prb.individuals")
+    likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
+    if not likelihoods:
+        raise TypeError(
+            "prb.individuals: got a model whose metrics compare distributions, expected a "
+            "prb.Simulator with metric=prb.LogLikelihood(), which has a record of each specimen"
+        )
+    points, coords = populations_of(result, model, n_draws, "prb.individuals")
+    if isinstance(result, Optimum):
+        points = {name: np.repeat(values, n_draws, axis=0) for name, values in points.items()}
+        coords["draw"] = np.arange(n_draws)
+    seed = None if random_seed is None else seed_number(random_seed)
+    rng = np.random.default_rng(seed)
+    names = ("posterior", "posterior_predictive", "observed_data", "constant_data")
+    groups: dict[str, dict[str, xr.DataArray]] = {name: {} for name in names}
+    for likelihood in likelihoods:
+        suffix = "" if len(likelihoods) == 1 else f" of {likelihood.name}"
+        labels = specimen_labels(likelihood)
+        size = len(likelihood.readings)
+        specimens = {f"specimen{suffix}": np.arange(size) if labels is None else labels}
+        inputs, gross_error = draw_inputs(likelihood, rng, points)
+        population_sd = _population_sd(likelihood, points, rng)
+        function = likelihood.measurements[0].responses.function
+        input_names = aleatory_names(likelihood.inputs, function)
+        for x, name, values, sd in zip(
+            likelihood.inputs.aleatory, input_names, inputs, population_sd, strict=True
+        ):
+            if is_condition(x):
+                condition = np.asarray(x.owner.op.values)
+                known = np.empty(size)
+                for numbers in likelihood.stacked.numbers:
+                    if len(numbers) == len(condition):
+                        known[numbers] = condition
+                array = xr.DataArray(known, specimens, tuple(specimens))
+                groups["constant_data"][name + suffix] = array
+                continue
+            shrinkage = 1 - values.mean(axis=0).std(axis=0) / sd
+            array = _array(name, values, coords | specimens)
+            groups["posterior"][name + suffix] = array.assign_attrs(shrinkage=shrinkage.tolist())
+        if gross_error is not None:
+            array = _array("gross_error", gross_error, coords | specimens)
+            groups["posterior"][f"gross_error{suffix}"] = array
+        for m in likelihood.measurements:
+            rows = specimens
+            if len(m.observed) != size:
+                row_labels = np.asarray(m.specimens)
+                rows = {f"specimen of {m.name}": row_labels}
+            replicates = draw_readings(likelihood, rng, points, len(m.observed), m)
+            array = _array(m.name, replicates, coords | rows, m.outputs)
+            groups["posterior_predictive"][m.name] = array
+            observed = array.isel(chain=0, draw=0, drop=True).copy(data=m.observed)
+            groups["observed_data"][m.name] = observed
+    datasets = {name: xr.Dataset(arrays) for name, arrays in groups.items() if arrays}
+    return xr.DataTree.from_dict(datasets)
+
+
+def _population_sd(
+    likelihood: SpecimenLikelihood, points: dict[str, Floats], rng: np.random.Generator
+) -> list[Floats]:
+    """Return the standard deviation of each input in the populations, (*event), over all groups."""
+    parts: list[list[Floats]] = []
+    for group, rows in likelihood.by_group:
+        parents = likelihood.parents(points, group, rows)
+        drawn, _ = likelihood.density.sampler(parents, 256, rng)
+        parts.append([values.var(axis=1).mean(axis=0) for values in drawn])
+    return [np.sqrt(np.mean(variances, axis=0)) for variances in zip(*parts, strict=True)]
+
+
+def _array(
+    name: str, values: Floats, coords: dict[str, Any], outputs: Outputs | None = None
+) -> xr.DataArray:
+    """Return draws, (P, n, *event), with the dimensions chain, draw, specimen, and of the event."""
+    event = values.shape[2:]
+    event_dims = [f"{name}_dim_{i}" for i in range(len(event))]
+    if outputs is not None and outputs.labels and event:
+        event_dims = [outputs.dim]
+        coords = coords | {outputs.dim: list(outputs.labels)}
+    dims = ("chain", "draw", *[dim for dim in coords if dim not in ("chain", "draw", *event_dims)])
+    sizes = (len(coords["chain"]), len(coords["draw"]), *values.shape[1:])
+    return xr.DataArray(values.reshape(sizes), coords, (*dims, *event_dims), name=name)
