@@ -24,8 +24,8 @@ class Runs:
 
     It is a `Surrogate` through the runs, whose error is cross-validated: the best one of two
     Gaussian processes and quintic splines. Outside the ranges of the runs, and beside a run that
-    failed, it is NaN. `Simulator`, `predict` and `exceedance` take it as a response. With the log-likelihood by
-    specimen the error of the surface is part of the comparison.
+    failed, it is NaN. `Simulator`, `predict` and `exceedance` take it as a response. With the
+    log-likelihood by specimen the error of the surface is part of the comparison.
 
     Parameters
     ----------
