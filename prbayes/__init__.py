@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from prbayes.validation.area_test import area_test as area_test
     from prbayes.validation.cross_validation import cross_validate as cross_validate
     from prbayes.validation.cross_validation import rank as rank
+    from prbayes.validation.fleet import calibrate_each as calibrate_each
 
 __version__ = version("prbayes")
 
@@ -118,6 +119,7 @@ _NAMES = {
     "results.predict": ("predict",),
     "validation.area_test": ("area_test",),
     "validation.cross_validation": ("cross_validate", "rank"),
+    "validation.fleet": ("calibrate_each",),
 }
 _NAMESPACES = (
     "datasets",

@@ -580,6 +580,11 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     "plots.plot_sensitivity": Row(
         table=(*(xr.Dataset(), xr.Dataset({"first": 1.0, "total": 1.0}), comparison, posterior),),
     ),
+    "calibrate_each": Row(
+        {"data_sets": {"a": OBSERVED, "b": OBSERVED + 1}},
+        data_sets=([1.0, 2.0], {}, {"a": [1.0]}, {"a": ["x", "y"]}, {"a": np.ones((3, 2))}),
+        validation=([1.0], {"zz": [1.0]}, {"a": []}, {"a": np.ones((3, 2))}),
+    ),
     "individuals": Row(
         {"result": at_optimum, "model": by_specimen},
         result=(None, 3, "result", xr.DataTree(), []),

@@ -44,6 +44,7 @@ from pytensor.graph.traversal import ancestors, toposort, walk
 from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
+from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.shape import Shape
@@ -289,6 +290,23 @@ def test_random_variables_draw_from_parameters_and_then_the_size() -> None:
     generator = pt.random.shared_rng(seed=None)
     _, variable = Recorded()(1.0, 2.0, size=(4,), rng=generator, return_next_rng=True)
     np.testing.assert_array_equal(variable.eval(mode=PLAIN), np.full(4, 3.0))
+
+
+def test_a_subclass_of_the_uniform_distribution_has_its_density_and_draws() -> None:
+    class ConditionRV(UniformRV):  # type: ignore[misc]
+        __props__ = (*UniformRV.__props__, "label")
+
+        def __init__(self, label: str, **keywords: Any) -> None:
+            super().__init__(**keywords)
+            self.label = label
+
+    _, variable = ConditionRV("load")(
+        1.0, 3.0, rng=pt.random.shared_rng(seed=0), return_next_rng=True
+    )
+    assert pm.logp(variable, 2.0).eval() == pytest.approx(-np.log(2))
+    draws = pm.draw(variable, 100, random_seed=1)
+    assert ((draws > 1) & (draws < 3)).all()
+    assert ConditionRV("load") != ConditionRV("dose")
 
 
 def test_distributions_have_operations_with_parameters() -> None:

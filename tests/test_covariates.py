@@ -178,6 +178,13 @@ def test_predictions_are_at_a_value_of_the_covariate(
         prb.exceedance(posterior, double, 3.0, x, model=model)
 
 
+def test_a_population_for_each_specimen_has_no_common_score(model: pm.Model) -> None:
+    table = prb.cross_validate(prb.minimize(model, progressbar=False), folds=2, progressbar=False)
+    assert np.isfinite(table["discrepancy"]).all()
+    with pytest.raises(ValueError, match="depends on a condition of each specimen"):
+        prb.rank({"first": table, "second": table})
+
+
 def test_other_covariates_are_another_problem(model: pm.Model) -> None:
     identity = identity_of(model)
     assert identity == identity_of(clone_model(model))

@@ -30,7 +30,7 @@ from prbayes._validate import (
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.model.data_checks import warn_duplicates
+from prbayes.model.data_checks import duplicate_findings
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
     AnySimulator,
@@ -544,7 +544,7 @@ def _add_simulator(
             responses.share(simulator.responses)
             break
     if labels is None:
-        warn_duplicates(name, target.observed)
+        report(*duplicate_findings(name, target.observed))
     else:
         _warn_shared_specimens(specification, labels, earlier)
     aleatory = set(inputs.aleatory)

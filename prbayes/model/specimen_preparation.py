@@ -126,8 +126,10 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
         if likelihood.has_table:
             raise
         cause = "" if runs.first is None else unreached(runs.first, likelihood.readings)
-        findings = _data_findings(likelihood, several_roots=False)
-        raise DesignError(". ".join([f"{error}{cause}", *map(str, findings)])) from None
+        if not cause:
+            data = _data_findings(likelihood, several_roots=False)
+            cause = "".join(finding.text.removesuffix(".") for finding in data[:1])
+        raise DesignError(f"{cause}. Therefore: {error}" if cause else str(error)) from None
     finally:
         for response in responses:
             response.on_start = None

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
-from prbayes.inference.checks.one_sided import one_sided_bounds
+from prbayes.inference.checks.one_sided import bound_findings, one_sided_bounds
 from prbayes.inference.checks.population import failing_region_findings, refuse_lost_specimens
 from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
@@ -401,7 +401,7 @@ def _findings(
         evaluator, best.theta, is_flat & is_direct, partial(_signed_root, objective, best)
     )
     bounds = [bound for bound in bounds if bound.name not in {end.name for end in ends}]
-    findings += [bound.finding for bound in bounds]
+    findings += bound_findings(bounds)
     excluded = {end.name for end in ends} | {bound.name for bound in bounds}
     flat = [name for name in unidentified if name not in excluded]
     if flat:

@@ -49,6 +49,11 @@ class SpecimenPoints:
     n_roots: NDArray[np.intp]  # (N,)
     difference: float = np.nan  # the half difference of the log-likelihoods
 
+    def rows(self, index: NDArray[np.intp]) -> SpecimenPoints:
+        """Return the points of selected specimens."""
+        arrays = {name: value[index] for name, value in vars(self).items() if name != "difference"}
+        return replace(self, **arrays)
+
 
 def joined(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
     """Return two independent sets of points as one; each counts half."""

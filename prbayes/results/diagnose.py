@@ -35,6 +35,7 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
 )
+from prbayes.optimize.design_refinement import rough_emulators
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.optimize.minimize import find_optimum
 from prbayes.optimize.objective import Minimisation
@@ -230,6 +231,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     }
     failures, harmless = _failure_findings(tree, lost, _stored_shares(calibration, "failed_mass"))
     compared = [Finding("outputs-compared", sentence) for sentence in compared_in(calibration)]
+    compared += [] if optimum is None else rough_emulators(optimum.evaluator)
     return Diagnosis(
         (
             *findings,
@@ -267,8 +269,10 @@ def _check_family(optimum: Optimum) -> Checked:
     evaluator = optimum.evaluator
     failures = unpredicted_failures(evaluator, optimum.theta) if is_stored(evaluator) else []
     obstacle = refit_obstacle(evaluator)
-    if not optimum.converged or optimum.search.at_edge or optimum.search.at_jump:
-        obstacle = "nothing is known of the sampling distribution of this optimum"
+    if optimum.search.at_edge or optimum.search.at_jump:
+        obstacle = "at an edge or a jump the optimum has no sampling distribution"
+    elif not optimum.converged:
+        obstacle = "the optimum did not converge; pass another start= or method= to prb.minimize"
     elif obstacle is None and _seconds_of_test(optimum) > 30:
         obstacle = f"it would take {SETS * evaluator.responses_per_theta} responses"
     if obstacle is not None:

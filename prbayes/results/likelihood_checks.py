@@ -160,6 +160,7 @@ def check_population(optimum: Optimum) -> Checked:
         reason = f"{len(null[0])} of {_OPTIONS.replicates} refits converged"
         return _not_tested(_FAMILY, reason)
     checked = Checked()
+    is_rounded = "rounded-data" in [finding.code for finding in optimum.findings]
     for likelihood, (z, weights), statistics in zip(likelihoods, samples, null, strict=True):
         inputs = likelihood.inputs
         labels = []
@@ -169,6 +170,10 @@ def check_population(optimum: Optimum) -> Checked:
             labels += [f"{name}[{i}]" for i in range(size)] if shape else [name]
         test = population_test(z, weights, statistics)
         misfit = population_findings(test, labels, threshold=0.05 / len(samples))
+        if misfit and is_rounded:
+            reason = f"rounded readings do not fit any; pass rounded= to {likelihood.name} first"
+            checked += _not_tested(_FAMILY, reason)
+            continue
         power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
         text = f"{likelihood.name}: the test of the population found no misfit. {power}"
         checked += Checked(misfit, () if misfit else (Finding("population-tested", text),))
@@ -184,8 +189,9 @@ def _population_obstacle(optimum: Optimum) -> str:
         return obstacle
     if optimum.search.prior:
         return "the prior was part of the optimum"
-    if not optimum.converged or not np.isfinite(optimum.covariance).all():
-        return "nothing is known of the sampling distribution of this optimum"
+    unknown = _without_sampling(optimum)
+    if unknown:
+        return unknown
     for likelihood in evaluator.likelihoods:
         outputs = likelihood.readings.values.shape[1]
         if likelihood.coordinates.size > outputs:
@@ -194,6 +200,21 @@ def _population_obstacle(optimum: Optimum) -> str:
                 f"({likelihood.coordinates.size}), with which the test has no power"
             )
     return ""
+
+
+def _without_sampling(optimum: Optimum) -> str:
+    """Return why the sampling distribution of an optimum is not known, empty if it is."""
+    if not optimum.converged:
+        return "the optimum did not converge; pass another start= to prb.minimize"
+    has_error = np.isfinite(np.diag(optimum.covariance))
+    if has_error.all():
+        return ""
+    names = np.array(optimum.evaluator.hyperparameters.readable_names)[~has_error]
+    fixed = ", ".join(dict.fromkeys(name.partition("[")[0] for name in names.tolist()))
+    return (
+        f"the optimum has no standard error of {', '.join(names)}, and data sets cannot be "
+        f"refitted; fix {fixed} with pm.do at likely values, and pass the optimum of that model"
+    )
 
 
 def score_function(inputs: Inputs) -> Any:
@@ -351,9 +372,9 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
 def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
     """Report hyperparameters whose prior pulls the posterior away from the data; draws (k, d)."""
     evaluator = optimum.evaluator
-    if not (optimum.converged and np.isfinite(optimum.covariance).all()):
-        reason = "nothing is known of the sampling distribution of the optimum"
-        return _not_tested(_CONFLICT, reason)
+    unknown = _without_sampling(optimum)
+    if unknown:
+        return _not_tested(_CONFLICT, unknown)
     if any(mode["comparable"] for mode in optimum.local_optima):
         return _not_tested(_CONFLICT, "the likelihood has several modes")
     names = evaluator.hyperparameters.names
