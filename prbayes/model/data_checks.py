@@ -89,6 +89,7 @@ def check_failing_region(
     responses: Floats,
     max_lost: float,
     apart: float = 6.0,
+    remedy: str = "repair the response",
 ) -> tuple[Finding, ...]:
     """Return a finding of observed values in gaps of the finite responses beside failing runs.
 
@@ -134,9 +135,9 @@ def check_failing_region(
         "population cannot be estimated there"
     )
     if count > max_lost * len(columns):
-        raise DesignError(f"{text}; repair the response, or pass a larger max_lost")
+        raise DesignError(f"{text}; {remedy}, or pass a larger max_lost")
     page = "expensive.md#when-a-run-fails"
-    return (Finding("failing-data", f"{text}; repair the response.", page),)
+    return (Finding("failing-data", f"{text}; {remedy}.", page),)
 
 
 def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:

@@ -66,16 +66,21 @@ class EmulatedResponse:
     columns: slice  # the outputs of the surface that are those of the response
     event: tuple[int, ...]  # shape of a specimen's outputs, () or (m,)
     error: Floats  # (m,): root mean square error of left-out runs, near the specimens
+    is_continued: bool = True  # whether there is a response beyond the runs' range
 
     def __call__(self, inputs: Sequence[Floats]) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
 
-        Beyond the runs' range an input has the response at the end of the range. Where the nearest
-        run has no finite response, the response is that of the run.
+        Beyond the runs' range an input has the response at the end of the range, or NaN. Where
+        the nearest run has no finite response, the response is that of the run.
         """
         z = self.coordinates.of(inputs, 1)
-        z = np.clip(z, self.z.min(axis=0), self.z.max(axis=0))
+        inside = np.clip(z, self.z.min(axis=0), self.z.max(axis=0))
+        is_outside = (np.abs(z - inside) > 1e-9).any(axis=1)
+        z = inside
         values = self.surface.values(z)[:, self.columns]
+        if not self.is_continued:
+            values[is_outside] = np.nan
         is_finite = np.isfinite(self.y).all(axis=1)
         if not is_finite.all():
             from scipy.spatial import cKDTree
@@ -177,7 +182,7 @@ class EmulatedSimulator:
             responses=m.responses,
             outputs=m.outputs,
             max_lost=getattr(m.propagation, "max_lost", MAX_LOST),
-            has_specimens=not self.likelihood.calls_response,
+            has_specimens=self.likelihood.has_table or not self.likelihood.calls_response,
         )
 
     @property
@@ -199,6 +204,7 @@ class EmulatedSimulator:
             columns,
             self.measurement.event,
             emulation.error[columns],
+            is_continued=not self.likelihood.has_table,
         )
 
     def emulator(self, responses: Responses) -> EmulatedResponse:

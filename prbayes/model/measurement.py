@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
+from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
 from prbayes.model.parameters import Hyperparameters, parent_values
@@ -287,7 +288,12 @@ class SpecimenLikelihood:
     @property
     def calls_response(self) -> bool:
         """Whether the response itself takes the place of an emulator."""
-        return self.measurements[0].propagation.calls_response
+        return self.has_table or self.measurements[0].propagation.calls_response
+
+    @property
+    def has_table(self) -> bool:
+        """Whether the response is a table of runs."""
+        return isinstance(self.measurements[0].responses.function, Runs)
 
     @cached_property
     def density(self) -> PopulationDensity:

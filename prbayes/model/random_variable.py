@@ -224,6 +224,7 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.first_points,
                 bound.first_responses,
                 bound.max_lost,
+                remedy=simulator.responses.remedy,
             )
             bound.findings = report(*findings)
             if simulator.specimens is None:  # reported where the simulator was written

@@ -18,6 +18,7 @@ import xarray as xr
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
+from prbayes.emulators.runs import Runs
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -98,6 +99,28 @@ def emulator_remarks(evaluator: Evaluator) -> Checked:
             )
         )
     return Checked(remarks=tuple(remarks))
+
+
+def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
+    """Report the error of the surface of each table of runs, as a finding from ``largest`` on.
+
+    An error of a tenth of a standard deviation of the data widens populations by half a percent.
+    """
+    texts = []
+    for simulator in evaluator.simulators:
+        table = simulator.responses.function
+        if isinstance(table, Runs):
+            share = table.error_beside(simulator.observed)
+            text = (
+                f"{simulator.name}: its responses are those of a surface through {len(table)} "
+                f"runs, with a cross-validated error of {share:.2g} standard deviations of the "
+                f"observed responses{'' if share <= largest else f', expected at most {largest}'}."
+            )
+            texts.append((share, Finding("table-error", text, "runs.md#the-error-of-the-surface")))
+    return Checked(
+        findings=tuple(finding for share, finding in texts if share > largest),
+        remarks=tuple(finding for share, finding in texts if share <= largest),
+    )
 
 
 # -- population ------------------------------------------------------------------------------

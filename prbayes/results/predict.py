@@ -27,6 +27,7 @@ from prbayes._validate import (
     positive_integer,
     seed_number,
 )
+from prbayes.emulators.runs import Runs
 from prbayes.model.conditions import at_conditions, stacked_values
 from prbayes.model.description import versions
 from prbayes.model.emulated import (
@@ -210,7 +211,9 @@ def predict(
         scatter=known_scatter(sources, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
-    simulator = serving(sources, responses) if stored else None
+    # A table costs no run, and is NaN outside its ranges.
+    is_served = stored and not isinstance(response, Runs)
+    simulator = serving(sources, responses) if is_served else None
     size = len(next(iter(points.values())))
     values = _covariates(label, inputs_read, at, has_runs=simulator is not None)
     points |= {covariate: np.full((size, 1), value) for covariate, value in values.items()}
@@ -219,7 +222,7 @@ def predict(
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
     if max_lost is None:
         max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
-    missing = _check_responses(label, drawn, max_lost)
+    missing = _check_responses(label, drawn, max_lost, responses.remedy)
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
@@ -458,7 +461,7 @@ def with_known_conditions(
     return changed, stacked_values(values)
 
 
-def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
+def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str) -> int:
     """Report a rough emulator; return and report the number of NaN, or raise if it is large."""
     values, error = drawn.values, drawn.error
     is_nan = is_missing(values.reshape(-1, *values.shape[2:]))
@@ -472,7 +475,7 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
         raise DesignError(
             f"{label}: lost mass: got {missing / is_nan.size:.1%} NaN among the predicted "
             f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
-            "the specimens that have a response; repair it, return +inf for specimens that fail, "
+            f"the specimens that have a response; {remedy}, return +inf for specimens that fail, "
             "or pass a larger max_lost"
         )
     if missing:
