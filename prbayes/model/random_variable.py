@@ -217,7 +217,9 @@ def computed(simulator: AnySimulator) -> Node:
             outputs = simulator.outputs
             with shown(simulator.progressbar):
                 bound = propagation.bind(simulator.name, responses.inputs, target, responses)
-                check_constant(simulator.name, bound.first_responses, outputs.names)
+                constant = check_constant(
+                    simulator.name, bound.first_responses, outputs.names, bound.stored
+                )
                 dimensions = bound.inputs.dimensions
                 bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
             responses.on_start = None
@@ -229,7 +231,7 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.first_responses,
                 bound.max_lost,
             )
-            bound.findings = report(*findings)
+            bound.findings = report(*constant, *findings)
             if simulator.specimens is None:  # reported where the simulator was written
                 bound.findings += duplicate_findings(simulator.name, target.observed)
             node = Node(
