@@ -393,16 +393,20 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     """Raise if the response is constant, or all readings are far outside the range of the runs.
 
     Far is more than the width of the range of the runs, outputs (n, m), over all populations of the
-    prior.
+    prior. An output that is constant, as at time zero, is one of the error of its readings alone.
     """
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     if len(finite) < 2:
         return
     low, high = finite.min(axis=0), finite.max(axis=0)
     size = np.abs(finite).max(axis=0)
+    is_constant = high - low <= 1e-9 * size
+    has_error = (readings.error > 0).all(axis=0) & (not is_constant.all())
     for j, width in enumerate(high - low):
+        if is_constant[j] and has_error[j]:
+            continue
         output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
-        if width <= 1e-9 * size[j]:
+        if is_constant[j]:
             raise DesignError(
                 f"{name}: got {high[j]:.6g} for {output} at all {len(finite)} runs, expected a "
                 "response that depends on its inputs; check the response, or leave the output out"
@@ -474,7 +478,8 @@ def refuse_unused_inputs(
     z, outputs = z[is_finite], outputs[is_finite]
     surface = fit_interpolant(z, outputs, np.ones(len(z), dtype=bool))
     _, jacobian = surface(z)
-    values, directions = _singular(jacobian / outputs.std(axis=0)[:, None])
+    spread = outputs.std(axis=0)
+    values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
     if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
         raise _undetermined(name, m, directions, inputs)
 
