@@ -205,6 +205,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     by_specimen = isinstance(metric, Metric) and metric.by_specimen
     if by_specimen:
         _refuse_by_specimen(name, arguments, epsilon, propagation)
+        if rows is not None:
+            metric = cast(LogLikelihood, metric).of_frequencies(rows, size)
         values = checked_specimens(name, values)
     else:
         refuse_covariates(name, arguments.covariates)
