@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from prbayes.decision.exceedance import exceedance as exceedance
     from prbayes.decision.plan import plan as plan
     from prbayes.decision.sensitivity import sensitivity as sensitivity
+    from prbayes.emulators.runs import Runs as Runs
     from prbayes.emulators.surrogate import Surrogate as Surrogate
     from prbayes.metrics.area import AreaMetric as AreaMetric
     from prbayes.metrics.base import Metric as Metric
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from prbayes.metrics.likelihood import LogLikelihood as LogLikelihood
     from prbayes.metrics.multivariate import Joint as Joint
     from prbayes.model.cost import cost as cost
+    from prbayes.model.proposed_runs import propose_runs as propose_runs
     from prbayes.model.random_variable import abc_distance as abc_distance
     from prbayes.model.simulator import Simulator as Simulator
     from prbayes.optimize.minimize import minimize as minimize
@@ -75,6 +77,7 @@ _NAMES = {
     "decision.exceedance": ("exceedance",),
     "decision.plan": ("plan",),
     "decision.sensitivity": ("sensitivity",),
+    "emulators.runs": ("Runs",),
     "emulators.surrogate": ("Surrogate",),
     "metrics.area": ("AreaMetric",),
     "metrics.base": ("Metric",),
@@ -85,6 +88,7 @@ _NAMES = {
     "metrics.likelihood": ("LogLikelihood",),
     "metrics.multivariate": ("Joint",),
     "model.cost": ("cost",),
+    "model.proposed_runs": ("propose_runs",),
     "model.random_variable": ("abc_distance",),
     "model.simulator": ("Simulator",),
     "optimize.minimize": ("minimize", "refine"),

@@ -507,6 +507,11 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
             Later(lambda: {1: optimum(), 2: optimum()}),
         ),
     ),
+    "Runs": Row(
+        {"inputs": np.arange(9.0), "responses": np.arange(9.0) ** 2},
+        inputs=("a", None, np.arange(5.0), np.ones(9), [np.nan, *range(1, 9)], [0, *range(8)]),
+        responses=("a", None, np.arange(8.0), [-np.inf, *range(8)], np.full(9, np.nan)),
+    ),
     "Surrogate.fit": Row(
         {"inputs": {"x": (0.0, 1.0)}, "n": 20},
         inputs=(

@@ -98,6 +98,7 @@ def check_failing_region(
     responses: Floats,
     max_lost: float,
     apart: float = 6.0,
+    remedy: str = "repair the response",
 ) -> tuple[Finding, ...]:
     """Return a finding of observed values in gaps of the finite responses beside failing runs.
 
@@ -143,9 +144,9 @@ def check_failing_region(
         "population cannot be estimated there"
     )
     if count > max_lost * len(columns):
-        raise DesignError(f"{text}; repair the response, or pass a larger max_lost")
+        raise DesignError(f"{text}; {remedy}, or pass a larger max_lost")
     page = "expensive.md#when-a-run-fails"
-    return (Finding("failing-data", f"{text}; repair the response.", page),)
+    return (Finding("failing-data", f"{text}; {remedy}.", page),)
 
 
 def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
@@ -401,16 +402,20 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     """Raise if the response is constant, or all readings are far outside the range of the runs.
 
     Far is more than the width of the range of the runs, outputs (n, m), over all populations of the
-    prior.
+    prior. An output that is constant, as at time zero, is one of the error of its readings alone.
     """
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     if len(finite) < 2:
         return
     low, high = finite.min(axis=0), finite.max(axis=0)
     size = np.abs(finite).max(axis=0)
+    is_constant = high - low <= 1e-9 * size
+    has_error = (readings.error > 0).all(axis=0) & (not is_constant.all())
     for j, width in enumerate(high - low):
+        if is_constant[j] and has_error[j]:
+            continue
         output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
-        if width <= 1e-9 * size[j]:
+        if is_constant[j]:
             raise DesignError(
                 f"{name}: the response is constant: got {high[j]:.6g} for {output} at all "
                 f"{len(finite)} runs, expected one that depends on its inputs; check the response, "
@@ -483,7 +488,8 @@ def refuse_unused_inputs(
     z, outputs = z[is_finite], outputs[is_finite]
     surface = fit_interpolant(z, outputs, np.ones(len(z), dtype=bool))
     _, jacobian = surface(z)
-    values, directions = _singular(jacobian / outputs.std(axis=0)[:, None])
+    spread = outputs.std(axis=0)
+    values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
     if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
         raise _undetermined(name, m, directions, inputs)
 

@@ -142,10 +142,7 @@ class Node:
             target = self.metric.against(values, target.weights if is_same_size else None)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
-        dimensions = bound.inputs.dimensions
-        changed = self.comparing(
-            target.metric.with_design(target, bound.first_responses, dimensions)
-        )
+        changed = self.comparing(target.metric.for_inputs(target, bound.inputs.dimensions))
         if has_default_epsilon(self):
             changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
         return changed
@@ -220,8 +217,7 @@ def computed(simulator: AnySimulator) -> Node:
                 constant = check_constant(
                     simulator.name, bound.first_responses, outputs.names, bound.stored
                 )
-                dimensions = bound.inputs.dimensions
-                bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
+                bound.target = target.metric.for_inputs(target, bound.inputs.dimensions)
             responses.on_start = None
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
             findings = check_failing_region(
@@ -230,6 +226,7 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.first_points,
                 bound.first_responses,
                 bound.max_lost,
+                remedy=simulator.responses.remedy,
             )
             bound.findings = report(*constant, *findings)
             if simulator.specimens is None:  # reported where the simulator was written

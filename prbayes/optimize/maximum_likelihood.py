@@ -149,13 +149,16 @@ _UNSUPPORTED = Finding(
 
 
 def _supported(
-    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 1.0
+    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 1.0, of_specimen: float = 0.1
 ) -> NDArray[np.bool_]:
     """Return which optima have a log-likelihood that is known to ``largest`` nats.
 
     Where points lie farther apart than a population is wide, a few points that lie close to each
-    other make a spurious maximum.
+    other make a spurious maximum. Of many specimens with rounded readings, which are known to .06
+    nats, each may be uncertain by ``of_specimen``.
     """
+    size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
+    largest = max(largest, of_specimen * float(np.sqrt(size)))
     thetas = np.stack([optimum.theta for optimum in optima])
     values = evaluator.hyperparameters.constrained(thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
