@@ -50,7 +50,7 @@ from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.shape import Shape
 from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.subtensor import Subtensor
-from pytensor.tensor.variable import TensorVariable
+from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 PLAIN = Mode(linker="py", optimizer="fast_run")
 
@@ -462,3 +462,13 @@ def test_traces_of_pymc_take_points_of_value_variables() -> None:
     trace.setup(1, 0)
     trace.record({"sigma_log__": np.asarray(0.0)}, in_warmup=False)
     assert MultiTrace([trace])["sigma"].tolist() == [1.0]
+
+
+def test_constants_have_subclasses_that_are_evaluated() -> None:
+    class Times(TensorConstant):
+        pass
+
+    times = Times(pt.dvector().type, np.array([1.0, 2.0]), name="times")
+    assert times.name == "times"
+    assert (2 * times).eval(mode=Mode(linker="py", optimizer=None)).tolist() == [2.0, 4.0]
+    assert times.data.tolist() == times.eval(mode=Mode(linker="py", optimizer=None)).tolist()

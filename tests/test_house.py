@@ -593,10 +593,13 @@ INNER = {
         "pytensor.tensor.subtensor.Subtensor",
         "pytensor.tensor.variable.TensorVariable",
     },
+    "model.conditions": {"pytensor.graph.basic.Variable"},
+    "results.predict": {"pytensor.tensor.variable.TensorVariable"},
     "response.condition": {
         "pytensor.graph.basic.Variable",
         "pytensor.graph.traversal.ancestors",
         "pytensor.tensor.random.basic.UniformRV",
+        "pytensor.tensor.variable.TensorConstant",
         "pytensor.tensor.variable.TensorVariable",
     },
     "response.distributions": {

@@ -20,7 +20,12 @@ from scipy.special import logsumexp
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.base import Metric
-from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
+from prbayes.model.conditions import at_conditions
+from prbayes.model.measurement import (
+    Measurement,
+    SpecimenLikelihood,
+    output_columns,
+)
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
@@ -180,6 +185,12 @@ class EmulatedSimulator:
             has_specimens=self.likelihood.has_table or not self.likelihood.calls_response,
         )
 
+    @property
+    def conditions(self) -> Floats | None:
+        """The conditions of the specimens, (N, C), None without one."""
+        conditions = self.measurement.conditions
+        return None if conditions is None else conditions[self.rows]
+
     @cached_property
     def _emulated(self) -> EmulatedResponse:
         """The emulator of the simulator's outputs; its first use computes the runs."""
@@ -219,6 +230,7 @@ class EmulatedSimulator:
         size, n = len(parents[0]), _SIZES.specimens
         rng = np.random.default_rng(0)
         specimens, _ = new_specimens(self.name, self.inputs, list(parents), n, rng)
+        specimens = at_conditions(self.inputs, specimens, self.conditions)
         flat = [x.reshape(size * n, *x.shape[2:]) for x in specimens]
         values = self._emulated(flat).reshape(size, n, *self.measurement.event)
         return values, np.full((size, n), 1 / n)
@@ -273,6 +285,7 @@ class EmulatedSample:
         specimens, _ = new_specimens(
             simulator.name, simulator.inputs, list(parents), of_each, np.random.default_rng(0)
         )
+        specimens = at_conditions(simulator.inputs, specimens, simulator.conditions)
         flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
         log_p = _log_density(simulator.inputs, parents, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))

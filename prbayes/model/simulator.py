@@ -30,6 +30,7 @@ from prbayes._validate import (
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.model.conditions import observed_at_conditions, stacked_values
 from prbayes.model.data_checks import duplicate_findings
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
@@ -194,6 +195,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             "name; to run this again, run `with pm.Model():` and all below it again"
         )
     arguments = _read_arguments(name, response, inputs, model)
+    observed, metric = observed_at_conditions(name, observed, metric, inputs)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
     refuse_vectors_of_specimens(name, arguments.aleatory, arguments.parents, len(values))
@@ -203,6 +205,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     by_specimen = isinstance(metric, Metric) and metric.by_specimen
     if by_specimen:
         _refuse_by_specimen(name, arguments, epsilon, propagation)
+        if rows is not None:
+            metric = cast(LogLikelihood, metric).of_frequencies(rows, size)
         values = checked_specimens(name, values)
     else:
         refuse_covariates(name, arguments.covariates)
@@ -220,6 +224,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         settings.check_likelihood(name)
         partners = _with_common_specimens(name, labels, model)
         arguments = _inputs_of_partners(name, arguments, partners)
+        inputs_of_specimens = [arguments.aleatory[place] for place in arguments.conditions]
+        conditions = stacked_values(known_covariates(name, inputs_of_specimens, size, rows))
         if weights is not None:
             weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
         responses = Responses(name, response, arguments, **calls | {"scatter": 0.0})
@@ -227,7 +233,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         extras = _measurement_variables(name, model, metric, partners)
         measurement = Measurement(
             name, cast(LogLikelihood, metric), values, weights, labels, arguments, responses,
-            settings, outputs, groups, covariates, extras,
+            settings, outputs, groups, covariates, conditions, extras,
         )  # fmt: skip
         return _add_measurement(model, measurement, partners, observed, dims)
     if labels is not None:

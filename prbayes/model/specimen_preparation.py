@@ -27,7 +27,7 @@ from prbayes.model.data_checks import (
     refuse_unused_inputs,
     unreached,
 )
-from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.measurement import SpecimenLikelihood, output_columns
 from prbayes.model.parameters import Hyperparameters, log_posterior
 from prbayes.model.random_variable import log_first_runs
 from prbayes.model.table_likelihood import OfTables, points_of_tables
@@ -116,6 +116,13 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             populations.prior_specimens,
             lambda share: populations.posterior(points.z, points.log_a, share=share),
         )
+        if share is not None and likelihood.inputs.conditions:
+            raise DesignError(
+                f"{likelihood.name}: got NaN from the response for a share of the specimens that "
+                "matters, expected a response of all specimens with prb.response.condition, since "
+                "the share depends on the condition; return a number there, such as the limit of "
+                "what can be measured, or narrow the priors"
+            )
         if likelihood.has_table:
             refined = emulation
         if refined is not emulation and not _is_partial(likelihood):
@@ -127,7 +134,8 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
             raise
         cause = "" if runs.first is None else unreached(runs.first, likelihood.readings)
         if not cause:
-            data = _data_findings(likelihood, several_roots=False)
+            outputs = np.empty((0, 0)) if runs.first is None else runs.first
+            data = _data_findings(likelihood, outputs, several_roots=False)
             cause = "".join(finding.text.removesuffix(".") for finding in data[:1])
         raise DesignError(f"{cause}. Therefore: {error}" if cause else str(error)) from None
     finally:
@@ -149,6 +157,8 @@ class Runs:
         measurements = likelihood.measurements
         inputs = likelihood.coordinates.inputs(z)
         parts = [m.responses(inputs, []).reshape(len(z), -1) for m in measurements]
+        # Conditions are outputs that were read exactly.
+        parts.append(z[:, likelihood.coordinates.is_condition])
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and self.first is None:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
@@ -227,24 +237,34 @@ def _findings(
 ) -> list[Finding]:
     """Return findings of the data, and of the emulator at the roots of the specimens, if any."""
     if roots is None:
-        return [*_data_findings(likelihood, several_roots=True)]
+        return [*_data_findings(likelihood, emulation.y, several_roots=True)]
     name, readings, error = likelihood.name, likelihood.readings, emulation.error
     return [
-        *_data_findings(likelihood, several_roots=bool((points.n_roots > 1).any())),
+        *_data_findings(likelihood, emulation.y, several_roots=bool((points.n_roots > 1).any())),
         *misfit_findings(name, readings, roots, error),
         *emulator_findings(name, readings, error),
     ]
 
 
-def _data_findings(likelihood: SpecimenLikelihood, *, several_roots: bool) -> tuple[Finding, ...]:
-    """Return findings of rounded, censored and repeated readings that are taken as exact."""
+def _data_findings(
+    likelihood: SpecimenLikelihood, outputs: Floats, *, several_roots: bool
+) -> tuple[Finding, ...]:
+    """Return findings of rounded, censored and repeated readings that are taken as exact.
+
+    None of outputs, (n, M), that are the same in all runs.
+    """
     findings: list[Finding] = []
+    finite = outputs[np.isfinite(outputs).all(axis=1)]
     for m in likelihood.measurements:
+        values = m.readings.values
+        if len(finite):
+            is_constant = np.ptp(finite[:, output_columns(likelihood, m)], axis=0) == 0
+            values = np.where(is_constant, np.nan, values)
         steps: Any = m.readings.step.max(axis=0)
         # A reading error that the user gives covers rounding.
         is_stated = (steps > 0) | (m.metric.error is not None)
         findings += data_findings(
-            m.readings.values,
+            values,
             labels=[f"{m.name}[{label}]" for label in m.outputs.names] or [m.name],
             several_roots=several_roots,
             rounded=np.where(is_stated, np.maximum(steps, 1e-300), np.nan),

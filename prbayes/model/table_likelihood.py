@@ -54,6 +54,7 @@ class OfTables:
 
     coordinates: Coordinates
     responses: tuple[Responses, ...]
+    of_conditions: float  # one for values of conditions, zero for their errors
 
     @classmethod
     def of(cls, likelihood: SpecimenLikelihood, kind: Callable[[Runs], Any]) -> OfTables:
@@ -62,13 +63,15 @@ class OfTables:
         for m in likelihood.measurements:
             function, outputs = kind(_table(m)), m.responses.outputs
             responses.append(Responses(m.name, function, m.responses.inputs, outputs=outputs))
-        return cls(likelihood.coordinates, tuple(responses))
+        is_error = kind is LeftOut
+        return cls(likelihood.coordinates, tuple(responses), 0.0 if is_error else 1.0)
 
     def __call__(self, z: Floats) -> Floats:
         """Return values by output; no run is counted."""
         inputs = self.coordinates.inputs(z)
         with unlimited():
             parts = [response(inputs, []).reshape(len(z), -1) for response in self.responses]
+        parts.append(self.of_conditions * z[:, self.coordinates.is_condition])
         return np.concatenate(parts, axis=1)
 
 

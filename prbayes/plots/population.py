@@ -177,7 +177,9 @@ def margins(evaluator: Evaluator) -> list[Margin]:
         names = aleatory_names(inputs, node.responses.function)
         group = [node.group] if node.group else []
         for position, (name, dist) in enumerate(zip(names, inputs.aleatory, strict=True)):
-            if any(margin.dist is dist and margin.group == node.group for margin in out):
+            if position in inputs.conditions or any(
+                margin.dist is dist and margin.group == node.group for margin in out
+            ):
                 continue
             if element_name(name, group) in taken:
                 name = f"{name} of {node.name}"

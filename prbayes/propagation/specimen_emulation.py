@@ -46,7 +46,8 @@ class PointOptions:
     starts: int = 12
     gap: float = 20.0  # largest misfit of a root above the specimen's best, in nats
     points: int = 4  # points around each root; doubled until two independent halves agree
-    most_points: int = 4096  # largest number of points of a specimen
+    most_points: int = 4096  # largest number of points of a specimen; of few, `most_in_all`
+    most_in_all: int = 2**17
     # Largest standard deviation, over plausible populations, of half the difference between the
     # log-likelihoods of the two halves.
     half_difference: float = 0.05
@@ -479,6 +480,7 @@ class Coordinates:
     # (2, d): smallest and largest z in data sets of the prior, one for each of 4096 populations. A
     # new data set of the prior exceeds an end with a probability of 1 in 4097.
     bounds: Floats
+    is_condition: NDArray[np.bool_]  # (d,): known for each specimen, and not integrated over
 
     @classmethod
     def of_prior(
@@ -504,6 +506,13 @@ class Coordinates:
         low, high = np.quantile(_logs(flat, is_log), [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)
         center = (low + high) / 2
+        is_condition = np.zeros(center.size, dtype=bool)
+        sizes = [int(np.prod(shape, dtype=int)) for shape in inputs.event_shapes]
+        for place in inputs.conditions:
+            column = sum(sizes[:place])
+            is_condition[column] = True
+            scale = inputs.aleatory[place].owner.op.scale
+            is_log[column], center[column], half_width[column] = scale
         ends = []
         # Specimens in blocks: memory stays constant.
         block = max(1, 16 * AT_ONCE // (populations * len(center)))
@@ -513,7 +522,7 @@ class Coordinates:
             z = z[np.isfinite(z).all(axis=1)]
             ends += [z.min(axis=0), z.max(axis=0)]
         bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
-        return cls(inputs.event_shapes, is_log, center, half_width, bounds)
+        return cls(inputs.event_shapes, is_log, center, half_width, bounds, is_condition)
 
     @property
     def size(self) -> int:
@@ -539,9 +548,10 @@ class Coordinates:
         return np.asarray((_logs(flat, self.is_log) - self.center) / self.half_width)
 
     def log_jacobian(self, z: Floats) -> Floats:
-        """Return log|dx/dz|, (..., d) -> (...)."""
-        logs = np.where(self.is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
-        return np.asarray(logs + np.log(self.half_width).sum())
+        """Return log|dx/dz|, (..., d) -> (...), of all inputs but conditions."""
+        is_log = self.is_log & ~self.is_condition
+        logs = np.where(is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
+        return np.asarray(logs + np.log(self.half_width[~self.is_condition]).sum())
 
 
 @np.errstate(divide="ignore", invalid="ignore")
