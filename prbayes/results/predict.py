@@ -126,10 +126,10 @@ def predict(
         Dims (chain, draw, sample), and for several outputs a last one, with their names where they
         are known: those of the simulator with this response, or the keys of a mapping. Where inputs
         depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
-        ``source`` (how specimens were made), ``responses``
-        (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
-        square error of runs that are left out), ``nan`` (how many values are NaN), ``findings``
-        (as JSON, such as that a model discrepancy extrapolates),
+        ``source`` (how specimens were made), ``responses`` (how many were computed), ``units`` (of
+        a simulator's response), ``emulator_error`` (of an emulator, by output: the root mean square
+        error of runs that are left out), ``nan`` (how many values are NaN), ``findings`` (as JSON,
+        such as that a model discrepancy extrapolates),
         ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
         ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration,
         which `area_test` compares), ``identity`` (of the problem that was calibrated).
@@ -200,7 +200,7 @@ def predict(
     seed = None if random_seed is None else seed_number(random_seed)
     simulator = serving(sources, responses) if stored else None
     size = len(next(iter(points.values())))
-    values = _covariates(label, inputs_read, at, has_runs=simulator is not None)
+    values = covariate_values(label, inputs_read, at, has_runs=simulator is not None)
     points |= {covariate: np.full((size, 1), value) for covariate, value in values.items()}
     with shown(progressbar):
         drawn = _predicted(simulator, responses, points, n_samples, np.random.default_rng(seed))
@@ -212,6 +212,7 @@ def predict(
         "source": drawn.source,
         "responses": n_computed,
         **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
+        **({} if responses.outputs is None else responses.outputs.attrs),
         "nan": missing,
         "specimens_id": _digest(*drawn.specimens),
         "random_seed": str(seed),
@@ -242,7 +243,7 @@ def _labelled(
     )
 
 
-def _covariates(
+def covariate_values(
     label: str, inputs: Inputs, at: Mapping[str, float] | None, *, has_runs: bool
 ) -> dict[str, float]:
     """Return the value of each covariate by name, which is near those of runs if there are any."""
