@@ -178,6 +178,47 @@ def test_predictions_are_at_a_value_of_the_covariate(
         prb.exceedance(posterior, double, 3.0, x, model=model)
 
 
+@pytest.mark.parametrize("is_last", [False, True])
+def test_a_condition_may_be_an_input_and_a_covariate(is_last: bool) -> None:
+    def response(*arguments: Any) -> Any:
+        hardness, x = arguments[::-1] if is_last else arguments
+        return hardness / 100 * x
+
+    with pm.Model() as model:
+        a = pm.Normal("a", 1, 0.5)
+        b = pm.Normal("b", 0.01, 0.005)
+        hardness = prb.response.condition("hardness", HARDNESS)
+        x = pm.Normal.dist(a + b * (hardness - 250.0), 0.2, name="x")
+        inputs = (x, hardness) if is_last else (hardness, x)
+        prb.Simulator("y", response, *inputs, observed=HARDNESS / 100 * X)
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.prior_thetas(30, 0)
+    values = evaluator.hyperparameters.constrained(thetas)
+    exact = stats.norm.logpdf(X, means(values), 0.2) - np.log(HARDNESS / 100)
+    logs = specimen_log_likelihoods(evaluator, thetas)["y"]
+    is_plausible = exact.sum(axis=1) > exact.sum(axis=1).max() - 20
+    assert np.abs(logs - exact)[is_plausible].max() < 0.05
+    if is_last:
+        return
+    optimum = prb.minimize(model, progressbar=False)
+    drawn = prb.predict(optimum, response, hardness, x, model=model, n_samples=400)
+    point = {name: np.array([float(optimum.point[name])]) for name in ("a", "b")}
+    expected = HARDNESS / 100 * means(point)[0]
+    # Four standard errors of 400 draws with a standard deviation of .6 at most.
+    assert np.abs(drawn.mean(("chain", "draw")) - expected).max() < 0.12
+    number = prb.predict(optimum, response, 250.0, x, model=model, at={"hardness": 250.0})
+    assert float(number.mean()) == pytest.approx(2.5 * point["a"][0], abs=0.05)
+    with pytest.raises(ValueError, match=r"at: got .*hardness"):
+        prb.predict(optimum, response, hardness, x, model=model, at={"hardness": 250.0})
+
+
+def test_a_population_for_each_specimen_has_no_common_score(model: pm.Model) -> None:
+    table = prb.cross_validate(prb.minimize(model, progressbar=False), folds=2, progressbar=False)
+    assert np.isfinite(table["discrepancy"]).all()
+    with pytest.raises(ValueError, match="depends on a condition of each specimen"):
+        prb.rank({"first": table, "second": table})
+
+
 def test_other_covariates_are_another_problem(model: pm.Model) -> None:
     identity = identity_of(model)
     assert identity == identity_of(clone_model(model))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,13 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes.model.evaluator import specimen_log_likelihoods
 from prbayes.model.specimen_likelihood import arrays
+from prbayes.optimize.convergence import Result
 from prbayes.optimize.maximum_likelihood import other_specimens, specimen_pool, specimen_refits
 from prbayes.response.distributions import compiled_log_density
 from prbayes.results.diagnose import _check_sampler
 from prbayes.results.likelihood_checks import (
     check_conflict,
+    check_population,
     influence,
     score_function,
     scored_specimens,
@@ -489,6 +491,20 @@ def test_groups() -> None:
     assert prb.cross_validate(optimum).sizes["simulator"] == 3
     with pytest.raises(TypeError, match="group"):
         prb.exceedance(optimum, growth, 2.0, inputs)
+
+
+def test_tests_without_standard_errors_name_what_to_fix(optimum: prb.Optimum) -> None:
+    """As in models of groups, whose mean and spread have no standard error."""
+    covariance = optimum.covariance.copy()
+    covariance[1] = covariance[:, 1] = np.inf
+    name = optimum.evaluator.hyperparameters.readable_names[1]
+    unknown = replace(optimum, covariance=covariance)
+    expected = f"no standard error of {name}, and data sets cannot be refitted; fix {name} with pm"
+    assert expected in check_population(unknown).untested[0]
+    assert expected in check_conflict(unknown, optimum.theta[None]).untested[0]
+    search = replace(optimum.search, result=Result.FAILED)
+    (reason,) = check_population(replace(optimum, search=search)).untested
+    assert "did not converge; pass another start=" in reason
 
 
 @pytest.mark.long

@@ -649,6 +649,16 @@ def test_the_optimum_reports_another_family() -> None:
     assert [each.code for each in check_population(optimum).findings] == ["population-misfit"]
 
 
+@pytest.mark.long
+def test_rounding_is_named_alone_before_the_family() -> None:
+    y = np.random.default_rng(0).normal(10, 0.7, 25).round()
+    optimum = prb.minimize(model_of(line, normal_input, y), progressbar=False)
+    assert [finding.code for finding in optimum.findings] == ["rounded-data"]
+    checked = check_population(optimum)
+    assert not checked.findings
+    assert "pass rounded= to y first" in checked.untested[0]
+
+
 @pytest.mark.slow
 def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
     data = [line(sample(np.random.default_rng([seed, 16]))) for seed in range(200)]

@@ -315,7 +315,7 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     n = max(round(node.n_specimens), 50)
     target = (metric or node.metric).against(_ideal_sample(sample, n))
     bound = design.copied(design.design.with_values(sample.outputs))
-    bound.target = target.metric.with_design(target, sample.outputs, design.inputs.dimensions)
+    bound.target = target.metric.for_inputs(target, design.inputs.dimensions)
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
     # Directions with a standard error of up to ten spreads of the prior: fainter ones have less
     # than a hundredth of the prior's information.

@@ -98,7 +98,7 @@ class PopulationReader:
         at = {str(v.name): self.at[v.name] for v in inputs.covariates if v.name in self.at}
         points = dict(self._points)
         size = len(self._thetas)
-        for covariate, value in covariate_values(label, inputs, at, has_runs=False).items():
+        for covariate, value in covariate_values(label, inputs, at, {}, has_runs=False).items():
             points[covariate] = np.full((size, 1), value)
         by_group = [points]
         if inputs.groups is not None:

@@ -7,8 +7,9 @@ weighted, together.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.random_variable import Node
 from prbayes.propagation.reweighted import same_points
 from prbayes.response.distributions import PopulationSampler
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # Points of a resimulated population from which data sets are drawn: hundreds of data sets are then
 # ten million weights at most.
@@ -140,51 +144,77 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
         thinned(*evaluator.populations(theta[None], k), node)
         for k, node in enumerate(evaluator.nodes)
     ]
-    if (counted := _counted_sets(evaluator, populations, n_sets, seed)) is not None:
-        return counted
+    responses = [values[0] for values, _ in populations]
+    if _are_countable(evaluator, responses):
+        rng = np.random.default_rng([seed, 3])
+        masses = [np.broadcast_to(weights[0], (n_sets, weights.size)) for _, weights in populations]
+        counts = _drawn_counts(evaluator, responses, masses, rng)
+        return _counted_sets(evaluator, responses, counts)
     points = simulated_points(evaluator, populations, n_sets, seed)
-    return sets_at(evaluator, [values[0] for values, _ in populations], points)
+    return sets_at(evaluator, responses, points)
+
+
+def _are_countable(evaluator: Evaluator, responses: list[Floats]) -> bool:
+    """Return whether it suffices, and is faster, to draw how often each point occurs.
+
+    The observations are different specimens, measured alike, and more than points.
+    """
+    nodes = evaluator.nodes
+    for node in nodes:
+        if node.specimens is not None or np.ptp(node.target.weights) > 0:
+            return False
+    n_observed = sum(len(node.observed) for node in nodes)
+    is_measured = not any(np.isnan(node.observed).any() for node in nodes)
+    return n_observed > sum(map(len, responses)) and is_measured
+
+
+def _drawn_counts(
+    evaluator: Evaluator,
+    responses: list[Floats],
+    masses: Iterable[Floats],
+    rng: np.random.Generator,
+) -> list[NDArray[np.int64]]:
+    """Draw how often each point occurs in data sets with weights (n_sets, n), by simulator."""
+    counts = []
+    for node, values, weights in zip(evaluator.nodes, responses, masses, strict=True):
+        mass = weights * observable(values, node.target)
+        share = mass / mass.sum(axis=1, keepdims=True)
+        counts.append(rng.multinomial(len(node.observed), share))
+    return counts
 
 
 def _counted_sets(
-    evaluator: Evaluator, populations: list[tuple[Floats, Floats]], n_sets: int, seed: int
-) -> DataSets | None:
-    """Draw how often each point occurs, or return None if that takes longer, or is not enough.
-
-    More specimens than points would be drawn one by one, if all count alike.
-    """
-    nodes = evaluator.nodes
-    n_points = sum(values.shape[1] for values, _ in populations)
-    if specimens(nodes)[1] <= n_points or not all(map(_is_countable, nodes)):
-        return None
-    rng = np.random.default_rng([seed, 3])
+    evaluator: Evaluator, responses: list[Floats], counts: list[NDArray[np.int64]]
+) -> DataSets:
+    """Return the data sets in which points occur so often."""
     values, weights = [], []
-    for node, (responses, masses) in zip(nodes, populations, strict=True):
-        is_observable = observable(responses[0], node.target)
-        mass = masses[0][is_observable]
-        counts = rng.multinomial(len(node.observed), mass / mass.sum(), size=n_sets)
-        values.append(responses[0][is_observable])
-        weights.append(counts / len(node.observed))
+    for node, response, count in zip(evaluator.nodes, responses, counts, strict=True):
+        is_observable = observable(response, node.target)
+        values.append(response[is_observable])
+        weights.append(count[:, is_observable] / len(node.observed))
     return DataSets(values, weights)
-
-
-def _is_countable(node: Node) -> bool:
-    """Return whether the observations are different specimens, measured alike."""
-    is_alike = np.ptp(node.target.weights) == 0 and not np.isnan(node.observed).any()
-    return node.specimens is None and bool(is_alike)
 
 
 def sets_along(
     evaluator: Evaluator, thetas: Floats, rng: np.random.Generator
-) -> tuple[DataSets, list[NDArray[np.intp]]]:
-    """Draw one data set at each theta, and return the points of its specimens by simulator too.
+) -> tuple[DataSets, list[csr_array]]:
+    """Draw one data set at each theta; return how often each point occurs, by group, too.
 
-    Points are those of stored responses, (n, specimens).
+    Points are those of stored responses: counts have shape (n, points).
     """
+    from scipy.sparse import csr_array
+
     nodes = evaluator.nodes
-    size = (len(thetas), specimens(nodes)[1])
     responses = [evaluator.populations(thetas[:1], k)[0][0] for k in range(len(nodes))]
+    if _are_countable(evaluator, responses):
+        masses = (evaluator.populations(thetas, k)[1] for k in range(len(nodes)))
+        drawn_counts = _drawn_counts(evaluator, responses, masses, rng)
+        sets = _counted_sets(evaluator, responses, drawn_counts)
+        return sets, [csr_array(count.astype(np.float64)) for count in drawn_counts]
+    numbers, total = specimens(nodes)
+    size = (len(thetas), total)
     points: dict[int, NDArray[np.intp]] = {}
+    counts = []
     for group in _aligned_groups(nodes):
         is_observable = _observable_by_all(evaluator, responses, group)
         uniform = rng.random(size)
@@ -195,8 +225,16 @@ def sets_along(
             for i, mass in enumerate(weights * is_observable, start=first):
                 drawn[i] = _points_of(mass, uniform[i])
         points |= dict.fromkeys(group, drawn)
+        # How often each stored response is a specimen of each data set.
+        places = drawn[:, np.unique(np.concatenate([numbers[k] for k in group]))]
+        n_sets, n = places.shape
+        ends = n * np.arange(n_sets + 1)
+        shape = (n_sets, nodes[group[0]].bound.n_points)
+        count = csr_array((np.ones(places.size), places.ravel(), ends), shape=shape)
+        count.sum_duplicates()
+        counts.append(count)
     by_simulator = [points[k] for k in range(len(nodes))]
-    return sets_at(evaluator, responses, by_simulator), by_simulator
+    return sets_at(evaluator, responses, by_simulator), counts
 
 
 def simulated_points(

@@ -89,6 +89,7 @@ def check_failing_region(
     responses: Floats,
     max_lost: float,
     apart: float = 6.0,
+    remedy: str = "repair the response",
 ) -> tuple[Finding, ...]:
     """Return a finding of observed values in gaps of the finite responses beside failing runs.
 
@@ -134,13 +135,13 @@ def check_failing_region(
         "population cannot be estimated there"
     )
     if count > max_lost * len(columns):
-        raise DesignError(f"{text}; repair the response, or pass a larger max_lost")
+        raise DesignError(f"{text}; {remedy}, or pass a larger max_lost")
     page = "expensive.md#when-a-run-fails"
-    return (Finding("failing-data", f"{text}; repair the response.", page),)
+    return (Finding("failing-data", f"{text}; {remedy}.", page),)
 
 
-def warn_duplicates(name: str, observed: Floats) -> None:
-    """Warn if each specimen without a label occurs at least twice.
+def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
+    """Return a finding if each specimen without a label occurs at least twice.
 
     Counts, and readings on a scale of few steps, have duplicates by chance.
     """
@@ -148,15 +149,15 @@ def warn_duplicates(name: str, observed: Floats) -> None:
     distinct, counts = np.unique(rows, axis=0, return_counts=True)
     # Of six specimens, duplicates of all are no chance.
     if len(rows) < 6 or counts.min() < 2 or all(map(_has_few_steps, rows.T)):
-        return
-    report(
+        return ()
+    return (
         Finding(
             "duplicated-data",
             f"{name}: got {len(rows)} observed values of which only {len(distinct)} are "
             "different, each at least twice: if these are repeated readings of a specimen, say "
             "so by specimens=, and leave out what is there twice by mistake; else every "
             "specimen counts, and the uncertainty is too small.",
-        )
+        ),
     )
 
 
@@ -336,6 +337,7 @@ def data_findings(
     counted = np.ones(len(y), dtype=bool)
     counted[copies] = np.isfinite(y[copies]).sum(axis=1) < 2
     findings: list[Finding] = []
+    rounded_outputs: list[tuple[str, float, float]] = []  # label, step and its share
     steps = np.zeros(m)
     exact = y.copy()  # NaN at a limit, where specimens are equal by censoring
     for j, (label, stated) in enumerate(zip(labels, np.broadcast_to(rounded, m), strict=True)):
@@ -345,12 +347,7 @@ def data_findings(
         steps[j] = step = float(resolution(values) if np.isnan(stated) else stated)
         share = step / values.std(ddof=1) if step else 0.0
         if np.isnan(stated) and share > largest_step:
-            text = (
-                f"{label}: got {len(values)} values that are all multiples of a step of {step:.4g} "
-                f"({share:.3g} standard deviations), expected exact values, or a step of at most "
-                f"{largest_step:g} standard deviations; pass rounded={step:.4g}."
-            )
-            findings.append(Finding("rounded-data", text, "likelihood.md#rounded-data"))
+            rounded_outputs.append((label, step, share))
         sample = y[counted & np.isfinite(y[:, j]), j]
         counts, p_values = count_at_ends(sample, step, options.draws, options.seed)
         ends = {
@@ -366,6 +363,16 @@ def data_findings(
                 )
                 findings.append(Finding("censored-data", text, "likelihood.md#censored-data"))
                 exact[np.abs(y[:, j] - limit) <= step / 2, j] = np.nan
+    if rounded_outputs:
+        names, all_steps, shares = zip(*rounded_outputs, strict=True)
+        listed = ", ".join(f"{step:.4g}" for step in dict.fromkeys(all_steps))
+        argument = listed if len(set(all_steps)) == 1 else "the step of each output"
+        text = (
+            f"{', '.join(names)}: got values that are all multiples of a step of {listed} (up to "
+            f"{max(shares):.3g} standard deviations), expected exact values, or a step of at most "
+            f"{largest_step:g} standard deviations; pass rounded={argument}."
+        )
+        findings.insert(0, Finding("rounded-data", text, "likelihood.md#rounded-data"))
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:
         groups = identical_specimens(exact)
         listed = "; ".join(" and ".join(map(str, group)) for group in groups[:3])
@@ -386,16 +393,20 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     """Raise if the response is constant, or all readings are far outside the range of the runs.
 
     Far is more than the width of the range of the runs, outputs (n, m), over all populations of the
-    prior.
+    prior. An output that is constant, as at time zero, is one of the error of its readings alone.
     """
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     if len(finite) < 2:
         return
     low, high = finite.min(axis=0), finite.max(axis=0)
     size = np.abs(finite).max(axis=0)
+    is_constant = high - low <= 1e-9 * size
+    has_error = (readings.error > 0).all(axis=0) & (not is_constant.all())
     for j, width in enumerate(high - low):
+        if is_constant[j] and has_error[j]:
+            continue
         output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
-        if width <= 1e-9 * size[j]:
+        if is_constant[j]:
             raise DesignError(
                 f"{name}: got {high[j]:.6g} for {output} at all {len(finite)} runs, expected a "
                 "response that depends on its inputs; check the response, or leave the output out"
@@ -427,8 +438,8 @@ def unreached(outputs: Floats, readings: Readings) -> str:
     if 2 * count <= len(readings):
         return ""
     return (
-        f". The readings of {count} of {len(readings)} specimens are outside the range of all "
-        "runs over the priors: check the response, the priors and the units, or pass "
+        f"the readings of {count} of {len(readings)} specimens are outside the range of all runs "
+        "over the priors: check the response, the priors and the units, or pass "
         "prb.LogLikelihood(error=...)"
     )
 
@@ -467,7 +478,8 @@ def refuse_unused_inputs(
     z, outputs = z[is_finite], outputs[is_finite]
     surface = fit_interpolant(z, outputs, np.ones(len(z), dtype=bool))
     _, jacobian = surface(z)
-    values, directions = _singular(jacobian / outputs.std(axis=0)[:, None])
+    spread = outputs.std(axis=0)
+    values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
     if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
         raise _undetermined(name, m, directions, inputs)
 

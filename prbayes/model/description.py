@@ -74,7 +74,9 @@ def _simulator(
     inputs = []
     for argument in simulator.inputs.arguments:
         if isinstance(argument, int):  # the place of an aleatory input
-            inputs.append(_distribution(simulator.inputs.aleatory[argument], named))
+            x = simulator.inputs.aleatory[argument]
+            is_known = argument in simulator.inputs.conditions
+            inputs.append(f"condition {x.name}" if is_known else _distribution(x, named))
         elif isinstance(argument, Variable):
             inputs.append(str(argument.name or f"an expression of {_parents(argument, named)}"))
         else:

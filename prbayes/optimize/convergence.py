@@ -43,9 +43,9 @@ class Result(Enum):
     """How a minimisation ended, with its message."""
 
     CONVERGED = "The minimiser converged."
-    SETTLED_BY_GRADIENTS = "Gradients around the end of the line search promise no further gain."
-    SETTLED_BY_SIMPLEX = "A simplex around the end of the line search gains nothing."
-    STALLED = "The line search stalled before convergence."
+    SETTLED_BY_GRADIENTS = "The minimiser converged: by gradients, no better value is nearby."
+    SETTLED_BY_SIMPLEX = "The minimiser converged: a search around its end found no better value."
+    STALLED = "The minimiser stopped before convergence: try another start or method."
     FAILED = "The minimiser failed."
     MAX_EVALUATIONS = "The largest number of evaluations was reached before convergence."
     STOPPED = "A budget was spent."
@@ -235,7 +235,7 @@ def _run_scipy(
         return Result.STOPPED, ""
     except StalledError:
         patience = objective.patience
-        return Result.STALLED, f"The line search gained nothing in {patience} evaluations."
+        return Result.STALLED, f"No better value was found in {patience} evaluations."
     return Result.CONVERGED if outcome.success else Result.FAILED, str(outcome.message)
 
 
@@ -271,7 +271,7 @@ def settle(search: Search, fit: Fit) -> Fit:
         "xatol": 1e-4,  # coarse, as the gain decides
         "fatol": 1e-7,
     }
-    result, message = _run_scipy(search, objective, start, method="Nelder-Mead", options=options)
+    result, _ = _run_scipy(search, objective, start, method="Nelder-Mead", options=options)
     gain = _relative_gain(fit.lowest, objective)
     if result.converged or gain < _NEGLIGIBLE_GAIN:
         result = Result.SETTLED_BY_SIMPLEX
@@ -280,7 +280,7 @@ def settle(search: Search, fit: Fit) -> Fit:
         fit,
         theta=objective.best if is_as_good else fit.theta,
         result=result,
-        details=f"{fit.details} A simplex from there gained {max(gain, 0):.1e}: {message}",
+        details=f"{fit.details} A search around it gained {max(gain, 0):.1e} of the value.",
         trace=fit.trace.extended(objective),
     )
 
@@ -330,9 +330,9 @@ def _follow_gradients(search: Search, fit: Fit) -> Fit:
                 break
             if gain < _NEGLIGIBLE_GAIN:
                 apart /= 4
-        details = "Gradients around it show no minimum there."
+        details = "Gradients show no minimum there."
         if np.isfinite(promise):
-            details = f"Gradients around it promise a gain of {promise:.1e}."
+            details = f"By gradients, a better value would be lower by {promise:.1e} of it."
     except SpentError:
         if spent + objective.count >= search.max_evaluations:
             result, details = Result.MAX_EVALUATIONS, f"max_evaluations = {search.max_evaluations}."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -12,7 +12,7 @@ import numpy as np
 from prbayes._finding import Finding
 from prbayes._validate import Floats
 from prbayes.inference.asymptotics import Information, oriented
-from prbayes.inference.checks.identification import unidentified_findings
+from prbayes.inference.checks.identification import unidentified_names
 from prbayes.inference.design_error import DesignErrors, design_error
 from prbayes.inference.refits import SamplingDistribution, sampling_obstacle
 from prbayes.inference.resampling import families, siblings
@@ -72,10 +72,10 @@ def refine_designs(
     short = shortcomings(evaluator, nearby) or shortcomings(evaluator, fit.theta[None])
     if short and round_ == MAX_ROUNDS:
         # A minimiser follows what is not identified until no design supports it.
-        findings = []
+        names = []
         if fit.sampling is not None:
-            findings = unidentified_findings(evaluator, fit.sampling.local)
-        refuse(short, evaluator, findings)
+            names = unidentified_names(evaluator, fit.sampling.local)
+        refuse(short, evaluator, names)
     if short:
         return fit, _cover(search, fit, nearby, seed)
     overlap = stored_overlap(evaluator, fit.theta)
@@ -195,8 +195,9 @@ def refine_at(
         return short
     for name, shortcoming in short.items():
         if shortcoming.is_lost:
+            remedy = evaluator.reweighted[name].responses.remedy
             raise DesignError(
-                f"{name}: {shortcoming}; repair the response there, return +inf for specimens "
+                f"{name}: {shortcoming}; {remedy} there, return +inf for specimens "
                 "that fail, narrow the priors, or raise max_lost"
             )
     names = set(short)
@@ -385,8 +386,8 @@ def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
     if min(len(design.emulated or ()) for design in designs) >= SIZES.largest:
         advice = (
             f"between its {runs} runs are {SIZES.largest} emulated points, the most there are: "
-            "more runs help as far as the emulator is off, which the message says, and the rest "
-            "counts as another error of the optimum"
+            "more runs help as far as it is by the emulator, whose error is in optimum.message; "
+            "add the rest to the standard errors"
         )
     text = (
         f"The optimum of another design would differ by about {error:.2f} standard errors, "
@@ -395,20 +396,43 @@ def design_error_findings(evaluator: Evaluator, error: float) -> list[Finding]:
     return [Finding("design-error", text, "choose.md#how-many-responses")]
 
 
+def rough_emulators(evaluator: Evaluator) -> list[Finding]:
+    """Report emulators between runs whose error is large, also where the optimum hardly moves."""
+    findings = []
+    for name, bound in evaluator.reweighted.items():
+        emulator = bound.design.emulator
+        if emulator is not None and emulator.error > _POOR_EMULATOR:
+            text = (
+                f"{name}: between its runs the emulator has an error of {emulator.error_text}, "
+                f"expected at most {_POOR_EMULATOR}. The optimum has few errors by it if there is "
+                "no finding design-error, but predictions of this output have; pass more runs."
+            )
+            page = "expensive.md#several-inputs-from-a-few-dozen-runs"
+            findings.append(Finding("rough-emulator", text, page))
+    return findings
+
+
 def refuse(
-    short: Mapping[str, Shortcoming], evaluator: Evaluator, findings: Iterable[Finding] = ()
+    short: Mapping[str, Shortcoming], evaluator: Evaluator, unidentified: Sequence[str] = ()
 ) -> None:
-    """Raise for designs that still fall short, with findings about the place."""
+    """Raise for designs that still fall short, with ``unidentified`` directions as the cause."""
     if not short:
         return
-    reasons = "; ".join(
-        f"{name}: the design does not support the answer: {s}" for name, s in short.items()
-    )
-    bound = evaluator.reweighted[next(iter(short))]
+    name, reason = next(iter(short.items()))
+    suffix = f" (and {len(short) - 1} more)" if len(short) > 1 else ""
+    runs = evaluator.reweighted[name].n_runs
+    if unidentified:
+        cause = (
+            f"the data are less informative than the prior about {', '.join(unidentified)}, and "
+            "the design does not support the answer"
+        )
+        advice = "narrow these priors, or measure more outputs or conditions"
+    else:
+        cause = "the design does not support the answer"
+        advice = "narrow the priors, or pass a larger prb.Reweighted(n)"
     raise DesignError(
-        f"{reasons}; narrow the priors, pass a larger prb.Reweighted(n) (now {bound.n_runs} runs "
-        f"in all, of at most {bound.config.most}), or use prb.Resimulated(n), which has no design"
-        + "".join(f". {finding}" for finding in findings)
+        f"{name}{suffix}: {cause}: {advice}, or use prb.Resimulated(n), which has no design; got "
+        f"{runs} runs, {reason}"
     )
 
 
@@ -416,4 +440,5 @@ def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
     """Raise if too much of a population, by simulator without a design, has no response."""
     for node in evaluator.nodes:
         if node.reweighted is None:
-            refuse_lost_share(node.name, lost.get(node.name, 0.0), node.bound.max_lost)
+            share, limit = lost.get(node.name, 0.0), node.bound.max_lost
+            refuse_lost_share(node.name, share, limit, node.responses.remedy)

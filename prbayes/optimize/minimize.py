@@ -34,12 +34,13 @@ from prbayes.inference.checks.identification import (
     unknown_error_findings,
 )
 from prbayes.inference.checks.metric_suitability import (
+    components_left_out,
     data_between_runs,
     few_for_whitening,
     heavy_tails,
     smoothing_bias,
 )
-from prbayes.inference.checks.one_sided import bounds_by_metric
+from prbayes.inference.checks.one_sided import bound_findings, bounds_by_metric
 from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.design_error import design_error
@@ -49,7 +50,6 @@ from prbayes.inference.refits import (
     sampling_obstacle,
 )
 from prbayes.inference.resampling import SETS
-from prbayes.metrics.multivariate import components_summary
 from prbayes.model.cost import explained, kept
 from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
 from prbayes.model.locking import locked
@@ -485,7 +485,7 @@ def _report(
         at_jump = tuple(evaluator.nodes[k].name for k in jumping_simulators(fit.sampling))
         if at_edge or at_jump:
             fit, optima = replace(fit, sampling=None), []
-    details = [fit.details, problem.record.details]
+    details = ["" if fit.result.converged else fit.details, problem.record.details]
     if stopped:
         details.append(f"{stopped} before the minimisation was finished.")
     else:
@@ -517,6 +517,7 @@ def _report(
         *heavy_tails(evaluator, fit.theta),
         *data_between_runs(evaluator, fit.theta),
         *smoothing_bias(evaluator, fit.theta, fit.scales, local),
+        *components_left_out(evaluator, fit.theta),
         *optimum_findings(evaluator, fit.sampling, optima, fit.design_error),
     )
     local_optima = tuple(
@@ -559,11 +560,8 @@ def optimum_findings(
     optima: Sequence[LocalOptimum],
     design_error: float,
 ) -> tuple[Finding, ...]:
-    """Report what the metric leaves out, the design's error, other optima, and identification."""
-    missed = {n.name: components_summary(n.target, missed=True) for n in evaluator.nodes}
-    findings = [
-        Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
-    ]
+    """Report few specimens, the design's error, other optima, and identification."""
+    findings: list[Finding] = []
     for node in evaluator.nodes:
         findings += few_for_whitening(node.name, node.target)
     findings += design_error_findings(evaluator, design_error)
@@ -576,7 +574,7 @@ def optimum_findings(
         names = {end.name for end in ends}
         bounds = bounds_by_metric(sampling)
         if bounds is not None:
-            findings += [bound.finding for bound in bounds if bound.name not in names]
+            findings += bound_findings([b for b in bounds if b.name not in names])
             names |= {bound.name for bound in bounds}
         findings += unidentified_findings(
             evaluator, sampling.local, names, has_bounds=bounds is not None

@@ -27,13 +27,7 @@ from prbayes._validate import AT_ONCE, Floats
 from prbayes.inference.checks.prior import conflict_findings
 from prbayes.inference.prior_continuation import Continuation, ContinuedEvaluator, continuation_of
 from prbayes.inference.refits import SamplingDistribution, needs_refits, refit
-from prbayes.inference.resampling import (
-    groups,
-    observable,
-    observed_set,
-    sets_along,
-    specimens,
-)
+from prbayes.inference.resampling import groups, observable, observed_set, sets_along
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import TOLERABLE, Evaluator, coarser_evaluator, supports_each
 from prbayes.model.parameters import THETAS, log_posterior
@@ -394,7 +388,7 @@ def _draw(
         )
     x, thetas = x[is_supported], thetas[is_supported]
     rng = np.random.default_rng([options.seed, seed])
-    data, points = sets_along(evaluator, thetas, rng)
+    data, counts = sets_along(evaluator, thetas, rng)
     # Populations at another optimum have their estimates near the first one.
     starts = x if len(centers) == 1 else np.zeros_like(x)
     if is_linear:
@@ -412,19 +406,7 @@ def _draw(
     if is_far.mean() > options.far:
         raise ValueError(_at_edge(f"{is_far.mean():.0%} of the estimates of synthetic data sets"))
     estimates = np.clip(estimates, -options.reach, options.reach)
-    numbers, _ = specimens(evaluator.nodes)
-    counts = []
-    for members in groups(evaluator.nodes):
-        columns = np.unique(np.concatenate([numbers[k] for k in members]))
-        places = points[members[0]][np.ix_(converged, columns)]
-        # How often each stored response is a specimen of each data set.
-        n_sets, n = places.shape
-        shape = (n_sets, evaluator.nodes[members[0]].bound.n_points)
-        ends = n * np.arange(n_sets + 1)
-        count = csr_array((np.ones(places.size), places.ravel(), ends), shape=shape)
-        count.sum_duplicates()
-        counts.append(count)
-    return x[converged], counts, estimates[converged]
+    return x[converged], [count[converged] for count in counts], estimates[converged]
 
 
 def _log_likelihoods(

@@ -108,10 +108,8 @@ class Design:
         if self.emulator is None:
             return f"{name}: {len(self.runs)} runs."
         text = (
-            f"{name}: {len(self.runs)} runs, between which {len(self.sample)} points are emulated: "
-            f"at runs that were left out the emulator is off by {self.emulator.error:.2g} of the "
-            f"response's spread, and {self.emulator.run_share:.0%} of a population are runs "
-            "themselves."
+            f"{name}: {len(self.runs)} runs, and {len(self.sample)} emulated points between them. "
+            f"At runs that were left out the emulator has an error of {self.emulator.error_text}."
         )
         if self.coarse is None:
             return text

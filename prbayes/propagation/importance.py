@@ -271,6 +271,7 @@ class DesignEmulator:
     # Root mean square error of the worst output at runs that were left out, in units of its spread
     # in the populations that matter.
     error: float = np.nan
+    worst_output: int = 0
 
     def for_populations(self, weights: Floats) -> DesignEmulator | None:
         """Return the same surfaces for populations; None where the runs alone are as good."""
@@ -282,14 +283,25 @@ class DesignEmulator:
         has_prediction = runs.good & np.isfinite(left_out).all(axis=1)
         importance = weights.mean(axis=0)[has_prediction]
         total = importance.sum()
-        worst = np.nan
+        errors = np.full(runs.y.shape[1], np.nan)
         if total > 0:
             y = runs.y[has_prediction]
             importance = importance / total
             spread = np.sqrt(importance @ (y - importance @ y) ** 2)
             error = np.sqrt(importance @ (left_out[has_prediction] - y) ** 2)
-            worst = float((error / np.where(spread > 0, spread, 1.0)).max())
-        return replace(self, weights=weights, run_share=share, error=worst)
+            errors = error / np.where(spread > 0, spread, 1.0)
+        worst = int(errors.argmax())
+        return replace(
+            self, weights=weights, run_share=share, error=float(errors[worst]), worst_output=worst
+        )
+
+    @property
+    def error_text(self) -> str:
+        """The error of the worst output."""
+        name = "the response"
+        if self.event:
+            name = f"output {self.worst_output} of {self.event[0]} (counted from 0)"
+        return f"{self.error:.2g} standard deviations of {name}"
 
     @property
     def n_following(self) -> int:

@@ -49,6 +49,11 @@ class SpecimenPoints:
     n_roots: NDArray[np.intp]  # (N,)
     difference: float = np.nan  # the half difference of the log-likelihoods
 
+    def rows(self, index: NDArray[np.intp]) -> SpecimenPoints:
+        """Return the points of selected specimens."""
+        arrays = {name: value[index] for name, value in vars(self).items() if name != "difference"}
+        return replace(self, **arrays)
+
 
 def joined(first: SpecimenPoints, second: SpecimenPoints) -> SpecimenPoints:
     """Return two independent sets of points as one; each counts half."""
@@ -103,6 +108,8 @@ def draw_points(
     is_certain = np.isfinite(components.log_mass).all()
     count = options.points * (1 if is_certain and error_is_known else 16)
     scales = (1.0,) if error_is_known else (0.125, 0.25, 0.5, 1.0, 1.3)
+    if not error_is_known:
+        components = _at_likely_error(sampler, components, roots, scales, options.gap, seed)
     fits: dict[float, list[Normal]] = {}
     # Where the error of the readings is as large as the scatter, populations may be much narrower
     # than their fit. They are added step by step: too few points exclude them wrongly.
@@ -128,7 +135,8 @@ def draw_points(
             difference = max(values, default=0.0)
             narrowing = narrowing[1:] if difference <= options.half_difference else narrowing
         largest = components.table.shape[1] * count
-        if difference <= options.half_difference or 2 * largest > options.most_points:
+        most = max(options.most_points, options.most_in_all // len(readings))
+        if difference <= options.half_difference or 2 * largest > most:
             break
         count *= 2
     if difference > options.half_difference and narrowing[0] == 1.0:
@@ -139,6 +147,40 @@ def draw_points(
         )
     n_roots = np.bincount(roots.specimen, minlength=len(readings))
     return replace(samples[1.0], n_roots=n_roots, difference=difference)
+
+
+def _at_likely_error(
+    sampler: _PointSampler,
+    components: _Components,
+    roots: Roots,
+    scales: Sequence[float],
+    gap: float,
+    seed: int,
+) -> _Components:
+    """Return components fitted at the largest plausible scale of an unknown error, at most one.
+
+    Points around components of a larger error are too far apart. A scale is plausible if a fitted
+    population has a likelihood of at most 4 nats below the best.
+    """
+    for _ in range(2):
+        sample = sampler.draw(components, 64, (seed, 10))
+        totals = []
+        for scale in scales:
+            at_scale = sampler.with_error(sample, scale)
+            normal = fit_normal(at_scale.z, at_scale.log_a)
+            totals.append(float(_log_likelihoods(at_scale, [normal]).sum()))
+        scale = max(s for s, total in zip(scales, totals, strict=True) if total > max(totals) - 4)
+        if scale >= 1:
+            break
+        misfit = roots.misfit / scale**2
+        best = np.full(len(sampler.readings), np.inf)
+        np.minimum.at(best, roots.specimen, misfit)
+        rows = misfit - best[roots.specimen] <= gap
+        subset = Roots(*(values[rows] for values in vars(roots).values()))
+        near = replace(subset, jacobian=subset.jacobian / scale)
+        narrow = replace(sampler, readings=sampler.readings.scaled(scale))
+        components = _fit_components(narrow, near, seed)
+    return components
 
 
 def _plausible(

@@ -45,6 +45,8 @@ class Inputs:
         # Conditions in the parameters of a ``.dist()``.
         self.covariates = tuple(filter(is_condition, self.parents))
         self.event_shapes = tuple(event_shape(x) for x in self.aleatory)
+        # Positions of aleatory inputs that are conditions, known for each specimen.
+        self.conditions = [i for i, x in enumerate(self.aleatory) if is_condition(x)]
         self.event_ndims = [x.type.ndim for x in (*self.aleatory, *self.epistemic)]
         # Numbers of one specimen in each argument, and those that are aleatory.
         self.sizes = []

@@ -35,6 +35,7 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
 )
+from prbayes.optimize.design_refinement import rough_emulators
 from prbayes.optimize.maximum_likelihood import simulation_obstacle
 from prbayes.optimize.minimize import find_optimum
 from prbayes.optimize.objective import Minimisation
@@ -51,6 +52,7 @@ from prbayes.results.likelihood_checks import (
     check_conflict,
     check_draws,
     check_population,
+    check_tables,
     emulator_remarks,
     separate_modes,
 )
@@ -222,11 +224,14 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     else:
         text = "The family of the population was not tested: that needs the model; pass the "
         checked += Checked(untested=(f"{text}Optimum itself.",))
+    if evaluator is not None:
+        checked += check_tables(evaluator)
     lost = _stored_shares(calibration, "lost_mass") or {
         name: float(support["lost_mass"].mean()) for name, (support, _) in coverage.items()
     }
     failures, harmless = _failure_findings(tree, lost, _stored_shares(calibration, "failed_mass"))
     compared = [Finding("outputs-compared", sentence) for sentence in compared_in(calibration)]
+    compared += [] if optimum is None else rough_emulators(optimum.evaluator)
     return Diagnosis(
         (
             *findings,
@@ -264,8 +269,10 @@ def _check_family(optimum: Optimum) -> Checked:
     evaluator = optimum.evaluator
     failures = unpredicted_failures(evaluator, optimum.theta) if is_stored(evaluator) else []
     obstacle = refit_obstacle(evaluator)
-    if not optimum.converged or optimum.search.at_edge or optimum.search.at_jump:
-        obstacle = "nothing is known of the sampling distribution of this optimum"
+    if optimum.search.at_edge or optimum.search.at_jump:
+        obstacle = "at an edge or a jump the optimum has no sampling distribution"
+    elif not optimum.converged:
+        obstacle = "the optimum did not converge; pass another start= or method= to prb.minimize"
     elif obstacle is None and _seconds_of_test(optimum) > 30:
         obstacle = f"it would take {SETS * evaluator.responses_per_theta} responses"
     if obstacle is not None:

@@ -18,6 +18,7 @@ import xarray as xr
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
+from prbayes.emulators.runs import Runs
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -35,6 +36,7 @@ from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.maximum_likelihood import simulation_obstacle, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_minimiser
 from prbayes.response.compile import compile_batched
+from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs, aleatory_names
 
@@ -99,6 +101,28 @@ def emulator_remarks(evaluator: Evaluator) -> Checked:
     return Checked(remarks=tuple(remarks))
 
 
+def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
+    """Report the error of the surface of each table of runs, as a finding from ``largest`` on.
+
+    An error of a tenth of a standard deviation of the data widens populations by half a percent.
+    """
+    texts = []
+    for simulator in evaluator.simulators:
+        table = simulator.responses.function
+        if isinstance(table, Runs):
+            share = table.error_beside(simulator.observed)
+            text = (
+                f"{simulator.name}: its responses are those of a surface through {len(table)} "
+                f"runs, with a cross-validated error of {share:.2g} standard deviations of the "
+                f"observed responses{'' if share <= largest else f', expected at most {largest}'}."
+            )
+            texts.append((share, Finding("table-error", text, "runs.md#the-error-of-the-surface")))
+    return Checked(
+        findings=tuple(finding for share, finding in texts if share > largest),
+        remarks=tuple(finding for share, finding in texts if share <= largest),
+    )
+
+
 # -- population ------------------------------------------------------------------------------
 
 
@@ -137,15 +161,22 @@ def check_population(optimum: Optimum) -> Checked:
         reason = f"{len(null[0])} of {_OPTIONS.replicates} refits converged"
         return _not_tested(_FAMILY, reason)
     checked = Checked()
+    is_rounded = "rounded-data" in [finding.code for finding in optimum.findings]
     for likelihood, (z, weights), statistics in zip(likelihoods, samples, null, strict=True):
         inputs = likelihood.inputs
         labels = []
         names = aleatory_names(inputs, likelihood.measurements[0].responses.function)
-        for name, shape in zip(names, inputs.event_shapes, strict=True):
+        for place, (name, shape) in enumerate(zip(names, inputs.event_shapes, strict=True)):
+            if place in inputs.conditions:
+                continue
             size = int(np.prod(shape, dtype=int))
             labels += [f"{name}[{i}]" for i in range(size)] if shape else [name]
         test = population_test(z, weights, statistics)
         misfit = population_findings(test, labels, threshold=0.05 / len(samples))
+        if misfit and is_rounded:
+            reason = f"rounded readings do not fit any; pass rounded= to {likelihood.name} first"
+            checked += _not_tested(_FAMILY, reason)
+            continue
         power = power_text(len(z), z.shape[-1], likelihood.readings.values.shape[1])
         text = f"{likelihood.name}: the test of the population found no misfit. {power}"
         checked += Checked(misfit, () if misfit else (Finding("population-tested", text),))
@@ -161,8 +192,9 @@ def _population_obstacle(optimum: Optimum) -> str:
         return obstacle
     if optimum.search.prior:
         return "the prior was part of the optimum"
-    if not optimum.converged or not np.isfinite(optimum.covariance).all():
-        return "nothing is known of the sampling distribution of this optimum"
+    unknown = _without_sampling(optimum)
+    if unknown:
+        return unknown
     for likelihood in evaluator.likelihoods:
         outputs = likelihood.readings.values.shape[1]
         if likelihood.coordinates.size > outputs:
@@ -171,6 +203,21 @@ def _population_obstacle(optimum: Optimum) -> str:
                 f"({likelihood.coordinates.size}), with which the test has no power"
             )
     return ""
+
+
+def _without_sampling(optimum: Optimum) -> str:
+    """Return why the sampling distribution of an optimum is not known, empty if it is."""
+    if not optimum.converged:
+        return "the optimum did not converge; pass another start= to prb.minimize"
+    has_error = np.isfinite(np.diag(optimum.covariance))
+    if has_error.all():
+        return ""
+    names = np.array(optimum.evaluator.hyperparameters.readable_names)[~has_error]
+    fixed = ", ".join(dict.fromkeys(name.partition("[")[0] for name in names.tolist()))
+    return (
+        f"the optimum has no standard error of {', '.join(names)}, and data sets cannot be "
+        f"refitted; fix {fixed} with pm.do at likely values, and pass the optimum of that model"
+    )
 
 
 def score_function(inputs: Inputs) -> Any:
@@ -208,6 +255,8 @@ def scored_specimens(
 ) -> list[tuple[Floats, Floats]]:
     """Return normal scores (N, K, d) and posterior weights (N, K) of points, by likelihood.
 
+    Conditions of the specimens have no score.
+
     ``scores`` are `score_function` and the compiled log-density of each likelihood's inputs, and
     ``data`` points (N, K, *event) and numbers A (N, K).
     """
@@ -217,7 +266,7 @@ def scored_specimens(
         evaluator.likelihoods, scores, data, strict=True
     ):
         inputs = likelihood.inputs
-        z = np.empty((*log_a.shape, likelihood.coordinates.size))
+        z = np.empty((*log_a.shape, inputs.dimensions - len(inputs.conditions)))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
             size = log_a[rows].size
@@ -226,6 +275,8 @@ def scored_specimens(
             values, (log_p,) = (function(*parents, *flat) for function in functions)
             columns = []
             for dist, value, x in zip(inputs.aleatory, values, flat, strict=True):
+                if is_condition(dist):
+                    continue
                 column = np.broadcast_to(value, (1, *x.shape))[0].reshape(size, -1)
                 columns.append(
                     column if isinstance(dist.owner.op, MVNORMAL) else normal_scores(np.exp(column))
@@ -328,9 +379,9 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
 def check_conflict(optimum: Optimum, thetas: Floats) -> Checked:
     """Report hyperparameters whose prior pulls the posterior away from the data; draws (k, d)."""
     evaluator = optimum.evaluator
-    if not (optimum.converged and np.isfinite(optimum.covariance).all()):
-        reason = "nothing is known of the sampling distribution of the optimum"
-        return _not_tested(_CONFLICT, reason)
+    unknown = _without_sampling(optimum)
+    if unknown:
+        return _not_tested(_CONFLICT, unknown)
     if any(mode["comparable"] for mode in optimum.local_optima):
         return _not_tested(_CONFLICT, "the likelihood has several modes")
     names = evaluator.hyperparameters.names

@@ -13,7 +13,7 @@ import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.resampling import (
     DataSets,
-    _counted_sets,
+    _are_countable,
     aligned,
     dependent,
     fresh_data,
@@ -163,7 +163,12 @@ def test_more_specimens_than_points_are_counted() -> None:
     # Weights, labels, and outputs that are not measured need the single specimens.
     for keywords in ({"weights": np.arange(1.0, n + 1)}, {"specimens": np.arange(n) // 2}):
         other = build(AREA, evaluator.nodes[0].observed, **keywords)
-        assert _counted_sets(other, [(values, mass[None])], 10, 0) is None
+        assert not _are_countable(other, list(values))
+    along, counted = sets_along(
+        evaluator, np.repeat(TRUTH[None], 2000, 0), np.random.default_rng(3)
+    )
+    np.testing.assert_allclose(along.weights[0] * n, counted[0].toarray())
+    assert (np.abs(counted[0].mean(axis=0) - n * mass) <= 5 * error + 1e-12).all()
 
 
 def test_shared_specimens_are_drawn_together() -> None:

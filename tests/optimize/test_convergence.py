@@ -128,7 +128,8 @@ def test_the_area_metric_takes_few_evaluations() -> None:
         prb.Simulator("y", response, x, metric=prb.AreaMetric(), observed=observed)
     optimum = prb.minimize(problem, starts=0)
     assert optimum.converged
-    assert "gained nothing in 4 evaluations. Gradients around it promise a gain" in optimum.message
+    # Numbers of the line search are not for users.
+    assert optimum.message == Result.SETTLED_BY_GRADIENTS.value
     # Its line search ends at the kinks of a thousand points: 23 here, 87 by a simplex.
     assert optimum.search.n_evaluations <= 40
     simplex = prb.minimize(problem, starts=0, method="Nelder-Mead")
@@ -197,7 +198,7 @@ def test_a_line_search_at_a_kink_goes_on_along_it() -> None:
     np.testing.assert_allclose(fit.theta, [1.0, -1.0], atol=1e-6)
     assert fit.lowest == pytest.approx(1)
     assert fit.trace.count == 10 + 2 * 5 + 2
-    assert fit.details.startswith("Gradients around it promise a gain of ")
+    assert fit.details.startswith("By gradients, a better value would be lower by ")
     # Nor is a spent budget convergence, even on the last evaluations around.
     fit = settled(valley, [0.2, -0.2], most=13)
     assert (fit.result, fit.trace.count) == (Result.MAX_EVALUATIONS, 13)
@@ -225,7 +226,7 @@ def test_a_small_minimum_on_a_slope_is_left() -> None:
 @pytest.mark.parametrize("cost", [1, 60])
 def test_a_simplex_decides_where_gradients_promise_too_much(cost: int) -> None:
     fit = settled(lambda t: (1 + t @ t, np.array([1.0, 1.0]) + 0 * t, cost), [0.0, 0.0])
-    assert "A simplex from there gained 0.0e+00" in fit.details
+    assert "A search around it gained 0.0e+00" in fit.details
     assert fit.result.converged
     # Differences that take many evaluations are not asked for all rounds.
     assert fit.trace.count < 10 + 5 * 60 + 120

@@ -1,5 +1,6 @@
 """Where designs are refined: thetas around an optimum."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,15 +9,16 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
-from prbayes._finding import Finding
 from prbayes.inference.asymptotics import Local
 from prbayes.model.evaluator import Evaluator, shortcomings
 from prbayes.optimize.design_refinement import (
     neighbourhood,
     pilot,
     refuse,
+    rough_emulators,
 )
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.importance import DesignEmulator
 
 PRIOR_SD = np.array([2.0, 0.5])
 
@@ -67,10 +69,30 @@ def test_a_refusal_tells_what_the_data_do_not() -> None:
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
     evaluator = Evaluator.of(model)
     short = shortcomings(evaluator, np.array([[30.0]]))
-    text = "The data do not identify mu."
-    with pytest.raises(DesignError, match=rf"y: .*; narrow the priors, .*\. {text}"):
-        refuse(short, evaluator, [Finding("not-identified", text)])
-    refuse({}, evaluator, [Finding("not-identified", text)])
+    with pytest.raises(DesignError, match=r"^y: the data are less .* about mu - tau, and") as error:
+        refuse(short, evaluator, ["mu - tau"])
+    assert len(str(error.value)) <= 400
+    text = str(error.value)
+    assert text.index("narrow these priors") < text.index("got 1024 runs, weight effective")
+    with pytest.raises(DesignError, match=r"^y \(and 1 more\): the design does not support"):
+        refuse(short | {"z": short["y"]}, evaluator)
+    refuse({}, evaluator, ["mu"])
+
+
+def test_a_rough_emulator_is_a_remark_that_names_its_output() -> None:
+    weights, runs = np.full((1, 16), 1 / 16), np.linspace(0, 1, 16)
+    y = np.stack([runs, np.sin(40 * runs)], axis=1)
+    left_out = np.stack([runs, -np.sin(40 * runs)], axis=1)
+    stored: Any = SimpleNamespace(y=y, good=np.ones(16, bool), blocks=np.arange(16) // 2)
+    emulator = DesignEmulator(stored, (), left_out, (2,), weights).for_populations(weights)
+    assert emulator is not None
+    assert emulator.error == pytest.approx(2 * y[:, 1].std() / y[:, 1].std(), rel=0.02)
+    bound = SimpleNamespace(design=SimpleNamespace(emulator=emulator))
+    evaluator: Any = SimpleNamespace(reweighted={"y": bound})
+    (finding,) = rough_emulators(evaluator)
+    assert "standard deviations of output 1 of 2 (counted from 0), expected" in finding.text
+    bound.design.emulator = replace(emulator, error=0.2)
+    assert rough_emulators(evaluator) == []
 
 
 def test_a_pilot_goes_towards_data_that_are_far() -> None:

@@ -26,6 +26,17 @@ from prbayes.response.discrepancy import has_discrepancy
 IntArray = NDArray[np.intp]
 
 
+def unidentified_names(evaluator: Evaluator, local: Local) -> list[str]:
+    """Name directions that the data identify less than the prior."""
+    hidden = local.unidentified
+    indirect = only_through_prior(evaluator)
+    if indirect.any():
+        # One, or zero up to rounding for elements on which nothing depends.
+        axes, strength, _ = np.linalg.svd(hidden * ~indirect[:, None], full_matrices=False)
+        hidden = np.asarray(axes[:, strength > 0.5])
+    return unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
+
+
 def unidentified_findings(
     evaluator: Evaluator,
     local: Local,
@@ -37,20 +48,13 @@ def unidentified_findings(
 
     ``has_bounds``: bounds from one side were searched.
     """
-    hidden = local.unidentified
-    indirect = only_through_prior(evaluator)
-    if indirect.any():
-        # One, or zero up to rounding for elements on which nothing depends.
-        axes, strength, _ = np.linalg.svd(hidden * ~indirect[:, None], full_matrices=False)
-        hidden = np.asarray(axes[:, strength > 0.5])
-    names = unidentified_directions(hidden, evaluator.hyperparameters.readable_names)
-    directions = [name for name in names if name not in excluded]
+    directions = [name for name in unidentified_names(evaluator, local) if name not in excluded]
     if not directions:
         return []
     text = (
         f"The data are less informative than the prior about {', '.join(directions)} (in units of "
-        "the priors' standard deviations): the posterior rests on the prior there; measure more "
-        "outputs or conditions, or state prior knowledge."
+        "the priors' standard deviations): the posterior rests mostly on the prior there; measure "
+        "more outputs or conditions, or state prior knowledge."
     )
     if not has_bounds:
         text += (

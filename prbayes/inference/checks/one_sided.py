@@ -7,7 +7,7 @@ a one-sided test: further on, the data would be an unlikely sample.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,19 +34,31 @@ class OneSidedBound:
     is_upper: bool
     end: float  # of the prior on the other side; NaN without one
 
-    @property
-    def finding(self) -> Finding:
-        """The value with its limit."""
-        side, most = ("above", "most") if self.is_upper else ("below", "least")
-        end = "" if np.isnan(self.end) else f" down to {self.end:.3g}"
-        if not self.is_upper:
-            end = end.replace("down", "up")
+
+def bound_findings(bounds: Sequence[OneSidedBound]) -> list[Finding]:
+    """Report values and limits, those of one side in one finding."""
+    findings = []
+    words = ("below", "least", "up", "larger"), ("above", "most", "down", "smaller")
+    for is_upper in (True, False):
+        side, most, way, size = words[is_upper]
+        same = [bound for bound in bounds if bound.is_upper is is_upper]
+        if not same:
+            continue
+        clauses = []
+        for bound in same:
+            end = f"values {way} to {bound.end:.3g}"
+            if np.isnan(bound.end):
+                end = f"all {size} values"
+            clauses.append(
+                f"{bound.name}: got {bound.value:.3g}, at {most} {bound.limit:.3g} (95%), and "
+                f"{end} are compatible with the data"
+            )
         text = (
-            f"The data bound {self.name} from {side} only: got {self.value:.3g}, at {most} "
-            f"{self.limit:.3g} (95%), and values{end} are compatible with them; report this limit, "
-            "or the interval of prb.sample. It has no standard error."
+            f"The data bound a hyperparameter from {side} only. {'; '.join(clauses)}. Report this "
+            "limit, or the interval of prb.sample: there is no standard error."
         )
-        return Finding("one-sided-bound", text, "optimum_or_abc.md#a-spread-near-zero")
+        findings.append(Finding("one-sided-bound", text, "optimum_or_abc.md#a-spread-near-zero"))
+    return findings
 
 
 def one_sided_bounds(
@@ -59,7 +71,8 @@ def one_sided_bounds(
 
     ``statistic`` of a theta and an element is the standardised distance of the data from the
     populations there, NaN where it is not known. The sides are searched up to four standard
-    deviations of the prior from theta, and from the median of the prior if it is on that side.
+    deviations of the prior from theta, and four
+    beyond the median of the prior if it is on that side, at most sixteen.
     """
     hyperparameters = evaluator.hyperparameters
     _, lower, upper = ends_of_prior(hyperparameters, theta)
@@ -68,7 +81,7 @@ def one_sided_bounds(
     for i in np.flatnonzero(flat).tolist():
         unit = hyperparameters.prior_sd[i]
         limits = [
-            _limit(theta, i, statistic, sign * unit, 4.0 + max(sign * to_median[i] / unit, 0.0))
+            _limit(theta, i, statistic, sign * unit, np.clip(sign * to_median[i] / unit, 0, 12) + 4)
             for sign in (1, -1)
         ]
         if np.isnan(limits).sum() != 1:

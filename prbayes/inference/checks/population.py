@@ -211,7 +211,8 @@ def refuse_lost_specimens(evaluator: Evaluator, theta: Floats, specimens: int = 
     """Raise if too much of a population has no response (NaN): it is not known from the rest."""
     for simulator, share in _failing_shares(evaluator, theta, specimens):
         if prepared(simulator.likelihood).share is not None:
-            refuse_lost_share(simulator.name, share, simulator.max_lost)
+            remedy = simulator.responses.remedy
+            refuse_lost_share(simulator.name, share, simulator.max_lost, remedy)
 
 
 def _failing_shares(

@@ -112,12 +112,14 @@ def ends_by_metric(sampling: SamplingDistribution) -> list[PriorEnd]:
 def prior_end_findings(
     ends: list[PriorEnd], page: str = "likelihood.md#end-of-a-prior"
 ) -> list[Finding]:
-    """Report ends of priors."""
-    advice = (
-        "and ask for more than it allows: widen the prior, or look at units, at the response and "
-        "at the family of the inputs."
+    """Report ends of priors in one finding."""
+    if not ends:
+        return []
+    text = (
+        f"The data push {', and '.join(map(str, ends))}, and ask for more than it allows: widen "
+        "the prior, or look at units, at the response and at the family of the inputs."
     )
-    return [Finding("prior-end", f"The data push {end}, {advice}", page) for end in ends]
+    return [Finding("prior-end", text, page)]
 
 
 @dataclass(frozen=True)

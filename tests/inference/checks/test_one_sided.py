@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -14,7 +15,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.inference.checks.identification import unidentified_findings
-from prbayes.inference.checks.one_sided import bounds_by_metric, one_sided_bounds
+from prbayes.inference.checks.one_sided import bound_findings, bounds_by_metric, one_sided_bounds
 from prbayes.inference.refits import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.target import estimate_target
@@ -58,9 +59,10 @@ def test_a_spread_that_may_be_zero_has_an_upper_limit(
     # population is above .25 / (1 - 1.645 sqrt(2 / 40)), by the normal approximation.
     exact = np.sqrt(0.25 / (1 - 1.645 * np.sqrt(2 / 40)) - 0.25)
     assert bound.limit == pytest.approx(exact, rel=0.2)
-    text = bound.finding.text
-    assert f"The data bound sigma from above only: got {spread:.3g}, at most 0." in text
-    assert "values down to 0 are compatible" in text
+    (finding,) = bound_findings([bound])
+    text = f"The data bound a hyperparameter from above only. sigma: got {spread:.3g}, at most 0."
+    assert finding.text.startswith(text)
+    assert "values down to 0 are compatible" in finding.text
 
 
 def test_bounds_are_not_searched_if_they_cost_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +117,11 @@ def test_two_limits_or_none_are_no_bound() -> None:
     assert above.limit == pytest.approx(np.exp(1.6449 / 2), rel=1e-3)
     (below,) = limits(lambda x: -2 * x)
     assert below.limit == pytest.approx(np.exp(-1.6449 / 2), rel=1e-3)
-    assert "from below only: got 1, at least 0.439 (95%)" in below.finding.text
+    # One finding for each side, with all hyperparameters.
+    first, second = bound_findings([below, above, replace(above, name="tau")])
+    assert "sigma: got 1, at most 2.28 (95%), and values down to 0" in first.text
+    assert "; tau: got 1, at most 2.28 (95%), and values" in first.text
+    assert "from below only. sigma: got 1, at least 0.439 (95%)" in second.text
 
 
 def exact_moments(y: Floats) -> tuple[float, float]:

@@ -51,6 +51,8 @@ def test_data_beyond_a_prior_push_to_its_end(name: str, place: float, bound: flo
     (finding,) = prior_end_findings([end])
     expected = f"The data push mu to {end.value:.4g}, next to the end of its prior at {bound:.4g}, "
     assert finding.text.startswith(expected)
+    (both,) = prior_end_findings([end, PriorEnd("sd", 0.1, 0.2)])
+    assert "and sd to 0.1, next to the end of its prior at 0.2, and ask for" in both.text
 
 
 @pytest.mark.long
