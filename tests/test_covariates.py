@@ -17,6 +17,9 @@ from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_log_likelihoods
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.random_variable import simulators
+from prbayes.model.specimen_likelihood import arrays
+from prbayes.response.distributions import compiled_log_density
+from prbayes.results.likelihood_checks import score_function, scored_specimens
 
 N = 12
 HARDNESS = np.random.default_rng(3).uniform(200, 300, N)
@@ -176,6 +179,19 @@ def test_predictions_are_at_a_value_of_the_covariate(
         prb.predict(posterior, double, x, model=model, at={"hardness": "high"})
     with pytest.raises(TypeError, match="has the responses of a population"):
         prb.exceedance(posterior, double, 3.0, x, model=model)
+
+
+def test_the_test_of_the_population_takes_the_population_of_each_specimen(model: pm.Model) -> None:
+    evaluator = Evaluator.of(model)
+    (likelihood,) = evaluator.likelihoods
+    theta = evaluator.hyperparameters.initial
+    values = evaluator.hyperparameters.constrained(theta[None])
+    points, log_a = arrays(likelihood)
+    functions = score_function(likelihood.inputs), compiled_log_density(likelihood.inputs)
+    data = [([x.get_value() for x in points], log_a.get_value())]
+    ((z, weights),) = scored_specimens(evaluator, [functions], theta, data)
+    exact = (X - means(values)[0]) / values["sigma"][0]
+    assert np.allclose((z[..., 0] * weights).sum(axis=1), exact, atol=0.01)
 
 
 @pytest.mark.parametrize("is_last", [False, True])
