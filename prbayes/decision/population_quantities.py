@@ -132,7 +132,7 @@ class PopulationReader:
         elements = []
         for column, label in enumerate(labels):
             output = replace(sample, column=column if several else None)
-            findings = output.checked_quantity(by_level[-1])
+            findings, _ = output.checked_quantity(by_level[-1])
             functionals = [*([] if np.isposinf(output.values[-1]) else moments), *by_level]
             numbers = np.full((1, len(self._thetas), 2 + len(by_level)), np.nan)
             numbers[0, :, -len(functionals) :] = np.concatenate(
