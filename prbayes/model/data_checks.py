@@ -60,26 +60,35 @@ def warn_out_of_range(
             return
 
 
-def check_constant(name: str, responses: Floats, outputs: Sequence[str]) -> None:
-    """Report an output that is the same in all runs; raise a DesignError from 32 runs on."""
-    # Of a user's own propagation there may be none, and with +inf the data may be failures alone.
-    if len(responses) < 8 or np.isposinf(responses).any():
-        return
+def check_constant(
+    name: str, responses: Floats, outputs: Sequence[str], is_stored: bool
+) -> tuple[Finding, ...]:
+    """Return findings of outputs that are the same in all runs; raise if no others are made.
+
+    Weights of equal stored responses make no difference. Responses of a propagation that simulates
+    again may be equal by chance, as counts can be.
+    """
+    # A user's own propagation may store none, and with +inf the data may be failures alone.
+    if not responses.size or np.isposinf(responses).any():
+        return ()
     values = responses.reshape(len(responses), -1)
     finite = values[np.isfinite(values).all(axis=1)]
-    if len(finite) < 8:
-        return
+    if len(finite) < (2 if is_stored else 8):
+        return ()
     labels = [f"{name}[{output}]" for output in outputs] or [name]
+    findings = []
     for label, column in zip(labels, finite.T, strict=True):
         if np.ptp(column) > 1e-9 * np.abs(column).max():
             continue
         text = (
-            f"{label}: got {column[0]:.6g} for the response at all {len(finite)} runs over the "
-            "priors, expected a response that depends on its inputs; check the response"
+            f"{label}: the response is constant: got {column[0]:.6g} at all {len(finite)} runs "
+            "over the priors, expected one that depends on its inputs; check the response"
         )
-        if len(finite) >= 32:
-            raise DesignError(f"{text}, or leave the output out")
-        report(Finding("constant-response", f"{text}."))
+        if is_stored:
+            advice = "take more runs if it changes rarely"
+            raise DesignError(f"{text}, {advice}, or leave the output out")
+        findings.append(Finding("constant-response", f"{text}."))
+    return tuple(findings)
 
 
 def check_failing_region(
@@ -408,8 +417,9 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
         output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
         if is_constant[j]:
             raise DesignError(
-                f"{name}: got {high[j]:.6g} for {output} at all {len(finite)} runs, expected a "
-                "response that depends on its inputs; check the response, or leave the output out"
+                f"{name}: the response is constant: got {high[j]:.6g} for {output} at all "
+                f"{len(finite)} runs, expected one that depends on its inputs; check the response, "
+                "or leave the output out"
             )
         values = readings.values[np.isfinite(readings.values[:, j]), j]
         if not values.size and readings.is_censored[:, j].any():

@@ -214,7 +214,9 @@ def computed(simulator: AnySimulator) -> Node:
             outputs = simulator.outputs
             with shown(simulator.progressbar):
                 bound = propagation.bind(simulator.name, responses.inputs, target, responses)
-                check_constant(simulator.name, bound.first_responses, outputs.names)
+                constant = check_constant(
+                    simulator.name, bound.first_responses, outputs.names, bound.stored
+                )
                 bound.target = target.metric.for_inputs(target, bound.inputs.dimensions)
             responses.on_start = None
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
@@ -226,7 +228,7 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.max_lost,
                 remedy=simulator.responses.remedy,
             )
-            bound.findings = report(*findings)
+            bound.findings = report(*constant, *findings)
             if simulator.specimens is None:  # reported where the simulator was written
                 bound.findings += duplicate_findings(simulator.name, target.observed)
             node = Node(

@@ -41,6 +41,7 @@ from prbayes.inference.checks.metric_suitability import (
     smoothing_bias,
 )
 from prbayes.inference.checks.one_sided import bound_findings, bounds_by_metric
+from prbayes.inference.checks.population import replaced_findings
 from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.design_error import design_error
@@ -514,6 +515,7 @@ def _report(
     findings = report(
         *breakdown_findings(at_edge, at_jump),
         *unknown_error_findings(dict(unknown), sampling_obstacle(evaluator)),
+        *replaced_findings(evaluator, fit.theta),
         *heavy_tails(evaluator, fit.theta),
         *data_between_runs(evaluator, fit.theta),
         *smoothing_bias(evaluator, fit.theta, fit.scales, local),

@@ -114,7 +114,7 @@ def predict(
         simulators allow, the largest.
     at : dict, optional
         The value of each covariate, by the name of its `prbayes.response.condition`, where inputs
-        depend on one.
+        depend on one. A condition that is an input as well has the values of the input.
     name : str, optional
         Of the result; by default that of the function.
     executor : concurrent.futures.Executor, optional
@@ -134,10 +134,10 @@ def predict(
         are known: those of the simulator with this response, or the keys of a mapping. With a
         condition, (chain, draw, specimen) with a specimen for each of its values. Where inputs
         depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
-        ``source`` (how specimens were made), ``responses``
-        (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
-        square error of runs that are left out), ``nan`` (how many values are NaN), ``findings``
-        (as JSON, such as that a model discrepancy extrapolates),
+        ``source`` (how specimens were made), ``responses`` (how many were computed), ``units`` (of
+        a simulator's response), ``emulator_error`` (of an emulator, by output: the root mean square
+        error of runs that are left out), ``nan`` (how many values are NaN), ``findings`` (as JSON,
+        such as that a model discrepancy extrapolates),
         ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
         ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration,
         which `area_test` compares), ``identity`` (of the problem that was calibrated).
@@ -215,8 +215,13 @@ def predict(
     is_served = stored and not isinstance(response, Runs)
     simulator = serving(sources, responses) if is_served else None
     size = len(next(iter(points.values())))
-    values = _covariates(label, inputs_read, at, has_runs=simulator is not None)
-    points |= {covariate: np.full((size, 1), value) for covariate, value in values.items()}
+    # A condition that is an input has the same values as a covariate.
+    stated = {} if conditions is None else _by_name(inputs_read, conditions)
+    values = covariate_values(label, inputs_read, at, stated, has_runs=simulator is not None)
+    points |= {
+        covariate: np.broadcast_to(value, (size, np.size(value)))
+        for covariate, value in values.items()
+    }
     with shown(progressbar):
         rng = np.random.default_rng(seed)
         drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
@@ -228,6 +233,7 @@ def predict(
         "source": drawn.source,
         "responses": n_computed,
         **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
+        **({} if responses.outputs is None else responses.outputs.attrs),
         "nan": missing,
         "specimens_id": _digest(*drawn.specimens),
         "random_seed": str(seed),
@@ -261,11 +267,21 @@ def _labelled(
     )
 
 
-def _covariates(
-    label: str, inputs: Inputs, at: Mapping[str, float] | None, *, has_runs: bool
-) -> dict[str, float]:
-    """Return the value of each covariate by name, which is near those of runs if there are any."""
+def covariate_values(
+    label: str,
+    inputs: Inputs,
+    at: Mapping[str, float] | None,
+    stated: Mapping[str, Floats],
+    *,
+    has_runs: bool,
+) -> dict[str, Any]:
+    """Return a number by covariate, or those of conditions that are stated, (N,).
+
+    Numbers have to be near those of runs if there are any.
+    """
     names = [str(covariate.name) for covariate in inputs.covariates]
+    known = {name: stated[name] for name in names if name in stated}
+    names = [name for name in names if name not in known]
     given = {} if at is None else at
     if not isinstance(given, Mapping) or set(given) != set(names):
         raise ValueError(
@@ -273,7 +289,10 @@ def _covariates(
             "pass at={'hardness': 250.0}, for example"
         )
     values = {name: finite_number(given[name], f"{label}: at: {name}") for name in names}
-    for name, covariate in zip(names, inputs.covariates, strict=True):
+    for covariate in inputs.covariates:
+        name = str(covariate.name)
+        if name in known:
+            continue
         low, high = (float(end.eval()) for end in covariate.owner.op.dist_params(covariate.owner))
         if has_runs and not low <= values[name] <= high:
             raise ValueError(
@@ -281,7 +300,13 @@ def _covariates(
                 f"{high:.4g}, where the response has runs; pass stored=False, which computes it at "
                 "new specimens"
             )
-    return values
+    return values | known
+
+
+def _by_name(inputs: Inputs, conditions: Floats) -> dict[str, Floats]:
+    """Return the values of conditions that are inputs, (N, C), by name."""
+    names = [str(inputs.aleatory[place].name) for place in inputs.conditions]
+    return dict(zip(names, conditions.T, strict=True))
 
 
 # -- populations -----------------------------------------------------------------------------------

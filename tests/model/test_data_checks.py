@@ -297,22 +297,32 @@ def test_data_beyond_all_responses_are_reported(logged: pytest.LogCaptureFixture
     assert "all below the first 64 responses" in logged.text
 
 
-def test_a_constant_response_is_refused_or_reported(logged: pytest.LogCaptureFixture) -> None:
-    with pytest.raises(DesignError, match=r"y: got 1 for the response at all 64 runs .* check the"):
-        check_constant("y", np.ones(64), [])
-    with pytest.raises(DesignError, match=r"y\[b\]: got 0 for .* at all 40 runs"):
-        check_constant("y", np.stack([SIMULATED[:40, 0], np.zeros(40)], axis=1), ["a", "b"])
-    with pytest.raises(DesignError, match="at all 40 runs"):
-        check_constant("y", np.where(np.arange(64) < 40, 5.0, np.nan), [])
-    assert not logged.records
-    check_constant("y", np.ones(16), [])  # counts may be equal by chance
-    assert [record.code for record in logged.records] == ["constant-response"]  # type: ignore[attr-defined]
-    logged.clear()
-    check_constant("y", SIMULATED, ["a", "b"])
-    check_constant("y", 1 + 1e-6 * SIMULATED[:, 0], [])
-    check_constant("y", np.where(np.arange(64) < 40, 5.0, np.inf), [])  # data may be failures
-    check_constant("y", np.empty(0), [])
-    assert not logged.records
+def test_constant_responses_that_are_stored_are_refused() -> None:
+    message = r"y: the response is constant: got 1 at all 3 runs .*; check the .*, take more runs"
+    with pytest.raises(DesignError, match=message):
+        check_constant("y", np.ones(3), [], True)
+    with pytest.raises(DesignError, match=r"y\[b\]: the .* constant: got 0 at all 40 runs"):
+        check_constant("y", np.stack([SIMULATED[:40, 0], np.zeros(40)], 1), ["a", "b"], True)
+    with pytest.raises(DesignError, match="at all 24 runs"):
+        check_constant("y", np.where(np.arange(64) < 24, 5.0, np.nan), [], True)
+
+
+def test_constant_responses_that_are_simulated_again_are_reported() -> None:
+    (finding,) = check_constant("y", np.ones(16), [], False)  # counts may be equal by chance
+    assert finding.code == "constant-response"
+
+
+@pytest.mark.parametrize("is_stored", [True, False])
+def test_other_responses_are_not_constant(is_stored: bool) -> None:
+    for values in (
+        1 + 1e-6 * SIMULATED[:, 0],
+        np.where(np.arange(64) < 40, 5.0, np.inf),  # data may be failures
+        np.empty(0),
+        np.ones(1),
+        np.array([5.0, np.nan, np.nan]),
+    ):
+        assert not check_constant("y", values, [], is_stored)
+    assert not check_constant("y", SIMULATED, ["a", "b"], is_stored)
 
 
 @pytest.mark.parametrize(
