@@ -19,7 +19,7 @@ from scipy import stats
 
 import prbayes as prb
 from benchmarks.study import Study
-from prbayes.metrics.summary import SummaryLikelihood
+from prbayes.metrics.summary_likelihood import SummaryLikelihood
 
 POPULATIONS = {
     "normal": stats.norm(),

@@ -154,9 +154,9 @@ def gross_errors() -> Iterator[Row]:
         yield [size, f"{shift} sd" if shift != "0" else "none", flag, bias, width]
 
 
-def readings_coverage() -> Iterator[Row]:
-    """Yield bias, width and coverage of measurement arguments beside the exact posterior."""
-    for case, table in summary("readings_coverage").items():
+def coverage_of(study: str) -> Iterator[Row]:
+    """Yield bias, width and coverage of a study's cases beside the exact posterior."""
+    for case, table in summary(study).items():
         for j, (name, within) in enumerate(table["prbayes"]["coverage"].items()):
             exact = table["exact"]["coverage"][name]
             error = np.sqrt(0.89 * 0.11 / (table["data sets"] - table["refused"]))
@@ -638,7 +638,8 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "measurement error": measurement_error,
     "data sheets": data_sheets,
     "gross errors": gross_errors,
-    "readings, coverage": readings_coverage,
+    "readings, coverage": partial(coverage_of, "readings_coverage"),
+    "covariates": partial(coverage_of, "covariates"),
     "metric prices": metric_prices,
     "landscapes": landscapes,
     "joint, errors": joint,

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from prbayes import validation as validation
     from prbayes.decision.exceedance import exceedance as exceedance
     from prbayes.decision.plan import plan as plan
+    from prbayes.decision.population_table import population as population
     from prbayes.decision.sensitivity import sensitivity as sensitivity
+    from prbayes.emulators.runs import Runs as Runs
     from prbayes.emulators.surrogate import Surrogate as Surrogate
     from prbayes.metrics.area import AreaMetric as AreaMetric
     from prbayes.metrics.base import Metric as Metric
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from prbayes.metrics.multivariate import Joint as Joint
     from prbayes.metrics.summary import Summary as Summary
     from prbayes.model.cost import cost as cost
+    from prbayes.model.proposed_runs import propose_runs as propose_runs
     from prbayes.model.random_variable import abc_distance as abc_distance
     from prbayes.model.simulator import Simulator as Simulator
     from prbayes.optimize.minimize import minimize as minimize
@@ -67,6 +70,7 @@ if TYPE_CHECKING:
     from prbayes.validation.area_test import area_test as area_test
     from prbayes.validation.cross_validation import cross_validate as cross_validate
     from prbayes.validation.cross_validation import rank as rank
+    from prbayes.validation.fleet import calibrate_each as calibrate_each
 
 __version__ = version("prbayes")
 
@@ -74,7 +78,9 @@ __version__ = version("prbayes")
 _NAMES = {
     "decision.exceedance": ("exceedance",),
     "decision.plan": ("plan",),
+    "decision.population_table": ("population",),
     "decision.sensitivity": ("sensitivity",),
+    "emulators.runs": ("Runs",),
     "emulators.surrogate": ("Surrogate",),
     "metrics.area": ("AreaMetric",),
     "metrics.base": ("Metric",),
@@ -86,6 +92,7 @@ _NAMES = {
     "metrics.multivariate": ("Joint",),
     "metrics.summary": ("Summary",),
     "model.cost": ("cost",),
+    "model.proposed_runs": ("propose_runs",),
     "model.random_variable": ("abc_distance",),
     "model.simulator": ("Simulator",),
     "optimize.minimize": ("minimize", "refine"),
@@ -116,6 +123,7 @@ _NAMES = {
     "results.predict": ("predict",),
     "validation.area_test": ("area_test",),
     "validation.cross_validation": ("cross_validate", "rank"),
+    "validation.fleet": ("calibrate_each",),
 }
 _NAMESPACES = (
     "datasets",

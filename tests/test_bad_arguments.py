@@ -317,6 +317,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         ),
         dims=("nope", "few", "", ("few", "few"), True),
         propagation=(prb.Reweighted, prb.AreaMetric()),
+        units=({"nothing": "mm"}, {"x": 3}, {3: "mm"}),
         own="observed",
     ),
     "Summary": Row(
@@ -472,6 +473,12 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         quantity=(prb.decision.Mean,),
         target=({}, {"tau": 1.0}, {"mu": 0.0}, {"mu": "a"}, {"quantity": 1.0}),
     ),
+    "population": Row(
+        inputs=("nothing", [], ["x", "nothing"], 3, np.mean),
+        quantiles=("ab", 3, [0.5, 1.0], [np.nan], None),
+        at=({"nothing": 1.0}, {"x": 1.0}),
+        n_draws=(1,),
+    ),
     "exceedance": Row(
         call=with_inputs(prb.exceedance, "result", "response", "limit"),
         input=NO_INPUT,
@@ -515,6 +522,11 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
             Later(lambda: {"a": optimum(), "b": comparison()}),
             Later(lambda: {1: optimum(), 2: optimum()}),
         ),
+    ),
+    "Runs": Row(
+        {"inputs": np.arange(9.0), "responses": np.arange(9.0) ** 2},
+        inputs=("a", None, np.arange(5.0), np.ones(9), [np.nan, *range(1, 9)], [0, *range(8)]),
+        responses=("a", None, np.arange(8.0), [-np.inf, *range(8)], np.full(9, np.nan)),
     ),
     "Surrogate.fit": Row(
         {"inputs": {"x": (0.0, 1.0)}, "n": 20},
@@ -583,6 +595,11 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
     ),
     "plots.plot_sensitivity": Row(
         table=(*(xr.Dataset(), xr.Dataset({"first": 1.0, "total": 1.0}), comparison, posterior),),
+    ),
+    "calibrate_each": Row(
+        {"data_sets": {"a": OBSERVED, "b": OBSERVED + 1}},
+        data_sets=([1.0, 2.0], {}, {"a": [1.0]}, {"a": ["x", "y"]}, {"a": np.ones((3, 2))}),
+        validation=([1.0], {"zz": [1.0]}, {"a": []}, {"a": np.ones((3, 2))}),
     ),
     "individuals": Row(
         {"result": at_optimum, "model": by_specimen},

@@ -44,12 +44,13 @@ from pytensor.graph.traversal import ancestors, toposort, walk
 from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
+from pytensor.tensor.random.basic import UniformRV
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.shape import Shape
 from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.subtensor import Subtensor
-from pytensor.tensor.variable import TensorVariable
+from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 PLAIN = Mode(linker="py", optimizer="fast_run")
 
@@ -291,6 +292,23 @@ def test_random_variables_draw_from_parameters_and_then_the_size() -> None:
     np.testing.assert_array_equal(variable.eval(mode=PLAIN), np.full(4, 3.0))
 
 
+def test_a_subclass_of_the_uniform_distribution_has_its_density_and_draws() -> None:
+    class ConditionRV(UniformRV):  # type: ignore[misc]
+        __props__ = (*UniformRV.__props__, "label")
+
+        def __init__(self, label: str, **keywords: Any) -> None:
+            super().__init__(**keywords)
+            self.label = label
+
+    _, variable = ConditionRV("load")(
+        1.0, 3.0, rng=pt.random.shared_rng(seed=0), return_next_rng=True
+    )
+    assert pm.logp(variable, 2.0).eval() == pytest.approx(-np.log(2))
+    draws = pm.draw(variable, 100, random_seed=1)
+    assert ((draws > 1) & (draws < 3)).all()
+    assert ConditionRV("load") != ConditionRV("dose")
+
+
 def test_distributions_have_operations_with_parameters() -> None:
     censored = pm.Censored.dist(pm.Normal.dist(), lower=0.0, upper=None).owner.op
     assert isinstance(censored, CensoredRV)
@@ -444,3 +462,13 @@ def test_traces_of_pymc_take_points_of_value_variables() -> None:
     trace.setup(1, 0)
     trace.record({"sigma_log__": np.asarray(0.0)}, in_warmup=False)
     assert MultiTrace([trace])["sigma"].tolist() == [1.0]
+
+
+def test_constants_have_subclasses_that_are_evaluated() -> None:
+    class Times(TensorConstant):
+        pass
+
+    times = Times(pt.dvector().type, np.array([1.0, 2.0]), name="times")
+    assert times.name == "times"
+    assert (2 * times).eval(mode=Mode(linker="py", optimizer=None)).tolist() == [2.0, 4.0]
+    assert times.data.tolist() == times.eval(mode=Mode(linker="py", optimizer=None)).tolist()

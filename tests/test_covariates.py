@@ -17,6 +17,9 @@ from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator, specimen_graphs, specimen_log_likelihoods
 from prbayes.model.fingerprint import identity_of
 from prbayes.model.random_variable import simulators
+from prbayes.model.specimen_likelihood import arrays
+from prbayes.response.distributions import compiled_log_density
+from prbayes.results.likelihood_checks import score_function, scored_specimens
 
 N = 12
 HARDNESS = np.random.default_rng(3).uniform(200, 300, N)
@@ -176,6 +179,60 @@ def test_predictions_are_at_a_value_of_the_covariate(
         prb.predict(posterior, double, x, model=model, at={"hardness": "high"})
     with pytest.raises(TypeError, match="has the responses of a population"):
         prb.exceedance(posterior, double, 3.0, x, model=model)
+
+
+def test_the_test_of_the_population_takes_the_population_of_each_specimen(model: pm.Model) -> None:
+    evaluator = Evaluator.of(model)
+    (likelihood,) = evaluator.likelihoods
+    theta = evaluator.hyperparameters.initial
+    values = evaluator.hyperparameters.constrained(theta[None])
+    points, log_a = arrays(likelihood)
+    functions = score_function(likelihood.inputs), compiled_log_density(likelihood.inputs)
+    data = [([x.get_value() for x in points], log_a.get_value())]
+    ((z, weights),) = scored_specimens(evaluator, [functions], theta, data)
+    exact = (X - means(values)[0]) / values["sigma"][0]
+    assert np.allclose((z[..., 0] * weights).sum(axis=1), exact, atol=0.01)
+
+
+@pytest.mark.parametrize("is_last", [False, True])
+def test_a_condition_may_be_an_input_and_a_covariate(is_last: bool) -> None:
+    def response(*arguments: Any) -> Any:
+        hardness, x = arguments[::-1] if is_last else arguments
+        return hardness / 100 * x
+
+    with pm.Model() as model:
+        a = pm.Normal("a", 1, 0.5)
+        b = pm.Normal("b", 0.01, 0.005)
+        hardness = prb.response.condition("hardness", HARDNESS)
+        x = pm.Normal.dist(a + b * (hardness - 250.0), 0.2, name="x")
+        inputs = (x, hardness) if is_last else (hardness, x)
+        prb.Simulator("y", response, *inputs, observed=HARDNESS / 100 * X)
+    evaluator = Evaluator.of(model)
+    thetas = evaluator.hyperparameters.prior_thetas(30, 0)
+    values = evaluator.hyperparameters.constrained(thetas)
+    exact = stats.norm.logpdf(X, means(values), 0.2) - np.log(HARDNESS / 100)
+    logs = specimen_log_likelihoods(evaluator, thetas)["y"]
+    is_plausible = exact.sum(axis=1) > exact.sum(axis=1).max() - 20
+    assert np.abs(logs - exact)[is_plausible].max() < 0.05
+    if is_last:
+        return
+    optimum = prb.minimize(model, progressbar=False)
+    drawn = prb.predict(optimum, response, hardness, x, model=model, n_samples=400)
+    point = {name: np.array([float(optimum.point[name])]) for name in ("a", "b")}
+    expected = HARDNESS / 100 * means(point)[0]
+    # Four standard errors of 400 draws with a standard deviation of .6 at most.
+    assert np.abs(drawn.mean(("chain", "draw")) - expected).max() < 0.12
+    number = prb.predict(optimum, response, 250.0, x, model=model, at={"hardness": 250.0})
+    assert float(number.mean()) == pytest.approx(2.5 * point["a"][0], abs=0.05)
+    with pytest.raises(ValueError, match=r"at: got .*hardness"):
+        prb.predict(optimum, response, hardness, x, model=model, at={"hardness": 250.0})
+
+
+def test_a_population_for_each_specimen_has_no_common_score(model: pm.Model) -> None:
+    table = prb.cross_validate(prb.minimize(model, progressbar=False), folds=2, progressbar=False)
+    assert np.isfinite(table["discrepancy"]).all()
+    with pytest.raises(ValueError, match="depends on a condition of each specimen"):
+        prb.rank({"first": table, "second": table})
 
 
 def test_other_covariates_are_another_problem(model: pm.Model) -> None:

@@ -59,6 +59,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "Report": lambda: prb.Report("A beam", optimum=optimum().to_datatree()),
     "Resimulated": lambda: prb.Resimulated(8),
     "Reweighted": lambda: prb.Reweighted(64, on_failure=prb.response.Replace()),
+    "Runs": lambda: prb.Runs(np.linspace(0, 1, 12), np.linspace(0, 1, 12) ** 2),
     "Surrogate": surrogate,
     "abc_distance": lambda: prb.abc_distance(prb.AreaMetric()),
     "decision.Interval": lambda: prb.decision.Interval(0.9, 1.1),

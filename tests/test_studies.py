@@ -13,12 +13,14 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import (
+    covariates,
     families,
     likelihood_coverage,
     likelihood_guards,
     posterior,
     readings_coverage,
 )
+from benchmarks.study import Study
 
 pytestmark = pytest.mark.slow
 
@@ -89,8 +91,9 @@ def test_guards_rarely_flag_right_models() -> None:
             assert cell["share"] <= largest[check] + 4 * cell["standard error"], (name, check)
 
 
-def test_measurement_arguments_have_the_exact_posterior() -> None:
-    for found in readings_coverage.STUDY.stored()["summary"].values():
+@pytest.mark.parametrize("study", [readings_coverage.STUDY, covariates.STUDY])
+def test_measurement_arguments_and_covariates_have_the_exact_posterior(study: Study) -> None:
+    for found in study.stored()["summary"].values():
         assert np.abs(found["bias"]).max() < 0.1
         error = (0.89 * 0.11 / (found["data sets"] - found["refused"])) ** 0.5
         for within in found["prbayes"]["coverage"].values():

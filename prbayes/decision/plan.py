@@ -110,8 +110,9 @@ def plan(
         ``"quantity"``. Variables ``sd``, the expected standard deviation in the user's units, inf
         where the quantity is infinite in some populations; ``now``, the present one; and with
         ``target``, ``specimens``: the smallest number that reaches it, inf if a million do not, NaN
-        without a target. Attributes: ``responses`` (number computed), ``findings`` (as JSON) and
-        ``identity``.
+        without a target. Attributes: ``responses`` (number computed), ``findings`` (as JSON),
+        ``identity``, and with a quantity ``value_error``, the standard error of its value from
+        points and emulator, which more specimens do not reduce.
 
     Raises
     ------
@@ -162,7 +163,7 @@ def plan(
     findings: tuple[Finding, ...] = ()
     if quantity is not None:
         quantity_sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-        findings = quantity_sample.checked_quantity(quantity)
+        findings, error = quantity_sample.checked_quantity(quantity)
     draws = Draws.of(populations.thetas, evaluator.hyperparameters.prior_sd)
     forecast = _Forecast(populations, draws, quantity, quantity_sample)
     now = forecast.sd(np.zeros((evaluator.hyperparameters.size, evaluator.hyperparameters.size)))
@@ -193,7 +194,7 @@ def plan(
         attrs={
             "responses": count,
             "findings": as_json(findings),
-            **({} if quantity is None else {"quantity": repr(quantity)}),
+            **({} if quantity is None else {"quantity": repr(quantity), "value_error": error}),
             **populations.provenance(),
         },
     )
@@ -315,7 +316,7 @@ def specimen_information(sample: ResponseSample, metric: Metric | None) -> Float
     n = max(round(node.n_specimens), 50)
     target = (metric or node.metric).against(_ideal_sample(sample, n))
     bound = design.copied(design.design.with_values(sample.outputs))
-    bound.target = target.metric.with_design(target, sample.outputs, design.inputs.dimensions)
+    bound.target = target.metric.for_inputs(target, design.inputs.dimensions)
     alone = replace(node, target=bound.target, bound=bound, specimens=None)
     # Directions with a standard error of up to ten spreads of the prior: fainter ones have less
     # than a hundredth of the prior's information.

@@ -17,7 +17,7 @@ from scipy.special import gammaincinv, ndtr, ndtri
 
 from prbayes._finding import Finding, report
 from prbayes._validate import AT_ONCE, Floats
-from prbayes.decision.quantities import Quantity
+from prbayes.decision.quantities import Quantile, Quantity, weighted_quantiles
 from prbayes.inference.asymptotics import oriented
 from prbayes.model.description import versions
 from prbayes.model.emulated import EmulatedResponse, EmulatedSample, values_of
@@ -271,8 +271,11 @@ class ResponseSample:
                 "repair it, or return +inf for specimens that fail"
             )
 
-    def checked_quantity(self, quantity: Quantity) -> tuple[Finding, ...]:
-        """Report a tail of few points; raise if there are none, or about failed specimens."""
+    def checked_quantity(self, quantity: Quantity) -> tuple[tuple[Finding, ...], float]:
+        """Return findings of a tail of few points, and the error of the quantity at the centre.
+
+        Raises ValueError if no response is in the tail, or specimens failed.
+        """
         caller, center = self.populations.caller, self.populations.center[None]
         if quantity.needs_finite and np.isposinf(self.values[-1]):
             raise ValueError(
@@ -280,27 +283,65 @@ class ResponseSample:
                 "which there is none, expected finite responses; ask for a Quantile or an "
                 "Exceedance"
             )
-        (at,) = self.evaluate(quantity, center)
+        (value,) = self.evaluate(quantity, center)
         # With the responses that are equal to a quantile, such as the largest.
-        at = np.nextafter(at, -np.inf)
+        at, side = np.nextafter(value, -np.inf), "beyond it"
         is_beyond = quantity.of_specimen(self.values, at)
         if not np.isin(is_beyond, (0.0, 1.0)).all():
-            return ()
+            return (), self._jackknife_error(quantity)
         share = float(self.mean_weights() @ is_beyond)
+        is_upper = share <= 0.5
+        if not is_upper:  # the rarer side decides how well the quantity is known
+            at, side = np.nextafter(value, np.inf), "on its other side"
+            share = float(self.mean_weights() @ (1 - quantity.of_specimen(self.values, at)))
         error = float(self.share_error(lambda values: quantity.of_specimen(values, at)))
         advice = "pass more responses to the propagation, or ask for a less rare quantity"
         if share == 0:
             raise ValueError(
-                f"{caller}: {quantity!r}: got no response beyond it, of {1 / error:.0f} effective "
+                f"{caller}: {quantity!r}: got no response {side}, of {1 / error:.0f} effective "
                 f"points, expected some; {advice}"
             )
-        if error <= 0.3 * share:
-            return ()
-        text = (
-            f"{quantity!r}: the share of responses beyond it, {share:.2g}, has a standard error of "
-            f"{error:.2g}, and the quantity is no better known; {advice}."
-        )
-        return report(Finding("rough-probability", text))
+        findings: tuple[Finding, ...] = ()
+        if error > 0.3 * share:
+            text = (
+                f"{quantity!r}: the share of responses {side}, {share:.2g}, has a standard error "
+                f"of {error:.2g}, and the quantity is no better known; {advice}."
+            )
+            findings = report(Finding("rough-probability", text))
+        if not isinstance(quantity, Quantile):
+            return findings, error
+        (weights,) = self.weights(center)
+        is_beyond = quantity.of_specimen(self.values, at)
+        on_line = self.design.has_runs and self.design.design.on_line
+        if not on_line:  # the jackknife of few points in a tail is itself rough
+            rare = weights * (is_beyond if is_upper else 1 - is_beyond)
+            error = max(error, float(np.linalg.norm(rare)))
+        tails = probability_bounds(share, error, float(ndtr(-1)))
+        tails *= min(quantity.probability, 1 - quantity.probability) / share
+        ends = weighted_quantiles(self.values, weights, tails, is_upper)
+        return findings, float(np.abs(ends - value).max())
+
+    def _jackknife_error(self, quantity: Quantity) -> float:
+        """Return the error of a quantity at the centre, by points and emulator."""
+        center = self.populations.center[None]
+        is_kept = self.blocks != np.arange(N_BLOCKS)[:, None]
+        rest = self.weights(center) * is_kept
+        without = quantity.of(self.values, rest / rest.sum(axis=1, keepdims=True))
+        variance = (N_BLOCKS - 1) * np.var(without)
+        outputs = self.emulated(self.points)
+        if outputs:
+            parents = self.populations.evaluator.parents(center, self.k)
+            mass = self.design.populations(parents)[1]
+            quantities = np.array([_of_unsorted(quantity, values, mass) for values in outputs])
+            variance += ((quantities[1:] - quantities[0]) ** 2).sum()
+        return float(np.sqrt(variance))
+
+
+def _of_unsorted(quantity: Quantity, values: Floats, weights: Floats) -> float:
+    """Return a quantity of responses in any order, (n,); NaN are left out."""
+    order = np.argsort(values)[: np.isfinite(values).sum()]
+    weights = weights[:, order]
+    return float(quantity.of(values[order], weights / weights.sum())[0])
 
 
 def probability_bounds(probability: ArrayLike, error: ArrayLike, tail: float) -> Floats:

@@ -10,6 +10,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import log_ndtr, logsumexp
 
 from prbayes._validate import Floats, finite_number, flag, share
@@ -163,12 +164,24 @@ class Quantile(Quantity):
 
     def of(self, values: Floats, weights: Floats) -> Floats:
         """Return the quantiles, by interpolation between the middles of the steps."""
-        middles = np.cumsum(weights, axis=1) - 0.5 * weights
-        return np.array([np.interp(self.probability, row, values) for row in middles])
+        return np.array([weighted_quantiles(values, row, self.probability) for row in weights])
 
     def of_specimen(self, values: Floats, at: float) -> Floats:
         """Return whether each specimen is beyond the population's quantile."""
         return (values > at).astype(float)
+
+
+def weighted_quantiles(
+    values: Floats, weights: Floats, probability: ArrayLike, is_upper: bool = False
+) -> Floats:
+    """Return quantiles of ascending values (n,), between the middles of the weights' steps.
+
+    With ``is_upper`` probabilities are those above the quantiles.
+    """
+    middles = np.cumsum(weights) - 0.5 * weights
+    below = np.asarray(probability)
+    below = 1 - below if is_upper else below
+    return np.asarray(np.interp(below, middles, values))
 
 
 class Exceedance(Quantity):

@@ -15,7 +15,7 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
-from prbayes._finding import as_json
+from prbayes._finding import Finding, as_json, report
 from prbayes._validate import Floats, Seed, flag, positive_integer, seed_number
 from prbayes.decision.populations import InverseTransform, Populations, ResponseSample
 from prbayes.decision.quantities import Quantity, refuse_quantity
@@ -83,8 +83,9 @@ def sensitivity(
         standard errors ``first_error``, ``total_error`` and ``derivative_error``: shares without a
         unit; NaN where they are not known, as derivatives of an indicator.
         Attributes: ``quantity``; ``of_inputs``, the number of a specimen whose variance is
-        attributed to the inputs; ``value``, the quantity at the centre, and ``sd``, its standard
-        deviation over the hyperparameters, both in its units; ``scatter``, the aleatory share of
+        attributed to the inputs; in the quantity's units ``value``, that at the centre,
+        ``value_error``, its standard error from points and emulator, and ``sd``, its standard
+        deviation over the hyperparameters; ``scatter``, the aleatory share of
         the variance of a new specimen; ``responses``, the number computed; ``inputs``, the reason
         if indices of inputs are not known; ``findings`` (as JSON), such as that few responses
         are beyond the quantity; and ``identity``.
@@ -140,9 +141,10 @@ def sensitivity(
     # 4000 draws: margins and correlations are then known to two percent.
     populations = Populations.of(result, model, 4000, caller)
     sample = populations.sample(quantity.response, quantity.inputs, quantity.output)
-    findings = sample.checked_quantity(quantity)
+    findings, error = sample.checked_quantity(quantity)
     hyperparameters = _hyperparameter_indices(sample, quantity, n_samples, seed)
     inputs, obstacle = input_indices(sample, quantity, n_samples, seed, computed=computed)
+    findings += report(*_constant_findings(hyperparameters, quantity))
     columns = {}
     for row, name in enumerate(("first", "total", "derivative")):
         values = [hyperparameters.values[row], inputs.values[row]]
@@ -162,6 +164,7 @@ def sensitivity(
         attrs={
             "quantity": repr(quantity),
             "value": float(sample.evaluate(quantity, populations.center[None])[0]),
+            "value_error": error,
             "sd": float(np.nanstd(sample.evaluate(quantity, populations.thetas))),
             "of_inputs": quantity.of_inputs,
             "scatter": _aleatory_share(sample, quantity),
@@ -273,7 +276,25 @@ def input_indices(
     is_known = np.array([[True], [True], [quantity.differentiable]])
     values = np.where(is_known, best.values, np.nan)
     errors = np.where(is_known, np.sqrt(best.errors**2 + emulator_error), np.nan)
-    return Indices(values, errors), ""
+    reason = ""
+    if np.isnan(values[:2]).any():
+        reason = (
+            f"{quantity.of_inputs} is the same for all {first.shape[1]} specimens of a replicate, "
+            "so that there is no variance to share; ask for a less rare quantity, or pass a "
+            "larger n_samples"
+        )
+    return Indices(values, errors), reason
+
+
+def _constant_findings(indices: Indices, quantity: Quantity) -> tuple[Finding, ...]:
+    """Return a finding if a quantity has no variance over the hyperparameters."""
+    if not np.isnan(indices.values).any():
+        return ()
+    text = (
+        f"{quantity!r} is the same in all populations of a replicate, so that there is no variance "
+        "to share between hyperparameters; ask for another quantity, or pass a larger n_samples."
+    )
+    return (Finding("constant-quantity", text),)
 
 
 def _indices_of_matched(numbers: Floats, columns: list[slice]) -> Floats:

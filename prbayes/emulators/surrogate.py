@@ -27,7 +27,12 @@ from prbayes._validate import (
 )
 from prbayes.emulators.io import read, write
 from prbayes.emulators.ranges import Ranges, read_ranges
-from prbayes.emulators.selection import CrossValidation, cross_validated, points_needed
+from prbayes.emulators.selection import (
+    CANDIDATES,
+    CrossValidation,
+    cross_validated,
+    points_needed,
+)
 from prbayes.emulators.surfaces import (
     MultifidelityModel,
     Predict,
@@ -36,6 +41,7 @@ from prbayes.emulators.surfaces import (
     fit_multifidelity,
     fitted,
 )
+from prbayes.emulators.table import Table, read_table
 from prbayes.numerics.points import sobol
 from prbayes.response.call import CallSettings, Points, Tally, column_names, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
@@ -347,6 +353,80 @@ class Surrogate:
         )
         return surrogate
 
+    @classmethod
+    def from_runs(
+        cls,
+        inputs: Any,
+        responses: Any,
+        *,
+        model: Any = None,
+        outside: OnFailure | None = None,
+        random_seed: Seed = 0,
+    ) -> Surrogate:
+        """Fit a surface to runs that were computed before; its ranges are those of the runs.
+
+        Parameters
+        ----------
+        inputs, responses
+            As for `Runs`.
+        model : object, optional
+            As for `fit`; by default the best one of two kinds of `GaussianProcess` and
+            quintic splines.
+        outside : OnFailure, optional
+        random_seed : int, sequence of int, numpy.random.Generator or None
+            Of the parts that cross-validation leaves out.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As for `Runs`.
+
+        Examples
+        --------
+        >>> import numpy as np, prbayes as prb
+        >>> x = np.linspace(0, 3, 20)
+        >>> prb.Surrogate.from_runs({"x": x}, np.sin(x))(1.0).round(3)
+        np.float64(0.841)
+        """
+        name = "Surrogate.from_runs"
+        table = read_table(name, inputs, responses)
+        return cls.of_table(name, table, model, outside, random_seed)
+
+    @classmethod
+    def of_table(
+        cls,
+        name: str,
+        table: Table,
+        model: Any = None,
+        outside: OnFailure | None = None,
+        random_seed: Seed = 0,
+    ) -> Surrogate:
+        """Fit a surface to the runs of a table; arguments as for `from_runs`."""
+        outside = Replace() if outside is None else outside
+        domain, design, values = table.domain, table.points, table.responses
+        seed = seed_number(random_seed, f"{name}: random_seed")
+        # Splines are better where responses of scattered runs differ by powers of ten.
+        models = (*CANDIDATES, RadialBasis("quintic")) if model is None else (model,)
+        for candidate in models:
+            refuse_wrong_surface(name, candidate, outside)
+        usable = _usable(values)
+        _refuse_unfit(name, values, max(points_needed(m, design.shape[1]) for m in models))
+        x, y = domain.scaled(design)[usable], values[usable]
+        spread = _spread(y)
+        unit = np.where(np.asarray(spread) > 0, spread, 1.0)
+        left_out = [cross_validated(candidate, x, y, seed) for candidate in models]
+        # The largest residuals are those of the most extreme runs.
+        errors = [np.quantile(np.abs(r / unit), 0.9, axis=0).sum() for r in left_out]
+        best = int(np.argmin(errors))
+        residuals = np.full(values.shape, np.nan)
+        residuals[usable] = left_out[best]
+        return cls(
+            *(domain, design, values, models[best], outside, 0),
+            error=CrossValidation(residuals, spread),
+            _named=table.labels,
+            _surface=FittedSurface.of(models[best], domain, design, values, None, joined=False),
+        )
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the inputs."""
@@ -582,7 +662,7 @@ def _learn_names(settings: CallSettings, points: Points, tally: Tally) -> None:
         )
 
 
-def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool) -> None:
+def _refuse_unfit(name: str, responses: Floats, needed: int, *, has_coarse: bool = False) -> None:
     """Raise if too few runs have a response, or several outputs would follow a coarse one."""
     n_usable = _usable(responses).sum()
     if n_usable < needed:
@@ -642,6 +722,14 @@ def _best(
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:
     """Raise if an argument of `Surrogate.fit` is not of its kind."""
     refuse_uncallable(name, response)
+    refuse_wrong_surface(name, model, outside)
+    designs = ("even", "predictive")
+    if points not in designs:
+        raise ValueError(f"{name}: points: got {points!r:.60}, expected one of {designs}")
+
+
+def refuse_wrong_surface(name: str, model: Any, outside: object) -> None:
+    """Raise if a model is no surface, or the policy outside the ranges is none."""
     is_regressor = hasattr(model, "fit") and hasattr(model, "predict")
     is_surface = isinstance(model, Surface) or is_regressor
     if isinstance(model, type) or not is_surface:
@@ -655,6 +743,3 @@ def _refuse_wrong(name: str, response: object, model: Any, outside: object, poin
             f"{name}: outside: got {outside!r:.60}, expected prb.response.Replace() or "
             "prb.response.Abort()"
         )
-    designs = ("even", "predictive")
-    if points not in designs:
-        raise ValueError(f"{name}: points: got {points!r:.60}, expected one of {designs}")

@@ -418,11 +418,8 @@ class Metric(ABC):
         """Return the comparison of the same outputs by another metric of one output."""
         return metric
 
-    def with_design(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
-        """Return the discrepancy with projections of the data and a design of responses together.
-
-        By default they are those of the data alone.
-        """
+    def for_inputs(self, target: Discrepancy, n_inputs: int) -> Discrepancy:
+        """Return the discrepancy of outputs of that many inputs; by default the same for all."""
         return target
 
     @abstractmethod

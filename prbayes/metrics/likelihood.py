@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._validate import Floats, flag, real_array
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
@@ -141,6 +142,20 @@ class LogLikelihood(Metric):
     def by_specimen(self) -> bool:  # type: ignore[override]
         """Whether it is the log-likelihood by specimen, which compares no two samples."""
         return self.density is None
+
+    def of_frequencies(self, rows: NDArray[np.intp], n: int) -> LogLikelihood:
+        """Return the likelihood of specimens that are rows of n readings, by their frequencies.
+
+        Arrays by reading become those of the specimens.
+        """
+
+        def of_specimens(value: Any) -> Any:
+            array = np.asarray(value, dtype=np.float64) if isinstance(value, tuple) else np.empty(0)
+            return _as_tuples(array[rows]) if len(array) == n else value
+
+        error = self.error if hasattr(self.error, "owner") else of_specimens(self.error)
+        censored = self.censored and tuple(map(of_specimens, self.censored))
+        return replace(self, error=error, rounded=of_specimens(self.rounded), censored=censored)
 
     def readings(self, values: Floats, error: Any = None, event: tuple[int, ...] = ()) -> Readings:
         """Return measured outputs, (N, m), with their errors, limits and rounding.

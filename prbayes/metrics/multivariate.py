@@ -129,11 +129,14 @@ class CompositeDiscrepancy(Discrepancy):
         return total
 
 
-def components_summary(target: Discrepancy, *, missed: bool = False) -> str:
-    """Return what principal components leave out, or only the structure of the data among it."""
-    components = target.components if isinstance(target, CompositeDiscrepancy) else ()
-    texts = [c.missed if missed else c.summary for c in components]
-    return "; ".join(filter(None, texts))
+def components_of(target: Discrepancy) -> tuple[Components, ...]:
+    """Return the principal components that outputs are compared by."""
+    return target.components if isinstance(target, CompositeDiscrepancy) else ()
+
+
+def components_summary(target: Discrepancy) -> str:
+    """Return what principal components leave out."""
+    return "; ".join(c.summary for c in components_of(target))
 
 
 # What a metric of several outputs declares as its metric of one output does.
@@ -262,7 +265,7 @@ class Joint(LiftedMetric):
     with one degree of freedom, and invariant coordinates. The metric compares projections of both
     sides on fixed, well-spread directions. It thus compares correlations and all other dependence,
     and is invariant under affine maps of the outputs, such as changes of units. The minimiser has
-    the robustness of the metric.
+    the robustness of the metric. Coordinates depend on the observed values alone.
 
     With the energy distance as metric, :math:`2 \int (F - S_N)^2`, the mean over all directions is
     a multiple of the energy distance of several outputs [1]_; with the area metric it is the sliced
@@ -277,9 +280,9 @@ class Joint(LiftedMetric):
         has parameters. Fewer than m (m + 1) / 2 miss some correlations.
     components : int, optional
         More than eight outputs, such as curves, are replaced by their scores on principal
-        components of data and design together: the fewest that leave out a hundredth of the
-        variance of either. With a number this holds for fewer outputs as well. All outputs must
-        have one unit.
+        components of the data: the fewest that leave out a hundredth of the variance, at most
+        eight, or one for five specimens. With a number this holds for fewer outputs as well. All
+        outputs must have one unit.
     random_seed : int
         Of the directions of three or more outputs.
 
@@ -288,6 +291,10 @@ class Joint(LiftedMetric):
     Outputs of fewer inputs are on a surface, or a curve. Only as many coordinates are compared as
     it has dimensions, if these leave out less than a hundredth of the outputs' variance, each in
     units of its spread; whitening would give the bend of the surface the same weight as the rest.
+
+    Few specimens, below 5 m and 3 m (m + 1) / 2, determine ratios of variances badly. These are
+    shrunk, in units of the outputs' spreads, so that the metric is invariant under changes of units
+    but not under all affine maps.
 
     A specimen that failed (+inf) counts as the largest observed value of that output plus the
     range. Where outputs are missing (NaN), each set of outputs that specimens have is compared with
@@ -328,37 +335,23 @@ class Joint(LiftedMetric):
             positive_integer(self.components, "components")
         positive_integer(self.random_seed, "random_seed", minimum=0)
 
-    def with_design(self, target: Discrepancy, design: Floats, n_inputs: int) -> Discrepancy:
-        """Return the discrepancy with principal components of data and design together.
-
-        Inputs fewer than the outputs matter as well.
-        """
-        if target.observed.ndim < 2 or target.observed.shape[1] < 2:
+    def for_inputs(self, target: Discrepancy, n_inputs: int) -> Discrepancy:
+        """Return the discrepancy of outputs of fewer inputs, which are on a surface."""
+        if target.observed.ndim < 2 or n_inputs >= target.observed.shape[1]:
             return target
-        components = target.components if isinstance(target, CompositeDiscrepancy) else ()
-        if not components and n_inputs >= target.observed.shape[1]:
-            return target
-        return self._prepare_outputs(target.observed, target.weights, design, n_inputs)
+        return self._prepare_outputs(target.observed, target.weights, n_inputs)
 
     def _prepare_outputs(
-        self,
-        observed: Floats,
-        weights: Floats,
-        design: Floats | None = None,
-        n_inputs: int | None = None,
+        self, observed: Floats, weights: Floats, n_inputs: int | None = None
     ) -> Discrepancy:
         """Return the mean over directions, for each set of outputs that specimens have."""
         caps = failure_caps(observed)
         parts: list[Part] = []
         components: list[Components] = []
         for outputs, share in patterns(observed, weights):
-            runs = None
-            if design is not None:
-                runs = design[:, outputs]
-                runs = _capped(runs[~np.isnan(runs).any(axis=1)], caps[outputs])
             sample = observed[:, outputs]
             (center, axes), principal = self._white(
-                sample, weights, outputs, caps[outputs], runs, n_inputs
+                sample, weights, outputs, caps[outputs], n_inputs
             )
             components += principal
             m = axes.shape[1]
@@ -384,15 +377,15 @@ class Joint(LiftedMetric):
         weights: Floats,
         outputs: NDArray[np.intp],
         caps: Floats,
-        design: Floats | None,
         n_inputs: int | None,
     ) -> tuple[_Coordinates, list[Components]]:
         """Return white coordinates of some outputs, or of their principal components."""
         if outputs.size > 1 and (outputs.size > MOST_OUTPUTS or self.components is not None):
             is_complete = ~np.isnan(sample).any(axis=-1)
-            sample, weights = _capped(sample[is_complete], caps), weights[is_complete]
+            sample, weights = sample[is_complete], weights[is_complete]
+            sample = np.where(np.isposinf(sample), caps, sample)
             weights = weights / weights.sum()
-            principal = principal_components(sample, weights, self.components, design)
+            principal = principal_components(sample, weights, outputs, self.components)
             return _whitened_scores(principal, sample, weights), [principal]
         is_finite = np.isfinite(sample).all(axis=-1)
         sample, weights = sample[is_finite], weights[is_finite]
@@ -421,16 +414,11 @@ def _flat(
     center, unit = units(sample, weights, outputs)
     standard = (sample - center) / unit
     for number in range(max(1, n_inputs), outputs.size):
-        principal = principal_components(standard, weights, number)
+        principal = principal_components(standard, weights, outputs, number)
         if principal.left_out <= LEFT_OUT:
             inner, axes = _whitened_scores(principal, standard, weights)
             return center + unit * inner, axes / unit[:, None]
     return None
-
-
-def _capped(outputs: Floats, caps: Floats) -> Floats:
-    """Return outputs (n, m) with a failure as the cap."""
-    return np.where(np.isposinf(outputs), caps, outputs)
 
 
 def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], float]]:

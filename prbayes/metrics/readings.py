@@ -37,6 +37,13 @@ class Readings:
         """Return the readings of selected specimens."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    def at_columns(self, columns: NDArray[np.intp]) -> Readings:
+        """Return the readings of selected outputs of each specimen, (N, k)."""
+        selected = {
+            f.name: np.take_along_axis(getattr(self, f.name), columns, axis=1) for f in fields(self)
+        }
+        return replace(self, **selected)
+
     @property
     def is_measured(self) -> NDArray[np.bool_]:
         """Which readings are numbers, (N, m)."""

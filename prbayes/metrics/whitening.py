@@ -17,7 +17,7 @@ from prbayes.metrics.density import spread
 
 # More outputs than this are compared by their principal components: eight need seventy directions.
 MOST_OUTPUTS = 8
-# Share of the variance, of the data and of the design, that components may leave out.
+# Share of the variance of the data that components may leave out.
 LEFT_OUT = 0.01
 
 
@@ -28,8 +28,8 @@ class Components:
     center: Floats  # (m,)
     axes: Floats  # (m, r): orthonormal
     left_out: float  # share of the observed variance
-    design_left_out: float  # share of the design's variance; NaN without a design
     rest_correlation: float  # of neighbours in the remainder of the data: near zero for noise
+    outputs: NDArray[np.intp]  # (m,): which of the outputs of a specimen
 
     @property
     def number(self) -> int:
@@ -39,69 +39,89 @@ class Components:
     @property
     def summary(self) -> str:
         """The number of components, and the variance that they leave out."""
-        left_out = f"{self.left_out:.2g} of the variance of the data"
-        if not np.isnan(self.design_left_out):
-            left_out += f" and {self.design_left_out:.2g} of that of the design"
         return (
             f"{len(self.axes)} outputs are compared by {self.number} principal component(s), which "
-            f"leave out {left_out}; neighbours in what is left out of the data are correlated by "
-            f"{self.rest_correlation:.2f}"
+            f"leave out {self.left_out:.2g} of the variance of the data; neighbours in what is "
+            f"left out are correlated by {self.rest_correlation:.2f}"
         )
 
-    @property
-    def missed(self) -> str:
-        """A clause about what is left out of the data; empty if it is noise that no model has."""
-        if self.left_out <= LEFT_OUT:
-            return ""
-        if self.rest_correlation < 0.5:  # white noise has .1
-            if not self.design_left_out > LEFT_OUT:
-                return ""
+    def share_left_out(self, values: Floats, weights: Floats) -> float:
+        """Return the share of the variance of a population, (n, m), that they leave out."""
+        values = values[:, self.outputs]
+        is_usable = np.isfinite(values).all(axis=1) & (weights > 0)
+        values, weights = values[is_usable], weights[is_usable]
+        deviations = values - np.average(values, axis=0, weights=weights)
+        rest = deviations - deviations @ self.axes @ self.axes.T
+        variance = float(weights @ (deviations**2).sum(axis=1))
+        return float(weights @ (rest**2).sum(axis=1)) / variance if variance > 0 else 0.0
+
+    def missed(self, population: float) -> str:
+        """Return a clause about what is left out; empty if it is noise that no model has.
+
+        Argument is the share of the variance of the best population that they leave out.
+        """
+        if self.left_out > LEFT_OUT and self.rest_correlation >= 0.5:  # white noise has .1
             return (
-                f"{self.summary}: noise that the model has too, and whose size rests on the few "
-                "directions in which the data happen to vary most; leave metric= out, for the "
+                f"{self.summary}: it is no noise, and the metric does not compare it; pass more "
+                "components= to prb.Joint, or measure more specimens"
+            )
+        if self.left_out > LEFT_OUT and population > LEFT_OUT:
+            return (
+                f"{self.summary}: noise that the model has too, and whose size rests on few "
+                "directions; leave metric= out, for the "
                 "log-likelihood by specimen, or use prb.MarginalCorrelation(metric)"
             )
-        return (
-            f"{self.summary}: it is no noise, and the metric does not compare it; pass more "
-            "components= to prb.Joint, or measure more specimens"
-        )
+        # Components of few data leave out more of a population than of the data.
+        if population > 3 * LEFT_OUT:
+            return (
+                f"{self.summary}, but {population:.2g} of that of the best population, which the "
+                "metric does not compare; pass more components= to prb.Joint"
+            )
+        return ""
 
 
 def principal_components(
-    sample: Floats, weights: Floats, number: int | None = None, design: Floats | None = None
+    sample: Floats, weights: Floats, outputs: NDArray[np.intp], number: int | None = None
 ) -> Components:
-    """Return principal components of observed outputs, (n, m), and of a design, (k, m), together.
+    """Return principal components of observed outputs, (n, m).
 
-    They are those of the mean of both scatters, each in units of its variance, and so span what the
-    data vary in, and what similar populations could vary in. The weight of a specimen falls with
-    its distance from the middle of the data. By default their ``number`` is the fewest that leave
-    out a hundredth of either variance, at most eight, or one for five specimens.
+    The weight of a specimen falls with its distance from the middle of the data. Components that
+    vary no more than white noise follow the others. By default their ``number`` is the fewest
+    that leave out a hundredth of the variance, at most eight, or one for five specimens.
     """
     n, m = sample.shape
     middle = np.array([quantile(y, weights, 0.5) for y in sample.T])
     squares = ((sample - middle) ** 2).sum(axis=1)
     typical = float(quantile(squares, weights, 0.5))
-    center, scatter = _robust_moments(sample, weights, middle, typical)
-    scatters = [scatter]
-    if design is not None and len(design) > 1:
-        equal = np.full(len(design), 1 / len(design))
-        scatters.append(_robust_moments(design, equal, middle, typical)[1])
-    scaled = [s / max(float(np.trace(s)), np.finfo(float).tiny) for s in scatters]
-    axes = np.linalg.eigh(np.mean(scaled, axis=0))[1][:, ::-1]
-    # The variance of each scatter that the first components explain.
-    variances = [np.einsum("ij,ik,kj->j", axes, s, axes) for s in scaled]
-    explained = np.cumsum(variances, axis=1)
+    # Weights that fall with the fourth power of the distance from the middle.
+    w = weights / (1 + squares / typical) ** 2 if typical > 0 else weights
+    w = w / w.sum()
+    center = w @ sample
+    deviations = sample - center
+    scatter = (w[:, None] * deviations).T @ deviations
+    variances, axes = np.linalg.eigh(scatter)
+    variances = np.maximum(variances[::-1], np.finfo(float).tiny)
+    # White noise starts below the largest variance that it has by chance (Marchenko and Pastur). Of
+    # its components the most typical are compared: those that vary most have too large a variance.
+    # The largest one precedes them where there is room, as it may be no noise.
+    most = max(1, min(m, MOST_OUTPUTS, n // 5)) if number is None else min(number, m)
+    remaining = np.arange(m, 0, -1)
+    means = np.cumsum(variances[::-1])[::-1] / remaining
+    is_noise = variances <= means * (1 + np.sqrt(remaining * (w @ w))) ** 2  # so is the last
+    first = int(np.argmax(is_noise))
+    first += most - first > 1
+    atypical = np.abs(np.log(variances[first:] / means[first]))
+    order = np.concatenate([np.arange(first), first + np.argsort(atypical)])
+    variances, axes = variances[order], axes[:, ::-1][:, order]
+    explained = np.cumsum(variances) / variances.sum()
     if number is None:
-        is_sufficient = (explained >= 1 - LEFT_OUT).all(axis=0)
-        sufficient = int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m
-        number = min(sufficient, max(1, min(m, MOST_OUTPUTS, n // 5)))
+        is_sufficient = explained >= 1 - LEFT_OUT
+        number = min(int(np.argmax(is_sufficient)) + 1 if is_sufficient.any() else m, most)
     # Signs that do not depend on the algorithm.
     largest = np.abs(axes).argmax(axis=0)
     axes = (axes * np.sign(axes[largest, np.arange(m)]))[:, :number]
-    left_out = 1 - explained[:, number - 1].clip(0, 1)
     # The correlation of neighbours in the remainder.
-    centered = sample - center
-    rest = centered - centered @ axes @ axes.T
+    rest = deviations - deviations @ axes @ axes.T
     rest = rest - rest.mean(axis=0)
     variance = float((rest**2).mean())
     correlation = 0.0
@@ -110,25 +130,10 @@ def principal_components(
     return Components(
         center=center,
         axes=axes,
-        left_out=float(left_out[0]),
-        design_left_out=float(left_out[1]) if len(left_out) > 1 else np.nan,
+        left_out=float(1 - explained[number - 1].clip(0, 1)),
         rest_correlation=correlation,
+        outputs=outputs,
     )
-
-
-def _robust_moments(
-    sample: Floats, weights: Floats, middle: Floats, typical: float
-) -> tuple[Floats, Floats]:
-    """Return the mean and the scatter of a sample with weights that fall with the fourth power.
-
-    Distances are from a middle, in units of a typical squared distance.
-    """
-    squares = ((sample - middle) ** 2).sum(axis=1)
-    w = weights / (1 + squares / typical) ** 2 if typical > 0 else weights
-    w = w / w.sum()
-    center = w @ sample
-    deviations = sample - center
-    return center, (w[:, None] * deviations).T @ deviations
 
 
 # Degrees of freedom of the t distribution of the scatter. One is the most robust, up to a share of
@@ -142,6 +147,8 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tup
     They are the same, to rounding, after any invertible affine map of the outputs: location and
     scatter are maximum likelihood of a t distribution [1]_, axes and signs are those of another
     scatter and of a third moment relative to it [2]_. All of them are robust to gross outliers.
+    With fewer specimens than `sufficient_specimens` the scatter is shrunk, and only changes of
+    units and of the order of outputs change nothing.
     Messages use the numbers of the ``outputs``, (m,). Raises ValueError if an output has equal
     values, outputs depend on each other linearly, or the specimens are fewer than m + 2.
 
@@ -178,6 +185,7 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tup
             "linearly, to 1e-5 of their spread, expected outputs that do not follow from "
             "others; leave one of them out"
         )
+    root = _shrunk(root, 1 / float(weights @ weights))
     # Rotate to the axes of a second scatter, with signs by a third moment.
     x = (z - location) @ root
     squares = (x**2).sum(axis=-1)
@@ -189,6 +197,33 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tup
     size = quantile(squares, weights, 0.5) / (2 * gammaincinv(m / 2, 0.5))
     axes = root / np.sqrt(size)
     return center + location * unit, axes / unit[:, None]
+
+
+def sufficient_specimens(m: int) -> int:
+    """Return a sufficient number of specimens to whiten m outputs without shrinkage.
+
+    Five for each output, and three for each number of the scatter.
+    """
+    return max(5 * m, 3 * m * (m + 1) // 2)
+
+
+def _shrunk(root: Floats, n: float, chance: float = 0.1) -> Floats:
+    """Return a root of the inverse scatter whose principal variances differ less, for few data.
+
+    A combination of outputs that happens to scatter little would count as much as all others. The
+    ratio of neighbouring variances shrinks, at most to one, by the ratio that two equal variances
+    of n normal values exceed by chance, ``P(log ratio > 2 g) = cosh(g)^(2 - n)``. This shrinkage
+    falls to zero at a sufficient number of specimens.
+    """
+    deficit = 1 - n / sufficient_specimens(len(root))
+    if deficit < 1e-9:  # rounding of weights
+        return root
+    _, size, axes = np.linalg.svd(np.linalg.inv(root))
+    log_size = np.log(size)
+    threshold = np.sqrt(deficit) * np.arccosh(chance ** (-1 / max(n - 2, 1)))
+    gaps = np.maximum(-np.diff(log_size) - threshold, 0)
+    shrunk = -np.concatenate([[0.0], np.cumsum(gaps)])
+    return np.asarray(axes.T / np.exp(shrunk - shrunk.mean() + log_size.mean()))
 
 
 def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:

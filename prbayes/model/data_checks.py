@@ -60,26 +60,35 @@ def warn_out_of_range(
             return
 
 
-def check_constant(name: str, responses: Floats, outputs: Sequence[str]) -> None:
-    """Report an output that is the same in all runs; raise a DesignError from 32 runs on."""
-    # Of a user's own propagation there may be none, and with +inf the data may be failures alone.
-    if len(responses) < 8 or np.isposinf(responses).any():
-        return
+def check_constant(
+    name: str, responses: Floats, outputs: Sequence[str], is_stored: bool
+) -> tuple[Finding, ...]:
+    """Return findings of outputs that are the same in all runs; raise if no others are made.
+
+    Weights of equal stored responses make no difference. Responses of a propagation that simulates
+    again may be equal by chance, as counts can be.
+    """
+    # A user's own propagation may store none, and with +inf the data may be failures alone.
+    if not responses.size or np.isposinf(responses).any():
+        return ()
     values = responses.reshape(len(responses), -1)
     finite = values[np.isfinite(values).all(axis=1)]
-    if len(finite) < 8:
-        return
+    if len(finite) < (2 if is_stored else 8):
+        return ()
     labels = [f"{name}[{output}]" for output in outputs] or [name]
+    findings = []
     for label, column in zip(labels, finite.T, strict=True):
         if np.ptp(column) > 1e-9 * np.abs(column).max():
             continue
         text = (
-            f"{label}: got {column[0]:.6g} for the response at all {len(finite)} runs over the "
-            "priors, expected a response that depends on its inputs; check the response"
+            f"{label}: the response is constant: got {column[0]:.6g} at all {len(finite)} runs "
+            "over the priors, expected one that depends on its inputs; check the response"
         )
-        if len(finite) >= 32:
-            raise DesignError(f"{text}, or leave the output out")
-        report(Finding("constant-response", f"{text}."))
+        if is_stored:
+            advice = "take more runs if it changes rarely"
+            raise DesignError(f"{text}, {advice}, or leave the output out")
+        findings.append(Finding("constant-response", f"{text}."))
+    return tuple(findings)
 
 
 def check_failing_region(
@@ -89,6 +98,7 @@ def check_failing_region(
     responses: Floats,
     max_lost: float,
     apart: float = 6.0,
+    remedy: str = "repair the response",
 ) -> tuple[Finding, ...]:
     """Return a finding of observed values in gaps of the finite responses beside failing runs.
 
@@ -134,13 +144,13 @@ def check_failing_region(
         "population cannot be estimated there"
     )
     if count > max_lost * len(columns):
-        raise DesignError(f"{text}; repair the response, or pass a larger max_lost")
+        raise DesignError(f"{text}; {remedy}, or pass a larger max_lost")
     page = "expensive.md#when-a-run-fails"
-    return (Finding("failing-data", f"{text}; repair the response.", page),)
+    return (Finding("failing-data", f"{text}; {remedy}.", page),)
 
 
-def warn_duplicates(name: str, observed: Floats) -> None:
-    """Warn if each specimen without a label occurs at least twice.
+def duplicate_findings(name: str, observed: Floats) -> tuple[Finding, ...]:
+    """Return a finding if each specimen without a label occurs at least twice.
 
     Counts, and readings on a scale of few steps, have duplicates by chance.
     """
@@ -148,15 +158,15 @@ def warn_duplicates(name: str, observed: Floats) -> None:
     distinct, counts = np.unique(rows, axis=0, return_counts=True)
     # Of six specimens, duplicates of all are no chance.
     if len(rows) < 6 or counts.min() < 2 or all(map(_has_few_steps, rows.T)):
-        return
-    report(
+        return ()
+    return (
         Finding(
             "duplicated-data",
             f"{name}: got {len(rows)} observed values of which only {len(distinct)} are "
             "different, each at least twice: if these are repeated readings of a specimen, say "
             "so by specimens=, and leave out what is there twice by mistake; else every "
             "specimen counts, and the uncertainty is too small.",
-        )
+        ),
     )
 
 
@@ -392,19 +402,24 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
     """Raise if the response is constant, or all readings are far outside the range of the runs.
 
     Far is more than the width of the range of the runs, outputs (n, m), over all populations of the
-    prior.
+    prior. An output that is constant, as at time zero, is one of the error of its readings alone.
     """
     finite = outputs[np.isfinite(outputs).all(axis=1)]
     if len(finite) < 2:
         return
     low, high = finite.min(axis=0), finite.max(axis=0)
     size = np.abs(finite).max(axis=0)
+    is_constant = high - low <= 1e-9 * size
+    has_error = (readings.error > 0).all(axis=0) & (not is_constant.all())
     for j, width in enumerate(high - low):
+        if is_constant[j] and has_error[j]:
+            continue
         output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
-        if width <= 1e-9 * size[j]:
+        if is_constant[j]:
             raise DesignError(
-                f"{name}: got {high[j]:.6g} for {output} at all {len(finite)} runs, expected a "
-                "response that depends on its inputs; check the response, or leave the output out"
+                f"{name}: the response is constant: got {high[j]:.6g} for {output} at all "
+                f"{len(finite)} runs, expected one that depends on its inputs; check the response, "
+                "or leave the output out"
             )
         values = readings.values[np.isfinite(readings.values[:, j]), j]
         if not values.size and readings.is_censored[:, j].any():
@@ -473,7 +488,8 @@ def refuse_unused_inputs(
     z, outputs = z[is_finite], outputs[is_finite]
     surface = fit_interpolant(z, outputs, np.ones(len(z), dtype=bool))
     _, jacobian = surface(z)
-    values, directions = _singular(jacobian / outputs.std(axis=0)[:, None])
+    spread = outputs.std(axis=0)
+    values, directions = _singular(jacobian / np.where(spread > 0, spread, 1.0)[:, None])
     if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
         raise _undetermined(name, m, directions, inputs)
 

@@ -74,7 +74,9 @@ def _simulator(
     inputs = []
     for argument in simulator.inputs.arguments:
         if isinstance(argument, int):  # the place of an aleatory input
-            inputs.append(_distribution(simulator.inputs.aleatory[argument], named))
+            x = simulator.inputs.aleatory[argument]
+            is_known = argument in simulator.inputs.conditions
+            inputs.append(f"condition {x.name}" if is_known else _distribution(x, named))
         elif isinstance(argument, Variable):
             inputs.append(str(argument.name or f"an expression of {_parents(argument, named)}"))
         else:
@@ -272,9 +274,7 @@ def labelled_responses(
         if name in values:
             if outputs.event:
                 data = _with_output_names(data, name, outputs)
-            if outputs.units:
-                units = list(dict.fromkeys(outputs.units))
-                data[name].attrs["units"] = units[0] if len(units) == 1 else list(outputs.units)
+            data[name].attrs |= outputs.attrs
     return data
 
 

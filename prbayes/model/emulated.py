@@ -20,7 +20,12 @@ from scipy.special import logsumexp
 from prbayes._validate import AT_ONCE, Floats
 from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.base import Metric
-from prbayes.model.measurement import Measurement, SpecimenLikelihood, output_columns
+from prbayes.model.conditions import at_conditions
+from prbayes.model.measurement import (
+    Measurement,
+    SpecimenLikelihood,
+    output_columns,
+)
 from prbayes.model.random_variable import Node, nodes
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
@@ -61,16 +66,21 @@ class EmulatedResponse:
     columns: slice  # the outputs of the surface that are those of the response
     event: tuple[int, ...]  # shape of a specimen's outputs, () or (m,)
     error: Floats  # (m,): root mean square error of left-out runs, near the specimens
+    is_continued: bool = True  # whether there is a response beyond the runs' range
 
     def __call__(self, inputs: Sequence[Floats]) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); computes no run.
 
-        Beyond the runs' range an input has the response at the end of the range. Where the nearest
-        run has no finite response, the response is that of the run.
+        Beyond the runs' range an input has the response at the end of the range, or NaN. Where
+        the nearest run has no finite response, the response is that of the run.
         """
         z = self.coordinates.of(inputs, 1)
-        z = np.clip(z, self.z.min(axis=0), self.z.max(axis=0))
+        inside = np.clip(z, self.z.min(axis=0), self.z.max(axis=0))
+        is_outside = (np.abs(z - inside) > 1e-9).any(axis=1)
+        z = inside
         values = self.surface.values(z)[:, self.columns]
+        if not self.is_continued:
+            values[is_outside] = np.nan
         is_finite = np.isfinite(self.y).all(axis=1)
         if not is_finite.all():
             from scipy.spatial import cKDTree
@@ -172,8 +182,14 @@ class EmulatedSimulator:
             responses=m.responses,
             outputs=m.outputs,
             max_lost=getattr(m.propagation, "max_lost", MAX_LOST),
-            has_specimens=not self.likelihood.calls_response,
+            has_specimens=self.likelihood.has_table or not self.likelihood.calls_response,
         )
+
+    @property
+    def conditions(self) -> Floats | None:
+        """The conditions of the specimens, (N, C), None without one."""
+        conditions = self.measurement.conditions
+        return None if conditions is None else conditions[self.rows]
 
     @cached_property
     def _emulated(self) -> EmulatedResponse:
@@ -188,6 +204,7 @@ class EmulatedSimulator:
             columns,
             self.measurement.event,
             emulation.error[columns],
+            is_continued=not self.likelihood.has_table,
         )
 
     def emulator(self, responses: Responses) -> EmulatedResponse:
@@ -213,6 +230,7 @@ class EmulatedSimulator:
         size, n = len(parents[0]), _SIZES.specimens
         rng = np.random.default_rng(0)
         specimens, _ = new_specimens(self.name, self.inputs, list(parents), n, rng)
+        specimens = at_conditions(self.inputs, specimens, self.conditions)
         flat = [x.reshape(size * n, *x.shape[2:]) for x in specimens]
         values = self._emulated(flat).reshape(size, n, *self.measurement.event)
         return values, np.full((size, n), 1 / n)
@@ -267,6 +285,7 @@ class EmulatedSample:
         specimens, _ = new_specimens(
             simulator.name, simulator.inputs, list(parents), of_each, np.random.default_rng(0)
         )
+        specimens = at_conditions(simulator.inputs, specimens, simulator.conditions)
         flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
         log_p = _log_density(simulator.inputs, parents, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(rows))

@@ -259,9 +259,7 @@ class Evaluator:
             if weights is None and np.shape(observed) == node.observed.shape:
                 counted = node.weights
             target = (metric or node.metric).against(observed, counted)
-            bound = node.bound
-            dimensions = bound.inputs.dimensions
-            targets.append(target.metric.with_design(target, bound.first_responses, dimensions))
+            targets.append(target.metric.for_inputs(target, node.bound.inputs.dimensions))
         return self.with_targets(common_targets(self.nodes, targets))
 
     def parents(self, thetas: Floats, k: int) -> list[Floats]:

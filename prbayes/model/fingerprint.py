@@ -137,7 +137,7 @@ def identity_of(problem: Evaluator | pm.Model, *, prior_minimised: bool | None =
 
 def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
     observed, weights, labels = simulator.observed, simulator.weights, simulator.specimens
-    known: tuple[Any, ...] = ()
+    of_specimens: tuple[Any, ...] = ()
     fields: dict[str, Any] = {}
     if isinstance(simulator, Node):
         bound = simulator.bound
@@ -157,10 +157,10 @@ def _simulator_identity(simulator: Node | Measurement) -> SimulatorIdentity:
             "points": _points(simulator),
         }
     else:
-        known = simulator.groups, *simulator.covariates.values()
+        of_specimens = simulator.groups, *simulator.covariates.values(), simulator.conditions
     return SimulatorIdentity(
         name=simulator.name,
-        data=_digest(observed, *known),
+        data=_digest(observed, *of_specimens),
         weights=_digest(weights),
         specimens=_digest(repr([] if labels is None else labels.tolist())),
         inputs=_inputs(simulator.inputs),

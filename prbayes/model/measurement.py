@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats
+from prbayes.emulators.runs import Runs
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings, Repeats, averaged, side_by_side
 from prbayes.model.parameters import Hyperparameters, parent_values
@@ -44,6 +45,7 @@ class Measurement:
     groups: NDArray[np.intp] | None = None  # (N,): index of each specimen's group
     # By name, (N,): conditions on which the population of a specimen depends.
     covariates: Mapping[str, Floats] = field(default_factory=dict)
+    conditions: Floats | None = None  # (N, C): those that are inputs of the response
     # Model variables of the measurement: ``error`` and ``gross_errors``.
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
 
@@ -92,7 +94,8 @@ class Measurement:
                 f"{('N', *self.event)}, as when the simulator was made"
             )
         is_plain = self.groups is None and self.weights is None and self.specimens is None
-        if len(values) != len(self.observed) and (self.covariates or not is_plain):
+        is_plain = is_plain and not self.covariates and self.conditions is None
+        if len(values) != len(self.observed) and not is_plain:
             raise ValueError(
                 f"{self.name}: observed: got {len(values)} specimens, expected "
                 f"{len(self.observed)}, as many as there are groups, conditions, weights= or "
@@ -103,7 +106,7 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False)
 class StackedReadings:
-    """Readings of S specimens in M outputs, those of all simulators."""
+    """Readings of S specimens in M outputs: those of all simulators, then exact conditions."""
 
     readings: Readings  # repeated readings of an output by their weighted mean, with its error
     scale: Floats  # (S, M): standard deviation of their error, in units of an unknown error
@@ -113,14 +116,27 @@ class StackedReadings:
     covariates: Floats  # (C, S)
     # (S,): log-density of a gross error, uniform over twice the range of each output.
     log_gross: Floats
+    conditions: Floats | None  # (S, C)
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement]) -> StackedReadings:
         """Stack the readings of simulators; raise if those of a specimen cannot be combined."""
+        first = measurements[0]
         numbers, size = _validated_counts(measurements)
         parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
+        conditions = None
+        variables = [first.inputs.aleatory[place] for place in first.inputs.conditions]
+        if variables:
+            conditions = np.empty((size, len(variables)))
+            coordinates = np.empty(conditions.shape)
+            for k, variable in enumerate(variables):
+                of_rows = [np.asarray(m.conditions)[:, k] for m in measurements]
+                kind = f"values of {variable.name}"
+                conditions[:, k] = _by_specimen(kind, measurements, of_rows, numbers, size)
+                coordinates[:, k] = variable.owner.op.coordinates(conditions[:, k])
+            zero = np.zeros(conditions.shape)
+            parts.append((Readings.exact(coordinates), zero, Repeats(zero, zero, zero)))
         readings, scales, repeats = zip(*parts, strict=True)
-        first = measurements[0]
         groups = None
         if first.groups is not None:
             of_rows = [np.asarray(m.groups) for m in measurements]
@@ -143,6 +159,7 @@ class StackedReadings:
             groups,
             covariates,
             log_gross,
+            conditions,
         )
 
 
@@ -224,7 +241,8 @@ class SpecimenLikelihood:
 
     def __getstate__(self) -> dict[str, Any]:
         """Replace the weak reference to the model, which has no pickle, by the model."""
-        cache = {key: value for key, value in self.cache.items() if key != "hyperparameters"}
+        derived = ("hyperparameters", "reading density")
+        cache = {key: value for key, value in self.cache.items() if key not in derived}
         model = None if self.model is None else self.model()
         return {**vars(self), "model": model, "cache": cache}
 
@@ -270,7 +288,12 @@ class SpecimenLikelihood:
     @property
     def calls_response(self) -> bool:
         """Whether the response itself takes the place of an emulator."""
-        return self.measurements[0].propagation.calls_response
+        return self.has_table or self.measurements[0].propagation.calls_response
+
+    @property
+    def has_table(self) -> bool:
+        """Whether the response is a table of runs."""
+        return isinstance(self.measurements[0].responses.function, Runs)
 
     @cached_property
     def density(self) -> PopulationDensity:

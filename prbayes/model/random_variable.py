@@ -42,7 +42,12 @@ from prbayes._validate import Floats, called
 from prbayes.metrics.area import with_unbiased_areas
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.density import with_common_bandwidths
-from prbayes.model.data_checks import check_constant, check_failing_region, warn_out_of_range
+from prbayes.model.data_checks import (
+    check_constant,
+    check_failing_region,
+    duplicate_findings,
+    warn_out_of_range,
+)
 from prbayes.model.locking import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import ReweightedBound, reweighted_of
@@ -137,10 +142,7 @@ class Node:
             target = self.metric.against(values, target.weights if is_same_size else None)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{self.name}: {error}") from None
-        dimensions = bound.inputs.dimensions
-        changed = self.comparing(
-            target.metric.with_design(target, bound.first_responses, dimensions)
-        )
+        changed = self.comparing(target.metric.for_inputs(target, bound.inputs.dimensions))
         if has_default_epsilon(self):
             changed.epsilon.set_value(np.asarray(1 / changed.n_specimens))
         return changed
@@ -212,9 +214,10 @@ def computed(simulator: AnySimulator) -> Node:
             outputs = simulator.outputs
             with shown(simulator.progressbar):
                 bound = propagation.bind(simulator.name, responses.inputs, target, responses)
-                check_constant(simulator.name, bound.first_responses, outputs.names)
-                dimensions = bound.inputs.dimensions
-                bound.target = target.metric.with_design(target, bound.first_responses, dimensions)
+                constant = check_constant(
+                    simulator.name, bound.first_responses, outputs.names, bound.stored
+                )
+                bound.target = target.metric.for_inputs(target, bound.inputs.dimensions)
             responses.on_start = None
             warn_out_of_range(simulator.name, target.observed, bound.first_responses, outputs.names)
             findings = check_failing_region(
@@ -223,8 +226,11 @@ def computed(simulator: AnySimulator) -> Node:
                 bound.first_points,
                 bound.first_responses,
                 bound.max_lost,
+                remedy=simulator.responses.remedy,
             )
-            bound.findings = report(*findings)
+            bound.findings = report(*constant, *findings)
+            if simulator.specimens is None:  # reported where the simulator was written
+                bound.findings += duplicate_findings(simulator.name, target.observed)
             node = Node(
                 simulator.name,
                 bound.target,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -26,11 +26,15 @@ from prbayes._validate import (
     refuse_single_precision,
     sample_labels,
     sample_weights,
+    texts,
 )
+from prbayes.emulators.runs import Runs
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.metrics.summary import Summary, SummaryLikelihood
-from prbayes.model.data_checks import warn_duplicates
+from prbayes.metrics.summary import Summary
+from prbayes.metrics.summary_likelihood import SummaryLikelihood
+from prbayes.model.conditions import observed_at_conditions, stacked_values
+from prbayes.model.data_checks import duplicate_findings
 from prbayes.model.measurement import Measurement, SpecimenLikelihood, specimen_labels
 from prbayes.model.random_variable import (
     AnySimulator,
@@ -66,9 +70,10 @@ from prbayes.response.inputs import (
     is_group,
     model_on_context,
     read_inputs,
+    set_units,
 )
 from prbayes.response.outputs import Outputs, in_order_of, read_observed
-from prbayes.response.response import Responses, refuse_uncallable
+from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
 
 # Settings of a propagation for calls of the response.
 _CALL_SETTINGS = ("executor", "store", "version", "on_failure", "retry_failed", "timeout")
@@ -85,6 +90,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     specimens: ArrayLike | None = None,
     dims: str | Sequence[str] | None = None,
     propagation: Propagation | None = None,
+    units: Mapping[str, str] | None = None,
     progressbar: bool = True,
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     r"""Add an observed node whose log-density is -discrepancy / epsilon to the current model.
@@ -93,12 +99,13 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     ----------
     name : str
         Name of the node.
-    response : callable
-        ``response(*inputs)``, a NumPy-style function. Each input is an array of any leading batch
-        shape; a multivariate input has its event axis last. The function returns an array of the
-        batch shape, in units of the observed values; for m outputs of a specimen an array with them
-        in a last axis, or a mapping of arrays with the keys of ``observed``. Labels of a DataArray
-        or DataFrame are matched to those of ``observed``. NaN, or a masked number, is a point
+    response : callable or Runs
+        A table of runs, or ``response(*inputs)``, a NumPy-style function. Each input is an array of
+        any leading batch shape; a multivariate input has its event axis last. The function returns
+        an array of the batch shape, in units of the observed values; for m outputs of a specimen an
+        array with them in a last axis, or a mapping of arrays with the keys of ``observed``. Labels
+        of a DataArray or DataFrame are matched to those of ``observed``. NaN, or a masked number,
+        is a point
         without response, +inf a specimen that failed; -inf is refused. The response of a specimen
         depends on the inputs of that specimen alone: three of the first ones are computed again, by
         themselves, and a difference is refused, and so is a function that takes one number of
@@ -143,6 +150,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         Names of the observed dimensions.
     propagation : Propagation, optional
         How populations become responses; ``Reweighted(1024)`` by default.
+    units : mapping, optional
+        Units for tables, pictures and the report: of aleatory inputs, by the name of the
+        ``.dist()`` or of the response's argument, and of the response, by the name of the
+        simulator or of an output. Those of the response are ``observed.attrs["units"]`` by default.
     progressbar : bool
         Whether the first runs show a bar on stderr if they take more than two seconds.
 
@@ -193,23 +204,15 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
             f"prb.Simulator: name: got {name!r}, which is in the model already, expected a new "
             "name; to run this again, run `with pm.Model():` and all below it again"
         )
-    refuse_uncallable(name, response)
-    arguments = read_inputs(name, inputs, model)
+    arguments = _read_arguments(name, response, inputs, model)
     if isinstance(observed, Summary):
         unused = {"metric": metric, "epsilon": epsilon, "weights": weights, "dims": dims}
         _refuse_beside_summary(name, arguments, unused | {"specimens": specimens}, propagation)
         metric, observed = SummaryLikelihood(observed), observed.values
-    for rv in simulators(model):
-        if rv in arguments.parents:
-            raise TypeError(
-                f"{name}: got inputs that depend on the simulator {rv.name}, expected "
-                "hyperparameters; let one response call the other, or return the outputs of both "
-                "from one response, with prb.Joint(metric)"
-            )
-    for parent in arguments.parents:
-        refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
+    observed, metric = observed_at_conditions(name, observed, metric, inputs)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
+    outputs = _with_units(name, units, arguments, response, outputs)
     refuse_vectors_of_specimens(name, arguments.aleatory, arguments.parents, len(values))
     size = len(values) if rows is None else len(np.asarray(weights))
     weights = weights if rows is None else None
@@ -217,6 +220,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     by_specimen = isinstance(metric, Metric) and metric.by_specimen
     if by_specimen:
         _refuse_by_specimen(name, arguments, epsilon, propagation)
+        if rows is not None:
+            metric = cast(LogLikelihood, metric).of_frequencies(rows, size)
         values = checked_specimens(name, values)
     else:
         refuse_covariates(name, arguments.covariates)
@@ -234,6 +239,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         settings.check_likelihood(name)
         partners = _with_common_specimens(name, labels, model)
         arguments = _inputs_of_partners(name, arguments, partners)
+        inputs_of_specimens = [arguments.aleatory[place] for place in arguments.conditions]
+        conditions = stacked_values(known_covariates(name, inputs_of_specimens, size, rows))
         if weights is not None:
             weights = sample_weights(weights, len(values), f"{name}: weights") * len(values)
         responses = Responses(name, response, arguments, **calls | {"scatter": 0.0})
@@ -241,7 +248,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         extras = _measurement_variables(name, model, metric, partners)
         measurement = Measurement(
             name, cast(LogLikelihood, metric), values, weights, labels, arguments, responses,
-            settings, outputs, groups, covariates, extras,
+            settings, outputs, groups, covariates, conditions, extras,
         )  # fmt: skip
         return _add_measurement(model, measurement, partners, observed, dims)
     if labels is not None:
@@ -288,6 +295,27 @@ def _refuse_beside_summary(
         )
 
 
+def _read_arguments(
+    name: str, response: Callable[..., Any], inputs: Sequence[Any], model: pm.Model
+) -> Inputs:
+    """Return the inputs of a response; raise if they are not as described."""
+    refuse_uncallable(name, response)
+    arguments = read_inputs(name, inputs, model)
+    if isinstance(response, Runs):
+        refuse_misfit(name, response, arguments.sizes)
+        response.refuse_inputs(name, arguments)
+    for rv in simulators(model):
+        if rv in arguments.parents:
+            raise TypeError(
+                f"{name}: got inputs that depend on the simulator {rv.name}, expected "
+                "hyperparameters; let one response call the other, or return the outputs of both "
+                "from one response, with prb.Joint(metric)"
+            )
+    for parent in arguments.parents:
+        refuse_single_precision(f"{name}: {parent.name}", parent.dtype)
+    return arguments
+
+
 # The log-likelihood by specimen.
 
 
@@ -306,6 +334,30 @@ def _read_specimens(
         values = values[rows]
         groups = None if groups is None else groups[rows]
     return values, outputs, groups, rows
+
+
+def _with_units(
+    name: str,
+    units: Mapping[str, str] | None,
+    inputs: Inputs,
+    response: Callable[..., Any],
+    outputs: Outputs,
+) -> Outputs:
+    """Store the units of the inputs with them, and return the outputs with theirs."""
+    if units is None:
+        return outputs
+    texts(units, f"{name}: units")
+    labels = outputs.names or (name,)
+    names = [*set_units(inputs, response, units), name, *outputs.names]
+    unknown = [key for key in units if key not in names]
+    if unknown:
+        raise KeyError(
+            f"{name}: units: got {unknown[0]!r:.60}, expected some of {list(dict.fromkeys(names))}"
+        )
+    defaults = outputs.units or ("",) * len(labels)
+    pairs = zip(labels, defaults, strict=True)
+    of_outputs = [units.get(label, units.get(name, unit)) for label, unit in pairs]
+    return replace(outputs, units=tuple(of_outputs)) if any(of_outputs) else outputs
 
 
 def _frequencies(
@@ -440,6 +492,13 @@ def _joint_likelihood(
                 f"{called(m.propagation)} in {m.name}, which has the same specimens, "
                 "expected the same kind in both"
             )
+        functions = m.responses.function, measurement.responses.function
+        if isinstance(functions[0], Runs) != isinstance(functions[1], Runs):
+            raise ValueError(
+                f"{name}: response: got a table of runs in one, and a function in the other, of "
+                f"it and {m.name}, which has the same specimens, expected the same kind in both; "
+                "make a table of both"
+            )
         if m.gross_errors != measurement.gross_errors:
             raise ValueError(
                 f"{name}: metric: gross_errors: got {measurement.gross_errors}, and "
@@ -549,7 +608,7 @@ def _add_simulator(
             responses.share(simulator.responses)
             break
     if labels is None:
-        warn_duplicates(name, target.observed)
+        report(*duplicate_findings(name, target.observed))
     else:
         _warn_shared_specimens(specification, labels, earlier)
     aleatory = set(inputs.aleatory)

@@ -27,6 +27,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._validate import Floats, called
 from prbayes.metrics.readings import Readings
+from prbayes.model.conditions import at_conditions
 from prbayes.model.measurement import (
     Measurement,
     SpecimenLikelihood,
@@ -42,6 +43,7 @@ from prbayes.model.random_variable import (
     simulators,
 )
 from prbayes.model.specimen_preparation import log_shares, prepared
+from prbayes.model.unknown_error import ReadingDensity
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare
 from prbayes.response.distributions import log_density
@@ -144,6 +146,7 @@ def _errors(likelihood: SpecimenLikelihood, values: Mapping[str, Floats]) -> Flo
         if "error" in m.extras:
             error *= values[str(m.extras["error"].name)].reshape(size, -1)
         columns.append(error)
+    columns.append(np.ones((size, len(likelihood.inputs.conditions))))
     return np.concatenate(columns, axis=1)
 
 
@@ -185,6 +188,7 @@ def log_likelihood_graph(
     for m in likelihood.measurements:
         error = params[m.extras["error"]] if "error" in m.extras else 1.0
         errors.append(error + pt.zeros(m.rows.shape[1]))
+    errors.append(pt.ones(len(likelihood.inputs.conditions)))
     error = pt.concatenate(errors)
     if not likelihood.error_is_known:
         terms = terms + _readings_log_density(likelihood, error, pt)
@@ -252,13 +256,11 @@ def _readings_log_density(likelihood: SpecimenLikelihood, error: Any, xp: Any) -
 
     As an array or a graph.
     """
-    readings, preparation = likelihood.readings, prepared(likelihood)
-    outputs = preparation.points.outputs
-    # Points that fill up the array have any output.
-    outputs = np.where(np.isfinite(outputs), outputs, 1e30)
-    unit = np.where(readings.is_relative[:, None], np.abs(outputs), 1.0)
-    sd = error * likelihood.stacked.scale[:, None] * unit
-    return readings.symbolic_log_density(outputs, preparation.emulation.error**2 + sd**2, xp)
+    if "reading density" not in likelihood.cache:
+        preparation = prepared(likelihood)
+        density = ReadingDensity.of(likelihood, preparation.points, preparation.emulation.error)
+        likelihood.cache["reading density"] = density
+    return likelihood.cache["reading density"](error, xp)
 
 
 def logsumexp_finite(terms: Any) -> TensorVariable:
@@ -333,16 +335,18 @@ def draw_readings(
 ) -> Floats:
     """Draw the emulated readings of n specimens of each population, (P, n), (P, n, m) or (P, n, M).
 
-    Values are those of the model's variables by name, (P, *shape). Specimens have groups and
-    covariates of the observed ones. Readings are those of one simulator, or the outputs of all. If
-    n is the number of a simulator's rows, repeated readings have common inputs. NaN in a population
-    of which next to nothing has a response.
+    Values are those of the model's variables by name, (P, *shape). Specimens have groups and known
+    values of the observed ones. Readings are those of one simulator, or the outputs of all.
+    If n is the number of a simulator's rows, repeated readings have common inputs. NaN in a
+    population of which next to nothing has a response.
     """
     emulation, size = prepared(likelihood).emulation, len(next(iter(values.values())))
     numbers = np.arange(len(likelihood.readings))
     if measurement is not None:
         numbers = specimen_numbers(likelihood, measurement)
     like = np.resize(numbers, n)  # observed specimens with the same group and covariates
+    conditions = likelihood.stacked.conditions
+    conditions = None if conditions is None else conditions[like]
     by_group: list[tuple[Any, Any]] = [(None, np.arange(n))]
     if likelihood.stacked.groups is not None:
         groups = likelihood.stacked.groups[like]
@@ -360,6 +364,7 @@ def draw_readings(
             inputs = inputs or [np.empty((size, n, *x.shape[2:])) for x in drawn]
             for whole, part in zip(inputs, drawn, strict=True):
                 whole[:, columns] = part
+        inputs = at_conditions(likelihood.inputs, inputs, conditions)
         flat = [x[:, specimens].reshape(-1, *x.shape[2:]) for x in inputs]
         # Beyond the runs' range an input has the response at the end of the range.
         z = np.clip(likelihood.coordinates.of(flat, 1), emulation.box[0], emulation.box[1])
@@ -401,10 +406,11 @@ def _with_errors(
     if share is not False:
         low, high = np.concatenate([m.range for m in measurements], axis=1)
         middle, width = (low + high) / 2, high - low
-        gross_errors = middle + width * (2 * rng.random(outputs.shape) - 1)
-        probability = np.reshape(share, (-1, 1))
-        is_gross = rng.random((size, n)) < probability
-        result = np.where(is_gross[..., None], gross_errors, result)
+        measured = slice(middle.size)  # without conditions
+        uniform = rng.random((size, n, middle.size))
+        gross_errors = middle + width * (2 * uniform - 1)
+        is_gross = rng.random((size, n, 1)) < np.reshape(share, (-1, 1, 1))
+        result[..., measured] = np.where(is_gross, gross_errors, result[..., measured])
     return np.asarray(result)
 
 

@@ -7,7 +7,7 @@ covered, and the unit of Monte Carlo errors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -27,14 +27,16 @@ from prbayes.model.data_checks import (
     refuse_unused_inputs,
     unreached,
 )
-from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.measurement import SpecimenLikelihood, output_columns
 from prbayes.model.parameters import Hyperparameters, log_posterior
 from prbayes.model.random_variable import log_first_runs
+from prbayes.model.table_likelihood import OfTables, points_of_tables
 from prbayes.numerics.points import sobol
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.population_density import WeightedPoints
 from prbayes.propagation.response_share import ResponseShare, response_share
+from prbayes.propagation.roots import Roots
 from prbayes.propagation.specimen_emulation import (
     Emulation,
     EmulationProblem,
@@ -80,6 +82,9 @@ def first_run_count(likelihood: SpecimenLikelihood) -> int | None:
 
 def emulator_cost(likelihood: SpecimenLikelihood) -> RunCost:
     """Return the runs for the emulator of a log-likelihood by specimen."""
+    if likelihood.has_table:
+        n = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
+        return RunCost(n, 0, n, "none: the table has all runs")
     first = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
     batch = max(first // 2, likelihood.options.fresh)
     computed = len(prepared(likelihood).emulation.z) if is_prepared(likelihood) else 0
@@ -96,26 +101,41 @@ def _prepare(likelihood: SpecimenLikelihood) -> Preparation:
     responses = [m.responses for m in likelihood.measurements]
     cost = emulator_cost(likelihood)
     n = first_run_count(likelihood) or first_runs(likelihood.coordinates.size)
-    for response in responses:
+    for response in responses if not likelihood.has_table else []:
         response.on_start = partial(log_first_runs, cost, f"Reweighted(n={n})", response)
     populations = Populations(likelihood)
     runs = Runs(likelihood)
     try:
         emulation, points, findings = _emulate(runs, populations, likelihood.shared_emulation)
+        problem = _problem(runs)
+        if likelihood.has_table:  # a call of the surface is no run
+            problem = replace(problem, run=OfTables.of(likelihood, lambda table: table))
         refined, share = response_share(
-            _problem(runs),
+            problem,
             emulation,
             populations.prior_specimens,
             lambda share: populations.posterior(points.z, points.log_a, share=share),
         )
+        if share is not None and likelihood.inputs.conditions:
+            raise DesignError(
+                f"{likelihood.name}: got NaN from the response for a share of the specimens that "
+                "matters, expected a response of all specimens with prb.response.condition, since "
+                "the share depends on the condition; return a number there, such as the limit of "
+                "what can be measured, or narrow the priors"
+            )
+        if likelihood.has_table:
+            refined = emulation
         if refined is not emulation and not _is_partial(likelihood):
             # Specimens beside the failing region have points on its right side now.
             refined, points, findings = _emulate(runs, populations, refined)
         return Preparation(refined, points, report(*runs.findings, *findings), share)
     except DesignError as error:
+        if likelihood.has_table:
+            raise
         cause = "" if runs.first is None else unreached(runs.first, likelihood.readings)
         if not cause:
-            data = _data_findings(likelihood, several_roots=False)
+            outputs = np.empty((0, 0)) if runs.first is None else runs.first
+            data = _data_findings(likelihood, outputs, several_roots=False)
             cause = "".join(finding.text.removesuffix(".") for finding in data[:1])
         raise DesignError(f"{cause}. Therefore: {error}" if cause else str(error)) from None
     finally:
@@ -137,6 +157,8 @@ class Runs:
         measurements = likelihood.measurements
         inputs = likelihood.coordinates.inputs(z)
         parts = [m.responses(inputs, []).reshape(len(z), -1) for m in measurements]
+        # Conditions are outputs that were read exactly.
+        parts.append(z[:, likelihood.coordinates.is_condition])
         values = np.concatenate(parts, axis=1)
         if likelihood.shared_emulation is None and self.first is None:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
@@ -182,6 +204,11 @@ def _emulate(
     name, options, readings = likelihood.name, likelihood.options, likelihood.readings
     bounds, d = likelihood.coordinates.bounds, likelihood.coordinates.size
     problem = _problem(runs)
+    if likelihood.has_table:
+        emulation, points, roots = points_of_tables(
+            problem, likelihood, populations.prior_specimens, populations.posterior
+        )
+        return emulation, points, _findings(likelihood, emulation, points, roots)
     if _is_partial(likelihood):
         if likelihood.calls_response:
             raise TypeError(
@@ -190,32 +217,54 @@ def _emulate(
             )
         specimens, posterior = populations.prior_specimens(), populations.posterior
         emulation, points = fibre_points(problem, bounds, specimens, posterior)
-        return emulation, points, _data_findings(likelihood, several_roots=True)
+        return emulation, points, _findings(likelihood, emulation, points, None)
     box = np.stack([-np.ones(d), np.ones(d)])
     if likelihood.calls_response:
         emulation = Emulation.of_function(problem, box, bounds)
     emulation, roots = emulate(problem, box, bounds, emulation)
     if not likelihood.calls_response:
         refuse_undetermined(name, emulation, roots, _coordinate_names(likelihood))
-    error, is_known = emulation.error, likelihood.error_is_known
+    is_known = likelihood.error_is_known
     points = draw_points(emulation, readings, roots, options, error_is_known=is_known)
-    findings: list[Finding] = [
-        *_data_findings(likelihood, several_roots=bool((points.n_roots > 1).any())),
+    return emulation, points, _findings(likelihood, emulation, points, roots)
+
+
+def _findings(
+    likelihood: SpecimenLikelihood,
+    emulation: Emulation,
+    points: SpecimenPoints,
+    roots: Roots | None,
+) -> list[Finding]:
+    """Return findings of the data, and of the emulator at the roots of the specimens, if any."""
+    if roots is None:
+        return [*_data_findings(likelihood, emulation.y, several_roots=True)]
+    name, readings, error = likelihood.name, likelihood.readings, emulation.error
+    return [
+        *_data_findings(likelihood, emulation.y, several_roots=bool((points.n_roots > 1).any())),
         *misfit_findings(name, readings, roots, error),
         *emulator_findings(name, readings, error),
     ]
-    return emulation, points, findings
 
 
-def _data_findings(likelihood: SpecimenLikelihood, *, several_roots: bool) -> tuple[Finding, ...]:
-    """Return findings of rounded, censored and repeated readings that are taken as exact."""
+def _data_findings(
+    likelihood: SpecimenLikelihood, outputs: Floats, *, several_roots: bool
+) -> tuple[Finding, ...]:
+    """Return findings of rounded, censored and repeated readings that are taken as exact.
+
+    None of outputs, (n, M), that are the same in all runs.
+    """
     findings: list[Finding] = []
+    finite = outputs[np.isfinite(outputs).all(axis=1)]
     for m in likelihood.measurements:
+        values = m.readings.values
+        if len(finite):
+            is_constant = np.ptp(finite[:, output_columns(likelihood, m)], axis=0) == 0
+            values = np.where(is_constant, np.nan, values)
         steps: Any = m.readings.step.max(axis=0)
         # A reading error that the user gives covers rounding.
         is_stated = (steps > 0) | (m.metric.error is not None)
         findings += data_findings(
-            m.readings.values,
+            values,
             labels=[f"{m.name}[{label}]" for label in m.outputs.names] or [m.name],
             several_roots=several_roots,
             rounded=np.where(is_stated, np.maximum(steps, 1e-300), np.nan),

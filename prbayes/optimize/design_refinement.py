@@ -195,8 +195,9 @@ def refine_at(
         return short
     for name, shortcoming in short.items():
         if shortcoming.is_lost:
+            remedy = evaluator.reweighted[name].responses.remedy
             raise DesignError(
-                f"{name}: {shortcoming}; repair the response there, return +inf for specimens "
+                f"{name}: {shortcoming}; {remedy} there, return +inf for specimens "
                 "that fail, narrow the priors, or raise max_lost"
             )
     names = set(short)
@@ -439,4 +440,5 @@ def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
     """Raise if too much of a population, by simulator without a design, has no response."""
     for node in evaluator.nodes:
         if node.reweighted is None:
-            refuse_lost_share(node.name, lost.get(node.name, 0.0), node.bound.max_lost)
+            share, limit = lost.get(node.name, 0.0), node.bound.max_lost
+            refuse_lost_share(node.name, share, limit, node.responses.remedy)

@@ -21,7 +21,11 @@ from numpy.typing import NDArray
 from prbayes._finding import Finding, report
 from prbayes._validate import Floats
 from prbayes.inference.checks.one_sided import bound_findings, one_sided_bounds
-from prbayes.inference.checks.population import failing_region_findings, refuse_lost_specimens
+from prbayes.inference.checks.population import (
+    failing_region_findings,
+    refuse_lost_specimens,
+    replaced_findings,
+)
 from prbayes.inference.checks.prior import elements_at_prior_ends, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.metrics.readings import Readings
@@ -145,13 +149,16 @@ _UNSUPPORTED = Finding(
 
 
 def _supported(
-    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 1.0
+    evaluator: Evaluator, optima: Sequence[Mode], largest: float = 1.0, of_specimen: float = 0.1
 ) -> NDArray[np.bool_]:
     """Return which optima have a log-likelihood that is known to ``largest`` nats.
 
     Where points lie farther apart than a population is wide, a few points that lie close to each
-    other make a spurious maximum.
+    other make a spurious maximum. Of many specimens with rounded readings, which are known to .06
+    nats, each may be uncertain by ``of_specimen``.
     """
+    size = sum(len(likelihood.readings) for likelihood in evaluator.likelihoods)
+    largest = max(largest, of_specimen * float(np.sqrt(size)))
     thetas = np.stack([optimum.theta for optimum in optima])
     values = evaluator.hyperparameters.constrained(thetas)
     variance = sum(monte_carlo_error(item, values) ** 2 for item in evaluator.likelihoods)
@@ -382,7 +389,8 @@ def _findings(
     is_flat = np.isinf(np.diag(best.covariance))
     # Three nats: a likelihood ratio of twenty.
     ends = elements_at_prior_ends(evaluator, best.theta, is_flat, lambda t: objective(t)[0], 3.0)
-    findings = list(failing_region_findings(evaluator, best.theta))
+    findings = [*failing_region_findings(evaluator, best.theta)]
+    findings += replaced_findings(evaluator, best.theta)
     findings += [*few_specimens(evaluator), *prior_end_findings(ends)]
     if np.isnan(best.covariance).any():
         findings.append(

@@ -34,12 +34,14 @@ from prbayes.inference.checks.identification import (
     unknown_error_findings,
 )
 from prbayes.inference.checks.metric_suitability import (
+    components_left_out,
     data_between_runs,
     few_for_whitening,
     heavy_tails,
     smoothing_bias,
 )
 from prbayes.inference.checks.one_sided import bound_findings, bounds_by_metric
+from prbayes.inference.checks.population import replaced_findings
 from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
 from prbayes.inference.design_error import design_error
@@ -49,7 +51,6 @@ from prbayes.inference.refits import (
     sampling_obstacle,
 )
 from prbayes.inference.resampling import SETS
-from prbayes.metrics.multivariate import components_summary
 from prbayes.model.cost import explained, kept
 from prbayes.model.evaluator import Evaluator, n_design_runs, only_through_prior, shortcomings
 from prbayes.model.locking import locked
@@ -514,9 +515,11 @@ def _report(
     findings = report(
         *breakdown_findings(at_edge, at_jump),
         *unknown_error_findings(dict(unknown), sampling_obstacle(evaluator)),
+        *replaced_findings(evaluator, fit.theta),
         *heavy_tails(evaluator, fit.theta),
         *data_between_runs(evaluator, fit.theta),
         *smoothing_bias(evaluator, fit.theta, fit.scales, local),
+        *components_left_out(evaluator, fit.theta),
         *optimum_findings(evaluator, fit.sampling, optima, fit.design_error),
     )
     local_optima = tuple(
@@ -559,11 +562,8 @@ def optimum_findings(
     optima: Sequence[LocalOptimum],
     design_error: float,
 ) -> tuple[Finding, ...]:
-    """Report what the metric leaves out, the design's error, other optima, and identification."""
-    missed = {n.name: components_summary(n.target, missed=True) for n in evaluator.nodes}
-    findings = [
-        Finding("components-left-out", f"{name}: {text}.") for name, text in missed.items() if text
-    ]
+    """Report few specimens, the design's error, other optima, and identification."""
+    findings: list[Finding] = []
     for node in evaluator.nodes:
         findings += few_for_whitening(node.name, node.target)
     findings += design_error_findings(evaluator, design_error)

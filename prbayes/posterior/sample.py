@@ -161,9 +161,9 @@ def draw_posterior(evaluator: Evaluator, settings: SamplingSettings) -> xr.DataT
             modes = modes_of(target)
             if modes is None:
                 break
-            chains = _importance_chains(target, modes, settings)
+            chains = importance_chains(target, modes, settings)
             if chains is None:
-                if len(modes) == 1 and not evaluator.nodes:
+                if len(modes) == 1 and not evaluator.nodes and evaluator.has_graph:
                     chains = _nuts_chains(evaluator, modes[0], settings)
                 break
             thetas = chains.thetas.reshape(-1, evaluator.hyperparameters.size)
@@ -206,7 +206,7 @@ def _distinct(modes: list[Laplace]) -> list[Laplace]:
     return distinct
 
 
-def _importance_chains(
+def importance_chains(
     target: Target, modes: list[Laplace], settings: SamplingSettings
 ) -> Chains | None:
     """Return draws by importance sampling, None if they are not reliable."""

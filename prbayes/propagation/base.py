@@ -85,13 +85,15 @@ def responding_weights(values: Floats, weights: Floats) -> Floats:
     return np.divide(responding, total, out=responding, where=total > 0)
 
 
-def refuse_lost_share(name: str, share: float, limit: float) -> None:
+def refuse_lost_share(
+    name: str, share: float, limit: float, remedy: str = "repair the response"
+) -> None:
     """Raise DesignError if a larger share of the population than the limit has no response."""
     if share > limit:
         raise DesignError(
             f"{name}: lost mass: got {share:.1%} of the population without a response (NaN) at "
             f"the answer, expected at most max_lost = {limit:.1%}: it would rest on the specimens "
-            "that have one; repair the response, return +inf for specimens that fail, or pass a "
+            f"that have one; {remedy}, return +inf for specimens that fail, or pass a "
             "larger max_lost, as in propagation=prb.Reweighted(n, max_lost=...)"
         )
 

@@ -91,22 +91,29 @@ type Posterior = Callable[[Floats, Floats, Floats | None], Draws]
 
 
 def fibre_points(
-    problem: EmulationProblem, bounds: Floats, prior_specimens: Floats, posterior: Posterior
+    problem: EmulationProblem,
+    bounds: Floats,
+    prior_specimens: Floats,
+    posterior: Posterior,
+    surface: Emulation | None = None,
 ) -> tuple[Emulation, SpecimenPoints]:
     """Emulate a response, and draw points on the fibres of all specimens.
 
     The middle 99 % of the prior predictive population lies within [-1, 1] in each coordinate.
     ``posterior`` maps points (N, K, d), their numbers (N, K), and None or a covariance by which
-    populations are smoothed, to draws. Raise DesignError if the emulator is too inaccurate, or
-    `most_points` are not enough.
+    populations are smoothed, to draws. A ``surface`` gets no runs. Raise DesignError if the
+    emulator is too inaccurate, or `most_points` are not enough.
     """
     readings, options, seed = problem.readings, problem.options, problem.seed
     d = bounds.shape[1]
     n = problem.n_first(d)
     population = ReferencePopulation.from_sample(prior_specimens)
-    # Wider than the population by half; even points of a box would be in its corners.
-    first = np.clip(population.inputs(1.5 * ndtri(sobol(n, d, seed))), *bounds)
-    emulation = Emulation.first(problem, first, bounds)
+    if surface is None:
+        # Wider than the population by half; even points of a box would be in its corners.
+        first = np.clip(population.inputs(1.5 * ndtri(sobol(n, d, seed))), *bounds)
+        emulation = Emulation.first(problem, first, bounds)
+    else:
+        emulation = surface
     rng = np.random.default_rng([seed, 1])
     count, batch_size = 256, max(n // 2, options.fresh)
     for batch in range(6):
@@ -114,11 +121,13 @@ def fibre_points(
         points, draws = _reliable_draws(emulation, numbered, population, posterior, count)
         count = points.z.shape[1]
         population = ReferencePopulation.from_sample(draws.specimens())
-        if batch >= 2 and emulation.bias <= options.bias:
+        if batch >= 2 and (surface is not None or emulation.bias <= options.bias):
             break
-        fresh = _fresh(points, draws, batch_size, bounds, rng)
-        emulation = extended(emulation, problem, fresh, batch_size // 2)
-    require_accurate(emulation, problem)
+        if surface is None:
+            fresh = _fresh(points, draws, batch_size, bounds, rng)
+            emulation = extended(emulation, problem, fresh, batch_size // 2)
+    if surface is None:
+        require_accurate(emulation, problem)
     # Points on fibres cost more than those around roots, and their error falls more slowly.
     unit = options.half_difference * _per_hyperparameter(draws)
     count = 128

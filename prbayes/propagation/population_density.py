@@ -30,6 +30,7 @@ from scipy.linalg import qr
 from prbayes._stats import log_sum_exp
 from prbayes._validate import IN_CACHE, Floats
 from prbayes.numerics.threads import one_thread
+from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs
 
@@ -57,6 +58,8 @@ def _coordinates(dist: pt.TensorVariable, values: Floats) -> list[tuple[Floats, 
     """Return coordinates (c, n) of each element, and if they are quadratic; None without a form."""
     if isinstance(dist.owner.op, MVNORMAL):
         return [(values.T, True)]
+    if is_condition(dist):
+        return []
     op = dist.owner.op
     if type(op) not in _FAMILIES:
         return None

@@ -46,7 +46,8 @@ class PointOptions:
     starts: int = 12
     gap: float = 20.0  # largest misfit of a root above the specimen's best, in nats
     points: int = 4  # points around each root; doubled until two independent halves agree
-    most_points: int = 4096  # largest number of points of a specimen
+    most_points: int = 4096  # largest number of points of a specimen; of few, `most_in_all`
+    most_in_all: int = 2**17
     # Largest standard deviation, over plausible populations, of half the difference between the
     # log-likelihoods of the two halves.
     half_difference: float = 0.05
@@ -222,7 +223,7 @@ def emulate(
         emulation = extended(emulation, problem, fresh)
     else:
         roots = specimen_roots(emulation, readings, options)
-    roots = _all_roots(emulation, readings, options, roots, seed)
+    roots = all_roots(emulation, readings, options, roots, seed)
     require_accurate(emulation, problem)
     return emulation, roots
 
@@ -267,6 +268,14 @@ def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
     return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
 
 
+def likely_roots(roots: Roots, box: Floats) -> Floats:
+    """Return the likeliest root of each specimen under a fitted normal population, (n, d)."""
+    table, log_mass, _ = _laplace(roots, box)
+    mean, root = fit_normal(roots.z[table], log_mass)
+    log_weights = normal_log_density(roots.z[table], mean, root) + log_mass
+    return np.asarray(roots.z[table[np.arange(len(table)), log_weights.argmax(axis=1)]])
+
+
 def _laplace(roots: Roots, box: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Return the roots of each specimen that has one, their log masses, and covariances.
 
@@ -303,15 +312,22 @@ def extended(
         # At the roots alone: points around them may lie far out, where nothing was measured.
         error = 2 * np.sqrt((misfit[rows] ** 2).mean(axis=0))
         error = np.maximum(error, options.floor * readings.spread())
-        unit = typical_sd(readings.comparison_sd(error))
-        scaled = misfit[rows] / unit, jacobian[rows] / unit[:, None]
-        bias = float(np.abs(predicted_bias(*scaled, fresh[rows], len(readings))).max())
-        # m readings identify m of d directions; the posterior is wider than the formula assumes.
-        readings_per_specimen = (readings.is_measured | readings.is_censored).sum(axis=1).mean()
-        bias *= np.sqrt(min(1.0, readings_per_specimen / fresh.shape[1]))
+        bias = shift_by_misfit(problem, error, misfit[rows], jacobian[rows], fresh[rows])
     reach = np.concatenate([emulation.range, fresh])
     extremes = np.stack([reach.min(axis=0), reach.max(axis=0)])
     return Emulation(z, y, emulation.box, surface, error, bias, extremes)
+
+
+def shift_by_misfit(
+    problem: EmulationProblem, error: Floats, misfit: Floats, jacobian: Floats, z: Floats
+) -> float:
+    """Return the largest `predicted_bias` of misfits (n, m) at coordinates (n, d)."""
+    readings = problem.readings
+    unit = typical_sd(readings.comparison_sd(error))
+    biases = predicted_bias(misfit / unit, jacobian / unit[:, None], z, len(readings))
+    # m readings identify m of d directions; the posterior is wider than the formula assumes.
+    of_each = (readings.is_measured | readings.is_censored).sum(axis=1).mean()
+    return float(np.abs(biases).max() * np.sqrt(min(1.0, of_each / z.shape[1])))
 
 
 def typical_sd(sd: Floats) -> Floats:
@@ -344,18 +360,27 @@ def surface_near(
     largest = 10 * np.quantile(np.abs(yg - center), 0.9, axis=0)
     largest = np.maximum(1e4 * spread, largest)
     yg = np.clip(yg, center - largest, center + largest)
-    # Outputs within the range of the readings or half of it away.
-    low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
-    margin = np.maximum((high - low) / 2, spread)
-    inside = ((yg >= low - margin) & (yg <= high + margin)).all(axis=1)
-    if inside.sum() < len(yg) // 4:
-        distance = (((yg - center) / spread) ** 2).sum(axis=1)
-        inside = np.zeros(len(yg), dtype=bool)
-        inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
+    inside = near_readings(yg, readings)
     surface = fit_interpolant(z[rows[first]], yg, inside)
     left_out, is_near = np.full_like(y, np.nan), np.zeros(len(y), dtype=bool)
     left_out[rows], is_near[rows] = surface.left_out[copies.ravel()], inside[copies.ravel()]
     return surface, left_out, is_near
+
+
+def near_readings(y: Floats, readings: Readings) -> NDArray[np.bool_]:
+    """Return which outputs (n, m) are within the range of the readings, or half of it away.
+
+    If these are less than a quarter, the nearest quarter, and at least eight.
+    """
+    spread, center = readings.spread(), np.nanmean(readings.values, axis=0)
+    low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
+    margin = np.maximum((high - low) / 2, spread)
+    is_near = ((y >= low - margin) & (y <= high + margin)).all(axis=1)
+    if is_near.sum() < len(y) // 4:
+        distance = (((y - center) / spread) ** 2).sum(axis=1)
+        is_near = np.zeros(len(y), dtype=bool)
+        is_near[np.argsort(distance, kind="stable")[: max(8, len(y) // 4)]] = True
+    return is_near
 
 
 def _widened(box: Floats, roots: Roots) -> Floats:
@@ -373,7 +398,7 @@ def _widened(box: Floats, roots: Roots) -> Floats:
     return np.stack([np.minimum(wider[0], mean - reach), np.maximum(wider[1], mean + reach)])
 
 
-def _all_roots(
+def all_roots(
     emulation: Emulation, readings: Readings, options: PointOptions, roots: Roots, seed: int
 ) -> Roots:
     """Double the starts until simulated specimens get their own inputs back."""
@@ -455,6 +480,7 @@ class Coordinates:
     # (2, d): smallest and largest z in data sets of the prior, one for each of 4096 populations. A
     # new data set of the prior exceeds an end with a probability of 1 in 4097.
     bounds: Floats
+    is_condition: NDArray[np.bool_]  # (d,): known for each specimen, and not integrated over
 
     @classmethod
     def of_prior(
@@ -480,6 +506,13 @@ class Coordinates:
         low, high = np.quantile(_logs(flat, is_log), [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)
         center = (low + high) / 2
+        is_condition = np.zeros(center.size, dtype=bool)
+        sizes = [int(np.prod(shape, dtype=int)) for shape in inputs.event_shapes]
+        for place in inputs.conditions:
+            column = sum(sizes[:place])
+            is_condition[column] = True
+            scale = inputs.aleatory[place].owner.op.scale
+            is_log[column], center[column], half_width[column] = scale
         ends = []
         # Specimens in blocks: memory stays constant.
         block = max(1, 16 * AT_ONCE // (populations * len(center)))
@@ -489,7 +522,7 @@ class Coordinates:
             z = z[np.isfinite(z).all(axis=1)]
             ends += [z.min(axis=0), z.max(axis=0)]
         bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
-        return cls(inputs.event_shapes, is_log, center, half_width, bounds)
+        return cls(inputs.event_shapes, is_log, center, half_width, bounds, is_condition)
 
     @property
     def size(self) -> int:
@@ -515,9 +548,10 @@ class Coordinates:
         return np.asarray((_logs(flat, self.is_log) - self.center) / self.half_width)
 
     def log_jacobian(self, z: Floats) -> Floats:
-        """Return log|dx/dz|, (..., d) -> (...)."""
-        logs = np.where(self.is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
-        return np.asarray(logs + np.log(self.half_width).sum())
+        """Return log|dx/dz|, (..., d) -> (...), of all inputs but conditions."""
+        is_log = self.is_log & ~self.is_condition
+        logs = np.where(is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
+        return np.asarray(logs + np.log(self.half_width[~self.is_condition]).sum())
 
 
 @np.errstate(divide="ignore", invalid="ignore")

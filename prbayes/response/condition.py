@@ -2,6 +2,7 @@
 
 A condition is a random variable with a known distribution over its range: the log-likelihood by
 specimen emulates the response over inputs and conditions, and takes the value of each specimen.
+Times of readings, several for each specimen, are a constant vector of all times.
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.basic import UniformRV
-from pytensor.tensor.variable import TensorVariable
+from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 from prbayes._validate import Floats, plain_text, real_array
+
+# Largest number of different values of a vector condition: an emulator has an output for each.
+MOST_OUTPUTS = 200
 
 
 class ConditionRV(UniformRV):  # type: ignore[misc]
@@ -31,29 +35,69 @@ class ConditionRV(UniformRV):  # type: ignore[misc]
         self.label = label
         self.values = values
 
+    @property
+    def range(self) -> tuple[float, float]:
+        """Lower and upper end of its distribution, with the sign of the values."""
+        low, high = min(self.values), max(self.values)
+        margin = 0.1 * (high - low)
+        lower = low - margin if low < 0 or low > margin else 0.9 * low
+        upper = high + margin if high > 0 or high < -margin else 0.9 * high
+        return lower, upper
+
+    @property
+    def scale(self) -> tuple[bool, float, float]:
+        """Whether its coordinate is a logarithm, and center and half width of the coordinate.
+
+        The coordinate of the range is from -1 to 1.
+        """
+        low, high = self.range
+        is_log = low > 0 and high > 10 * low
+        low, high = (np.log(low), np.log(high)) if is_log else (low, high)
+        return is_log, (low + high) / 2, (high - low) / 2
+
+    def coordinates(self, values: Floats) -> Floats:
+        """Return values in the units of the coordinate."""
+        is_log, center, half_width = self.scale
+        return ((np.log(values) if is_log else values) - center) / half_width
+
+
+class ReadingsCondition(TensorConstant):  # type: ignore[misc]
+    """The sorted values of a vector condition, (G,), and where the readings of specimens are."""
+
+    columns: NDArray[np.intp]  # (N, T): index of the value of each reading, -1 where there is none
+
 
 def condition(name: str, values: ArrayLike) -> TensorVariable:
     """Return a value that is known for each specimen, such as its load, dose or hardness.
 
     As an input of a response it is the condition under which the specimen was measured. In the
-    parameters of a ``.dist()`` it is a covariate: the population depends on it.
+    parameters of a ``.dist()`` it is a covariate: the population depends on it. Times, or other
+    values of which each specimen has several, are an input of a response with an output for each.
 
     Parameters
     ----------
     name : str
         Name of the condition.
-    values : array_like, shape (N,)
-        Its value for each specimen, in the order of the observed values.
+    values : array_like, shape (N,) or (N, T)
+        Its value for each specimen, in the order of the observed values. With T values for each
+        specimen, NaN where there are fewer, ``observed`` has the shape (N, T) too.
 
     Returns
     -------
     TensorVariable
-        A number of one specimen. Call this once, and use it for all inputs.
+        A number of one specimen, or the vector (G,) of all different values of specimens with
+        several, sorted. Call this once, and use it for all inputs.
 
     Raises
     ------
     TypeError, ValueError
-        If the values are not finite numbers, or all equal.
+        If the values are not finite numbers, or all equal, or if specimens with several values have
+        one of them twice, or more than 200 different ones in all.
+
+    Notes
+    -----
+    A response with a vector of values returns as many outputs, each of which depends on its own
+    value alone. With a condition of one number the emulator has one more input.
 
     Examples
     --------
@@ -61,27 +105,60 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
     >>> load = prb.response.condition("load", [1.0, 2.0, 3.0])
     >>> load.name
     'load'
+    >>> time = prb.response.condition("time", [[0.5, 2.0], [1.0, 2.0], [2.0, np.nan]])
+    >>> time.eval()
+    array([0.5, 1. , 2. ])
     """
     caller = f"prb.response.condition({name!r}, ...)"
     plain_text(name, f"{caller}: name")
     array = real_array(values, f"{caller}: values").astype(float)
+    if array.ndim == 2 and len(array) > 1:
+        return _vector(name, array, caller)
     if array.ndim != 1 or len(array) < 2 or not np.isfinite(array).all():
         raise ValueError(
             f"{caller}: values: got shape {array.shape}, {int((~np.isfinite(array)).sum())} of "
-            "them not finite, expected a finite number for each of at least two specimens"
+            "them not finite, expected a finite number for each of at least two specimens, or a "
+            "row of them, filled up with NaN"
         )
-    low, high = array.min(), array.max()
-    if low == high:
+    if array.min() == array.max():
         raise ValueError(
-            f"{caller}: values: got {low} for all specimens, expected different values; pass the "
-            "number itself as an input"
+            f"{caller}: values: got {array[0]} for all specimens, expected different values; pass "
+            "the number itself as an input"
         )
-    margin = 0.1 * (high - low)
     op = ConditionRV(label=name, values=tuple(array.tolist()))
     rng = pt.random.shared_rng(seed=None)
-    _, variable = op(low - margin, high + margin, rng=rng, return_next_rng=True)
+    _, variable = op(*op.range, rng=rng, return_next_rng=True)
     variable.name = name
     return variable
+
+
+def _vector(name: str, array: Floats, caller: str) -> TensorVariable:
+    """Return the different values of specimens with several values, (N, T), as a constant."""
+    is_number = ~np.isnan(array)
+    if np.isinf(array).any() or not is_number.any(axis=1).all():
+        raise ValueError(
+            f"{caller}: values: got infinite values, or a row without a number, expected finite "
+            "numbers for each specimen, filled up with NaN"
+        )
+    distinct, inverse = np.unique(array[is_number], return_inverse=True)
+    if len(distinct) > MOST_OUTPUTS:
+        raise ValueError(
+            f"{caller}: values: got {len(distinct)} different values, expected at most "
+            f"{MOST_OUTPUTS}, since the emulator has an output for each; round them, as in "
+            "np.round(values, 1)"
+        )
+    columns = np.full(array.shape, -1)
+    columns[is_number] = inverse
+    for row, of_row in enumerate(columns):
+        places = of_row[of_row >= 0]
+        if len(np.unique(places)) < len(places):
+            raise ValueError(
+                f"{caller}: values: got a value twice in row {row}, {array[row].tolist()!s:.60}, "
+                "expected different ones in a row; pass the mean of readings at the same value"
+            )
+    constant = ReadingsCondition(pt.dvector().type, distinct, name=name)
+    constant.columns = columns
+    return constant
 
 
 def known_covariates(

@@ -34,10 +34,15 @@ def log_density(
     values: Sequence[Any],
     instead: Mapping[int, Callable[[TensorVariable, Any], TensorVariable]] | None = None,
 ) -> TensorVariable:
-    """Return log p(x), (n,), of values (n, *event), by ``instead`` for some positions of inputs."""
+    """Return log p(x), (n,), of values (n, *event), by ``instead`` for some positions of inputs.
+
+    It is that given the conditions of specimens.
+    """
     total: Any = 0.0
     triples = zip(aleatory, values, inputs.event_shapes, strict=True)
     for i, (dist, x, shape) in enumerate(triples):
+        if i in inputs.conditions:
+            continue
         if instead and i in instead:
             logp = instead[i](dist, x)
         elif isinstance(dist.owner.op, ELLIPTICAL):

@@ -222,6 +222,11 @@ class Responses:
         """Number of workers."""
         return capacity(self._settings.executor)[0]
 
+    @property
+    def remedy(self) -> str:
+        """What to do where the response is NaN, as a clause."""
+        return str(getattr(self.function, "remedy", "repair the response"))
+
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, inputs and constants, and output order."""
         # A mapping's arrays are concatenated in the order of what was observed.

@@ -52,6 +52,7 @@ from prbayes.results.likelihood_checks import (
     check_conflict,
     check_draws,
     check_population,
+    check_tables,
     emulator_remarks,
     separate_modes,
 )
@@ -223,6 +224,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     else:
         text = "The family of the population was not tested: that needs the model; pass the "
         checked += Checked(untested=(f"{text}Optimum itself.",))
+    if evaluator is not None:
+        checked += check_tables(evaluator)
     lost = _stored_shares(calibration, "lost_mass") or {
         name: float(support["lost_mass"].mean()) for name, (support, _) in coverage.items()
     }

@@ -18,6 +18,7 @@ import xarray as xr
 
 from prbayes._finding import Finding
 from prbayes._validate import Floats
+from prbayes.emulators.runs import Runs
 from prbayes.inference.asymptotics import oriented
 from prbayes.inference.checks.population import (
     failing_region_findings,
@@ -35,6 +36,7 @@ from prbayes.numerics.derivatives import cross, slopes
 from prbayes.optimize.maximum_likelihood import simulation_obstacle, specimen_refits
 from prbayes.optimize.optimum import Optimum, require_minimiser
 from prbayes.response.compile import compile_batched
+from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs, aleatory_names
 
@@ -99,6 +101,28 @@ def emulator_remarks(evaluator: Evaluator) -> Checked:
     return Checked(remarks=tuple(remarks))
 
 
+def check_tables(evaluator: Evaluator, largest: float = 0.1) -> Checked:
+    """Report the error of the surface of each table of runs, as a finding from ``largest`` on.
+
+    An error of a tenth of a standard deviation of the data widens populations by half a percent.
+    """
+    texts = []
+    for simulator in evaluator.simulators:
+        table = simulator.responses.function
+        if isinstance(table, Runs):
+            share = table.error_beside(simulator.observed)
+            text = (
+                f"{simulator.name}: its responses are those of a surface through {len(table)} "
+                f"runs, with a cross-validated error of {share:.2g} standard deviations of the "
+                f"observed responses{'' if share <= largest else f', expected at most {largest}'}."
+            )
+            texts.append((share, Finding("table-error", text, "runs.md#the-error-of-the-surface")))
+    return Checked(
+        findings=tuple(finding for share, finding in texts if share > largest),
+        remarks=tuple(finding for share, finding in texts if share <= largest),
+    )
+
+
 # -- population ------------------------------------------------------------------------------
 
 
@@ -142,7 +166,9 @@ def check_population(optimum: Optimum) -> Checked:
         inputs = likelihood.inputs
         labels = []
         names = aleatory_names(inputs, likelihood.measurements[0].responses.function)
-        for name, shape in zip(names, inputs.event_shapes, strict=True):
+        for place, (name, shape) in enumerate(zip(names, inputs.event_shapes, strict=True)):
+            if place in inputs.conditions:
+                continue
             size = int(np.prod(shape, dtype=int))
             labels += [f"{name}[{i}]" for i in range(size)] if shape else [name]
         test = population_test(z, weights, statistics)
@@ -229,6 +255,8 @@ def scored_specimens(
 ) -> list[tuple[Floats, Floats]]:
     """Return normal scores (N, K, d) and posterior weights (N, K) of points, by likelihood.
 
+    Conditions of the specimens have no score.
+
     ``scores`` are `score_function` and the compiled log-density of each likelihood's inputs, and
     ``data`` points (N, K, *event) and numbers A (N, K).
     """
@@ -238,7 +266,7 @@ def scored_specimens(
         evaluator.likelihoods, scores, data, strict=True
     ):
         inputs = likelihood.inputs
-        z = np.empty((*log_a.shape, likelihood.coordinates.size))
+        z = np.empty((*log_a.shape, inputs.dimensions - len(inputs.conditions)))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
             size = log_a[rows].size
@@ -247,6 +275,8 @@ def scored_specimens(
             values, (log_p,) = (function(*parents, *flat) for function in functions)
             columns = []
             for dist, value, x in zip(inputs.aleatory, values, flat, strict=True):
+                if is_condition(dist):
+                    continue
                 column = np.broadcast_to(value, (1, *x.shape))[0].reshape(size, -1)
                 columns.append(
                     column if isinstance(dist.owner.op, MVNORMAL) else normal_scores(np.exp(column))

@@ -13,6 +13,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+from pytensor.tensor.variable import TensorVariable
 
 from prbayes._finding import Finding, as_json, report
 from prbayes._progress import shown
@@ -26,6 +27,8 @@ from prbayes._validate import (
     positive_integer,
     seed_number,
 )
+from prbayes.emulators.runs import Runs
+from prbayes.model.conditions import at_conditions, stacked_values
 from prbayes.model.description import versions
 from prbayes.model.emulated import (
     EmulatedResponse,
@@ -46,7 +49,9 @@ from prbayes.optimize.optimum import Optimum, identity_in, require_of_model
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.importance import new_specimens
 from prbayes.propagation.reweighted import PoorEmulatorError, ReweightedBound, designs_restored
+from prbayes.response.condition import is_condition, known_covariates
 from prbayes.response.discrepancy import findings_of
+from prbayes.response.distributions import PopulationSampler
 from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.inputs import Inputs, is_group, model_on_context, read_inputs
 from prbayes.response.outputs import Outputs, is_missing
@@ -73,7 +78,9 @@ def predict(
 ) -> xr.DataArray:
     """Draw responses of the calibrated population.
 
-    Also of another response, or under another condition.
+    Also of another response, or under another condition: a number in place of
+    `prbayes.response.condition`, or a condition with the same name and values of other specimens,
+    each of which is drawn once from each population.
 
     Each draw of the posterior is a population, from which ``n_samples`` specimens are drawn; an
     optimum is one population. If a simulator with `Reweighted` has the same ``.dist()`` objects,
@@ -96,7 +103,7 @@ def predict(
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     n_samples : int
-        Specimens from each population.
+        Specimens from each population; with a condition and an optimum, draws of all specimens.
     n_draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     stored : bool
@@ -107,7 +114,7 @@ def predict(
         simulators allow, the largest.
     at : dict, optional
         The value of each covariate, by the name of its `prbayes.response.condition`, where inputs
-        depend on one.
+        depend on one. A condition that is an input as well has the values of the input.
     name : str, optional
         Of the result; by default that of the function.
     executor : concurrent.futures.Executor, optional
@@ -124,12 +131,13 @@ def predict(
     -------
     xarray.DataArray
         Dims (chain, draw, sample), and for several outputs a last one, with their names where they
-        are known: those of the simulator with this response, or the keys of a mapping. Where inputs
+        are known: those of the simulator with this response, or the keys of a mapping. With a
+        condition, (chain, draw, specimen) with a specimen for each of its values. Where inputs
         depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
-        ``source`` (how specimens were made), ``responses``
-        (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
-        square error of runs that are left out), ``nan`` (how many values are NaN), ``findings``
-        (as JSON, such as that a model discrepancy extrapolates),
+        ``source`` (how specimens were made), ``responses`` (how many were computed), ``units`` (of
+        a simulator's response), ``emulator_error`` (of an emulator, by output: the root mean square
+        error of runs that are left out), ``nan`` (how many values are NaN), ``findings`` (as JSON,
+        such as that a model discrepancy extrapolates),
         ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
         ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration,
         which `area_test` compares), ``identity`` (of the problem that was calibrated).
@@ -183,8 +191,13 @@ def predict(
         )
     model = model_of(result, model, "prb.predict")
     points, coords = populations_of(result, model, n_draws, "prb.predict")
-    inputs_read = read_inputs(label, inputs, model)
     sources = population_simulators(model)
+    arguments, conditions = with_known_conditions(label, inputs, sources, stored=stored)
+    if conditions is not None and isinstance(result, Optimum):
+        points = {key: np.repeat(value, n_samples, axis=0) for key, value in points.items()}
+        coords["draw"] = np.arange(n_samples)
+    n_samples = n_samples if conditions is None else len(conditions)
+    inputs_read = read_inputs(label, arguments, model)
     n_stored = sum(s.responses.count for s in sources)
     responses = Responses(
         label,
@@ -193,25 +206,34 @@ def predict(
         executor=executor,
         store=store,
         version=version,
-        outputs=known_outputs(sources, response),
+        outputs=known_outputs(sources, response, inputs_read),
         caller="prb.predict",
         scatter=known_scatter(sources, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
-    simulator = serving(sources, responses) if stored else None
+    # A table costs no run, and is NaN outside its ranges.
+    is_served = stored and not isinstance(response, Runs)
+    simulator = serving(sources, responses) if is_served else None
     size = len(next(iter(points.values())))
-    values = _covariates(label, inputs_read, at, has_runs=simulator is not None)
-    points |= {covariate: np.full((size, 1), value) for covariate, value in values.items()}
+    # A condition that is an input has the same values as a covariate.
+    stated = {} if conditions is None else _by_name(inputs_read, conditions)
+    values = covariate_values(label, inputs_read, at, stated, has_runs=simulator is not None)
+    points |= {
+        covariate: np.broadcast_to(value, (size, np.size(value)))
+        for covariate, value in values.items()
+    }
     with shown(progressbar):
-        drawn = _predicted(simulator, responses, points, n_samples, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        drawn = _predicted(simulator, responses, points, n_samples, rng, conditions)
     if max_lost is None:
         max_lost = max((s.max_lost for s in sources), default=MAX_LOST)
-    missing = _check_responses(label, drawn, max_lost)
+    missing = _check_responses(label, drawn, max_lost, responses.remedy)
     n_computed = responses.count - n_stored + sum(s.responses.count for s in sources)
     attrs = {
         "source": drawn.source,
         "responses": n_computed,
         **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
+        **({} if responses.outputs is None else responses.outputs.attrs),
         "nan": missing,
         "specimens_id": _digest(*drawn.specimens),
         "random_seed": str(seed),
@@ -220,7 +242,10 @@ def predict(
         **as_attributes(identity_in(result) or identity_of(model)),
         **versions(),
     }
-    return _labelled(drawn.values, responses, coords, n_samples).rename(label).assign_attrs(attrs)
+    result_values = _labelled(drawn.values, responses, coords, n_samples)
+    if conditions is not None:
+        result_values = result_values.rename(sample="specimen")
+    return result_values.rename(label).assign_attrs(attrs)
 
 
 def _labelled(
@@ -242,11 +267,21 @@ def _labelled(
     )
 
 
-def _covariates(
-    label: str, inputs: Inputs, at: Mapping[str, float] | None, *, has_runs: bool
-) -> dict[str, float]:
-    """Return the value of each covariate by name, which is near those of runs if there are any."""
+def covariate_values(
+    label: str,
+    inputs: Inputs,
+    at: Mapping[str, float] | None,
+    stated: Mapping[str, Floats],
+    *,
+    has_runs: bool,
+) -> dict[str, Any]:
+    """Return a number by covariate, or those of conditions that are stated, (N,).
+
+    Numbers have to be near those of runs if there are any.
+    """
     names = [str(covariate.name) for covariate in inputs.covariates]
+    known = {name: stated[name] for name in names if name in stated}
+    names = [name for name in names if name not in known]
     given = {} if at is None else at
     if not isinstance(given, Mapping) or set(given) != set(names):
         raise ValueError(
@@ -254,7 +289,10 @@ def _covariates(
             "pass at={'hardness': 250.0}, for example"
         )
     values = {name: finite_number(given[name], f"{label}: at: {name}") for name in names}
-    for name, covariate in zip(names, inputs.covariates, strict=True):
+    for covariate in inputs.covariates:
+        name = str(covariate.name)
+        if name in known:
+            continue
         low, high = (float(end.eval()) for end in covariate.owner.op.dist_params(covariate.owner))
         if has_runs and not low <= values[name] <= high:
             raise ValueError(
@@ -262,7 +300,13 @@ def _covariates(
                 f"{high:.4g}, where the response has runs; pass stored=False, which computes it at "
                 "new specimens"
             )
-    return values
+    return values | known
+
+
+def _by_name(inputs: Inputs, conditions: Floats) -> dict[str, Floats]:
+    """Return the values of conditions that are inputs, (N, C), by name."""
+    names = [str(inputs.aleatory[place].name) for place in inputs.conditions]
+    return dict(zip(names, conditions.T, strict=True))
 
 
 # -- populations -----------------------------------------------------------------------------------
@@ -357,8 +401,12 @@ def _predicted(
     points: dict[str, Floats],
     n: int,
     rng: np.random.Generator,
+    conditions: Floats | None,
 ) -> _Predicted:
-    """Return responses of n specimens from each population, of one group after the other."""
+    """Return responses of n specimens from each population, of one group after the other.
+
+    The specimens have the conditions, (n, C).
+    """
     inputs = responses.inputs
     by_group = [points]
     if inputs.groups is not None:
@@ -373,7 +421,11 @@ def _predicted(
             results.append(_resampled_responses(simulator, responses, group_points, n, rng))
             continue
         parents = [group_points[str(rv.name)] for rv in inputs.parents]
-        specimens, epistemic = new_specimens(responses.name, inputs, parents, n, rng)
+        if conditions is None:
+            specimens, epistemic = new_specimens(responses.name, inputs, parents, n, rng)
+        else:  # independent ones: those of a population are a data set
+            specimens, epistemic = PopulationSampler(inputs)(parents, n, rng)
+            specimens = at_conditions(inputs, specimens, conditions)
         if simulator is None:
             values = responses(specimens, epistemic)
             results.append(_Predicted(values, specimens, "new specimens"))
@@ -393,7 +445,48 @@ def _predicted(
     return replace(results[0], values=values, specimens=specimens)
 
 
-def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
+def with_known_conditions(
+    label: str,
+    inputs: Sequence[Any],
+    simulators: Sequence[PopulationSimulator],
+    *,
+    stored: bool,
+) -> tuple[list[Any], Floats | None]:
+    """Return inputs with the model's own conditions, and the values of those given, (N, C)."""
+    of_model = {
+        str(s.inputs.aleatory[place].name): s.inputs.aleatory[place]
+        for s in simulators
+        for place in s.inputs.conditions
+    }
+    conditions = {
+        str(x.name): x for x in inputs if isinstance(x, TensorVariable) and is_condition(x)
+    }
+    sizes = {name: len(x.owner.op.values) for name, x in conditions.items()}
+    if len(set(sizes.values())) > 1:
+        raise ValueError(
+            f"{label}: got conditions of {sizes} specimens, expected one value of each condition "
+            "for each specimen"
+        )
+    size = next(iter(sizes.values()), 0)
+    changed = [
+        of_model.get(str(x.name), x) if any(x is y for y in conditions.values()) else x
+        for x in inputs
+    ]
+    if stored:
+        for name, x in conditions.items():
+            low, high = of_model[name].owner.op.range if name in of_model else (-np.inf, np.inf)
+            outside = [v for v in x.owner.op.values if not low <= v <= high]
+            if outside:
+                raise ValueError(
+                    f"{label}: got {name} = {outside[0]:g}, expected values from {low:.4g} to "
+                    f"{high:.4g}, the range of the runs; pass stored=False, which computes the "
+                    "response of new specimens"
+                )
+    values = known_covariates(label, list(conditions.values()), size, None)
+    return changed, stacked_values(values)
+
+
+def _check_responses(label: str, drawn: _Predicted, max_lost: float, remedy: str) -> int:
     """Report a rough emulator; return and report the number of NaN, or raise if it is large."""
     values, error = drawn.values, drawn.error
     is_nan = is_missing(values.reshape(-1, *values.shape[2:]))
@@ -407,7 +500,7 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
         raise DesignError(
             f"{label}: lost mass: got {missing / is_nan.size:.1%} NaN among the predicted "
             f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
-            "the specimens that have a response; repair it, return +inf for specimens that fail, "
+            f"the specimens that have a response; {remedy}, return +inf for specimens that fail, "
             "or pass a larger max_lost"
         )
     if missing:
@@ -431,11 +524,24 @@ def _check_responses(label: str, drawn: _Predicted, max_lost: float) -> int:
 
 
 def known_outputs(
-    simulators: Sequence[PopulationSimulator], response: Callable[..., Any]
+    simulators: Sequence[PopulationSimulator],
+    response: Callable[..., Any],
+    inputs: Inputs | None = None,
 ) -> Outputs | None:
-    """Return the outputs of a response that is a simulator's; None if only a run shows them."""
-    nodes = (node for node in simulators if node.responses.function is response)
-    return next((node.outputs for node in nodes), None)
+    """Return the outputs of a response that is a simulator's; None if only a run shows them.
+
+    With another vector of constants, such as times, a response may have other outputs.
+    """
+    vectors = None if inputs is None else _vectors(inputs)
+    for node in simulators:
+        if node.responses.function is response and vectors in (None, _vectors(node.inputs)):
+            return node.outputs
+    return None
+
+
+def _vectors(inputs: Inputs) -> list[list[float]]:
+    """Return the arguments that are vectors of constants."""
+    return [x.ravel().tolist() for x in inputs.arguments if isinstance(x, np.ndarray)]
 
 
 def known_scatter(

@@ -29,6 +29,7 @@ Predicted = xr.DataArray | NDArray[Any]
 # Separates the name of a condition from the number of a projection of its outputs.
 DIRECTION = ", direction "
 _SAMPLE_DIMS = ("chain", "draw", "sample")
+_SPECIMEN = "specimen"  # in place of samples: specimens under conditions of their own
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +146,9 @@ def read_case(
     numbers: dict[object, int] = {}
     conditions: list[Condition] = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
+        has_own_conditions = _SPECIMEN in getattr(simulated, "dims", ())
+        if has_own_conditions:
+            simulated = simulated.rename({_SPECIMEN: "sample"})
         y = _measured(name, measured, simulated)
         names: tuple[str, ...] | None = None
         if labels is not None:
@@ -161,19 +165,20 @@ def read_case(
             numbers=np.array([numbers.setdefault(key, len(numbers)) for key in keys], np.intp),
             attributes=simulated.attrs if isinstance(simulated, xr.DataArray) else {},
         )
-        if y.ndim == 1:
-            conditions.append(condition)
-            continue
-        for k, projection in enumerate(projections(condition.predicted), start=1):
-            projected = replace(
-                condition,
-                name=f"{name}{DIRECTION}{k}",
-                observed=projection.of(y),
-                predicted=projection.of(condition.predicted),
-                projection=projection,
-                group=k,
-            )
-            conditions.append(projected)
+        for part in _by_specimen(condition) if has_own_conditions else [condition]:
+            if y.ndim == 1:
+                conditions.append(part)
+                continue
+            for k, projection in enumerate(projections(part.predicted), start=1):
+                projected = replace(
+                    part,
+                    name=f"{part.name}{DIRECTION}{k}",
+                    observed=projection.of(part.observed),
+                    predicted=projection.of(part.predicted),
+                    projection=projection,
+                    group=k,
+                )
+                conditions.append(projected)
     draws = [len(c.predicted) for c in conditions]
     if len(set(draws)) > 1:
         raise ValueError(
@@ -193,6 +198,27 @@ def read_case(
         folded=folded,
         identity=require_together(identities, "area_test", level=Level.OPTIMUM),
     )
+
+
+def _by_specimen(condition: Condition) -> list[Condition]:
+    """Return a condition for each specimen, whose predicted values are those of a column."""
+    n, predicted = len(condition.observed), condition.predicted
+    if predicted.shape[1] != n:
+        raise ValueError(
+            f"{condition.name}: observed: got {n} values, expected {predicted.shape[1]}, one for "
+            "each specimen of the prediction"
+        )
+    return [
+        replace(
+            condition,
+            name=f"{condition.name}[{i}]",
+            observed=condition.observed[i : i + 1],
+            predicted=predicted[:, i : i + 1],
+            labels=None if condition.labels is None else condition.labels[i : i + 1],
+            numbers=condition.numbers[i : i + 1],
+        )
+        for i in range(n)
+    ]
 
 
 def projections(pool: Floats) -> list[Projection]:
@@ -311,6 +337,7 @@ class Comparable:
     name: str  # of the condition, with the output's as an index
     measured: Floats  # (n,): +inf is a specimen that failed
     predicted: Floats  # (P, S): a row for each population; NaN has no weight
+    unit: str = ""
 
     @property
     def weights(self) -> Floats:
@@ -354,12 +381,14 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
         m = event[0] if event else 1
         columns = values.reshape(-1, m)
         samples = prediction.values.reshape(-1, prediction.sizes["sample"], m)
+        attrs = {**getattr(observed[name], "attrs", {}), **prediction.attrs}
+        units = np.broadcast_to(attrs.get("units", ""), m)
         for j in map(round, np.linspace(0, m - 1, min(m, 8)).tolist()):
             label = f"{name}[{prediction[dims[0]].values.tolist()[j]}]" if event else str(name)
             # Panels are places in a tree, whose levels a slash separates.
             label = label.replace("/", "\u2215")
             measured = columns[~np.isnan(columns[:, j]), j]
-            pairs.append(Comparable(label, measured, samples[..., j]))
+            pairs.append(Comparable(label, measured, samples[..., j], str(units[j])))
     return pairs
 
 

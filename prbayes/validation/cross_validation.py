@@ -213,6 +213,9 @@ def _scores(evaluator: Evaluator, thetas: Floats, held_out: list[Floats]) -> tup
     for k, simulator in enumerate(evaluator.simulators):
         weights = simulator.weights
         counts += np.bincount(numbers[k], weights * weights.size, total)
+        if simulator.inputs.covariates:  # each specimen has a population of its own
+            scores[numbers[k]] = np.nan
+            continue
         try:
             target = scoring_target(simulator.observed, weights)
         except ValueError:  # no density, for example because all observations are equal
@@ -336,8 +339,9 @@ def rank(
             raise ValueError(
                 f"rank: got {label} without a score of {n_missing} of "
                 f"{table.sizes['specimen']} specimens, expected one of each: the observed values "
-                "have no density, as where all are equal, or the population of a fold has no "
-                "response; compare the discrepancies of prb.cross_validate instead"
+                "have no density, as where all are equal, the population of a fold has no "
+                "response, or it depends on a condition of each specimen; compare the "
+                "discrepancies of prb.cross_validate instead"
             )
     return _comparison(tables)
 

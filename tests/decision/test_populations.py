@@ -40,7 +40,8 @@ def test_a_tail_of_few_points_is_reported_and_one_of_none_refused() -> None:
     found = populations(posterior(), 500)
 
     def findings(response: Any, quantity: Any, **options: Any) -> Any:
-        return found.sample(response, (x,), None).checked_quantity(quantity(response, x, **options))
+        sample = found.sample(response, (x,), None)
+        return sample.checked_quantity(quantity(response, x, **options))[0]
 
     def scattered(x: Any) -> Any:
         return np.sin(1e4 * x)
@@ -55,8 +56,34 @@ def test_a_tail_of_few_points_is_reported_and_one_of_none_refused() -> None:
     assert findings(np.tanh, prb.decision.Quantile, probability=0.99) == ()
     assert findings(lambda x: np.minimum(x, 1), prb.decision.Quantile, probability=0.99) == ()
     assert len(findings(scattered, prb.decision.Quantile, probability=1 - 1e-9)) == 1
+    # The rarer side counts: a low quantile, and a probability near one.
+    assert len(findings(scattered, prb.decision.Quantile, probability=1e-9)) == 1
+    assert findings(doubled, prb.decision.Quantile, probability=0.01) == ()
+    (finding,) = findings(scattered, prb.decision.Exceedance, limit=-np.cos(np.pi / 200))
+    assert "on its other side, 0.00" in finding.text
     with pytest.raises(ValueError, match=r"got no response beyond it, of \d+ effective points"):
         findings(doubled, prb.decision.Exceedance, limit=99.0)
+    with pytest.raises(ValueError, match="got no response on its other side, of"):
+        findings(doubled, prb.decision.Exceedance, limit=-99.0)
+
+
+def test_quantities_have_the_error_of_their_computation() -> None:
+    _, x = normal()
+    found = populations(posterior(), 500)
+    sample = found.sample(doubled, (x,), None)
+    mu, sigma = found.center[0], np.exp(found.center[1])
+    for quantity, expected in (
+        (prb.decision.Mean(doubled, x), 2 * mu),
+        (prb.decision.StandardDeviation(doubled, x), 2 * sigma),
+        (prb.decision.Exceedance(doubled, x, limit=2 * mu), 0.5),
+        *(
+            (prb.decision.Quantile(doubled, x, probability=p), 2 * (mu + sigma * z))
+            for p, z in ((1e-6, -4.7534), (0.01, -2.3263), (0.99, 2.3263), (1 - 1e-6, 4.7534))
+        ),
+    ):
+        (value,) = sample.evaluate(quantity, found.center[None])
+        _, error = sample.checked_quantity(quantity)
+        assert abs(value - expected) < 3 * error < 1.5
 
 
 def test_an_optimum_is_its_sampling_distribution() -> None:

@@ -239,6 +239,20 @@ def test_where_the_nearest_run_failed_a_line_ends() -> None:
     assert indices.values[1] == pytest.approx(1.0, abs=0.15)
 
 
+def test_shares_of_no_variance_have_a_reason() -> None:
+    model, x = normal()
+    at_limit = prb.decision.Quantile(lambda x: np.minimum(x, 1), x, probability=0.9)
+    table = prb.sensitivity(posterior(), at_limit, model=model, n_samples=64)
+    assert table.attrs["sd"] == 0
+    assert np.isnan(table["first"].sel(factor="mu"))
+    assert "constant-quantity" in table.attrs["findings"]
+    rare = prb.decision.Quantile(same, x, probability=1 - 1e-6)
+    table = prb.sensitivity(posterior(), rare, model=model, n_samples=64)
+    assert np.isnan(table["first"].sel(factor="x"))
+    assert "beyond the quantile is the same for all 16 specimens" in table.attrs["inputs"]
+    assert table.attrs["value_error"] > 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:

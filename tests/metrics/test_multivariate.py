@@ -307,18 +307,18 @@ def bent(size: int, bend: float, seed: int = 0) -> Floats:
 def test_a_surface_is_compared_on_itself() -> None:
     y, other = bent(60, 0.05), bent(40, 0.05, 1)
     metric = Joint(ProbabilityResidual())
-    beside = metric.with_design(metric.against(y), other, 2)
+    beside = metric.for_inputs(metric.against(y), 2)
     assert len(beside.parts) == 4
     # As the plane alone, and in any units.
     plane = Joint(ProbabilityResidual()).against(y[:, :2])
     assert beside(other) == pytest.approx(plane(other[:, :2]), rel=0.15)
     scale = np.array([1e3, 1.0, 1e-6])
-    scaled = metric.with_design(metric.against(y * scale), other * scale, 2)
+    scaled = metric.for_inputs(metric.against(y * scale), 2)
     assert scaled(other * scale) == pytest.approx(beside(other), rel=1e-6)
     # Other outputs are compared as they are.
     for bend, inputs in ((0.05, 3), (0.5, 2)):
         y, other = bent(60, bend), bent(40, bend, 1)
         target = metric.against(y)
-        beside = metric.with_design(target, other, inputs)
+        beside = metric.for_inputs(target, inputs)
         assert len(beside.parts) == len(target.parts) == 10
         assert beside(other) == target(other)

@@ -16,7 +16,7 @@ from scipy.stats import chi2, norm
 
 import prbayes as prb
 from prbayes._validate import Floats
-from prbayes.metrics.summary import SummaryLikelihood
+from prbayes.metrics.summary_likelihood import SummaryLikelihood
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
 
 import prbayes as prb
 from prbayes._validate import Floats
 from prbayes.metrics.whitening import principal_components, whitening
+from prbayes.model.evaluator import Evaluator
 
 T = np.linspace(0.1, 1.0, 40)
 EQUAL = np.full(30, 1 / 30)
+ALL = np.arange(40)
 
 
 def curves(n: int, seed: int = 1, noise: float = 0.0) -> Floats:
@@ -25,44 +27,65 @@ def curves(n: int, seed: int = 1, noise: float = 0.0) -> Floats:
 
 
 def test_two_inputs_make_two_components_and_a_remainder_is_noise_or_structure() -> None:
-    found = principal_components(curves(30), EQUAL, 2)
+    found = principal_components(curves(30), EQUAL, ALL, 2)
     np.testing.assert_allclose(found.axes.T @ found.axes, np.eye(2), atol=1e-12)
     scores = (curves(30) - found.center) @ found.axes
     np.testing.assert_allclose(found.center + scores @ found.axes.T, curves(30), atol=1e-10)
     assert "40 outputs are compared by 2 principal component(s)" in found.summary
-    noisy = principal_components(curves(30, noise=0.2), EQUAL, 2)
-    shifted = principal_components(curves(30, noise=0.2) - 70, EQUAL, 2)
+    noisy = principal_components(curves(30, noise=0.2), EQUAL, ALL, 2)
+    shifted = principal_components(curves(30, noise=0.2) - 70, EQUAL, ALL, 2)
     np.testing.assert_allclose(shifted.axes, noisy.axes, atol=1e-9)
     np.testing.assert_allclose(shifted.center, noisy.center - 70, rtol=1e-9)
     assert noisy.left_out > 0.01
     assert abs(noisy.rest_correlation) < 0.2
-    too_few = principal_components(curves(30), EQUAL, 1)
+    too_few = principal_components(curves(30), EQUAL, ALL, 1)
     assert too_few.rest_correlation > 0.5
-    assert "it is no noise" in too_few.missed
-    assert not found.missed
-    assert not noisy.missed
-    assert "noise that the model has too" in replace(noisy, design_left_out=0.2).missed
+    assert "it is no noise" in too_few.missed(0.0)
+    assert not found.missed(0.0)
+    assert not noisy.missed(0.0)
+    assert "noise that the model has too" in noisy.missed(0.2)
 
 
-def test_the_fewest_that_leave_out_a_hundredth_of_data_and_design() -> None:
-    sample = curves(30)
-    alone = principal_components(sample, EQUAL)
-    assert alone.number <= 2
-    # Populations of the design vary in a way in which the data do not.
-    more = curves(400, 2) + np.random.default_rng(3).normal(0, 0.4, (400, 1)) * np.sin(9 * T)
-    both = principal_components(sample, EQUAL, design=more)
-    assert both.number == alone.number + 1
-    assert max(both.left_out, both.design_left_out) < 0.01
-    # A design far from the data does not decide.
-    far = 1e3 * np.random.default_rng(4).standard_normal((200, 40))
-    beside = principal_components(sample, EQUAL, 2, design=np.concatenate([curves(200, 5), far]))
-    assert beside.left_out < 0.01
+def test_the_fewest_that_leave_out_a_hundredth_and_a_population_that_varies_elsewhere() -> None:
+    found = principal_components(curves(30), EQUAL, ALL)
+    assert found.number <= 2
+    assert found.left_out < 0.01
+    similar = curves(400, 2)
+    weights = np.arange(400) / np.arange(400).sum()
+    assert not found.missed(found.share_left_out(similar, weights))
+    # The population varies in a way in which the data do not.
+    other = similar + np.random.default_rng(3).normal(0, 0.4, (400, 1)) * np.sin(9 * T)
+    share = found.share_left_out(other, weights)
+    deviations = other - weights @ other
+    scores = deviations @ found.axes
+    explained = (weights @ scores**2).sum() / (weights @ deviations**2).sum()
+    assert share == pytest.approx(1 - explained, rel=1e-9)
+    assert f"but {share:.2g} of that of the best population" in found.missed(share)
+    # Points without response, and failed ones, have no influence.
+    other[0] = np.nan
+    other[1, 3] = np.inf
+    assert found.share_left_out(other, weights) == pytest.approx(share, rel=1e-3)
+
+
+def test_components_of_noise_have_its_typical_variance() -> None:
+    # Lines with noise: the largest component of the noise has about 2.5 times its variance.
+    times = np.arange(10.0)
+    sizes = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        lines = rng.normal(0, 100, (18, 1)) + rng.normal(0, 50, (18, 1)) * times
+        sample = lines + rng.normal(0, 1, (18, 10))
+        found = principal_components(sample, np.full(18, 1 / 18), np.arange(10), 3)
+        scores = (sample - found.center) @ found.axes
+        sizes.append(scores.std(axis=0))
+    assert (np.min(sizes, axis=0)[:2] > 10).all()
+    assert np.log(np.median(sizes, axis=0)[2]) == pytest.approx(0, abs=0.25)
 
 
 def test_gross_outliers_do_not_decide() -> None:
     sample = curves(60, noise=0.01)
     sample[:3] += 50 * np.random.default_rng(6).standard_normal((3, 40))
-    found = principal_components(sample, np.full(60, 1 / 60), 2)
+    found = principal_components(sample, np.full(60, 1 / 60), ALL, 2)
     rest = sample[3:] - found.center
     assert (rest - rest @ found.axes @ found.axes.T).std() < 0.02
 
@@ -87,6 +110,27 @@ def test_a_joint_metric_compares_curves_by_their_scores() -> None:
     assert target(simulated) < target(simulated * 1.2)
 
 
+@pytest.mark.parametrize("outputs", [40, 3])
+def test_coordinates_do_not_depend_on_the_propagation_or_the_prior(outputs: int) -> None:
+    times = T[:outputs]
+    found = []
+    for propagation, sd in ((prb.Resimulated(64), 1.0), (prb.Reweighted(64), 5.0)):
+        with pm.Model() as model:
+            a = pm.Normal.dist(pm.Normal("mean", 2, sd), pm.HalfNormal("sd", sd))
+            prb.Simulator(
+                "y",
+                lambda a: np.asarray(a)[..., None] * times,
+                a,
+                metric=prb.Joint(prb.AreaMetric()),
+                observed=curves(30, noise=0.01)[:, :outputs],
+                propagation=propagation,
+            )
+        target: Any = Evaluator.of(model).nodes[0].target
+        projections = [part.projection for part in target.parts]
+        found.append(np.array([[p.center, p.direction] for p in projections]))
+    np.testing.assert_array_equal(*found)
+
+
 def coordinates(y: Floats, weights: Floats | None = None) -> Floats:
     u = np.full(len(y), 1 / len(y)) if weights is None else weights
     center, axes = whitening(y, u, np.arange(y.shape[1]))
@@ -100,7 +144,7 @@ def correlated(rho: float, n: int = 50, m: int = 2) -> Floats:
 
 
 @pytest.mark.parametrize(
-    ("m", "n", "rho"), [(2, 50, 0.95), (2, 9, -0.995), (4, 40, 0.9999), (8, 60, 0)]
+    ("m", "n", "rho"), [(2, 50, 0.95), (2, 10, -0.995), (4, 40, 0.9999), (8, 110, 0)]
 )
 def test_an_affine_map_of_the_outputs_changes_nothing(m: int, n: int, rho: float) -> None:
     rng = np.random.default_rng(m)
@@ -111,6 +155,32 @@ def test_an_affine_map_of_the_outputs_changes_nothing(m: int, n: int, rho: float
     for matrix in maps:
         np.testing.assert_allclose(coordinates(y @ matrix.T), before, rtol=1e-7, atol=1e-8)
     np.testing.assert_allclose(coordinates(y + 1e3), before, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize(("m", "n"), [(2, 4), (3, 5), (5, 7), (8, 10)])
+def test_few_specimens_are_whitened_alike_in_other_units_and_orders(m: int, n: int) -> None:
+    rng = np.random.default_rng(m)
+    y = rng.standard_normal((n, 1)) + 0.1 * rng.standard_normal((n, m))
+    before = coordinates(y)
+    columns = rng.permutation(m)
+    for other in (y * 10.0 ** rng.integers(-150, 150, m), -y + 1e3, y[:, columns]):
+        np.testing.assert_allclose(coordinates(other), before, rtol=1e-7, atol=1e-7)
+    rows = rng.permutation(n)
+    np.testing.assert_allclose(coordinates(y[rows]), before[rows], rtol=1e-7, atol=1e-7)
+
+
+def test_a_combination_that_scatters_little_by_chance_does_not_decide() -> None:
+    # Three readings of specimens: the difference of two readings and that of their mean from the
+    # third have equal variances, but not in data of six specimens.
+    contrasts = np.array([[1, -1, 0], [1, 1, -2]]).T / np.sqrt([2, 6])
+    ratios = []
+    for seed in range(10):
+        rng = np.random.default_rng([seed, 6])
+        y = rng.normal(0, 25, (6, 1)) + rng.normal(0, 4, (6, 3))
+        _, axes = whitening(y, np.full(6, 1 / 6), np.arange(3))
+        size = np.linalg.svd(axes.T @ contrasts)[1]
+        ratios.append(np.log(size[0] / size[1]))
+    assert np.median(ratios) < 0.3  # .64 without shrinkage
 
 
 def test_a_normal_sample_has_unit_spread_in_all_directions() -> None:

@@ -16,9 +16,9 @@ from prbayes.model.data_checks import (
     check_constant,
     count_at_ends,
     data_findings,
+    duplicate_findings,
     identical_specimens,
     resolution,
-    warn_duplicates,
     warn_out_of_range,
 )
 from prbayes.propagation.base import DesignError
@@ -297,22 +297,32 @@ def test_data_beyond_all_responses_are_reported(logged: pytest.LogCaptureFixture
     assert "all below the first 64 responses" in logged.text
 
 
-def test_a_constant_response_is_refused_or_reported(logged: pytest.LogCaptureFixture) -> None:
-    with pytest.raises(DesignError, match=r"y: got 1 for the response at all 64 runs .* check the"):
-        check_constant("y", np.ones(64), [])
-    with pytest.raises(DesignError, match=r"y\[b\]: got 0 for .* at all 40 runs"):
-        check_constant("y", np.stack([SIMULATED[:40, 0], np.zeros(40)], axis=1), ["a", "b"])
-    with pytest.raises(DesignError, match="at all 40 runs"):
-        check_constant("y", np.where(np.arange(64) < 40, 5.0, np.nan), [])
-    assert not logged.records
-    check_constant("y", np.ones(16), [])  # counts may be equal by chance
-    assert [record.code for record in logged.records] == ["constant-response"]  # type: ignore[attr-defined]
-    logged.clear()
-    check_constant("y", SIMULATED, ["a", "b"])
-    check_constant("y", 1 + 1e-6 * SIMULATED[:, 0], [])
-    check_constant("y", np.where(np.arange(64) < 40, 5.0, np.inf), [])  # data may be failures
-    check_constant("y", np.empty(0), [])
-    assert not logged.records
+def test_constant_responses_that_are_stored_are_refused() -> None:
+    message = r"y: the response is constant: got 1 at all 3 runs .*; check the .*, take more runs"
+    with pytest.raises(DesignError, match=message):
+        check_constant("y", np.ones(3), [], True)
+    with pytest.raises(DesignError, match=r"y\[b\]: the .* constant: got 0 at all 40 runs"):
+        check_constant("y", np.stack([SIMULATED[:40, 0], np.zeros(40)], 1), ["a", "b"], True)
+    with pytest.raises(DesignError, match="at all 24 runs"):
+        check_constant("y", np.where(np.arange(64) < 24, 5.0, np.nan), [], True)
+
+
+def test_constant_responses_that_are_simulated_again_are_reported() -> None:
+    (finding,) = check_constant("y", np.ones(16), [], False)  # counts may be equal by chance
+    assert finding.code == "constant-response"
+
+
+@pytest.mark.parametrize("is_stored", [True, False])
+def test_other_responses_are_not_constant(is_stored: bool) -> None:
+    for values in (
+        1 + 1e-6 * SIMULATED[:, 0],
+        np.where(np.arange(64) < 40, 5.0, np.inf),  # data may be failures
+        np.empty(0),
+        np.ones(1),
+        np.array([5.0, np.nan, np.nan]),
+    ):
+        assert not check_constant("y", values, [], is_stored)
+    assert not check_constant("y", SIMULATED, ["a", "b"], is_stored)
 
 
 @pytest.mark.parametrize(
@@ -336,12 +346,9 @@ def test_data_around_few_or_many_responses_are_not_reported(
 @pytest.mark.parametrize(
     "values", [MEASURED[:, 0], MEASURED, MEASURED[:, 0].round(3), 0.001 * np.arange(20) ** 2]
 )
-def test_duplicates_of_all_specimens_are_reported(
-    values: Floats, logged: pytest.LogCaptureFixture
-) -> None:
-    warn_duplicates("y", np.concatenate([values, values[::-1]]))
-    (record,) = logged.records
-    assert "y: got 40 observed values of which only 20 are different" in record.message
+def test_duplicates_of_all_specimens_are_reported(values: Floats) -> None:
+    (finding,) = duplicate_findings("y", np.concatenate([values, values[::-1]]))
+    assert "y: got 40 observed values of which only 20 are different" in finding.text
 
 
 @pytest.mark.parametrize(
@@ -358,6 +365,5 @@ def test_duplicates_of_all_specimens_are_reported(
     ],
     ids=["once", "some", "counts", "other counts", "hundreds", "rounded", "equal", "few"],
 )
-def test_ties_by_chance_are_no_duplicates(values: Floats, logged: pytest.LogCaptureFixture) -> None:
-    warn_duplicates("y", np.asarray(values, dtype=float))
-    assert not logged.records
+def test_ties_by_chance_are_no_duplicates(values: Floats) -> None:
+    assert not duplicate_findings("y", np.asarray(values, dtype=float))

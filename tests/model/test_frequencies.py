@@ -8,6 +8,8 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from scipy.optimize import minimize
+from scipy.stats import norm
 
 import prbayes as prb
 from prbayes.model.random_variable import simulators
@@ -40,6 +42,24 @@ def test_a_histogram_is_as_many_specimens_as_it_counts(metric: Any) -> None:
     assert counted.stderr == repeated.stderr
     if isinstance(metric, prb.LogLikelihood | prb.KullbackLeibler):
         assert counted.stderr["mu"] == pytest.approx(SAMPLE.std() / 20, rel=0.1)
+
+
+@pytest.mark.parametrize("bins", [6, [3.0, 7.0, 8.0, 9.0, 10.0, 12.0, 17.0]])
+def test_the_likelihood_of_bins_is_exact(bins: Any) -> None:
+    """Rounding has the width of each bin: the likelihood is that of the bins' probabilities."""
+    counts, edges = np.histogram(SAMPLE, bins=bins)
+    metric = prb.LogLikelihood(rounded=np.diff(edges))
+    optimum = prb.minimize(model(metric, (edges[1:] + edges[:-1]) / 2, weights=counts))
+    assert optimum.converged
+
+    def minus_log_likelihood(theta: Any) -> float:
+        shares = np.diff(norm.cdf(edges, theta[0], np.exp(theta[1])))
+        return -float(counts @ np.log(shares))
+
+    exact = minimize(minus_log_likelihood, [10.0, 0.7], method="BFGS")
+    se = np.sqrt(np.diag(exact.hess_inv))
+    assert optimum.point["mu"] == pytest.approx(exact.x[0], abs=0.15 * se[0])
+    assert np.log(optimum.point["sigma"]) == pytest.approx(exact.x[1], abs=0.15 * se[1])
 
 
 def test_a_table_of_counts_of_groups() -> None:

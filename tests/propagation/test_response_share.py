@@ -44,7 +44,8 @@ def log_share(share: ResponseShare, dist: Callable[..., Any], *parents: Floats) 
         symbols = [pm.Flat(f"p{i}", shape=x.shape[1:]) for i, x in enumerate(parents)]
         inputs = read_inputs("y", [dist(*symbols, shape=d)], model)
     ends = np.stack([np.full(d, -np.inf), np.full(d, np.inf)])
-    identity = Coordinates(((d,),), np.zeros(d, dtype=bool), np.zeros(d), np.ones(d), ends)
+    none = np.zeros(d, dtype=bool)
+    identity = Coordinates(((d,),), none, np.zeros(d), np.ones(d), ends, none)
     values = [parents[symbols.index(parent)] for parent in inputs.parents]
     return share.of_populations(PopulationDensity(inputs), values, identity)
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize as scipy_minimize
+from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
 from prbayes._finding import Finding
@@ -25,9 +26,12 @@ from prbayes._stats import adjusted_p_values, upper_p_values
 from prbayes._validate import Floats
 from prbayes.model.emulated import EmulatedSimulator
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import refuse_lost_share
+from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.distributions import PopulationSampler
+from prbayes.response.response import Responses
 
 
 def normal_scores(u: Floats) -> Floats:
@@ -183,6 +187,56 @@ def failing_region_findings(
     return tuple(findings)
 
 
+def replaced_findings(
+    evaluator: Evaluator, theta: Floats, specimens: int = 4096, smallest: float = 5e-4
+) -> tuple[Finding, ...]:
+    """Report populations that rest on finite numbers in place of responses that failed.
+
+    Of stored responses the share is that of the runs' weights; of the log-likelihood by specimen
+    that of specimens whose nearest run has the number. Responses that are simulated again are
+    computed once more.
+    """
+    shares = {}
+    for k, node in enumerate(evaluator.nodes):
+        if _replaces(node.bound.responses):
+            parents, bound = evaluator.parents(theta[None], k), node.bound
+            if isinstance(bound, ReweightedBound):
+                bound = bound.copied(bound.design.runs_alone())
+            values, weights = bound.populations(parents)
+            shares[node.name] = _replaced_share(node.bound.responses, values[0], weights[0])
+    for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
+        if _replaces(simulator.responses):
+            emulation = prepared(simulator.likelihood).emulation
+            z = _population_coordinates(evaluator, theta, k, simulator.likelihood, specimens)
+            _, nearest = cKDTree(emulation.z).query(z)
+            values, weights = emulation.y[nearest], np.full(specimens, 1 / specimens)
+            shares[simulator.name] = _replaced_share(simulator.responses, values, weights)
+    responses = {s.name: s.responses for s in evaluator.simulators}
+    return tuple(
+        Finding(
+            "responses-replaced",
+            f"{name}: got {responses[name].failures} failed responses, replaced by "
+            f"{responses[name].replacement:g}, with {share:.1%} of the population on that number, "
+            "which is compared with the data like any response. Repair the response; or replace it "
+            "by NaN, if such specimens cannot be measured, or by inf, if they fail.",
+            "distributed.md#when-a-response-fails",
+        )
+        for name, share in shares.items()
+        if share >= smallest
+    )
+
+
+def _replaces(responses: Responses) -> bool:
+    """Return whether numbers are in place of some responses."""
+    return responses.failures > 0 and bool(np.isfinite(responses.replacement))
+
+
+def _replaced_share(responses: Responses, values: Floats, weights: Floats) -> float:
+    """Return the weight of the responses, (n, ...), that are the number."""
+    is_replaced = (values == responses.replacement).reshape(len(values), -1).all(axis=1)
+    return float(weights @ is_replaced)
+
+
 def lost_mass_shift(evaluator: Evaluator, theta: Floats, scales: Floats, stderr: Floats) -> Floats:
     """Return the shift of an optimum, in standard errors (d,), if lost specimens counted.
 
@@ -211,21 +265,29 @@ def refuse_lost_specimens(evaluator: Evaluator, theta: Floats, specimens: int = 
     """Raise if too much of a population has no response (NaN): it is not known from the rest."""
     for simulator, share in _failing_shares(evaluator, theta, specimens):
         if prepared(simulator.likelihood).share is not None:
-            refuse_lost_share(simulator.name, share, simulator.max_lost)
+            remedy = simulator.responses.remedy
+            refuse_lost_share(simulator.name, share, simulator.max_lost, remedy)
 
 
 def _failing_shares(
     evaluator: Evaluator, theta: Floats, specimens: int
 ) -> Iterator[tuple[EmulatedSimulator, float]]:
     """Yield the emulated simulators with failing runs and the failing share of the population."""
-    rng = np.random.default_rng(23)
     for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
         likelihood = simulator.likelihood
         emulation = prepared(likelihood).emulation
         if np.isfinite(emulation.y).all():
             continue
-        sampler = PopulationSampler(likelihood.inputs)
-        drawn, _ = sampler(evaluator.parents(theta[None], k), specimens, rng)
-        z = likelihood.coordinates.of([x[0] for x in drawn], 1)
+        z = _population_coordinates(evaluator, theta, k, likelihood, specimens)
         fails = emulation.fails(np.clip(z, emulation.box[0], emulation.box[1]))
         yield simulator, float(fails.mean())
+
+
+def _population_coordinates(
+    evaluator: Evaluator, theta: Floats, k: int, likelihood: SpecimenLikelihood, specimens: int
+) -> Floats:
+    """Return the coordinates, (n, d), of specimens drawn from a population."""
+    sampler = PopulationSampler(likelihood.inputs)
+    rng = np.random.default_rng(23)
+    drawn, _ = sampler(evaluator.parents(theta[None], k), specimens, rng)
+    return np.asarray(likelihood.coordinates.of([x[0] for x in drawn], 1))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
 from scipy.special import logsumexp, ndtr, ndtri
 from scipy.stats import norm
 
+import prbayes as prb
 from prbayes._stats import adjusted_p_values
 from prbayes._validate import Floats
 from prbayes.inference.checks.population import (
@@ -20,8 +23,10 @@ from prbayes.inference.checks.population import (
     population_statistics,
     population_test,
     power_text,
+    replaced_findings,
     zhang_statistic,
 )
+from prbayes.model.evaluator import Evaluator
 
 # The alternatives of the study: standardised inputs.
 
@@ -238,3 +243,38 @@ def test_the_power_is_that_of_the_study() -> None:
     assert "0.41 for skewness 1" in power_text(round(np.sqrt(20 * 50)))
     assert "less power than at 20: 0.23 for skewness 1" in power_text(8)
     assert "no power with fewer outputs (1) than inputs (3)" in power_text(50, inputs=3)
+
+
+def responding(value: float, propagation: Any) -> tuple[float, tuple[Any, ...]]:
+    """Return P(x < -1) at the normal of sd 1, and findings of a response that fails there."""
+
+    def response(x: float) -> float:
+        if x < -1:
+            raise ArithmeticError("no convergence")
+        return x
+
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        settings = propagation(64, on_failure=prb.response.Replace(value))
+        data = np.linspace(-0.5, 2, 20)
+        metric = prb.KullbackLeibler()
+        prb.Simulator(
+            "y", prb.scalar(response), x, metric=metric, observed=data, propagation=settings
+        )
+    evaluator = Evaluator.of(model)
+    evaluator.total(np.zeros((1, 1)), np.ones(1))
+    return ndtr(-1), replaced_findings(evaluator, np.zeros(1))
+
+
+@pytest.mark.parametrize("propagation", [prb.Reweighted, prb.Resimulated])
+def test_numbers_in_place_of_responses_are_reported(propagation: Any) -> None:
+    share, (finding,) = responding(-1.0, propagation)
+    assert finding.code == "responses-replaced"
+    match = re.search(r"replaced by -1, with ([\d.]+)% of the population", finding.text)
+    assert match is not None
+    assert float(match[1]) / 100 == pytest.approx(share, abs=0.02)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_other_replacements_are_lost_or_failed_specimens(value: float) -> None:
+    assert responding(value, prb.Resimulated)[1] == ()

@@ -1,0 +1,247 @@
+"""`Runs`: a table of existing runs, in place of a function."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from prbayes._display import view
+from prbayes._validate import Floats
+from prbayes.emulators.selection import CrossValidation
+from prbayes.emulators.surrogate import Surrogate
+from prbayes.emulators.table import read_csv, read_table
+from prbayes.response.inputs import Inputs
+from prbayes.response.outputs import Outputs
+
+
+class Runs:
+    """A table of runs that were computed before, in place of a function of the inputs.
+
+    It is a `Surrogate` through the runs, whose error is cross-validated: the best one of two
+    Gaussian processes and quintic splines. Outside the ranges of the runs, and beside a run that
+    failed, it is NaN. `Simulator`, `predict` and `exceedance` take it as a response. With the
+    log-likelihood by specimen the error of the surface is part of the comparison.
+
+    Parameters
+    ----------
+    inputs : DataFrame, mapping, Dataset, DataArray or array_like, shape (n, d)
+        A row for each run, in the input's own units; an entry of a mapping has shape (n,), or (n,
+        k) for an input of k numbers. The order is that of the inputs of the simulator. Inputs of
+        the model that have a name are compared with the names of the columns.
+    responses : Series, DataFrame, mapping, Dataset, DataArray or array_like, (n,) or (n, m)
+        NaN is a run without response, +inf a specimen that failed. An index is matched to that of
+        the inputs. Outputs with names are matched to those of ``observed``.
+
+    Attributes
+    ----------
+    inputs : tuple of str
+        Names of the inputs; x1, x2, ... without names.
+    outputs : tuple of str
+    points : ndarray, shape (n, d)
+    responses : ndarray, shape (n,) or (n, m)
+    surrogate : Surrogate
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a cell is no number, inputs are missing, constant or equal in two runs, or fewer than
+        eight runs, or four for each input, have a response.
+
+    See Also
+    --------
+    prbayes.propose_runs : points where more runs are needed.
+
+    Examples
+    --------
+    >>> import numpy as np, prbayes as prb
+    >>> x, y = np.random.default_rng(0).random((2, 60))
+    >>> runs = prb.Runs({"x": x, "y": y}, np.sin(3 * x) * np.exp(y))
+    >>> runs.error.relative < 0.01
+    True
+    >>> runs(np.array([0.5, 2.0]), 0.5).round(2)
+    array([1.64,  nan])
+    """
+
+    # What to do where the response is NaN.
+    remedy = "add the runs that prb.propose_runs(model) returns"
+
+    def __init__(self, inputs: Any, responses: Any) -> None:
+        # Without the warning of points outside the ranges: a large share of them is refused.
+        table = read_table("Runs", inputs, responses)
+        self.surrogate = replace(Surrogate.of_table("Runs", table), _warned=[True])
+        self.outputs = table.outputs
+
+    @classmethod
+    def read_csv(
+        cls,
+        path: str | PathLike[str],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        *,
+        delimiter: str = ",",
+        decimal: str = ".",
+    ) -> Runs:
+        r"""Read a text file whose first line has the names of the columns.
+
+        Parameters
+        ----------
+        path : path-like
+        inputs : sequence of str
+            Columns of the inputs, in the order of the inputs of the simulator.
+        outputs : sequence of str
+            Columns of the responses. An empty cell is a run without response.
+        delimiter, decimal : str
+            Characters between columns, and before decimals.
+
+        Raises
+        ------
+        ValueError
+            At the first cell that is no number, with its line.
+
+        Examples
+        --------
+        >>> import pathlib, tempfile, prbayes as prb
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "runs.csv"
+        >>> _ = path.write_text("load,sag\n" + "".join(f"{k},{k * k}\n" for k in range(1, 12)))
+        >>> prb.Runs.read_csv(path, ["load"], ["sag"]).ranges
+        {'load': (1.0, 11.0)}
+        """
+        return cls(*read_csv("Runs.read_csv", path, inputs, outputs, delimiter, decimal))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.surrogate.names
+
+    @property
+    def points(self) -> Floats:
+        """Inputs of the runs, (n, d)."""
+        return self.surrogate.points
+
+    @property
+    def responses(self) -> Floats:
+        """Responses of the runs, (n,) or (n, m)."""
+        return self.surrogate.responses
+
+    @property
+    def ranges(self) -> dict[str, tuple[Any, Any]]:
+        """Lowest and highest value of each input."""
+        return self.surrogate.ranges
+
+    @property
+    def error(self) -> CrossValidation:
+        """The cross-validated error of the surface through the runs."""
+        return self.surrogate.error
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __call__(self, *inputs: ArrayLike) -> Any:
+        """Return the response, (...), or (..., m) with labels; NaN outside the ranges."""
+        return self.surrogate(*inputs)
+
+    def to_dataframe(self) -> Any:
+        """Return the runs as a DataFrame: a column for each number of the inputs and outputs."""
+        import pandas as pd
+
+        values = self.responses.reshape(len(self), -1)
+        columns = [*self.columns, *self.outputs]
+        return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)
+
+    @property
+    def columns(self) -> list[str]:
+        """Name of each number of the inputs."""
+        names = []
+        for r in self.surrogate.domain.inputs:
+            names += [r.name] if not r.event else [f"{r.name}[{i}]" for i in range(r.size)]
+        return names
+
+    def error_beside(self, observed: Floats) -> float:
+        """Return the largest left-out error of an output beside data (N,) or (N, m).
+
+        In standard deviations of the data: the 90 % quantile at the runs within their range or half
+        of it away. At a few runs at the ends of the ranges left-out errors are far larger.
+        """
+        data = np.where(np.isfinite(observed), observed, np.nan).reshape(len(observed), -1)
+        low, high, sd = np.nanmin(data, axis=0), np.nanmax(data, axis=0), np.nanstd(data, axis=0)
+        values, margin = self.responses.reshape(len(self), -1), (high - low) / 2
+        is_near = ((values >= low - margin) & (values <= high + margin)).all(axis=1)
+        rows = is_near if is_near.sum() >= 8 else np.isfinite(values).all(axis=1)
+        residuals = self.error.residuals.reshape(values.shape)[rows]
+        errors = np.quantile(np.abs(residuals), 0.9, axis=0)
+        return float((errors / np.where(sd > 0, sd, np.inf)).max())
+
+    def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Outputs | None) -> None:
+        """Raise if inputs of these sizes, or the observed outputs, are not those of the table."""
+        expected = [r.size for r in self.surrogate.domain.inputs]
+        if list(sizes) != expected:
+            raise TypeError(
+                f"{name}: response: got inputs of {list(sizes)} numbers for a table of runs of "
+                f"{', '.join(self.columns)}, expected {expected}, in the order of its columns"
+            )
+        m, table = 1 if outputs is None else max(1, len(outputs.labels)), len(self.outputs)
+        if outputs is not None and m != table:
+            raise ValueError(
+                f"{name}: observed: got {m} output(s) for a table of runs with "
+                f"{', '.join(self.outputs)}, expected {table}; make prb.Runs of those measured"
+            )
+
+    def refuse_inputs(self, name: str, inputs: Inputs) -> None:
+        """Raise if an input with the name of a column is at another place, or a constant outside.
+
+        Raises TypeError or ValueError.
+        """
+        for place, argument in enumerate(inputs.arguments):
+            r = self.surrogate.domain.inputs[place]
+            x = inputs.aleatory[argument] if isinstance(argument, int) else argument
+            label = getattr(x, "name", None)
+            if label in self.inputs and label != r.name:
+                raise TypeError(
+                    f"{name}: got {label} as input {place + 1}, expected {r.name}, in the order "
+                    f"of the columns of the table: {', '.join(self.inputs)}"
+                )
+            is_constant = not isinstance(argument, int) and not hasattr(argument, "owner")
+            if is_constant and not (r.low <= argument).all() & (argument <= r.high).all():
+                raise ValueError(
+                    f"{name}: {r.name}: got the constant {argument}, expected {np.min(r.low):.6g} "
+                    f"to {np.max(r.high):.6g}, the range of the runs"
+                )
+
+    def __repr__(self) -> str:
+        heading, header, rows = self._described()
+        table = [header, *rows]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        lines = [
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
+            for row in table
+        ]
+        return "\n  ".join([heading, *lines])
+
+    def _repr_html_(self) -> str:
+        heading, header, rows = self._described()
+        return view(heading, header=header, rows=rows)
+
+    def _described(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return a sentence, and a table of ranges and errors."""
+        values = self.responses.reshape(len(self), -1)
+        failed = int((~np.isfinite(values).all(axis=1)).sum())
+        heading = f"Runs: {len(self)} runs, {failed} of them without response"
+        domain, error = self.surrogate.domain, self.error
+        rows = [
+            [name, f"{low:.6g}", f"{high:.6g}", "", ""]
+            for name, low, high in zip(self.columns, domain.low, domain.high, strict=True)
+        ]
+        numbers = zip(
+            self.outputs, values.T, np.atleast_1d(error.rms), np.atleast_1d(error.relative),
+            strict=True,
+        )  # fmt: skip
+        for name, column, rms, relative in numbers:
+            finite = column[np.isfinite(column)]
+            ends = [f"{finite.min():.6g}", f"{finite.max():.6g}"]
+            rows.append([name, *ends, f"{rms:.3g}", f"{relative:.2g} sd"])
+        return heading, ["", "lowest", "highest", "left-out error", "relative"], rows

@@ -1,0 +1,194 @@
+"""Reading of tables of runs: inputs and responses of arrays, labelled arrays and CSV files."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from prbayes._validate import Floats, file_path, plain_text, real_array
+from prbayes.emulators.ranges import Range, Ranges
+from prbayes.response.outputs import Outputs, in_order_of, is_missing
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Runs, and the names of their outputs."""
+
+    domain: Ranges
+    points: Floats  # (n, columns)
+    responses: Floats  # (n,) or (n, m)
+    outputs: tuple[str, ...]  # "response" of one without a name, "response[0]" of several
+
+    @property
+    def labels(self) -> Outputs | None:
+        """Labels of several outputs that have names."""
+        is_named = self.responses.ndim > 1 and not self.outputs[0].startswith("response[")
+        return Outputs(self.outputs) if is_named else None
+
+
+def read_table(caller: str, inputs: Any, responses: Any) -> Table:
+    """Read runs; raise TypeError or ValueError at the first cell that is not as expected."""
+    named = _columns(f"{caller}: inputs", inputs)
+    names = [name or f"x{i}" for i, (name, _) in enumerate(named, 1)]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{caller}: inputs: got the names {names}, expected different ones")
+    n = len(named[0][1])
+    ranges = []
+    for name, (_, column) in zip(names, named, strict=True):
+        label = f"{caller}: inputs: {name}"
+        _refuse_length(label, column, n)
+        is_bad = ~np.isfinite(column)
+        if is_bad.any():
+            row = int(np.argwhere(is_bad)[0][0])
+            raise ValueError(
+                f"{label}: got {column[is_bad][0]} in row {row} (counted from 0), expected the "
+                "value of the input of each run; leave the row out. A run that failed has NaN as "
+                "its response"
+            )
+        low, high = column.min(axis=0), column.max(axis=0)
+        if (low == high).any():
+            raise ValueError(
+                f"{label}: got {np.ravel(low[low == high])[0]:.6g} in all {n} runs, expected an "
+                "input that varies between them; leave the column out"
+            )
+        ranges.append(Range(name, low, high))
+    if not isinstance(inputs, Mapping) and not isinstance(responses, Mapping):
+        responses = in_order_of(responses, inputs, caller)
+    outputs = _columns(f"{caller}: responses", responses)
+    parts, labels = [], []
+    for name, column in outputs:
+        _refuse_length(f"{caller}: responses{name and f': {name}'}", column, n)
+        parts.append(column.reshape(n, -1))
+        size = parts[-1].shape[1]
+        labels += [name] if column.ndim == 1 else [f"{name}[{i}]" for i in range(size)]
+    values = np.concatenate(parts, axis=1)
+    points = np.concatenate([column.reshape(n, -1) for _, column in named], axis=1)
+    domain = Ranges(tuple(ranges))
+    _refuse_runs(caller, points, values)
+    m = values.shape[1]
+    if not all(labels) or len(set(labels)) < m:
+        labels = ["response"] if m == 1 else [f"response[{i}]" for i in range(m)]
+    return Table(domain, points, values[:, 0] if m == 1 else values, tuple(labels))
+
+
+def read_csv(
+    caller: str,
+    path: str | PathLike[str],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    delimiter: str,
+    decimal: str,
+) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Return columns of a CSV file with a line of names: those of inputs, and of outputs."""
+    path = file_path(path, f"{caller}: path")
+    for argument, names in (("inputs", inputs), ("outputs", outputs)):
+        if isinstance(names, str) or not len(names):
+            raise TypeError(
+                f"{caller}: {argument}: got {names!r:.60}, expected names of columns, such as "
+                "['E', 't']"
+            )
+    plain_text(delimiter, f"{caller}: delimiter")
+    plain_text(decimal, f"{caller}: decimal")
+    wanted = [*inputs, *outputs]
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.reader(file, delimiter=delimiter)
+        header = [cell.strip() for cell in next(reader, [])]
+        absent = [name for name in wanted if header.count(name) != 1]
+        if absent:
+            raise ValueError(
+                f"{caller}: got a first line with the columns {header}, expected {absent[0]!r} "
+                "once among them; where columns are separated by another character, pass "
+                "delimiter=';'"
+            )
+        places = [header.index(name) for name in wanted]
+        rows = []
+        for cells in reader:
+            if not any(map(str.strip, cells)):
+                continue
+            cells += [""] * (len(header) - len(cells))
+            label = f"{caller}: line {reader.line_num}"
+            rows.append(
+                [
+                    _number(cells[place], decimal, f"{label}: {name}")
+                    for place, name in zip(places, wanted, strict=True)
+                ]
+            )
+    table = dict(zip(wanted, np.array(rows).reshape(-1, len(wanted)).T, strict=True))
+    return {name: table[name] for name in inputs}, {name: table[name] for name in outputs}
+
+
+def _number(cell: str, decimal: str, label: str) -> float:
+    """Return the number of a cell; NaN of an empty one."""
+    text = cell.strip()
+    try:
+        return float(text.replace(decimal, ".")) if text else np.nan
+    except ValueError:
+        raise ValueError(
+            f"{label}: got the text {text!r:.40}, expected a number, or an empty cell for a run "
+            "that failed; leave lines of units out, and pass decimal=',' for decimal commas"
+        ) from None
+
+
+def _columns(label: str, values: Any) -> list[tuple[str, Floats]]:
+    """Return columns (n, *event) with their names, empty without one."""
+    if isinstance(values, Mapping):  # datasets of xarray among them
+        columns = [(str(key), real_array(x, f"{label}: {key}")) for key, x in values.items()]
+    elif hasattr(values, "columns"):
+        columns = [
+            (str(key), real_array(values.iloc[:, i], f"{label}: {key}"))
+            for i, key in enumerate(values.columns)
+        ]
+    else:
+        array = real_array(values, label)
+        names = [str(getattr(values, "name", None) or "")]
+        if array.ndim == 2:
+            names = [""] * array.shape[1]
+            if hasattr(values, "dims") and values.dims[1] in values.coords:
+                names = [str(x) for x in values.coords[values.dims[1]].values]
+            columns = list(zip(names, array.T, strict=True))
+        else:
+            columns = [(names[0], array)]
+    if not columns or not columns[0][1].ndim or not columns[0][1].size:
+        raise ValueError(f"{label}: got no runs, expected a row for each run")
+    return columns
+
+
+def _refuse_length(label: str, column: Floats, n: int) -> None:
+    if len(column) != n:
+        raise ValueError(
+            f"{label}: got {len(column)} values, expected {n}, one for each run of the inputs"
+        )
+
+
+def _refuse_runs(caller: str, points: Floats, values: Floats) -> None:
+    """Raise for too few or too many runs, for equal ones, and for responses without meaning."""
+    n, d = points.shape
+    usable = int((~is_missing(values) & np.isfinite(values).all(axis=1)).sum())
+    least = max(8, 4 * d)
+    if usable < least:
+        raise ValueError(
+            f"{caller}: got {usable} runs with responses for {d} input(s), expected at least "
+            f"{least}; add runs, or leave inputs out that do not matter"
+        )
+    if n > 4000:  # the time of a surface grows with their cube
+        raise ValueError(
+            f"{caller}: got {n} runs, expected at most 4000; pass a sample of the rows"
+        )
+    if np.isneginf(values).any():
+        raise ValueError(
+            f"{caller}: responses: got -inf, expected numbers; NaN is a run without response"
+        )
+    _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    copies = np.flatnonzero(first[inverse.ravel()] != np.arange(n))
+    if copies.size:
+        row = int(copies[0])
+        raise ValueError(
+            f"{caller}: got rows {first[inverse.ravel()[row]]} and {row} (counted from 0) with "
+            "equal inputs, expected different runs of a deterministic response; leave one out, or "
+            "pass the input in which they differ"
+        )

@@ -1,0 +1,226 @@
+r"""The likelihood of statistics of n specimens: mean, standard deviation, extremes and quantiles.
+
+Extremes and quantiles are order statistics :math:`z_1 \le \dots \le z_I` of ranks :math:`r_i`. They
+divide the other specimens into strata of :math:`n_j` each, with population shares :math:`P_j`:
+
+.. math:: p(z_1, \dots, z_I | \theta) \propto \prod_i f(z_i) \prod_j P_j^{n_j}.       (1)
+
+Given the order statistics, the specimens of a stratum are independent draws from the population
+between its ends. Mean and variance of their sum A, and of the sum of squares W about the mean of
+all specimens, follow from the first four moments of each stratum. A is nearly normal, and the cube
+root of W as well (Wilson and Hilferty 1931, doi:10.1073/pnas.17.12.684):
+
+.. math:: W / E W \sim M \chi^2_\nu / \nu, \quad (\chi^2_\nu / \nu)^{1/3} \sim
+    N(1 - 2 / (9 \nu), 2 / (9 \nu)).                                                   (2)
+
+For a normal population without order statistics, nu is n - 1 and M is one. A smaller variance of W
+makes nu larger. A larger one, by heavy tails, is that of a lognormal M with mean one and variance v
+of its logarithm, :math:`1 + Var W / (E W)^2 = e^v (1 + 2 / \nu)`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from prbayes._validate import AT_ONCE, Floats
+from prbayes.metrics.base import Basis, DenseBasis, Discrepancy, Features, Metric, Minimum
+from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.summary import Summary
+
+# Width of the kernel in standard deviations, times n^(1/4): half of that of `LogLikelihood`, as the
+# scale of a tail may be a fraction of the standard deviation.
+WIDTH = 0.175
+# Weight of the standard normal population that is mixed in before logarithms and ratios are taken.
+_FLOOR = 1e-9
+# Largest standardised response, also of failed specimens: its fourth power is still exact enough.
+_LARGEST = 1e4
+
+
+@dataclass(frozen=True)
+class SummaryLikelihood(Metric):
+    """Minus the mean log-likelihood of the statistics of a `Summary`, for each specimen."""
+
+    summary: Summary
+    minimum: ClassVar[Minimum] = Minimum.QUADRATIC
+    likelihood: ClassVar[bool] = True
+    distance: ClassVar[bool] = False
+    exact_likelihood: ClassVar[bool] = True
+    additive = False
+
+    def __post_init__(self) -> None:
+        if self.summary.order_statistics.size:  # as many as the kernel log-likelihood needs
+            object.__setattr__(self, "tail_responses", LogLikelihood.tail_responses)
+
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        summary = self.summary
+        if not np.array_equal(observed, summary.values):
+            raise ValueError(
+                f"observed: got {observed.tolist()!s:.60}, expected the values of the Summary that "
+                "the simulator was made with, which has no single specimens; build the model again "
+                "with another Summary"
+            )
+        rank, value = summary.order_statistics.T
+        knots = (value - summary.center) / (summary.unit or 1.0)
+        counts = np.maximum(np.diff(rank, prepend=0.0, append=summary.n + 1.0) - 1, 0.0)
+        return SummaryDiscrepancy(self, observed, weights, summary, knots, counts)
+
+
+@dataclass(frozen=True, eq=False)
+class SummaryDiscrepancy(Discrepancy):
+    """Minus log-likelihood over n; features are moments of strata and densities, in units of sd.
+
+    Attributes
+    ----------
+    summary : Summary
+    knots : ndarray, shape (I,)
+        The order statistics.
+    counts : ndarray, shape (I + 1,)
+        Numbers of other specimens between them.
+    """
+
+    summary: Summary
+    knots: Floats
+    counts: Floats
+
+    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
+        """Return the same discrepancy: there are no specimens that others could replace."""
+        return self
+
+    def rows(self, index: Any) -> Self:
+        """Return the same discrepancy, that of the only data set."""
+        return self
+
+    @property
+    def n_effective(self) -> float:
+        """The number of specimens."""
+        return float(self.summary.n)
+
+    def replicate(self, specimens: Floats) -> Floats:
+        """Return the statistics of as many specimens, (..., n) -> (..., statistics)."""
+        return self.summary.values_of(specimens)
+
+    @property
+    def scale(self) -> float:
+        """One: a log-likelihood has no units."""
+        return 1.0
+
+    @property
+    def _powers(self) -> int:
+        """The highest moment that the statistics need, plus one."""
+        return 5 if self.summary.sd is not None else 3 if self.summary.mean is not None else 1
+
+    def _columns(self, simulated: Any, xp: Any) -> list[Any]:
+        """Return the features of single responses, (..., n) each.
+
+        Strata by power, then densities. The kernel smooths the ends of the strata too.
+        """
+        is_known = xp.isfinite(simulated) | (simulated > 0)  # +inf is beyond all others
+        z = (xp.where(is_known, simulated, self.summary.center) - self.summary.center) / self._unit
+        z = xp.where(z < _LARGEST, xp.where(z > -_LARGEST, z, -_LARGEST), _LARGEST)
+        width = WIDTH * self.summary.n**-0.25
+        steps = [(knot - z) / width for knot in self.knots]
+        below = [0.0, *(_normal_cdf(step, xp) for step in steps), 1.0]
+        shares = [high - low for low, high in pairwise(below)]
+        columns = [share * z**power for power in range(self._powers) for share in shares]
+        columns += [xp.exp(-0.5 * step**2) / (width * np.sqrt(2 * np.pi)) for step in steps]
+        return [xp.where(is_known, column, 0.0) for column in columns]
+
+    @cached_property
+    def _unit(self) -> float:
+        """The unit of standardised responses."""
+        return self.summary.unit or abs(self.summary.center) or 1.0
+
+    @cached_property
+    def _reference(self) -> Floats:
+        """The features of a normal population like the sample."""
+        score = ndtri((np.arange(1001) + 0.5) / 1001)
+        columns = self._columns(self.summary.center + self._unit * score, np)
+        return np.array([np.mean(column) for column in columns])
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> Features:
+        """Return the features, (..., m)."""
+        sums = [(weights * column).sum(axis=-1) for column in self._columns(simulated, xp)]
+        return (xp.stack(sums, axis=-1),)
+
+    def basis(self, simulated: Floats, most: float = AT_ONCE) -> Basis:
+        """Return the matrix of the features of the responses, (n, m)."""
+        return DenseBasis((np.stack(self._columns(simulated, np), axis=-1),))
+
+    def outer(self, *features: Any, xp: Any) -> Any:
+        """Return minus the log-likelihood over n."""
+        (sums,) = features
+        n, size = self.summary.n, self.counts.size
+        total = xp.maximum(sums[..., :size].sum(axis=-1), 1e-300)  # less than one without response
+        shares = (1 - _FLOOR) * sums / total[..., None] + _FLOOR * self._reference
+        positive = xp.maximum(shares, 1e-300)
+        mass = [positive[..., j] for j in range(size)]
+        densities = [positive[..., size * self._powers + i] for i in range(size - 1)]
+        log_l = sum(xp.log(density) for density in densities)  # (1)
+        for count, share in zip(self.counts, mass, strict=True):
+            if count:
+                log_l = log_l + count * xp.log(share)
+        if self._powers > 1 and self.counts.any():
+            moments = [
+                [shares[..., size * power + j] / mass[j] for power in range(self._powers)]
+                for j in range(size)
+            ]
+            log_l = log_l + self._log_sums(moments, xp)
+        return -log_l / n
+
+    def _log_sums(self, moments: list[list[Any]], xp: Any) -> Any:
+        """Return the log-density of mean and standard deviation, given the moments of strata."""
+        summary, counts, n = self.summary, self.counts, self.summary.n
+        strata = [(c, m) for c, m in zip(counts, moments, strict=True) if c]
+        mean_sum = sum(c * m[1] for c, m in strata) + self.knots.sum()
+        variance = sum(c * (m[2] - m[1] ** 2) for c, m in strata)
+        log_l, sum_score = 0.0, 0.0
+        if summary.mean is not None:
+            observed = n * (summary.mean - summary.center) / self._unit
+            sum_score = (observed - mean_sum) / xp.sqrt(variance)
+            log_l = -0.5 * sum_score**2 - 0.5 * xp.log(variance)
+        if summary.sd is None:
+            return log_l
+        squares = sum(c * m[2] for c, m in strata) + (self.knots**2).sum()
+        expected = squares - (variance + mean_sum**2) / n
+        # Influence of a specimen: its squared distance from the mean.
+        middle = mean_sum / n
+        square_variance, covariance = 0.0, 0.0
+        for count, (_, first, second, third, fourth) in strata:
+            distance = second - 2 * middle * first + middle**2
+            power = (
+                fourth - 4 * middle * third + 6 * middle**2 * second
+                - 4 * middle**3 * first + middle**4
+            )  # fmt: skip
+            square_variance += count * (power - distance**2)
+            covariance += count * (third - 2 * middle * second + middle**2 * first)
+            covariance -= count * first * distance
+        if not self.knots.size:  # exact for independent specimens, as is the covariance
+            square_variance = (n - 1) / n * square_variance + 2 * (variance / n) ** 2
+        square_variance, covariance = ((n - 1) / n * v for v in (square_variance, covariance))
+        relative = square_variance / expected**2
+        freedom = xp.maximum(2 / relative, n - 1.0)
+        excess = xp.log((1 + relative) / (1 + 2 / freedom))  # v of (2)
+        spread = 2 / (9 * freedom)
+        center = (1 - spread) * xp.exp(-excess / 9)
+        scatter = ((1 - spread) ** 2 + spread) * xp.exp(-excess / 9) - center**2
+        ratio = (n - 1) * (summary.sd / self._unit) ** 2 / expected
+        square_score = (ratio ** (1 / 3) - center) / xp.sqrt(scatter)
+        log_l = log_l - 0.5 * xp.log(scatter) - xp.log(expected) / 3
+        if summary.mean is None:
+            return log_l - 0.5 * square_score**2
+        # Given the mean.
+        correlation = covariance / xp.sqrt(variance * square_variance)
+        rest = xp.maximum(1 - correlation**2, 1e-6)
+        residual = (square_score - correlation * sum_score) ** 2 / rest
+        return log_l - 0.5 * residual - 0.5 * xp.log(rest)
+
+
+def _normal_cdf(x: Any, xp: Any) -> Any:
+    """Return the distribution function of the standard normal distribution."""
+    return ndtr(x) if xp is np else 0.5 * xp.erfc(-x / np.sqrt(2))

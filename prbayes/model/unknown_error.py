@@ -1,0 +1,99 @@
+r"""Densities of readings at points of specimens, as functions of an unknown error of the readings.
+
+Outputs with one unknown error e, scales :math:`c_j` and a negligible error of the emulator need no
+more than a sum of squares for each point,
+
+.. math:: \log p(y \mid x, e) = -\frac{1}{2 e^2} \sum_j \Bigl(\frac{y_j - f_j(x)}{c_j}\Bigr)^2
+          - \sum_j \log c_j - \frac{n}{2} \log(2 \pi e^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._validate import Floats
+from prbayes.metrics.readings import Readings
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.propagation.specimen_points import SpecimenPoints
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingDensity:
+    """Log-density of the readings of S specimens at their K points, for errors (M,) of outputs."""
+
+    readings: Readings  # (S, k): of outputs without a sum of squares
+    outputs: Floats  # (S, K, k)
+    unit: Floats  # standard deviation of a reading in units of its error; broadcasts to outputs
+    emulator_variance: Floats  # broadcasts to outputs
+    columns: NDArray[np.intp] | None  # (S, k): which outputs; None for all in their order
+    # By unknown error: an output that has it, sums of squares (S, K), numbers of readings (S, 1),
+    # and the variance of the emulator's error in units of the scales.
+    sums: Sequence[tuple[int, Floats, Floats, float]]
+    constant: Floats  # (S, 1): minus the sum of the logarithms of scales
+
+    @classmethod
+    def of(
+        cls, likelihood: SpecimenLikelihood, points: SpecimenPoints, emulator_error: Floats
+    ) -> ReadingDensity:
+        """Return the density at points; ``emulator_error``, (M,), is that of the outputs."""
+        readings, scale = likelihood.readings, likelihood.stacked.scale
+        # Points that fill up the array have any output.
+        outputs = np.where(np.isfinite(points.outputs), points.outputs, 1e30)
+        is_missing = ~(readings.is_measured | readings.is_censored)
+        sums, constant = [], np.zeros((len(readings), 1))
+        first = 0
+        for m in likelihood.measurements:
+            of_simulator = np.arange(first, first + m.rows.shape[1])
+            first += len(of_simulator)
+            if "error" not in m.extras or m.extras["error"].type.ndim:
+                continue
+            is_measured = readings.is_measured[:, of_simulator]
+            unit = np.where(is_measured, scale[:, of_simulator], 1.0)
+            relative = (emulator_error[of_simulator] / unit) ** 2
+            is_plain = (readings.step[:, of_simulator] == 0) & ~readings.is_relative[
+                :, of_simulator
+            ]
+            is_plain &= ~readings.is_censored[:, of_simulator]
+            # A density changes by less than 1e-4 nats at an eighth of the largest plausible error.
+            is_plain &= relative <= 1e-6 * (readings.error[:, of_simulator] / unit) ** 2
+            if not is_plain[is_measured].all():
+                continue
+            measured = np.where(is_measured, readings.values[:, of_simulator], 0.0)
+            inverse = np.where(is_measured, 1 / unit, 0.0)
+            squares = np.zeros(outputs.shape[:2])
+            for column, y, c in zip(of_simulator, measured.T, inverse.T, strict=True):
+                squares += ((y[:, None] - outputs[:, :, column]) * c[:, None]) ** 2
+            count = is_measured.sum(axis=1, keepdims=True).astype(float)
+            constant -= np.log(unit).sum(axis=1, keepdims=True)
+            sums.append((int(of_simulator[0]), squares, count, float(relative[is_measured].mean())))
+            is_missing[:, of_simulator] = True
+        variance, columns = emulator_error**2, None
+        size = int((~is_missing).sum(axis=1).max())
+        if size < outputs.shape[-1]:
+            columns = np.argsort(is_missing, axis=1, kind="stable")[:, :size]
+            is_outside = np.take_along_axis(is_missing, columns, axis=1)
+            readings = readings.at_columns(columns)
+            readings = replace(readings, values=np.where(is_outside, np.nan, readings.values))
+            outputs = np.take_along_axis(outputs, columns[:, None], axis=2)
+            scale, variance = np.take_along_axis(scale, columns, 1), variance[columns][:, None]
+        unit = scale[:, None]
+        if readings.is_relative.any():
+            unit = unit * np.where(readings.is_relative[:, None], np.abs(outputs), 1.0)
+        return cls(readings, outputs, unit, variance, columns, sums, constant)
+
+    def __call__(self, error: Any, xp: Any) -> Any:
+        """Return the log-density, (S, K), as an array or a graph."""
+        total: Any = self.constant
+        for column, squares, count, variance in self.sums:
+            v = error[column] ** 2 + variance
+            total = total - 0.5 * (squares / v + count * xp.log(2 * np.pi * v))
+        if not self.outputs.shape[-1]:
+            return total
+        by_output = error if self.columns is None else error[self.columns][:, None]
+        variance = self.emulator_variance + (by_output * self.unit) ** 2
+        return total + self.readings.symbolic_log_density(self.outputs, variance, xp)

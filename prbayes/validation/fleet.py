@@ -1,0 +1,408 @@
+"""Calibration of many products that share one model and its runs, each with a validity test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, as_completed
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from prbayes._finding import Finding, report
+from prbayes._progress import progress, shown
+from prbayes._stats import reached
+from prbayes._validate import (
+    Floats,
+    Seed,
+    called,
+    executes,
+    flag,
+    positive_integer,
+    real_array,
+    seed_number,
+    share,
+)
+from prbayes.model.description import labelled, versions
+from prbayes.model.emulated import EmulatedSimulator
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.locking import locked
+from prbayes.model.measurement import SpecimenLikelihood
+from prbayes.model.specimen_likelihood import draw_readings
+from prbayes.model.specimen_preparation import prepared
+from prbayes.posterior.sample import draw_posterior, importance_chains, modes_of
+from prbayes.posterior.smc import SamplingSettings
+from prbayes.posterior.target import specimen_target
+from prbayes.propagation.reweighted import designs_restored
+from prbayes.response.inputs import model_on_context
+from prbayes.validation.area_test import area_test
+from prbayes.validation.nulls import PosteriorNull
+
+# Specimens of each population that a validity test compares with measured ones.
+_SPECIMENS = 50
+
+
+@locked
+def calibrate_each(
+    data_sets: Mapping[str, ArrayLike],
+    *,
+    model: pm.Model | None = None,
+    validation: Mapping[str, ArrayLike] | None = None,
+    draws: int = 1000,
+    alpha: float = 0.05,
+    executor: Executor | None = None,
+    random_seed: Seed = 0,
+    progressbar: bool = True,
+) -> xr.DataTree:
+    """Calibrate many products with one model, one set of runs and one compilation.
+
+    Each product has a population and a posterior of its own. The runs, the emulator and the points
+    of the log-likelihood by specimen serve all products: they are computed once, for the specimens
+    of all of them. A product that fails leaves the others as they are.
+
+    Parameters
+    ----------
+    data_sets : mapping of array_like, shape (N,) or (N, m)
+        Measured responses of each product by its name, in the form of ``observed`` of the
+        simulator; products may have different numbers of specimens.
+    model : pymc.Model, optional
+        A model with one `Simulator`, by default that on the context. Its own observed values matter
+        by their form only.
+    validation : mapping of array_like, optional
+        Measured responses of further specimens of some products, for `area_test`.
+    draws : int
+        Draws of each posterior.
+    alpha : float
+        Significance level of the tests.
+    executor : concurrent.futures.Executor, optional
+        Where products are calibrated, 25 at a time; the model is sent with cloudpickle. The result
+        does not depend on it.
+    random_seed : int, sequence of int, numpy.random.Generator or None
+    progressbar : bool
+
+    Returns
+    -------
+    xarray.DataTree
+        Group ``posterior``: the hyperparameters with dims (chain, draw, product), for
+        `arviz.summary` or `arviz.plot_forest`; NaN for products that failed. Group ``products``, by
+        product: ``pareto_k`` of importance sampling (NaN for another
+        sampler), ``finding`` (why it failed, or which specimens no inputs reproduce; else an empty
+        text), and with ``validation`` the ``statistic``, ``critical_value``, ``p_value`` and
+        ``rejected`` of its validity test. Of many valid products the share alpha is rejected.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described, or the model has groups, weights, labels or several
+        simulators.
+    DesignError, ResponseError
+        If the response does not allow the calibration of any product.
+    RuntimeError
+        If more than half of the products fail.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> rng = np.random.default_rng(1)
+    >>> data = {name: 2 * rng.normal(mean, 0.3, 12) for name, mean in [("A", 1), ("B", 2)]}
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 1.5, 1), pm.HalfNormal("sigma", 1))
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, observed=data["A"])
+    >>> each = prb.calibrate_each(data, model=model, progressbar=False)
+    >>> each["posterior"]["mu"].mean(("chain", "draw")).values.round(1)
+    array([1.1, 2. ])
+    """
+    caller = "prb.calibrate_each"
+    model = model_on_context(model, caller)
+    positive_integer(draws, "draws", minimum=10)
+    share(alpha, "alpha")
+    executes(executor, "executor")
+    flag(progressbar, "progressbar")
+    seed = seed_number(random_seed)
+    evaluator = Evaluator.of(model)
+    every: list[Any] = [*evaluator.nodes, *evaluator.measurements]
+    simulator, *more = every
+    if more:
+        raise TypeError(
+            f"{caller}: got a model with the simulators {simulator.name} and {more[0].name}, "
+            "expected one; write a response with several outputs"
+        )
+    event = np.shape(simulator.observed)[1:]
+    observed = _read_data(data_sets, "data_sets", 2, event)
+    further = {} if validation is None else _read_data(validation, "validation", 1, event)
+    unknown = sorted(set(further) - set(observed))
+    if unknown:
+        raise KeyError(
+            f"{caller}: validation: got {unknown[:5]}, expected products of data_sets, "
+            f"{list(observed)[:5]}"
+        )
+    names = list(observed)
+    settings = SamplingSettings(draws=draws, random_seed=seed)
+    fleet = Fleet(evaluator, observed, further, settings, alpha)
+    if evaluator.likelihoods:
+        fleet = replace(fleet, likelihood=_common_likelihood(evaluator, observed))
+    jobs = [names[first : first + 25] for first in range(0, len(names), 25)]
+    with shown(progressbar), progress("products", len(names)) as advance:
+        if executor is None:
+            parts = [fleet.calibrated(job, lambda: advance(1, "")) for job in jobs]
+        else:
+            import cloudpickle
+
+            futures = [
+                executor.submit(_calibrated, cloudpickle.dumps(fleet.part(job)), job)
+                for job in jobs
+            ]
+            for future in as_completed(futures):
+                advance(len(future.result()), "")
+            parts = [future.result() for future in futures]
+    rows = [row for part in parts for row in part]
+    failures = [row.finding for row in rows if not row.values]
+    if failures:
+        text = f"{len(failures)} of {len(names)} products failed; the first: {failures[0]}"
+        report(Finding("failed-products", text, "fleets.md#products-that-fail"))
+    if len(failures) > len(names) / 2:
+        raise RuntimeError(
+            f"{caller}: {len(failures)} of {len(names)} products failed; {failures[0]}"
+        )
+    return _tree(evaluator, names, rows, draws, {"random_seed": str(seed), "alpha": alpha})
+
+
+def _read_data(data: object, name: str, minimum: int, event: tuple[int, ...]) -> dict[str, Floats]:
+    """Return the measured responses of each product, or raise."""
+    if not isinstance(data, Mapping) or not data:
+        raise TypeError(
+            f"{name}: got {called(data)}, expected a mapping of measured responses by product, "
+            "such as {'A': [1.2, 1.4], 'B': [0.9, 1.1]}"
+        )
+    arrays = {}
+    for product, values in data.items():
+        array = real_array(values, f"{name}: {product}").astype(float)
+        if array.ndim != 1 + len(event) or array.shape[1:] != event or len(array) < minimum:
+            raise ValueError(
+                f"{name}: {product}: got shape {array.shape}, expected {('N', *event)} with at "
+                f"least {minimum} specimen(s), in the form of the simulator's observed values"
+            )
+        arrays[str(product)] = array
+    return arrays
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The posterior of one product, and its validity test."""
+
+    values: Mapping[str, Floats]  # hyperparameters, (draws, *shape); empty after a failure
+    pareto_k: float = np.nan
+    # Statistic, critical value and p-value of the validity test.
+    test: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    finding: str = ""  # why it failed, or what a reader should know
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """Products with a common model, and the points of all their specimens."""
+
+    evaluator: Evaluator
+    observed: Mapping[str, Floats]
+    further: Mapping[str, Floats]  # of a validity test
+    settings: SamplingSettings
+    alpha: float
+    likelihood: SpecimenLikelihood | None = None  # of the specimens of all products, in order
+
+    def part(self, names: Sequence[str]) -> Fleet:
+        """Return the fleet of some products."""
+        likelihood = self.likelihood
+        if likelihood is not None:
+            rows = np.concatenate([self._rows(name) for name in names])
+            likelihood = _of_rows(likelihood, rows)
+        observed = {name: self.observed[name] for name in names}
+        further = {name: self.further[name] for name in names if name in self.further}
+        return replace(self, observed=observed, further=further, likelihood=likelihood)
+
+    def calibrated(
+        self, names: Sequence[str], advance: Callable[[], Any] = lambda: None
+    ) -> list[Calibration]:
+        """Calibrate some products."""
+        results = []
+        for name in names:
+            with shown(False):
+                try:
+                    results.append(self._calibrated(name))
+                except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
+                    results.append(Calibration({}, finding=f"{name}: {error}"))
+            advance()
+        return results
+
+    def _rows(self, name: str) -> NDArray[np.intp]:
+        """Return the rows of a product among the specimens of all."""
+        names = list(self.observed)
+        sizes = [len(values) for values in self.observed.values()]
+        first = sum(sizes[: names.index(name)])
+        return np.arange(first, first + len(self.observed[name]))
+
+    def _calibrated(self, name: str) -> Calibration:
+        """Return the posterior and the validity test of one product."""
+        evaluator = self._evaluator(name)
+        with designs_restored(evaluator.reweighted.values()):
+            values, pareto_k = self._posterior(evaluator)
+            finding = " ".join(map(_misfit, evaluator.likelihoods))
+            if name not in self.further:
+                return Calibration(values, pareto_k, finding=finding)
+            test = area_test(
+                self.further[name], self._predicted(evaluator, values), alpha=self.alpha,
+                null=PosteriorNull(999), progressbar=False,
+            )  # fmt: skip
+        areas = (test.statistic, test.critical_value, test.p_value)
+        return Calibration(values, pareto_k, areas, finding)
+
+    def _posterior(self, evaluator: Evaluator) -> tuple[dict[str, Floats], float]:
+        """Return draws of the hyperparameters, and Pareto k of importance sampling."""
+        variables = [str(rv.name) for rv in evaluator.model.unobserved_RVs]
+        chains = None
+        if evaluator.likelihoods:
+            # Without the groups of ArviZ, which take as long as the draws.
+            target = specimen_target(evaluator, None)
+            modes = modes_of(target)
+            chains = None if modes is None else importance_chains(target, modes, self.settings)
+        if chains is not None:
+            values = evaluator.hyperparameters.constrained(chains.thetas[0])
+            return {name: values[name] for name in variables}, chains.sampler["pareto_k"]
+        posterior = draw_posterior(evaluator, self.settings)["posterior"].to_dataset()
+        pareto_k = float(posterior.attrs.get("pareto_k", np.nan))
+        return {name: posterior[name].values[0] for name in variables}, pareto_k
+
+    def _evaluator(self, name: str) -> Evaluator:
+        """Return the evaluator of a product's data."""
+        if self.likelihood is None:
+            (node,) = self.evaluator.nodes
+            return self.evaluator.observing({node.name: self.observed[name]})
+        likelihood = _of_rows(self.likelihood, self._rows(name))
+        return replace(
+            self.evaluator,
+            likelihoods=(likelihood,),
+            measurements=likelihood.measurements,
+            emulated=(EmulatedSimulator(likelihood, likelihood.measurements[0]),),
+            has_graph=False,
+        )
+
+    def _predicted(self, evaluator: Evaluator, values: Mapping[str, Floats]) -> xr.DataArray:
+        """Return responses of the calibrated populations, (1, draws, samples, ...)."""
+        rows = np.linspace(0, self.settings.draws - 1, 100).astype(np.intp)
+        thinned = {name: value[rows] for name, value in values.items()}
+        rng = np.random.default_rng(self.settings.random_seed)
+        if evaluator.likelihoods:
+            (likelihood,) = evaluator.likelihoods
+            responses = draw_readings(
+                likelihood, rng, thinned, _SPECIMENS, likelihood.measurements[0]
+            )
+        else:
+            responses = _resampled(evaluator, thinned, rng)
+        dims = ("chain", "draw", "sample", "output")[: responses.ndim + 1]
+        return xr.DataArray(responses[None], dims=dims)
+
+
+def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
+    """Calibrate some products in a worker."""
+    import cloudpickle
+
+    fleet: Fleet = cloudpickle.loads(pickled)
+    return fleet.calibrated(names)
+
+
+def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> SpecimenLikelihood:
+    """Return the likelihood of the specimens of all products, with their points.
+
+    Limits of the errors of the emulator and the points are those of a product: less specimens, in a
+    narrower population.
+    """
+    (likelihood,) = evaluator.likelihoods
+    (measurement,) = likelihood.measurements
+    stacked = np.concatenate(list(observed.values()))
+    within = np.median([np.nanstd(values, axis=0) for values in observed.values()], axis=0)
+    narrower = float(np.min(within / np.nanstd(stacked, axis=0)))
+    fewer = np.sqrt(len(stacked) / np.median([len(values) for values in observed.values()]))
+    options = likelihood.options
+    options = replace(
+        options,
+        bias=options.bias * fewer * min(narrower, 1.0),
+        half_difference=options.half_difference * fewer,
+    )
+    of_all = likelihood.observing({measurement.name: stacked})
+    of_all = replace(of_all, options=options)
+    prepared(of_all)
+    return of_all
+
+
+def _of_rows(likelihood: SpecimenLikelihood, rows: NDArray[np.intp]) -> SpecimenLikelihood:
+    """Return the likelihood of some specimens, with their points."""
+    (measurement,) = likelihood.measurements
+    part = replace(measurement, observed=measurement.observed[rows])
+    result = replace(likelihood, measurements=(part,))
+    preparation = prepared(likelihood)
+    result.cache["preparation"] = replace(preparation, points=preparation.points.rows(rows))
+    # Compiled functions and coordinates are those of the populations, not of the specimens.
+    vars(result).update(density=likelihood.density, coordinates=likelihood.coordinates)
+    return result
+
+
+def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
+    """Return a report of specimens whose readings no point reproduces to so many nats."""
+    preparation, readings = prepared(likelihood), likelihood.readings
+    sd = readings.comparison_sd(preparation.emulation.error)[:, None]
+    residual = (preparation.points.outputs - readings.values[:, None]) / sd
+    misfit = np.where(np.isnan(residual), 0.0, residual**2).sum(axis=-1) / 2
+    exists = np.isfinite(preparation.points.log_a) | (misfit > largest)
+    is_poor = np.where(exists, misfit, np.inf).min(axis=1) > largest
+    if not is_poor.any():
+        return ""
+    return (
+        f"No inputs in the range of the priors reproduce the readings of {is_poor.sum()} of "
+        f"{len(is_poor)} specimens."
+    )
+
+
+def _resampled(
+    evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator
+) -> Floats:
+    """Return responses of points of the populations, (P, n), by weight."""
+    hyperparameters = evaluator.hyperparameters
+    free = [values[str(rv.name)] for rv in evaluator.model.free_RVs]
+    responses, weights = evaluator.populations(hyperparameters.thetas_of(free), 0)
+    levels = (np.arange(_SPECIMENS) + rng.random((len(weights), 1))) / _SPECIMENS
+    rows = rng.permuted(reached(weights, levels, normalized=True), axis=1)
+    return np.take_along_axis(np.broadcast_to(responses, weights.shape), rows, axis=1)
+
+
+def _tree(
+    evaluator: Evaluator,
+    names: Sequence[str],
+    rows: Sequence[Calibration],
+    draws: int,
+    attrs: Mapping[str, Any],
+) -> xr.DataTree:
+    """Return the posteriors and the table of products."""
+    sizes = {"chain": 1, "draw": draws}
+    first = next(row for row in rows if row.values)
+    missing = {name: np.full_like(values, np.nan) for name, values in first.values.items()}
+    by_product = [
+        labelled(evaluator, {k: v[None] for k, v in (row.values or missing).items()}, sizes)
+        for row in rows
+    ]
+    posterior = xr.concat(by_product, xr.Variable("product", np.array(names)))
+    posterior = posterior.transpose("chain", "draw", "product", ...)
+    columns = {
+        "pareto_k": [row.pareto_k for row in rows],
+        "finding": [row.finding for row in rows],
+    }
+    tests = np.array([row.test for row in rows])
+    if np.isfinite(tests).any():
+        for key, column in zip(("statistic", "critical_value", "p_value"), tests.T, strict=True):
+            columns[key] = column
+        columns["rejected"] = tests[:, 2] <= attrs["alpha"]
+    products = xr.Dataset({k: ("product", v) for k, v in columns.items()}, {"product": names})
+    attrs = {**attrs, **versions()}
+    return xr.DataTree.from_dict(
+        {"posterior": posterior.assign_attrs(attrs), "products": products.assign_attrs(attrs)}
+    )

@@ -1,0 +1,121 @@
+"""Products of a fleet have the posteriors that they have alone."""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.validation.fleet import Fleet
+
+QUIET = {"progressbar": False}
+
+
+def half_exponential(x: Any) -> Any:
+    return np.exp(0.5 * x)
+
+
+def products(count: int, seed: int = 0) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(9, 20, count)
+    return {
+        f"p{i}": half_exponential(rng.normal(rng.normal(1, 0.4), 0.2, size))
+        for i, size in enumerate(sizes)
+    }
+
+
+def model_of(observed: Any, metric: prb.Metric | None = None) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 0.4), pm.HalfNormal("sigma", 0.4))
+        prb.Simulator("y", half_exponential, x, observed=observed, metric=metric, **QUIET)
+    return model
+
+
+def summary(posterior: xr.Dataset) -> Any:
+    draws = posterior.stack(sample=("chain", "draw"))
+    return np.array(
+        [[float(draws[name].mean()), float(draws[name].std())] for name in ("mu", "sigma")]
+    )
+
+
+@pytest.fixture(scope="module")
+def fleet() -> xr.DataTree:
+    data = products(3)
+    further = {"p0": products(1, 5)["p0"] + 3.0, "p1": data["p1"][:6] + 0.01}
+    return prb.calibrate_each(data, model=model_of([1.0, 2.0]), validation=further, **QUIET)
+
+
+def test_posteriors_are_those_of_single_products(fleet: xr.DataTree) -> None:
+    for name, observed in products(3).items():
+        alone = prb.sample(model=model_of(observed), random_seed=2, **QUIET)
+        expected = summary(alone["posterior"].to_dataset())
+        got = summary(fleet["posterior"].to_dataset().sel(product=name))
+        sd = expected[:, 1]
+        # 1000 draws: four standard errors of the mean are .13, of the standard deviation .09.
+        np.testing.assert_allclose((got[:, 0] - expected[:, 0]) / sd, 0, atol=0.15)
+        np.testing.assert_allclose(got[:, 1] / sd, 1, atol=0.12)
+
+
+def test_each_product_has_its_validity_test(fleet: xr.DataTree) -> None:
+    table = fleet["products"].to_dataset()
+    assert table["rejected"].values.tolist() == [True, False, False]
+    assert np.isnan(table["p_value"].values).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("metric", [None, prb.KullbackLeibler()])
+def test_an_executor_changes_nothing(metric: prb.Metric | None) -> None:
+    data = products(2)
+    settings = {"draws": 50, "model": model_of([1.0, 2.0, 3.0], metric), **QUIET}
+    alone = prb.calibrate_each(data, **settings)
+    with ThreadPoolExecutor(1) as executor:
+        other = prb.calibrate_each(data, executor=executor, **settings)
+    xr.testing.assert_identical(alone, other)
+
+
+def test_a_product_that_no_inputs_reproduce_is_a_finding_of_its_own() -> None:
+    data = products(3) | {"bad": -products(1)["p0"]}
+    table = prb.calibrate_each(data, model=model_of([1.0, 2.0]), draws=20, **QUIET)["products"]
+    findings = table["finding"].values.tolist()
+    assert findings[:3] == ["", "", ""]
+    assert "reproduce the readings of 18 of 18 specimens" in findings[3]
+
+
+def test_a_failure_leaves_the_other_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    calibrated = Fleet._posterior
+    calls = 0
+
+    def failing(self: Fleet, evaluator: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return calibrated(self, evaluator)
+
+    monkeypatch.setattr(Fleet, "_posterior", failing)
+    tree = prb.calibrate_each(products(3), model=model_of([1.0, 2.0]), draws=20, **QUIET)
+    assert tree["products"]["finding"].values.tolist() == ["", "p1: Singular matrix", ""]
+    is_missing = np.isnan(tree["posterior"]["mu"]).all(("chain", "draw")).values
+    assert is_missing.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ([1.0, 2.0], "expected a mapping"),
+        ({"a": [1.0]}, "data_sets: a: got shape"),
+        ({"a": [[1.0, 2.0], [1.0, 2.0]]}, "expected .'N',. with at least 2"),
+    ],
+)
+def test_bad_data_are_refused(data: Any, message: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=message):
+        prb.calibrate_each(data, model=model_of([1.0, 2.0]))
+
+
+def test_further_specimens_are_of_a_product() -> None:
+    with pytest.raises(KeyError, match=r"\['b'\], expected products"):
+        prb.calibrate_each(
+            {"a": [1.0, 2.0]}, model=model_of([1.0, 2.0]), validation={"b": [1.0]}, **QUIET
+        )
