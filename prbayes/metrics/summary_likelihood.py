@@ -33,14 +33,6 @@ from prbayes.metrics.base import Basis, DenseBasis, Discrepancy, Features, Metri
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.summary import Summary
 
-# Width of the kernel in standard deviations, times n^(1/4): half of that of `LogLikelihood`, as the
-# scale of a tail may be a fraction of the standard deviation.
-WIDTH = 0.175
-# Weight of the standard normal population that is mixed in before logarithms and ratios are taken.
-_FLOOR = 1e-9
-# Largest standardised response, also of failed specimens: its fourth power is still exact enough.
-_LARGEST = 1e4
-
 
 @dataclass(frozen=True)
 class SummaryLikelihood(Metric):
@@ -122,8 +114,10 @@ class SummaryDiscrepancy(Discrepancy):
         """
         is_known = xp.isfinite(simulated) | (simulated > 0)  # +inf is beyond all others
         z = (xp.where(is_known, simulated, self.summary.center) - self.summary.center) / self._unit
-        z = xp.where(z < _LARGEST, xp.where(z > -_LARGEST, z, -_LARGEST), _LARGEST)
-        width = WIDTH * self.summary.n**-0.25
+        z = xp.clip(z, -1e4, 1e4)  # the fourth power is still exact enough
+        # In standard deviations. Half the width of `LogLikelihood`: the scale of a tail may be a
+        # fraction of the standard deviation.
+        width = 0.175 * self.summary.n**-0.25
         steps = [(knot - z) / width for knot in self.knots]
         below = [0.0, *(_normal_cdf(step, xp) for step in steps), 1.0]
         shares = [high - low for low, high in pairwise(below)]
@@ -157,7 +151,8 @@ class SummaryDiscrepancy(Discrepancy):
         (sums,) = features
         n, size = self.summary.n, self.counts.size
         total = xp.maximum(sums[..., :size].sum(axis=-1), 1e-300)  # less than one without response
-        shares = (1 - _FLOOR) * sums / total[..., None] + _FLOOR * self._reference
+        # A little of the normal population, so that logarithms and ratios are finite.
+        shares = (1 - 1e-9) * sums / total[..., None] + 1e-9 * self._reference
         positive = xp.maximum(shares, 1e-300)
         mass = [positive[..., j] for j in range(size)]
         densities = [positive[..., size * self._powers + i] for i in range(size - 1)]
@@ -178,16 +173,17 @@ class SummaryDiscrepancy(Discrepancy):
         summary, counts, n = self.summary, self.counts, self.summary.n
         strata = [(c, m) for c, m in zip(counts, moments, strict=True) if c]
         mean_sum = sum(c * m[1] for c, m in strata) + self.knots.sum()
-        variance = sum(c * (m[2] - m[1] ** 2) for c, m in strata)
+        variance = xp.maximum(sum(c * (m[2] - m[1] ** 2) for c, m in strata), 1e-12)
         log_l, sum_score = 0.0, 0.0
         if summary.mean is not None:
             observed = n * (summary.mean - summary.center) / self._unit
             sum_score = (observed - mean_sum) / xp.sqrt(variance)
             log_l = -0.5 * sum_score**2 - 0.5 * xp.log(variance)
-        if summary.sd is None:
+        is_known = summary.mean is not None and counts.sum() <= 1  # by the mean
+        if summary.sd is None or is_known:
             return log_l
         squares = sum(c * m[2] for c, m in strata) + (self.knots**2).sum()
-        expected = squares - (variance + mean_sum**2) / n
+        expected = xp.maximum(squares - (variance + mean_sum**2) / n, 1e-12)
         # Influence of a specimen: its squared distance from the mean.
         middle = mean_sum / n
         square_variance, covariance = 0.0, 0.0
@@ -203,6 +199,7 @@ class SummaryDiscrepancy(Discrepancy):
         if not self.knots.size:  # exact for independent specimens, as is the covariance
             square_variance = (n - 1) / n * square_variance + 2 * (variance / n) ** 2
         square_variance, covariance = ((n - 1) / n * v for v in (square_variance, covariance))
+        square_variance = xp.maximum(square_variance, 1e-12)
         relative = square_variance / expected**2
         freedom = xp.maximum(2 / relative, n - 1.0)
         excess = xp.log((1 + relative) / (1 + 2 / freedom))  # v of (2)
