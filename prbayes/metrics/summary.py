@@ -90,9 +90,9 @@ class Summary:
 
     def __repr__(self) -> str:
         """Show the statistics that are given."""
-        given = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        shown = [f"{name}={value!r}" for name, value in given.items() if value is not None]
-        return f"Summary({', '.join(shown)})"
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        arguments = [f"{name}={value!r}" for name, value in values.items() if value is not None]
+        return f"Summary({', '.join(arguments)})"
 
     @property
     def order_statistics(self) -> Floats:

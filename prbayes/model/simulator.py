@@ -206,9 +206,8 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         )
     arguments = _read_arguments(name, response, inputs, model)
     if isinstance(observed, Summary):
-        unused = {"metric": metric, "epsilon": epsilon, "weights": weights, "dims": dims}
-        _refuse_beside_summary(name, arguments, unused | {"specimens": specimens}, propagation)
-        metric, observed = SummaryLikelihood(observed), observed.values
+        unused = [metric, epsilon, weights, specimens, dims, arguments.groups]
+        metric, observed = _read_summary(name, observed, unused, propagation)
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
@@ -276,23 +275,25 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     return tuple(variables) if arguments.groups is not None else variables[0]
 
 
-def _refuse_beside_summary(
-    name: str, inputs: Inputs, unused: dict[str, Any], propagation: Propagation | None
-) -> None:
-    """Raise for arguments that a data sheet, without single specimens, has no use for."""
-    given = [f"{argument}=" for argument, value in unused.items() if value is not None]
-    given += ["groups"] if inputs.groups is not None else []
-    if given:
+def _read_summary(
+    name: str, summary: Summary, unused: Sequence[Any], propagation: Propagation | None
+) -> tuple[Metric, Floats]:
+    """Return metric and values of a data sheet; raise for what has no use without specimens."""
+    names = ("metric=", "epsilon=", "weights=", "specimens=", "dims=", "groups")
+    arguments = [text for text, value in zip(names, unused, strict=True) if value is not None]
+    if arguments:
+        text = ", ".join(arguments)
         raise TypeError(
-            f"{name}: observed: got a prb.Summary and {', '.join(given)}, expected the Summary "
-            "alone: it has no single specimens, and its likelihood needs no scale; leave "
-            f"{', '.join(given)} out, or write a simulator for each data sheet"
+            f"{name}: observed: got a prb.Summary and {text}, expected the Summary alone: it has "
+            f"no single specimens, and its likelihood needs no scale; leave {text} out, or write a "
+            "simulator for each data sheet"
         )
     if isinstance(propagation, Propagation) and propagation.is_random:
         raise TypeError(
             f"{name}: propagation: got {called(propagation)}, whose likelihood would be random, "
             "expected prb.Reweighted(n) or prb.Resimulated(n) for a prb.Summary"
         )
+    return SummaryLikelihood(summary), summary.values
 
 
 def _read_arguments(

@@ -278,10 +278,10 @@ def _scores(
                 default = _METRICS[:-1]
             if simulator.observed.ndim > 1:
                 default = [Joint(metric) for metric in default]  # the same in all directions
-            chosen = default if metrics is None else metrics
+            selection = default if metrics is None else metrics
             if simulator.metric.exact_likelihood:  # of statistics, not of specimens
-                chosen = [simulator.metric]
-            for metric in chosen:
+                selection = [simulator.metric]
+            for metric in selection:
                 target = metric.against(simulator.observed, simulator.weights)
                 if simulator.is_emulated:
                     responses, weights = evaluator.populations(thetas, k)
