@@ -123,8 +123,8 @@ def calibrate_each(
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator.of(model)
-    every: list[Any] = [*evaluator.nodes, *evaluator.measurements]
-    simulator, *more = every
+    simulators: list[Any] = [*evaluator.nodes, *evaluator.measurements]
+    simulator, *more = simulators
     if more:
         raise TypeError(
             f"{caller}: got a model with the simulators {simulator.name} and {more[0].name}, "
