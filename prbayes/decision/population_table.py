@@ -229,7 +229,7 @@ class PopulationTable(xr.Dataset):  # type: ignore[no-untyped-call]
             for quantity, (estimate, interval) in cells.items():
                 text = f"{quantity} {estimate}"
                 if quantity == "cv":
-                    text += " %"
+                    text += "%"
                 if interval:
                     text += f" ({interval})"
                 if quantity == "mean" and unit:
@@ -243,7 +243,7 @@ class PopulationTable(xr.Dataset):  # type: ignore[no-untyped-call]
         bounds = self.attrs.get("bounds", "")
         return (
             f"Population, with {prob:.0%} intervals by the {kind}; A- and B-basis values are "
-            f"{bounds} bounds for 99 % and 90 % of the specimens with 95 % confidence"
+            f"{bounds} bounds for 99% and 90% of the specimens with 95% confidence"
         )
 
     def __repr__(self) -> str:
