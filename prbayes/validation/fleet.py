@@ -37,10 +37,13 @@ from prbayes.posterior.sample import draw_posterior, importance_chains, modes_of
 from prbayes.posterior.smc import SamplingSettings
 from prbayes.posterior.target import specimen_target
 from prbayes.propagation.reweighted import designs_restored
+from prbayes.propagation.specimen_emulation import Coordinates, Emulation
 from prbayes.response.inputs import model_on_context
 from prbayes.validation.area_test import area_test
 from prbayes.validation.nulls import PosteriorNull
 
+# Specimens from which the emulator is made, if there are many more.
+_EMULATED = 512
 # Specimens of each population that a validity test compares with measured ones.
 _SPECIMENS = 50
 
@@ -314,25 +317,36 @@ def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
 def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> SpecimenLikelihood:
     """Return the likelihood of the specimens of all products, with their points.
 
-    Limits of the errors of the emulator and the points are those of a product: less specimens, in a
-    narrower population.
+    The emulator is that of evenly spaced specimens. Limits of the errors of the emulator and the
+    points are those of a product: fewer specimens, in a narrower population.
     """
     (likelihood,) = evaluator.likelihoods
     (measurement,) = likelihood.measurements
     stacked = np.concatenate(list(observed.values()))
+    sizes = [len(values) for values in observed.values()]
     within = np.median([np.nanstd(values, axis=0) for values in observed.values()], axis=0)
-    narrower = float(np.min(within / np.nanstd(stacked, axis=0)))
-    fewer = np.sqrt(len(stacked) / np.median([len(values) for values in observed.values()]))
-    options = likelihood.options
-    options = replace(
-        options,
-        bias=options.bias * fewer * min(narrower, 1.0),
-        half_difference=options.half_difference * fewer,
-    )
-    of_all = likelihood.observing({measurement.name: stacked})
-    of_all = replace(of_all, options=options)
-    prepared(of_all)
-    return of_all
+    narrower = min(1.0, float(np.min(within / np.nanstd(stacked, axis=0))))
+    inputs, sampler = likelihood.inputs, likelihood.density.sampler
+    coordinates = Coordinates.of_prior(inputs, max(sizes), sampler=sampler)
+
+    def prepared_of(values: Floats, emulation: Emulation | None) -> SpecimenLikelihood:
+        fewer = np.sqrt(len(values) / np.median(sizes))
+        options = replace(
+            likelihood.options,
+            bias=likelihood.options.bias * fewer * narrower,
+            half_difference=likelihood.options.half_difference * fewer,
+        )
+        result = likelihood.observing({measurement.name: values})
+        result = replace(result, options=options, shared_emulation=emulation)
+        vars(result).update(density=likelihood.density, coordinates=coordinates)
+        prepared(result)
+        return result
+
+    if len(stacked) <= 2 * _EMULATED:
+        return prepared_of(stacked, None)
+    order = np.argsort(stacked.reshape(len(stacked), -1)[:, 0], kind="stable")
+    rows = order[np.linspace(0, len(order) - 1, _EMULATED).astype(np.intp)]
+    return prepared_of(stacked, prepared(prepared_of(stacked[rows], None)).emulation)
 
 
 def _of_rows(likelihood: SpecimenLikelihood, rows: NDArray[np.intp]) -> SpecimenLikelihood:
