@@ -23,9 +23,8 @@ from prbayes.results.predict import width_of_epsilon
 
 _CALLER = "prb.population"
 _VARIABLES = ("estimate", "lower", "upper")
-# Shares of specimens beyond tolerance bounds, and their confidence (MMPDS, CMH-17).
+# Shares of specimens beyond tolerance bounds of 95 % confidence (MMPDS, CMH-17).
 BASES = {"B-basis": 0.10, "A-basis": 0.01}
-_CONFIDENCE = 0.95
 
 
 @locked
@@ -148,7 +147,7 @@ def population(
     # Estimate, lower and upper
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
     tails = [(1 - prob) / 2, (1 + prob) / 2]
-    confidence = _CONFIDENCE if upper else 1 - _CONFIDENCE
+    confidence = 0.95 if upper else 0.05
     for i, x in enumerate(elements):
         for name, values in x.numbers.items():
             draws = values if populations.are_draws else values[..., 1:]

@@ -42,11 +42,6 @@ from prbayes.response.inputs import model_on_context
 from prbayes.validation.area_test import area_test
 from prbayes.validation.nulls import PosteriorNull
 
-# Specimens from which the emulator is made, if there are many more.
-_EMULATED = 512
-# Specimens of each population that a validity test compares with measured ones.
-_SPECIMENS = 50
-
 
 @locked
 def calibrate_each(
@@ -290,18 +285,18 @@ class Fleet:
             has_graph=False,
         )
 
-    def _predicted(self, evaluator: Evaluator, values: Mapping[str, Floats]) -> xr.DataArray:
-        """Return responses of the calibrated populations, (1, draws, samples, ...)."""
+    def _predicted(
+        self, evaluator: Evaluator, values: Mapping[str, Floats], n: int = 50
+    ) -> xr.DataArray:
+        """Return responses of n specimens of calibrated populations, (1, draws, n, ...)."""
         rows = np.linspace(0, self.settings.draws - 1, 100).astype(np.intp)
         thinned = {name: value[rows] for name, value in values.items()}
         rng = np.random.default_rng(self.settings.random_seed)
         if evaluator.likelihoods:
             (likelihood,) = evaluator.likelihoods
-            responses = draw_readings(
-                likelihood, rng, thinned, _SPECIMENS, likelihood.measurements[0]
-            )
+            responses = draw_readings(likelihood, rng, thinned, n, likelihood.measurements[0])
         else:
-            responses = _resampled(evaluator, thinned, rng)
+            responses = _resampled(evaluator, thinned, rng, n)
         dims = ("chain", "draw", "sample", "output")[: responses.ndim + 1]
         return xr.DataArray(responses[None], dims=dims)
 
@@ -314,11 +309,13 @@ def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
     return fleet.calibrated(names)
 
 
-def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> SpecimenLikelihood:
+def _common_likelihood(
+    evaluator: Evaluator, observed: Mapping[str, Floats], emulated: int = 512
+) -> SpecimenLikelihood:
     """Return the likelihood of the specimens of all products, with their points.
 
-    The emulator is that of evenly spaced specimens. Limits of the errors of the emulator and the
-    points are those of a product: fewer specimens, in a narrower population.
+    The emulator is that of so many evenly spaced specimens. Limits of the errors of the emulator
+    and the points are those of a product: fewer specimens, in a narrower population.
     """
     (likelihood,) = evaluator.likelihoods
     (measurement,) = likelihood.measurements
@@ -342,10 +339,10 @@ def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> 
         prepared(result)
         return result
 
-    if len(stacked) <= 2 * _EMULATED:
+    if len(stacked) <= 2 * emulated:
         return prepared_of(stacked, None)
     order = np.argsort(stacked.reshape(len(stacked), -1)[:, 0], kind="stable")
-    rows = order[np.linspace(0, len(order) - 1, _EMULATED).astype(np.intp)]
+    rows = order[np.linspace(0, len(order) - 1, emulated).astype(np.intp)]
     return prepared_of(stacked, prepared(prepared_of(stacked[rows], None)).emulation)
 
 
@@ -378,13 +375,13 @@ def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
 
 
 def _resampled(
-    evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator
+    evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator, n: int
 ) -> Floats:
     """Return responses of points of the populations, (P, n), by weight."""
     hyperparameters = evaluator.hyperparameters
     free = [values[str(rv.name)] for rv in evaluator.model.free_RVs]
     responses, weights = evaluator.populations(hyperparameters.thetas_of(free), 0)
-    levels = (np.arange(_SPECIMENS) + rng.random((len(weights), 1))) / _SPECIMENS
+    levels = (np.arange(n) + rng.random((len(weights), 1))) / n
     rows = rng.permuted(reached(weights, levels, normalized=True), axis=1)
     return np.take_along_axis(np.broadcast_to(responses, weights.shape), rows, axis=1)
 
