@@ -29,7 +29,6 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.specimen_preparation import prepared
 from prbayes.propagation.base import refuse_lost_share
-from prbayes.propagation.reweighted import ReweightedBound
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.response import Responses
 
@@ -199,10 +198,10 @@ def replaced_findings(
     shares = {}
     for k, node in enumerate(evaluator.nodes):
         if _replaces(node.bound.responses):
-            parents, bound = evaluator.parents(theta[None], k), node.bound
-            if isinstance(bound, ReweightedBound):
-                bound = bound.copied(bound.design.runs_alone())
-            values, weights = bound.populations(parents)
+            bound = node.bound
+            if stored := evaluator.reweighted.get(node.name):
+                bound = stored.copied(stored.design.runs_alone())
+            values, weights = bound.populations(evaluator.parents(theta[None], k))
             shares[node.name] = _replaced_share(node.bound.responses, values[0], weights[0])
     for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
         if _replaces(simulator.responses):
