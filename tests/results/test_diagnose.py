@@ -22,7 +22,7 @@ from prbayes.optimize.convergence import Result
 from prbayes.posterior.results import Chains
 from prbayes.posterior.smc import _lost_findings
 from prbayes.propagation.base import DesignError
-from prbayes.results.diagnose import _NOISE, _failure_findings
+from prbayes.results.diagnose import _NOISE, _each_once, _failure_findings
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 AREA, KL = prb.AreaMetric(), prb.KullbackLeibler()
@@ -403,3 +403,10 @@ def test_components_of_curves_are_reported(components: int | None) -> None:
         assert any("no noise" in line for line in diagnosis.messages) == (components == 1)
     report = prb.Report("Cracks", optimum=best, pictures=False)
     assert any(note in text for section in report.sections for text in section.text)
+
+
+def test_each_finding_is_shown_once() -> None:
+    first, again = (Finding("failed-responses", f"y: {text}.") for text in ("5%", "at 3 points"))
+    others = [Finding("failed-responses", "z: at 2 points."), Finding("output-misfit", "y: a.")]
+    assert _each_once([first, first], [again, *others, others[0]]) == (first, *others)
+    assert _each_once([], [again]) == (again,)
