@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from prbayes import validation as validation
     from prbayes.decision.exceedance import exceedance as exceedance
     from prbayes.decision.plan import plan as plan
+    from prbayes.decision.population_table import population as population
     from prbayes.decision.sensitivity import sensitivity as sensitivity
     from prbayes.emulators.runs import Runs as Runs
     from prbayes.emulators.surrogate import Surrogate as Surrogate
@@ -76,6 +77,7 @@ __version__ = version("prbayes")
 _NAMES = {
     "decision.exceedance": ("exceedance",),
     "decision.plan": ("plan",),
+    "decision.population_table": ("population",),
     "decision.sensitivity": ("sensitivity",),
     "emulators.runs": ("Runs",),
     "emulators.surrogate": ("Surrogate",),

@@ -22,6 +22,12 @@ Floats = NDArray[np.float64]
 # Numbers in memory at a time where work is done in blocks: 32 MiB. Where the blocks leave a trace
 # in an answer, that place says so.
 AT_ONCE = 1 << 22
+
+# Advice where a problem has no specimens.
+NO_POPULATION = (
+    "for one time series, or parameters common to all specimens, use pm.Simulator or a pm.Normal "
+    "likelihood"
+)
 # Numbers of arrays that stay in the cache of a processor: 2 MiB.
 IN_CACHE = 1 << 18
 # Squares of measured values, and sums of them, are finite up to here.
@@ -92,7 +98,8 @@ def observed_sample(
     if array.ndim != 1:
         raise ValueError(
             f"{name}: got an array of shape {array.shape}, expected one dimension, (N,); "
-            "several outputs of a specimen, (N, m), take prb.Joint(metric), or one Simulator each"
+            "several outputs of a specimen, (N, m), take prb.Joint(metric), or one Simulator each; "
+            f"{NO_POPULATION}"
         )
     n_failed = int(np.isposinf(array).sum())
     n_invalid = int((~np.isfinite(array)).sum()) - (n_failed if failures else 0)

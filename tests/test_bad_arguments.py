@@ -317,6 +317,7 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         ),
         dims=("nope", "few", "", ("few", "few"), True),
         propagation=(prb.Reweighted, prb.AreaMetric()),
+        units=({"nothing": "mm"}, {"x": 3}, {3: "mm"}),
         own="observed",
     ),
     "Reweighted": Row(max_points=(3,), emulator=(3, "a"), timeout=WITHOUT_PROCESSES),
@@ -462,6 +463,12 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         k=([], [0], "ab"),
         quantity=(prb.decision.Mean,),
         target=({}, {"tau": 1.0}, {"mu": 0.0}, {"mu": "a"}, {"quantity": 1.0}),
+    ),
+    "population": Row(
+        inputs=("nothing", [], ["x", "nothing"], 3, np.mean),
+        quantiles=("ab", 3, [0.5, 1.0], [np.nan], None),
+        at=({"nothing": 1.0}, {"x": 1.0}),
+        n_draws=(1,),
     ),
     "exceedance": Row(
         call=with_inputs(prb.exceedance, "result", "response", "limit"),

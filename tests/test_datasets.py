@@ -51,3 +51,20 @@ def test_the_virkler_data_are_those_of_their_publications() -> None:
         column = lengths.sel(kilocycles=kilocycles)
         assert float(column.mean()) == pytest.approx(mean, abs=0.005)
         assert float(column.std(ddof=1)) == pytest.approx(sd, abs=0.005)
+
+
+def test_each_subject_has_doses_and_times_of_its_own() -> None:
+    drug = datasets.theophylline()
+    assert drug.concentration_mg_per_l.shape == drug.time_h.shape == (12, 11)
+    np.testing.assert_array_equal(drug.specimen, np.arange(1, 13))
+    assert (drug.time_h.diff("sample") > 0).all()
+    with files("prbayes.datasets").joinpath("theophylline.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        subject = drug.sel(specimen=int(row["subject"]))
+        (place,) = np.flatnonzero(subject.time_h == float(row["time_h"]))
+        value = float(subject.concentration_mg_per_l[place])
+        assert value == float(row["concentration_mg_per_l"])
+        dose = float(row["dose_mg_per_kg"]) * float(row["weight_kg"])
+        assert float(subject.dose_mg) == pytest.approx(dose, rel=1e-12)
+    assert "Boeckmann" in drug.attrs["source"]

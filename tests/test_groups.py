@@ -17,9 +17,9 @@ from suppliers import labelled
 import prbayes as prb
 from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator, n_design_runs
+from prbayes.model.margins import margins, select_margins
 from prbayes.model.random_variable import nodes
 from prbayes.optimize.design_refinement import _add_runs
-from prbayes.plots.population import margins, select_margins
 from prbayes.propagation.reweighted import same_points
 from prbayes.response.compile import PLAIN
 

@@ -544,7 +544,8 @@ INNER = {
         "pytensor.graph.traversal.ancestors",
         "pytensor.tensor.variable.TensorVariable",
     },
-    "plots.population": {"pytensor.tensor.variable.TensorVariable"},
+    "decision.population_quantities": {"pytensor.tensor.variable.TensorVariable"},
+    "model.margins": {"pytensor.tensor.variable.TensorVariable"},
     "posterior.kernel": {
         "pymc.smc.kernels.SMC_KERNEL",
         "pymc.smc.kernels.systematic_resampling",

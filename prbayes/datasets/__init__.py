@@ -7,7 +7,7 @@ from importlib.resources import files
 import numpy as np
 import xarray as xr
 
-__all__ = ["crack_growth", "virkler"]
+__all__ = ["crack_growth", "theophylline", "virkler"]
 
 
 def crack_growth() -> xr.Dataset:
@@ -61,6 +61,56 @@ def crack_growth() -> xr.Dataset:
             "Cumulative Damage, Wiley"
         ),
         notch_inch=0.90,
+    )
+
+
+def theophylline() -> xr.Dataset:
+    """Return concentrations of theophylline in the blood of 12 subjects after an oral dose.
+
+    Each subject had a dose and times of samples of their own.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``concentration_mg_per_l`` and ``time_h`` with dims ``(specimen, sample)``, shape (12, 11),
+        in mg/l and hours; ``dose_mg`` and ``weight_kg`` with the dim ``specimen``, in mg and kg.
+        ``specimen`` counts from 1. Every call returns a new object.
+
+    References
+    ----------
+    .. [1] A. J. Boeckmann, L. B. Sheiner and S. L. Beal (1994), NONMEM Users Guide: Part V, NONMEM
+       Project Group, University of California, San Francisco; from the data set Theoph of R.
+
+    Examples
+    --------
+    >>> from prbayes import datasets
+    >>> drug = datasets.theophylline()
+    >>> round(float(drug.concentration_mg_per_l.max()), 1), round(float(drug.dose_mg.mean()))
+    (11.4, 318)
+    """
+    with files(__package__).joinpath("theophylline.csv").open(encoding="utf-8") as file:
+        table = np.loadtxt(file, delimiter=",", skiprows=1)
+    subject, weight, dose, time, concentration = table.reshape(12, 11, 5).transpose(2, 0, 1)
+    dims = ("specimen", "sample")
+    return xr.Dataset(
+        {
+            "concentration_mg_per_l": (dims, concentration, {"units": "mg/l"}),
+            "time_h": (dims, time, {"units": "h"}),
+            "dose_mg": ("specimen", dose[:, 0] * weight[:, 0], {"units": "mg"}),
+            "weight_kg": ("specimen", weight[:, 0], {"units": "kg"}),
+        },
+        coords={"specimen": subject[:, 0].astype(int)},
+        attrs={
+            "description": (
+                "Concentration of theophylline in serum after an oral dose: 12 subjects, each "
+                "with 11 times of their own, up to 25 hours"
+            ),
+            "source": (
+                "A. J. Boeckmann, L. B. Sheiner and S. L. Beal (1994), NONMEM Users Guide: Part V, "
+                "NONMEM Project Group, University of California, San Francisco; data set Theoph of "
+                "R"
+            ),
+        },
     )
 
 

@@ -274,9 +274,7 @@ def labelled_responses(
         if name in values:
             if outputs.event:
                 data = _with_output_names(data, name, outputs)
-            if outputs.units:
-                units = list(dict.fromkeys(outputs.units))
-                data[name].attrs["units"] = units[0] if len(units) == 1 else list(outputs.units)
+            data[name].attrs |= outputs.attrs
     return data
 
 

@@ -11,8 +11,10 @@ from prbayes._validate import Floats, Seed, positive_integer, seed_number
 from prbayes.emulators.continued import Continued
 from prbayes.emulators.ranges import predictive_inputs
 from prbayes.emulators.runs import Runs
+from prbayes.model.measurement import SpecimenLikelihood
 from prbayes.model.random_variable import simulators
-from prbayes.model.specimen_likelihood import measurements_of
+from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_preparation import PopulationDraws, Populations
 from prbayes.numerics.points import farthest_rows
 from prbayes.response.call import checked
 from prbayes.response.inputs import model_on_context
@@ -66,11 +68,12 @@ def propose_runs(
     """
     model = model_on_context(model, "prb.propose_runs()")
     seed = seed_number(random_seed, "propose_runs: random_seed")
-    used: list[tuple[Responses, Floats]] = [
-        *((m.responses, m.observed) for m in measurements_of(model).values()),
-        *((s.responses, s.target.observed) for s in simulators(model).values()),
+    used: list[tuple[Responses, Floats, SpecimenLikelihood | None]] = [
+        (s.responses, s.target.observed, None) for s in simulators(model).values()
     ]
-    tables = list(dict.fromkeys(r.function for r, _ in used if isinstance(r.function, Runs)))
+    for likelihood in dict.fromkeys(specimen_likelihoods(model).values()):
+        used += [(m.responses, m.observed, likelihood) for m in likelihood.measurements]
+    tables = list(dict.fromkeys(r.function for r, *_ in used if isinstance(r.function, Runs)))
     if runs is None:
         if len(tables) != 1:
             raise ValueError(
@@ -83,7 +86,11 @@ def propose_runs(
     domain = runs.surrogate.domain
     n = max(4 * domain.dimensions, -(-len(runs) // 4)) if n is None else n
     positive_integer(n, "propose_runs: n")
-    pools = [_near_data(model, r, runs, data, seed) for r, data in used if r.function is runs]
+    pools = [
+        _near_data(_arguments(model, responses, likelihood, seed), responses, runs, data)
+        for responses, data, likelihood in used
+        if responses.function is runs
+    ]
     pool = np.unique(np.concatenate(pools), axis=0)
     is_outside = domain.outside(pool).any(axis=1)
     if is_outside.mean() > 0.01:
@@ -97,21 +104,27 @@ def propose_runs(
     return pd.DataFrame(pool[rows], columns=runs.columns)
 
 
-def _near_data(
-    model: pm.Model,
-    responses: Responses,
-    runs: Runs,
-    observed: Floats,
-    seed: int,
-    of_each: int = 16,
-) -> Floats:
-    """Return inputs, (k, d), of specimens of the prior with responses near each measured one."""
-    inputs, name = responses.inputs, responses.name
+def _arguments(
+    model: pm.Model, responses: Responses, likelihood: SpecimenLikelihood | None, seed: int
+) -> list[Any]:
+    """Return a response's arguments, (n, *event), for specimens of the prior."""
+    inputs = responses.inputs
+    if likelihood is not None:
+        populations = Populations(likelihood)
+        thetas = populations.hyperparameters.prior_thetas(2048, seed)
+        z = PopulationDraws(populations, thetas).specimens(16)
+        return inputs.fill(likelihood.coordinates.inputs(z), [])
     with model:
-        drawn = predictive_inputs(name, [*inputs.aleatory, *inputs.epistemic], seed)
+        drawn = predictive_inputs(responses.name, [*inputs.aleatory, *inputs.epistemic], seed)
     flat = [x.reshape(-1, *x.shape[2:]) for x in drawn]
     count = len(inputs.aleatory)
-    arguments = inputs.fill(flat[:count], flat[count:])
+    return inputs.fill(flat[:count], flat[count:])
+
+
+def _near_data(
+    arguments: list[Any], responses: Responses, runs: Runs, observed: Floats, of_each: int = 16
+) -> Floats:
+    """Return inputs, (k, d), of specimens with responses near each measured one."""
     columns, batch = runs.surrogate.domain.columns(arguments)
     values, _ = checked(Continued(runs)(*arguments), batch, arguments, responses.outputs)
     values = values.reshape(len(columns), -1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -26,6 +26,7 @@ from prbayes._validate import (
     refuse_single_precision,
     sample_labels,
     sample_weights,
+    texts,
 )
 from prbayes.emulators.runs import Runs
 from prbayes.metrics.base import Discrepancy, Metric, is_likelihood
@@ -67,6 +68,7 @@ from prbayes.response.inputs import (
     is_group,
     model_on_context,
     read_inputs,
+    set_units,
 )
 from prbayes.response.outputs import Outputs, in_order_of, read_observed
 from prbayes.response.response import Responses, refuse_misfit, refuse_uncallable
@@ -86,6 +88,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     specimens: ArrayLike | None = None,
     dims: str | Sequence[str] | None = None,
     propagation: Propagation | None = None,
+    units: Mapping[str, str] | None = None,
     progressbar: bool = True,
 ) -> TensorVariable | tuple[TensorVariable, ...]:
     r"""Add an observed node whose log-density is -discrepancy / epsilon to the current model.
@@ -144,6 +147,10 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
         Names of the observed dimensions.
     propagation : Propagation, optional
         How populations become responses; ``Reweighted(1024)`` by default.
+    units : mapping, optional
+        Units for tables, pictures and the report: of aleatory inputs, by the name of the
+        ``.dist()`` or of the response's argument, and of the response, by the name of the
+        simulator or of an output. Those of the response are ``observed.attrs["units"]`` by default.
     progressbar : bool
         Whether the first runs show a bar on stderr if they take more than two seconds.
 
@@ -198,6 +205,7 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     observed, metric = observed_at_conditions(name, observed, metric, inputs)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
+    outputs = _with_units(name, units, arguments, response, outputs)
     refuse_vectors_of_specimens(name, arguments.aleatory, arguments.parents, len(values))
     size = len(values) if rows is None else len(np.asarray(weights))
     weights = weights if rows is None else None
@@ -300,6 +308,30 @@ def _read_specimens(
         values = values[rows]
         groups = None if groups is None else groups[rows]
     return values, outputs, groups, rows
+
+
+def _with_units(
+    name: str,
+    units: Mapping[str, str] | None,
+    inputs: Inputs,
+    response: Callable[..., Any],
+    outputs: Outputs,
+) -> Outputs:
+    """Store the units of the inputs with them, and return the outputs with theirs."""
+    if units is None:
+        return outputs
+    texts(units, f"{name}: units")
+    labels = outputs.names or (name,)
+    names = [*set_units(inputs, response, units), name, *outputs.names]
+    unknown = [key for key in units if key not in names]
+    if unknown:
+        raise KeyError(
+            f"{name}: units: got {unknown[0]!r:.60}, expected some of {list(dict.fromkeys(names))}"
+        )
+    defaults = outputs.units or ("",) * len(labels)
+    pairs = zip(labels, defaults, strict=True)
+    of_outputs = [units.get(label, units.get(name, unit)) for label, unit in pairs]
+    return replace(outputs, units=tuple(of_outputs)) if any(of_outputs) else outputs
 
 
 def _frequencies(

@@ -28,6 +28,7 @@ from prbayes.propagation.specimen_emulation import (
     Emulation,
     EmulationProblem,
     all_roots,
+    likely_roots,
     near_readings,
     shift_by_misfit,
     specimen_roots,
@@ -95,13 +96,16 @@ def points_of_tables(
         )
     else:
         roots = specimen_roots(emulation, readings, options)
-        inside = roots.z[_is_inside(roots.z, ranges)]
-        if len(inside) >= 4:
-            error = _error(problem, OfTables.of(likelihood, LeftOut)(inside))
-            emulation = replace(emulation, error=error)
-            roots = specimen_roots(emulation, readings, options)
+        if len(roots.z):
+            likely = likely_roots(roots, emulation.box)
+            inside = likely[_is_inside(likely, ranges)]
+            if len(inside) >= 4:
+                error = _error(problem, OfTables.of(likelihood, LeftOut)(inside))
+                emulation = replace(emulation, error=error)
+                roots = specimen_roots(emulation, readings, options)
         roots = all_roots(emulation, readings, options, roots, problem.seed)
-        emulation = _with_bias(problem, likelihood, emulation, roots.z, ranges)
+        likely = likely_roots(roots, emulation.box) if len(roots.z) else roots.z
+        emulation = _with_bias(problem, likelihood, emulation, likely, ranges)
         _require_accurate(likelihood, problem, emulation)
         points = draw_points(
             emulation, readings, roots, options, error_is_known=likelihood.error_is_known
@@ -218,8 +222,9 @@ def _require_cover(
     raise DesignError(
         f"{likelihood.name}: got runs that do not cover the populations of the data: the inputs "
         f"of {int((outside > 0.5).sum())} of {len(outside)} specimens are outside their ranges, "
-        f"expected none: about {'; '.join(parts) or 'the corners of the ranges'}; "
-        "prb.propose_runs(model) returns a table of runs to add"
+        f"and {outside.mean():.0%} of those of all, expected none and {MAX_LOST:.0%}: about "
+        f"{'; '.join(parts) or 'the corners of the ranges'}; prb.propose_runs(model) returns a "
+        "table of runs to add"
     )
 
 

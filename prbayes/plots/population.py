@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import xarray as xr
-from pytensor.tensor.variable import TensorVariable
 
 from prbayes._stats import INTERVAL
-from prbayes._validate import Floats, called, share
+from prbayes._validate import Floats, share
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.locking import locked
-from prbayes.model.parameters import element_name, variable_of
+from prbayes.model.margins import Margin, margins, select_margins
 from prbayes.optimize.optimum import Optimum
 from prbayes.plots.canvas import (
     BLUE,
@@ -32,7 +30,8 @@ from prbayes.plots.curves import GRID_POINTS, central_range, outlines, smooth_de
 from prbayes.plots.ensemble import Ensemble, draw_calibrated, read_result
 from prbayes.response.compile import compile_batched
 from prbayes.response.distributions import MVNORMAL, PopulationSampler
-from prbayes.response.inputs import Inputs, aleatory_names
+from prbayes.response.inputs import Inputs
+from prbayes.response.outputs import with_unit
 
 
 @locked
@@ -106,13 +105,19 @@ def plot_population(
         grid, curves = densities[margin.name]
         draw_calibrated(panel, grid, curves, ensemble, prob)
         y = "probability" if margin.discrete else "density"
-        panel.axes(x=named(margin.name, labels), y=y)
+        panel.axes(x=_text(margin, labels), y=y)
     for name, (first, second) in pairs.items():
         panel = canvas.panels[name]
         correlation = _draw_pair(panel, ensemble, first, second, prob)
         title = f"correlation {correlation:.2f}"
-        panel.axes(x=named(first.name, labels), y=named(second.name, labels), title=title)
+        panel.axes(x=_text(first, labels), y=_text(second, labels), title=title)
     return canvas.finish()
+
+
+def _text(margin: Margin, labels: Mapping[str, str] | None) -> str:
+    """Return the label that was given, or the name with the unit."""
+    label = named(margin.name, labels)
+    return with_unit(label, margin.unit) if label == margin.name else label
 
 
 def _pairs(shown: list[Margin]) -> dict[str, tuple[Margin, Margin]]:
@@ -143,75 +148,6 @@ def _draw_pair(panel: Panel, ensemble: Ensemble, x: Margin, y: Margin, prob: flo
 
 
 # -- margins ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Margin:
-    """One number that varies from specimen to specimen."""
-
-    # Name of the distribution, or of the response's argument; with the index of an element.
-    name: str
-    dist: TensorVariable  # the ``.dist()``
-    node: int  # index of the simulator
-    position: int  # among the simulator's aleatory inputs
-    index: tuple[int, ...]  # element of a multivariate input
-    group: str = ""  # the group whose population it is, if there are groups
-
-    @property
-    def axis(self) -> Hashable:
-        """A key of margins with the same range of the axis: those of groups."""
-        return (self.dist, self.index) if self.group else self.name
-
-    @property
-    def discrete(self) -> bool:
-        """Whether it takes whole numbers only."""
-        return not self.dist.dtype.startswith("float")
-
-
-def margins(evaluator: Evaluator) -> list[Margin]:
-    """Return the margins of all aleatory inputs; an input of several simulators counts once."""
-    out: list[Margin] = []
-    taken = {str(variable.name) for variable in evaluator.model.basic_RVs}
-    for k, node in enumerate(evaluator.simulators):
-        inputs = node.inputs
-        names = aleatory_names(inputs, node.responses.function)
-        group = [node.group] if node.group else []
-        for position, (name, dist) in enumerate(zip(names, inputs.aleatory, strict=True)):
-            if position in inputs.conditions or any(
-                margin.dist is dist and margin.group == node.group for margin in out
-            ):
-                continue
-            if element_name(name, group) in taken:
-                name = f"{name} of {node.name}"
-            taken.add(element_name(name, group))
-            for index in np.ndindex(inputs.event_shapes[position]):
-                element = element_name(name, [*group, *index])
-                out.append(Margin(element, dist, k, position, index, node.group))
-    return out
-
-
-def select_margins(available: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:
-    """Return margins by name, with or without index, or by ``.dist()``; all by default."""
-    if inputs is None:
-        return available
-    if isinstance(inputs, str | TensorVariable):
-        inputs = [inputs]
-    names = [margin.name for margin in available]
-    if not isinstance(inputs, list | tuple) or not inputs:
-        raise TypeError(
-            f"inputs: got {called(inputs)}, expected a list of names or .dist() objects, such as "
-            f"{names[:2]}"
-        )
-    selected: list[Margin] = []
-    for x in inputs:
-        if isinstance(x, str):
-            matches = [m for m in available if x in (m.name, variable_of(m.name))]
-        else:
-            matches = [m for m in available if m.dist is x]
-        if not matches:
-            raise KeyError(f"inputs: got {x}, expected some of {names}, or their .dist() objects")
-        selected += [margin for margin in matches if margin not in selected]
-    return selected
 
 
 def margin_densities(

@@ -18,6 +18,7 @@ from prbayes.plots.curves import (
     pointwise_band,
     staircase,
 )
+from prbayes.response.outputs import with_unit
 from prbayes.validation.conditions import comparables
 
 
@@ -92,5 +93,7 @@ def plot_prediction(
         panel.line("measured", steps, INK, width=1.4, legend="measured")
         failed = np.count_nonzero(np.isinf(measured))
         title = f"{measured.size} measured values" + (f", {failed} failed" if failed else "")
-        panel.axes(x=named(pair.name, labels), y="share of specimens", title=title)
+        label = named(pair.name, labels)
+        label = with_unit(label, pair.unit) if label == pair.name else label
+        panel.axes(x=label, y="share of specimens", title=title)
     return canvas.finish()

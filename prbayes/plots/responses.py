@@ -45,7 +45,7 @@ from prbayes.plots.ensemble import (
     read_before,
     read_result,
 )
-from prbayes.response.outputs import Outputs
+from prbayes.response.outputs import Outputs, with_unit
 
 
 @locked
@@ -318,21 +318,21 @@ class Output:
         outputs = self.node.outputs
         if self.column is None:
             units = set(outputs.units)
-            unit = f" ({units.pop()})" if len(units) == 1 else ""
-            return labels.get(self.node.name, self.node.name + unit)
+            unit = units.pop() if len(units) == 1 else ""
+            return labels.get(self.node.name, with_unit(self.node.name, unit))
         output = outputs.names[self.column]
         for name in (self.name, output):
             if name in labels:
                 return labels[name]
-        unit = f" ({outputs.units[self.column]})" if outputs.units else ""
+        unit = outputs.units[self.column] if outputs.units else ""
         simulator = named(self.node.name, labels)
         if is_curve(outputs):
-            return f"{simulator} at {outputs.dim} {output}{unit}"
+            return with_unit(f"{simulator} at {outputs.dim} {output}", unit)
         if not isinstance(outputs.labels[self.column], str):
             output = f"{outputs.dim} {output}"
         if self.alone and self.node.name not in labels:
-            return output + unit
-        return f"{simulator}: {output}{unit}"
+            return with_unit(output, unit)
+        return with_unit(f"{simulator}: {output}", unit)
 
     def of(self, values: Floats) -> Floats:
         """Return its values among those of all outputs, (..., m) -> (...)."""

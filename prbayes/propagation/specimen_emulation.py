@@ -268,6 +268,14 @@ def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
     return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
 
 
+def likely_roots(roots: Roots, box: Floats) -> Floats:
+    """Return the likeliest root of each specimen under a fitted normal population, (n, d)."""
+    table, log_mass, _ = _laplace(roots, box)
+    mean, root = fit_normal(roots.z[table], log_mass)
+    log_weights = normal_log_density(roots.z[table], mean, root) + log_mass
+    return np.asarray(roots.z[table[np.arange(len(table)), log_weights.argmax(axis=1)]])
+
+
 def _laplace(roots: Roots, box: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Return the roots of each specimen that has one, their log masses, and covariances.
 

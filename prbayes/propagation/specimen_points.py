@@ -29,6 +29,7 @@ from prbayes.propagation.population_density import (
     bootstrap_normals,
     fit_normal,
     normal_log_density,
+    normalised_weights,
 )
 from prbayes.propagation.roots import Roots, rows_by_specimen
 from prbayes.propagation.specimen_emulation import Emulation, PointOptions, half_difference
@@ -109,7 +110,7 @@ def draw_points(
     count = options.points * (1 if is_certain and error_is_known else 16)
     scales = (1.0,) if error_is_known else (0.125, 0.25, 0.5, 1.0, 1.3)
     if not error_is_known:
-        components = _at_likely_error(sampler, components, roots, scales, options.gap, seed)
+        components = _at_likely_error(sampler, components, roots, options.gap, seed)
     fits: dict[float, list[Normal]] = {}
     # Where the error of the readings is as large as the scatter, populations may be much narrower
     # than their fit. They are added step by step: too few points exclude them wrongly.
@@ -153,7 +154,6 @@ def _at_likely_error(
     sampler: _PointSampler,
     components: _Components,
     roots: Roots,
-    scales: Sequence[float],
     gap: float,
     seed: int,
 ) -> _Components:
@@ -162,6 +162,7 @@ def _at_likely_error(
     Points around components of a larger error are too far apart. A scale is plausible if a fitted
     population has a likelihood of at most 4 nats below the best.
     """
+    scales = (0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
     for _ in range(2):
         sample = sampler.draw(components, 64, (seed, 10))
         totals = []
@@ -170,6 +171,7 @@ def _at_likely_error(
             normal = fit_normal(at_scale.z, at_scale.log_a)
             totals.append(float(_log_likelihoods(at_scale, [normal]).sum()))
         scale = max(s for s, total in zip(scales, totals, strict=True) if total > max(totals) - 4)
+        narrow = sampler
         if scale >= 1:
             break
         misfit = roots.misfit / scale**2
@@ -180,7 +182,65 @@ def _at_likely_error(
         near = replace(subset, jacobian=subset.jacobian / scale)
         narrow = replace(sampler, readings=sampler.readings.scaled(scale))
         components = _fit_components(narrow, near, seed)
-    return components
+    return _with_modes(narrow, components, seed)
+
+
+def _with_modes(sampler: _PointSampler, components: _Components, seed: int) -> _Components:
+    """Add components at the modes of specimens that the population pulls far from their roots.
+
+    Such a specimen has a flat likelihood, whose maximum may lie far out. The mode is that of the
+    readings' density times a normal population, by Levenberg-Marquardt. The population has the
+    medians of the specimens' means and twice their median absolute deviations, in which a specimen
+    without points near the population does not count.
+    """
+    sample = sampler.draw(components, 256, (seed, 11))
+    mean, root = fit_normal(sample.z, sample.log_a)
+    weights = normalised_weights(normal_log_density(sample.z, mean, root) + sample.log_a)
+    means = np.einsum("nk,nkd->nd", weights, sample.z)
+    mean = np.median(means, axis=0)
+    deviation = 1.4826 * np.median(np.abs(means - mean), axis=0)
+    deviation = np.where(deviation > 0, deviation, np.diag(root))
+    precision = np.diag(1 / (2 * deviation) ** 2)
+    emulation, readings = sampler.emulation, sampler.readings
+    target = np.where(readings.is_measured, readings.values, 0.0)
+    sd = readings.comparison_sd(emulation.error)
+
+    def evaluate(z: Floats) -> tuple[Floats, Floats, Floats]:
+        values, jacobian = emulation(z)
+        residual, jacobian = (target - values) / sd, jacobian / sd[..., None]
+        away = z - mean
+        misfit = (residual**2).sum(axis=1) + np.einsum("nd,de,ne->n", away, precision, away)
+        slope = np.einsum("nmd,nm->nd", jacobian, residual) - away @ precision
+        curvature = np.einsum("nmd,nme->nde", jacobian, jacobian) + precision
+        return np.where(np.isfinite(misfit), misfit, np.inf), slope, curvature
+
+    z = np.tile(mean, (len(readings), 1))
+    misfit, slope, curvature = evaluate(z)
+    damping = np.full(len(z), 1e-3)
+    for _ in range(60):
+        scaled = (
+            damping[:, None, None] * np.einsum("ndd->nd", curvature)[:, None] * np.eye(len(mean))
+        )
+        trial = z + np.linalg.solve(curvature + scaled, slope[..., None])[..., 0]
+        trial_misfit, trial_slope, trial_curvature = evaluate(trial)
+        better = trial_misfit < misfit
+        z = np.where(better[:, None], trial, z)
+        misfit = np.where(better, trial_misfit, misfit)
+        slope = np.where(better[:, None], trial_slope, slope)
+        curvature = np.where(better[:, None, None], trial_curvature, curvature)
+        damping = np.where(better, damping / 3, damping * 4)
+    away = np.linalg.solve(components.root, (z[components.specimen] - components.center)[..., None])
+    nearest = np.full(len(z), np.inf)
+    np.minimum.at(nearest, components.specimen, (away**2).sum(axis=(1, 2)))
+    far = np.flatnonzero((nearest > chdtri(len(mean), 0.05)) & np.isfinite(misfit))
+    order = np.argsort(np.concatenate([components.specimen, far]), kind="stable")
+    added = np.linalg.cholesky(1.5 * np.linalg.inv(curvature[far]))
+    return _Components(
+        np.concatenate([components.specimen, far])[order],
+        np.concatenate([components.center, z[far]])[order],
+        np.concatenate([components.root, added])[order],
+        np.concatenate([components.log_mass, np.full(len(far), np.nan)])[order],
+    )
 
 
 def _plausible(

@@ -13,7 +13,9 @@ import xarray as xr
 from prbayes._finding import from_json
 from prbayes._stats import INTERVAL
 from prbayes._validate import Floats
+from prbayes.decision.population_table import population
 from prbayes.model.description import labelled
+from prbayes.model.emulated import population_simulators
 from prbayes.model.parameters import (
     optimum_elements,
     readable_elements,
@@ -22,7 +24,7 @@ from prbayes.model.parameters import (
     stacked_draws,
     table_elements,
 )
-from prbayes.optimize.optimum import compared_in
+from prbayes.optimize.optimum import Optimum, compared_in
 from prbayes.plots.canvas import named
 from prbayes.reports.assessment import (
     answers,
@@ -52,13 +54,14 @@ from prbayes.reports.numbers import (
     with_zeros,
 )
 from prbayes.reports.section import Section
-from prbayes.response.outputs import SINGLE_OUTPUT
+from prbayes.response.outputs import SINGLE_OUTPUT, with_unit
 
 
 def sections_of(material: Material, *, pictures: bool) -> tuple[Section, ...]:
     """Return the sections that the material allows, with or without pictures."""
     parts = (
         _summary,
+        population_in_units,
         model,
         data,
         metric,
@@ -84,6 +87,42 @@ def _summary(m: Material) -> list[Section]:
     if steps:
         sections.append(Section("What to do next", steps, level=3))
     return sections
+
+
+# -- population ------------------------------------------------------------------------------
+
+
+def population_in_units(m: Material) -> list[Section]:
+    """Return moments, quantiles and tolerance bounds of the inputs, by the first result."""
+    results: list[Optimum | xr.DataTree] = [*m.posteriors.values(), *m.live_optima.values()]
+    result = results[0] if results else None
+    if m.model is None or result is None or m.rejected or not population_simulators(m.model):
+        return []
+    try:
+        table = population(result, model=m.model)
+    except (TypeError, ValueError, NotImplementedError) as error:
+        return [Section("Population", f"Not shown: {error}.", level=3)]
+    quantities = table["quantity"].values.tolist()
+    columns: dict[str, dict[str, str]] = {}
+    for name, unit, cells in table.rows():
+        label = named(name, m.labels)
+        texts = {}
+        for quantity in quantities:
+            value, interval = cells.get(quantity, ("", ""))
+            texts[quantity.replace("cv", "cv, %")] = f"{value} ({interval})" if interval else value
+        columns[with_unit(label, unit) if label == name else label] = texts
+    if len(columns) <= 4:  # a line for each quantity, which fits on a page
+        names = next(iter(columns.values()))
+        rows = [{"": q} | {x: texts[q] for x, texts in columns.items()} for q in names]
+    else:
+        rows = [{"input": x} | texts for x, texts in columns.items()]
+    about = (
+        "How the inputs vary from specimen to specimen: mean, standard deviation (sd), coefficient "
+        f"of variation (cv) and quantiles, with {INTERVAL:.0%} intervals in brackets. "
+        "A B-basis (A-basis) value is a tolerance bound: 90 % (99 %) of all specimens exceed it, "
+        "with 95 % confidence."
+    )
+    return [Section("Population", about, rows_table(rows), level=3)]
 
 
 # -- model -----------------------------------------------------------------------------------

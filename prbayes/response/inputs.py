@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._validate import plain_text, real_array
+from prbayes._validate import NO_POPULATION, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
 from prbayes.response.condition import is_condition
 
@@ -144,8 +144,13 @@ class Inputs:
 # -- reading ---------------------------------------------------------------------------------------
 
 
-def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
-    """Sort the inputs of a response into aleatory, epistemic and constant ones, or raise."""
+def read_inputs(
+    name: str, inputs: Sequence[Any], model: pm.Model, *, fixed: bool = False
+) -> Inputs:
+    """Sort the inputs of a response into aleatory, epistemic and constant ones, or raise.
+
+    ``fixed`` is whether they may depend on no hyperparameter.
+    """
     model_variables: set[Variable] = set(model.basic_RVs)
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
@@ -205,9 +210,9 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
         raise ValueError(
             f"{name}: got {len(inputs)} inputs, none of them aleatory, expected at least one that "
             "varies between specimens; pass a distribution made with `.dist()`, such as "
-            "pm.Normal.dist(mu, sigma)"
+            f"pm.Normal.dist(mu, sigma); {NO_POPULATION}"
         )
-    if all(map(is_known, parents)):  # also if there are none
+    if not fixed and all(map(is_known, parents)):  # also if there are none
         raise ValueError(
             f"{name}: got inputs that depend on no variable of the model, expected hyperparameters "
             "to calibrate; give the `.dist()` parameters that are model variables, such as "
@@ -330,6 +335,20 @@ def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
     """Return a name of each aleatory input: of its distribution, or the response's argument."""
     names = argument_names(inputs, function)
     return [names[inputs.arguments.index(position)] for position in range(len(inputs.aleatory))]
+
+
+def set_units(inputs: Inputs, function: Callable[..., Any], units: Mapping[str, str]) -> list[str]:
+    """Store the units of aleatory inputs by their names; return the names of the inputs."""
+    names = aleatory_names(inputs, function)
+    for name, x in zip(names, inputs.aleatory, strict=True):
+        if name in units:
+            x.tag.units = units[name]
+    return names
+
+
+def unit_of(x: Any) -> str:
+    """Return the unit of an aleatory input, or an empty text."""
+    return str(getattr(x.tag, "units", ""))
 
 
 def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
@@ -534,10 +553,10 @@ def _labels_and_values(name: str, observed: Any, dim: str) -> tuple[list[Any], A
     if hasattr(observed, "columns") and dim in observed.columns:
         values = observed.drop(columns=dim)
         is_single = values.shape[1] == 1
-        return list(observed[dim]), real_array(values.iloc[:, 0], name) if is_single else values
+        return list(observed[dim]), values.iloc[:, 0] if is_single else values
     index: Any = getattr(observed, "index", None)
     if dim in getattr(index, "names", ()) and not hasattr(observed, "columns"):
-        return list(index.get_level_values(dim)), real_array(observed, name)
+        return list(index.get_level_values(dim)), observed
     raise TypeError(
         f"{name}: got {type(observed).__name__} without the group of each specimen, expected a "
         f"DataArray with a coordinate {dim!r} along the specimens, a DataFrame with a column of "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ class Outputs:
     # Keys of a response that returns a mapping, and the number of outputs of each, None for one
     # number without an axis. Empty where outputs have no names.
     keys: tuple[tuple[str, int | None], ...] = ()
-    units: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()  # of each output, or of one number; empty where unknown
 
     @property
     def event(self) -> tuple[int, ...]:
@@ -34,6 +34,13 @@ class Outputs:
     def names(self) -> tuple[str, ...]:
         """The labels as text."""
         return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
+
+    @property
+    def attrs(self) -> dict[str, Any]:
+        """The units as an attribute of an array: a text if all outputs have the same."""
+        if not self.units:
+            return {}
+        return {"units": self.units[0] if len(set(self.units)) == 1 else list(self.units)}
 
     def by_key(self, values: Floats) -> Any:
         """Return outputs in the last axis, (..., m), as a mapping with the response's keys.
@@ -89,6 +96,11 @@ class Outputs:
 
 
 SINGLE_OUTPUT = Outputs()
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Return a name with its unit in brackets, if there is one."""
+    return f"{name} ({unit})" if unit else name
 
 
 def relabelled(values: Any, like: Any) -> Any:
@@ -219,10 +231,24 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
             raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
         outputs = _labelled_columns(observed, values.shape[1])
         if hasattr(observed, "columns") and values.shape[1] == 1:
-            return values[:, 0], Outputs(keys=outputs.keys)
+            return values[:, 0], Outputs(keys=outputs.keys, units=outputs.units)
         return values, outputs
-    unit = getattr(observed, "attrs", {}).get("units") if hasattr(observed, "dims") else None
-    return values, Outputs(units=(str(unit),)) if unit else SINGLE_OUTPUT
+    unit = _units_in(observed, (getattr(observed, "name", None),))
+    return values, Outputs(units=unit) if unit else SINGLE_OUTPUT
+
+
+def _units_in(observed: Any, labels: Sequence[Any]) -> tuple[str, ...]:
+    """Return the unit of each output that the attributes of a labelled array have.
+
+    A text is the unit of all outputs; otherwise one by label, or in their order.
+    """
+    unit = getattr(observed, "attrs", {}).get("units")
+    if isinstance(unit, Mapping):
+        unit = [unit.get(label, "") for label in labels]
+    if unit is None or (not isinstance(unit, str) and len(unit) not in (1, len(labels))):
+        return ()
+    units = tuple(map(str, np.broadcast_to(np.asarray(unit), len(labels)).tolist()))
+    return units if any(units) else ()
 
 
 def _labelled_columns(observed: Any, m: int) -> Outputs:
@@ -234,17 +260,17 @@ def _labelled_columns(observed: Any, m: int) -> Outputs:
         dim = str(observed.dims[1])
         if dim in observed.coords:
             labels = tuple(observed.coords[dim].values.tolist())
-        # A coordinate of units, or one unit for all.
-        unit: Any = observed.coords.get("units", observed.attrs.get("units"))
-        if unit is not None:
-            units = tuple(map(str, np.broadcast_to(np.asarray(unit), m).tolist()))
+        if "units" in observed.coords:
+            unit = np.asarray(observed.coords["units"])
+            units = tuple(map(str, np.broadcast_to(unit, m).tolist()))
     elif hasattr(observed, "columns"):
         labels = tuple(np.asarray(observed.columns).tolist())
         dim = str(getattr(observed.columns, "name", None) or dim)
     else:
         return Outputs(labels)
     are_names = all(isinstance(label, str) for label in labels)
-    return Outputs(labels, dim, tuple((x, None) for x in labels) if are_names else (), units)
+    keys = tuple((x, None) for x in labels) if are_names else ()
+    return Outputs(labels, dim, keys, units or _units_in(observed, labels))
 
 
 def in_order_of(values: Any, observed: Any, name: str) -> Any:
@@ -275,9 +301,10 @@ def specimen_index(values: Any) -> Any:
 
 
 def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:
-    columns, keys = [], []
+    columns, keys, units = [], [], []
     first = next(iter(observed.values()), None)
     for key, column in observed.items():
+        unit = getattr(column, "attrs", {}).get("units", "")
         if not isinstance(key, str):
             raise TypeError(f"{label}: got the key {key!r:.60}, expected names of outputs")
         column = in_order_of(column, first, f"{label}[{key!r}]")
@@ -289,13 +316,17 @@ def _from_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outp
             )
         keys.append((key, None if values.ndim == 1 else values.shape[1]))
         columns.append(values[:, None] if values.ndim == 1 else values)
+        units += [str(unit)] * columns[-1].shape[1]
     lengths = [len(column) for column in columns]
     if len(set(lengths)) != 1:
         raise ValueError(
             f"{label}: got arrays of {lengths} values, expected one value for each specimen in "
             "every output; NaN where it was not measured"
         )
-    return np.concatenate(columns, axis=1), outputs_of_keys(keys)
+    outputs = outputs_of_keys(keys)
+    return np.concatenate(columns, axis=1), replace(
+        outputs, units=tuple(units) if any(units) else ()
+    )
 
 
 def is_missing(values: Floats) -> NDArray[np.bool_]:

@@ -134,10 +134,10 @@ def predict(
         are known: those of the simulator with this response, or the keys of a mapping. With a
         condition, (chain, draw, specimen) with a specimen for each of its values. Where inputs
         depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
-        ``source`` (how specimens were made), ``responses``
-        (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
-        square error of runs that are left out), ``nan`` (how many values are NaN), ``findings``
-        (as JSON, such as that a model discrepancy extrapolates),
+        ``source`` (how specimens were made), ``responses`` (how many were computed), ``units`` (of
+        a simulator's response), ``emulator_error`` (of an emulator, by output: the root mean square
+        error of runs that are left out), ``nan`` (how many values are NaN), ``findings`` (as JSON,
+        such as that a model discrepancy extrapolates),
         ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
         ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration,
         which `area_test` compares), ``identity`` (of the problem that was calibrated).
@@ -217,7 +217,7 @@ def predict(
     size = len(next(iter(points.values())))
     # A condition that is an input has the same values as a covariate.
     stated = {} if conditions is None else _by_name(inputs_read, conditions)
-    values = _covariates(label, inputs_read, at, stated, has_runs=simulator is not None)
+    values = covariate_values(label, inputs_read, at, stated, has_runs=simulator is not None)
     points |= {
         covariate: np.broadcast_to(value, (size, np.size(value)))
         for covariate, value in values.items()
@@ -233,6 +233,7 @@ def predict(
         "source": drawn.source,
         "responses": n_computed,
         **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
+        **({} if responses.outputs is None else responses.outputs.attrs),
         "nan": missing,
         "specimens_id": _digest(*drawn.specimens),
         "random_seed": str(seed),
@@ -266,7 +267,7 @@ def _labelled(
     )
 
 
-def _covariates(
+def covariate_values(
     label: str,
     inputs: Inputs,
     at: Mapping[str, float] | None,

@@ -337,6 +337,7 @@ class Comparable:
     name: str  # of the condition, with the output's as an index
     measured: Floats  # (n,): +inf is a specimen that failed
     predicted: Floats  # (P, S): a row for each population; NaN has no weight
+    unit: str = ""
 
     @property
     def weights(self) -> Floats:
@@ -380,12 +381,14 @@ def comparables(observed: Any, predicted: Any, caller: str) -> list[Comparable]:
         m = event[0] if event else 1
         columns = values.reshape(-1, m)
         samples = prediction.values.reshape(-1, prediction.sizes["sample"], m)
+        attrs = {**getattr(observed[name], "attrs", {}), **prediction.attrs}
+        units = np.broadcast_to(attrs.get("units", ""), m)
         for j in map(round, np.linspace(0, m - 1, min(m, 8)).tolist()):
             label = f"{name}[{prediction[dims[0]].values.tolist()[j]}]" if event else str(name)
             # Panels are places in a tree, whose levels a slash separates.
             label = label.replace("/", "\u2215")
             measured = columns[~np.isnan(columns[:, j]), j]
-            pairs.append(Comparable(label, measured, samples[..., j]))
+            pairs.append(Comparable(label, measured, samples[..., j], str(units[j])))
     return pairs
 
 

@@ -12,7 +12,8 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.plots.population import margin_densities, margins, select_margins
+from prbayes.model.margins import margins, select_margins
+from prbayes.plots.population import margin_densities
 from prbayes.propagation.base import Propagation
 
 

@@ -158,10 +158,10 @@ def test_a_section_of_the_users_own(
     assert report.with_section(mine).sections[-1] is mine
     part = dataclasses.replace(mine, title="Part", level=3)
     inside = report.with_section(part, after="Model").sections
-    beginning = ["Summary", "What to do next", "Model", "Part", "Simulators"]
-    assert [s.title for s in inside][:5] == beginning
+    beginning = ["Summary", "What to do next", "Population", "Model", "Part", "Simulators"]
+    assert [s.title for s in inside][:6] == beginning
     few = dataclasses.replace(report, title="Two", sections=report.sections[:3])
-    assert [s.title for s in few.sections] == ["Summary", "What to do next", "Model"]
+    assert [s.title for s in few.sections] == ["Summary", "What to do next", "Population"]
     with pytest.raises(KeyError, match="expected the title of a section"):
         report.with_section(mine, after="Nothing")
 
@@ -277,7 +277,7 @@ def test_the_layout_has_a_first_page_and_colours_for_the_dark(
 ) -> None:
     classes = [attrs["class"] or "" for tag, attrs in page.tags if tag == "section"]
     titles = dict(zip([section.title for section in report.sections], classes, strict=True))
-    first_page = ["Summary", "What to do next"]
+    first_page = ["Summary", "What to do next", "Population"]
     assert [title for title, names in titles.items() if "lead" in names] == first_page
     assert [title for title, names in titles.items() if "chapter" in names] == ["Model"]
     css = page.text("style")

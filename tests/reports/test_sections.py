@@ -17,7 +17,14 @@ from prbayes._finding import Finding
 from prbayes.optimize.convergence import Result
 from prbayes.reports.material import gather
 from prbayes.reports.numbers import NOTHING, cells
-from prbayes.reports.sections import _other_optimum, data, metric, optima, posteriors
+from prbayes.reports.sections import (
+    _other_optimum,
+    data,
+    metric,
+    optima,
+    population_in_units,
+    posteriors,
+)
 from prbayes.response.outputs import Outputs
 
 
@@ -417,3 +424,19 @@ def test_what_is_no_decision_or_another_problem_s_is_refused() -> None:
     foreign = prb.exceedance(prb.minimize(model, progressbar=False), same, 2.0, x)
     with pytest.raises(ValueError, match="expected"):
         decided(decision=foreign)
+
+
+def test_the_population_is_in_units_near_the_answer(calibrated: Any) -> None:
+    model, optimum, posterior, _ = calibrated
+    material = gather(model, optimum, posterior, labels={"x": "stiffness (kN/mm)"})
+    (part,) = population_in_units(material)
+    assert part.level == 3
+    table = prb.population(posterior, model=model)
+    cells = dict(zip(part.table[""], part.table["stiffness (kN/mm)"], strict=True))
+    assert list(cells) == [q.replace("cv", "cv, %") for q in table["quantity"].values.tolist()]
+    lower = float(table.lower.sel(quantity="mean")[0])
+    assert cells["mean"].split("(")[1].startswith(f"{lower:.2f}")
+    assert cells["A-basis"] == f"{float(table.estimate.sel(quantity='A-basis')[0]):.4g}"
+    assert population_in_units(gather(optimum=optimum)) == []
+    rejected = dataclasses.replace(calibrated.test, p_value=0.001)
+    assert population_in_units(gather(model, None, posterior, rejected)) == []

@@ -1,0 +1,279 @@
+"""Population tables: moments, quantiles and tolerance bounds of inputs and responses, in units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from prbayes._display import view
+from prbayes._finding import as_json, from_json, report
+from prbayes._stats import INTERVAL
+from prbayes._validate import Floats, called, flag, positive_integer, share
+from prbayes.decision.population_quantities import PopulationReader
+from prbayes.decision.populations import Populations
+from prbayes.model.locking import locked
+from prbayes.model.parameters import element_name
+from prbayes.optimize.optimum import Optimum
+from prbayes.response.outputs import with_unit
+from prbayes.results.predict import width_of_epsilon
+
+_CALLER = "prb.population"
+_VARIABLES = ("estimate", "lower", "upper")
+# Shares of specimens beyond tolerance bounds, and their confidence (MMPDS, CMH-17).
+BASES = {"B-basis": 0.10, "A-basis": 0.01}
+_CONFIDENCE = 0.95
+
+
+@locked
+def population(
+    result: Optimum | xr.DataTree,
+    inputs: Any = None,
+    *,
+    model: pm.Model | None = None,
+    quantiles: Sequence[float] = (0.05, 0.5, 0.95),
+    prob: float = INTERVAL,
+    upper: bool = False,
+    at: Mapping[str, float] | None = None,
+    n_draws: int = 4000,
+) -> PopulationTable:
+    r"""Return mean, spread, quantiles and tolerance bounds of inputs and responses, in units.
+
+    The intervals are those of a quantity of the population: of its posterior, or of the sampling
+    distribution of an optimum. An A-basis (B-basis) value is a tolerance bound: 99 % (90 %) of all
+    specimens exceed it, with 95 % confidence.
+
+    Parameters
+    ----------
+    result : Optimum or xarray.DataTree
+        From `minimize`; or with a ``posterior`` group, from any sampler.
+    inputs : str, TensorVariable, Condition, xarray.DataArray, or a sequence of such, optional
+        The name of an input, which is that of the ``.dist()`` or of the response's argument, or a
+        ``.dist()``; all inputs by default. A response is a `prbayes.decision.Condition`, or the
+        result of `predict` for a posterior.
+    model : pymc.Model, optional
+        That of the optimum, or the one on the context, by default.
+    quantiles : sequence of float
+        Probabilities between 0 and 1.
+    prob : float
+        Probability of the intervals, which have equal tails.
+    upper : bool
+        Whether tolerance bounds are upper ones, which the specimens do not exceed.
+    at : mapping, optional
+        The value of each covariate, by the name of its `prbayes.response.condition`, where inputs
+        depend on one.
+    n_draws : int
+        Largest number of populations.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dims (name, quantity); with groups (name, group, quantity), with the name of their
+        dimension. Variables ``estimate`` (at the optimum, or the posterior mean), ``lower`` and
+        ``upper``; a coordinate ``unit`` by name. Quantities are the mean, ``sd``, ``cv`` (sd over
+        absolute mean, without unit), quantiles, tolerance bounds, and the correlations of elements
+        of a vector. Tolerance bounds are estimates without an interval. Moments that do not exist,
+        as of a Cauchy distribution or of responses with failures (+inf), are NaN. It prints as
+        sentences; a notebook shows a table.
+
+    Raises
+    ------
+    TypeError, KeyError, ValueError
+        If an argument is not as described, or the result is another model's, or an optimum without
+        standard errors.
+    DesignError
+        If stored responses do not support the populations of a `Condition`.
+
+    Notes
+    -----
+    Let :math:`q_p(\theta)` be the p-quantile of the population :math:`\theta`. The B-basis value is
+    the 5 % quantile of :math:`q_{.1}(\theta)`, and the A-basis value that of
+    :math:`q_{.01}(\theta)`, over the draws [1]_. For a normal population and the reference prior it
+    is the classical bound :math:`\bar y - k s`, with the factor k of the noncentral t distribution.
+    An optimum's bounds have the confidence only for many specimens; take the posterior.
+
+    Margins come from inverse distribution functions, or from random draws where there is none.
+
+    References
+    ----------
+    .. [1] Krishnamoorthy, K. and T. Mathew (2009), Statistical Tolerance Regions, Wiley,
+       doi:10.1002/9780470473900, chapter 11.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     k = pm.Normal.dist(pm.Normal("mu", 3, 2), pm.HalfNormal("sigma", 1))
+    ...     y = prb.Simulator(
+    ...         "y", lambda k: 2 * k, k, metric=prb.AreaMetric(), units={"k": "kN/mm"},
+    ...         observed=[5.0, 5.5, 6.0, 6.2, 6.4, 7.0, 7.5, 8.1],
+    ...     )
+    >>> table = prb.population(prb.minimize(model), "k")
+    >>> float(table.estimate.sel(name="k", quantity="mean").round(1)), str(table.unit.values[0])
+    (3.2, 'kN/mm')
+    """
+    prob = share(prob, f"{_CALLER}: prob")
+    upper = flag(upper, f"{_CALLER}: upper")
+    positive_integer(n_draws, f"{_CALLER}: n_draws", minimum=2)
+    if not isinstance(quantiles, Sequence | np.ndarray) or isinstance(quantiles, str):
+        raise TypeError(
+            f"{_CALLER}: quantiles: got {called(quantiles)}, expected probabilities between 0 and "
+            "1, such as (0.05, 0.5, 0.95)"
+        )
+    probabilities = [share(p, f"{_CALLER}: quantiles") for p in quantiles]
+    levels = {f"{100 * p:g}% quantile": p for p in probabilities}
+    populations = Populations.of(result, model, n_draws, _CALLER)
+    simulators = populations.evaluator.simulators
+    covariates = {str(v.name) for node in simulators for v in node.inputs.covariates}
+    if at is not None and not (isinstance(at, Mapping) and set(at) <= covariates):
+        raise ValueError(
+            f"{_CALLER}: at: got {called(at)}, expected values of covariates of the model, some of "
+            f"{sorted(covariates)}"
+        )
+    bases = {name: 1 - p if upper else p for name, p in BASES.items()}
+    levels |= bases
+    reader = PopulationReader(populations, levels, at or {})
+    elements = reader.elements(inputs)
+    names = list(dict.fromkeys(name for x in elements for name in x.numbers))
+    groups = {x.groups.dim: list(x.groups.labels) for x in elements if x.groups is not None}
+    if len(groups) > 1:
+        raise ValueError(
+            f"{_CALLER}: inputs: got populations of the groups {list(groups)}, expected those of "
+            "one partition; ask for one input at a time"
+        )
+    n_groups = max(map(len, groups.values()), default=1)
+    # Estimate, lower and upper
+    table = np.full((3, len(elements), n_groups, len(names)), np.nan)
+    tails = [(1 - prob) / 2, (1 + prob) / 2]
+    confidence = _CONFIDENCE if upper else 1 - _CONFIDENCE
+    for i, x in enumerate(elements):
+        for name, values in x.numbers.items():
+            draws = values if populations.are_draws else values[..., 1:]
+            q = names.index(name)
+            if name in bases:
+                table[0, i, :, q] = _quantiles(draws, [confidence])[0]
+                continue
+            low, high = _quantiles(draws, tails)
+            table[:, i, :, q] = [_mean(draws) if populations.are_draws else values[:, 0], low, high]
+    width = width_of_epsilon(result, populations.evaluator.model)
+    if not groups:
+        table = table[:, :, 0]
+    dims = ["name", *groups, "quantity"]
+    return PopulationTable(
+        {key: (dims, numbers) for key, numbers in zip(_VARIABLES, table, strict=True)},
+        coords={
+            "name": [x.name for x in elements],
+            **groups,
+            "quantity": names,
+            "unit": ("name", [x.unit for x in elements]),
+        },
+        attrs={
+            "prob": prob,
+            "interval": "posterior" if populations.are_draws else "standard error",
+            "bounds": "upper" if upper else "lower",
+            "findings": as_json((*report(*width), *(f for x in elements for f in x.findings))),
+            **populations.provenance(),
+        },
+    )
+
+
+def _quantiles(draws: Floats, probabilities: Sequence[float]) -> Floats:
+    """Return quantiles over populations, (groups, k) -> (p, groups)."""
+    return np.array([np.quantile(_defined(row), probabilities) for row in draws]).T
+
+
+def _mean(draws: Floats) -> Floats:
+    """Return means over populations, (groups, k) -> (groups,)."""
+    return np.array([_defined(row).mean() for row in draws])
+
+
+def _defined(row: Floats) -> Floats:
+    """Return the finite numbers of populations; NaN where most populations have none."""
+    finite = row[np.isfinite(row)]
+    return finite if finite.size > 0.5 * row.size else np.array([np.nan])
+
+
+class PopulationTable(xr.Dataset):  # type: ignore[no-untyped-call]
+    """A dataset that prints as sentences, and that notebooks show as a table."""
+
+    __slots__ = ()
+
+    @property
+    def _is_whole(self) -> bool:
+        return {"name", "quantity"} <= set(self.dims) and set(_VARIABLES) <= set(self.data_vars)
+
+    def rows(self) -> Iterator[tuple[str, str, dict[str, tuple[str, str]]]]:
+        """Yield name, unit, and texts of estimate and interval by quantity, of each population."""
+        group_dims = [dim for dim in self["estimate"].dims if dim not in ("name", "quantity")]
+        stacked = self.stack(population=["name", *group_dims])
+        for place in range(stacked.sizes["population"]):
+            row = stacked.isel(population=place)
+            name, *labels = row["population"].item()
+            cells = {}
+            for quantity in self["quantity"].values.tolist():
+                cell = row.sel(quantity=quantity)
+                values = [float(cell[key]) for key in _VARIABLES]
+                if np.isfinite(values[0]):
+                    cells[quantity] = _texts(values, 100.0 if quantity == "cv" else 1.0)
+            unit = str(self["unit"].sel(name=name).item()) if "unit" in self.coords else ""
+            yield element_name(name, labels), unit, cells
+
+    def sentences(self) -> list[str]:
+        """Return a sentence for each population."""
+        sentences = []
+        for name, unit, cells in self.rows():
+            parts = []
+            for quantity, (estimate, interval) in cells.items():
+                text = f"{quantity} {estimate}"
+                if quantity == "cv":
+                    text += " %"
+                if interval:
+                    text += f" ({interval})"
+                if quantity == "mean" and unit:
+                    text += f" {unit}"
+                parts.append(text)
+            sentences.append(f"{name}: {', '.join(parts)}.")
+        return sentences
+
+    def _heading(self) -> str:
+        kind, prob = self.attrs.get("interval", ""), self.attrs.get("prob", np.nan)
+        bounds = self.attrs.get("bounds", "")
+        return (
+            f"Population, with {prob:.0%} intervals by the {kind}; A- and B-basis values are "
+            f"{bounds} bounds for 99 % and 90 % of the specimens with 95 % confidence"
+        )
+
+    def __repr__(self) -> str:
+        """Return sentences; of a selection what xarray shows."""
+        if not self._is_whole:
+            return super().__repr__()
+        return "\n  ".join([f"{self._heading()}:", *self.sentences()])
+
+    def _repr_html_(self) -> str:
+        """Show a table; of a selection what xarray shows."""
+        if not self._is_whole:
+            return super()._repr_html_()
+        quantities = self["quantity"].values.tolist()
+        rows = []
+        for name, unit, cells in self.rows():
+            texts = [cells.get(quantity, ("", "")) for quantity in quantities]
+            shown = [f"{value} ({interval})" if interval else value for value, interval in texts]
+            rows.append([with_unit(name, unit), *shown])
+        header = ["", *(q if q != "cv" else "cv (%)" for q in quantities)]
+        sentences = [str(finding) for finding in from_json(self.attrs.get("findings", "[]"))]
+        return view(self._heading(), header=header, rows=rows, sentences=sentences)
+
+
+def _texts(values: Sequence[float], factor: float) -> tuple[str, str]:
+    """Return an estimate and its interval, with two digits of the half width of the interval."""
+    estimate, low, high = (factor * value for value in values)
+    width = (high - low) / 2
+    if not (np.isfinite(width) and width > 1e-9 * max(abs(low), abs(high))):
+        return f"{estimate:.4g}", ""
+    decimals = 1 - int(np.floor(np.log10(width)))
+    if not 0 <= decimals <= 6:
+        return f"{estimate:.4g}", f"{low:.4g}, {high:.4g}"
+    return f"{estimate:.{decimals}f}", f"{low:.{decimals}f}, {high:.{decimals}f}"

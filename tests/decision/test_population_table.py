@@ -1,0 +1,226 @@
+"""Population tables are the closed forms of populations, and their tolerance bounds the classical ones."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy import stats
+
+import prbayes as prb
+from prbayes.model.random_variable import simulators
+
+DATA = np.random.default_rng(1).normal(3.0, 0.5, 20)
+FRESH: dict[str, Any] = {"metric": prb.AreaMetric(), "propagation": prb.Fresh(50)}
+
+
+def draws(**values: Any) -> xr.DataTree:
+    """Return a posterior of one chain."""
+    data = {}
+    for name, value in values.items():
+        array = np.asarray(value)[None]
+        dims = ["chain", "draw", *(f"{name}_dim_{i}" for i in range(array.ndim - 2))]
+        data[name] = (dims, array)
+    return xr.DataTree.from_dict({"posterior": xr.Dataset(data)})
+
+
+def normal_model(observed: Any = DATA, **settings: Any) -> pm.Model:
+    with pm.Model() as model:
+        k = pm.Normal.dist(pm.Normal("mu", 3, 2), pm.HalfNormal("sigma", 1), name="k")
+        prb.Simulator("y", np.positive, k, observed=observed, **FRESH | settings)
+    return model
+
+
+def reference_posterior(n: int, seed: int) -> xr.DataTree:
+    """Return draws of the reference posterior of a normal population."""
+    rng = np.random.default_rng(seed)
+    sigma = DATA.std(ddof=1) * np.sqrt((DATA.size - 1) / rng.chisquare(DATA.size - 1, n))
+    return draws(mu=rng.normal(DATA.mean(), sigma / np.sqrt(DATA.size)), sigma=sigma)
+
+
+def test_tolerance_bounds_are_the_classical_ones() -> None:
+    size, posterior = DATA.size, reference_posterior(20_000, 2)
+    model = normal_model()
+    for upper, sign in ((False, -1), (True, 1)):
+        table = prb.population(posterior, "k", model=model, upper=upper, n_draws=20_000)
+        for basis, share in (("B-basis", 0.9), ("A-basis", 0.99)):
+            noncentral = np.sqrt(size) * stats.norm.ppf(share)
+            factor = stats.nct.ppf(0.95, size - 1, noncentral) / np.sqrt(size)
+            bound = float(table.estimate.sel(name="k", quantity=basis))
+            # The standard error of the factor by so many draws is .006 and .010.
+            assert bound == pytest.approx(
+                DATA.mean() + sign * factor * DATA.std(ddof=1), abs=0.04 * DATA.std(ddof=1)
+            )
+
+
+def test_numbers_are_those_of_the_distribution_in_each_draw() -> None:
+    rng = np.random.default_rng(3)
+    mu, sigma = rng.normal(1, 0.1, 300), rng.gamma(40, 0.01, 300)
+    with pm.Model() as model:
+        k = pm.LogNormal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        count = pm.Poisson.dist(pm.math.exp(model["mu"]))
+        known = pm.StudentT.dist(3.0, mu=0.0, sigma=2.0)
+        heavy = pm.Cauchy.dist(0.0, 1.0)
+        prb.Simulator(
+            "y", lambda k, count, known, heavy: np.log(k) + 0 * (count + known + heavy),
+            k, count, known, heavy, observed=DATA, units={"k": "kN/mm", "y": "mm"}, **FRESH,
+        )  # fmt: skip
+    table = prb.population(draws(mu=mu, sigma=sigma), model=model, prob=0.8, quantiles=[0.25])
+    assert table.name.values.tolist() == ["k", "count", "known", "heavy"]
+    assert table.unit.values.tolist() == ["kN/mm", "", "", ""]
+    exact = {
+        "mean": np.exp(mu + sigma**2 / 2),
+        "cv": np.sqrt(np.expm1(sigma**2)),
+        "25% quantile": np.exp(mu + sigma * stats.norm.ppf(0.25)),
+    }
+    for quantity, values in exact.items():
+        cell = table.sel(name="k", quantity=quantity)
+        assert float(cell.estimate) == pytest.approx(values.mean(), rel=1e-9)
+        interval = [float(cell.lower), float(cell.upper)]
+        np.testing.assert_allclose(interval, np.quantile(values, [0.1, 0.9]), rtol=1e-9)
+    # 2000 specimens of each of 300 populations
+    counted = table.sel(name="count", quantity=["mean", "sd"]).estimate
+    np.testing.assert_allclose(counted, [np.exp(mu).mean(), np.exp(mu / 2).mean()], rtol=0.02)
+    of_known = table.sel(name="known", quantity=["mean", "sd"])
+    np.testing.assert_allclose(of_known.estimate, [0, 2 * np.sqrt(3)], atol=2e-3)
+    np.testing.assert_array_equal(of_known.lower, of_known.upper)
+    assert np.isnan(table.estimate.sel(name="heavy", quantity=["mean", "sd", "cv"])).all()
+    pattern = r"k: mean \d\.\d+ \(\d\.\d+, \d\.\d+\) kN/mm, sd 1\.\d+ \(.*\), cv 4\d(\.\d)? "
+    assert re.search(pattern, repr(table))
+    assert ">k (kN/mm)</th>" in table._repr_html_()
+    assert table.to_dataframe().loc[("k", "mean"), "unit"] == "kN/mm"
+    assert "xarray" in repr(table.sel(name="k"))
+
+
+def test_a_vector_has_the_correlations_of_its_elements() -> None:
+    rho = np.random.default_rng(4).uniform(0.2, 0.8, 200)
+    for nu, spread in ((None, 1.0), (9.0, 9 / 7)):
+        with pm.Model() as model:
+            r = pm.Uniform("rho", -1, 1)
+            covariance = pm.math.stack([[1.0, 2 * r], [2 * r, 4.0]])
+            mean = np.array([1.0, 2.0])
+            load = pm.MvNormal.dist(mean, covariance)
+            if nu is not None:
+                load = pm.MvStudentT.dist(nu, mu=mean, scale=covariance)
+            prb.Simulator("y", lambda load: load.sum(axis=-1), load, observed=DATA, **FRESH)
+        table = prb.population(draws(rho=rho), "load", model=model)
+        assert table.name.values.tolist() == ["load[0]", "load[1]"]
+        cell = table.sel(name="load[1]", quantity="correlation with load[0]")
+        found = [float(cell[key]) for key in ("estimate", "lower", "upper")]
+        expected = [rho.mean(), *np.quantile(rho, [0.055, 0.945])]
+        np.testing.assert_allclose(found, expected, atol=0.02)
+        np.testing.assert_allclose(
+            table.estimate.sel(quantity=["mean", "sd"]),
+            [[1, np.sqrt(spread)], [2, 2 * np.sqrt(spread)]], atol=0.04,
+        )  # fmt: skip
+
+
+def test_groups_are_a_dimension() -> None:
+    data = xr.DataArray(DATA, {"supplier": ("specimen", ["Adler", "Busch"] * 10)}, "specimen")
+    with pm.Model(coords={"supplier": ["Adler", "Busch"]}) as model:
+        mu = pm.Normal("mu", 2, 2, dims="supplier")
+        x = pm.Normal.dist(mu[prb.response.group("supplier")], 0.3)
+        prb.Simulator("y", np.positive, x, observed=data, **FRESH)
+    means = np.random.default_rng(5).normal([1.0, 3.0], 0.1, (100, 2))
+    table = prb.population(draws(mu=means), model=model)
+    assert table.estimate.dims == ("name", "supplier", "quantity")
+    of_mean = table.estimate.sel(quantity="mean")[0]
+    np.testing.assert_allclose(of_mean, means.mean(axis=0))
+    assert "[Busch]: mean 2.99 (2." in repr(table)
+
+
+def test_a_covariate_needs_its_value() -> None:
+    hardness = np.linspace(1.0, 2.0, 20)
+    with pm.Model() as model:
+        slope = pm.Normal("slope", 1, 1)
+        covariate = prb.response.condition("hardness", hardness)
+        x = pm.Normal.dist(slope * covariate, 0.3)
+        prb.Simulator("y", np.positive, x, observed=DATA)
+        at_2 = pm.Normal.dist(slope * 2.0, 0.3)
+    posterior = draws(slope=np.linspace(1.0, 2.0, 50))
+    with pytest.raises(ValueError, match=r"expected a value of each covariate.*hardness"):
+        prb.population(posterior, model=model)
+    table = prb.population(posterior, model=model, at={"hardness": 2.0})
+    expected = prb.population(posterior, at_2, model=model)
+    assert float(table.estimate[0, 0]) == pytest.approx(3.0)
+    np.testing.assert_allclose(table.estimate, expected.estimate)
+
+
+def test_responses_are_weighted_or_predicted_populations() -> None:
+    model = normal_model(propagation=prb.Reweighted(2048), units={"y": "mm"})
+    (node,) = prb.minimize(model, starts=0, refine=False).evaluator.nodes
+    (k,) = node.inputs.aleatory
+    response = node.responses.function
+    posterior = reference_posterior(400, 6)
+    later = prb.predict(
+        posterior, response, k, model=model, n_samples=2000, stored=False, name="later"
+    )
+    table = prb.population(
+        posterior, ["k", prb.decision.Condition(response, k), later], model=model
+    )
+    assert later.attrs["units"] == "mm"
+    assert table.name.values.tolist() == ["k", "positive", "later"]
+    assert table.unit.values.tolist() == ["", "mm", "mm"]
+    of_k = table.estimate[0]
+    for place in (1, 2):
+        np.testing.assert_allclose(table.estimate[place], of_k, atol=0.05)
+        np.testing.assert_allclose(table.upper[place, :6], table.upper[0, :6], atol=0.06)
+
+
+def test_an_optimum_has_the_intervals_of_its_standard_errors() -> None:
+    model = normal_model(metric=prb.KullbackLeibler(), propagation=prb.Reweighted(512))
+    optimum = prb.minimize(model, starts=0)
+    table = prb.population(optimum, "k")
+    cell = table.sel(name="k", quantity="mean")
+    z = stats.norm.ppf(0.945)
+    assert float(cell.estimate) == pytest.approx(float(optimum.point["mu"]))
+    half = float(cell.upper - cell.lower) / 2
+    assert half == pytest.approx(z * float(optimum.stderr["mu"]), rel=0.02)
+    (k,) = optimum.evaluator.nodes[0].inputs.aleatory
+    later = prb.predict(optimum, np.positive, k)
+    with pytest.raises(TypeError, match=r"expected prb.predict of a posterior.*Condition"):
+        prb.population(optimum, later)
+
+
+@pytest.mark.parametrize(
+    ("observed", "settings", "units"),
+    [
+        (DATA, {"units": {"y": "mm"}}, ("mm",)),
+        (xr.DataArray(DATA, dims="specimen", attrs={"units": "mm"}), {}, ("mm",)),
+        ("series", {}, ("mm",)),
+        ("series", {"units": {"y": "m"}}, ("m",)),
+        ("frame", {}, ("mm", "")),
+        ("mapping", {"units": {"b": "kg"}}, ("mm", "kg")),
+        (DATA, {}, ()),
+    ],
+)
+def test_units_of_responses_come_from_the_data(
+    observed: Any, settings: dict[str, Any], units: tuple[str, ...]
+) -> None:
+    series = pd.Series(DATA, name="y")
+    frame = pd.DataFrame({"a": DATA, "b": DATA**2})
+    series.attrs["units"], frame.attrs["units"] = "mm", {"a": "mm"}
+    mapping = {"a": series, "b": DATA**2}
+    observed = {"series": series, "frame": frame, "mapping": mapping}.get(str(observed), observed)
+    if isinstance(observed, dict | pd.DataFrame):
+        settings = settings | {"metric": prb.Joint(prb.AreaMetric())}
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 3, 2), 0.5)
+        response = outputs if isinstance(observed, dict | pd.DataFrame) else np.positive
+        prb.Simulator("y", response, x, observed=observed, **FRESH | settings)
+    (simulator,) = simulators(model).values()
+    assert simulator.outputs.units == units
+
+
+def outputs(x: Any) -> dict[str, Any]:
+    return {"a": x, "b": x**2}
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(KeyError, match=r"units: got 'force', expected some of \['k', 'y'\]"):
+        normal_model(units={"force": "N"})
+    with pytest.raises(KeyError, match=r"inputs: got nothing, expected some of \['k'\]"):
+        prb.population(reference_posterior(10, 1), "nothing", model=normal_model())
