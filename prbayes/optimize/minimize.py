@@ -426,7 +426,7 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
     evaluator, settings = problem.search.evaluator, problem.settings
     n_starts = settings.starts
     if n_starts is None:
-        n_starts = _starts_by_cost(evaluator, fit)
+        n_starts = _starts_by_cost(problem.search, fit)
     optima: list[LocalOptimum] = []
     for is_first in (True, False):
         if not n_starts or fit.sampling is None:
@@ -445,15 +445,17 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
     return fit, optima
 
 
-def _starts_by_cost(evaluator: Evaluator, fit: Fit) -> int:
+def _starts_by_cost(search: Search, fit: Fit) -> int:
     """Return the number of starts in search of other optima.
 
     Where responses are simulated again, a few if the fit is poor and they take half a minute.
     """
+    evaluator = search.evaluator
     if not evaluator.responses_per_theta:
         return 32
-    if fit.sampling is None or not is_far_from_data(fit.sampling):
+    if fit.sampling is None or search.prior or not is_far_from_data(fit.sampling, fit.lowest):
         return 0
+    evaluator.total(fit.theta[None], fit.scales)  # the first call compiles
     start = time.perf_counter()
     evaluator.total(fit.theta[None], fit.scales)
     seconds = time.perf_counter() - start

@@ -129,16 +129,13 @@ def _limit(
     return float(theta[i] + middle * unit)
 
 
-def is_far_from_data(sampling: SamplingDistribution) -> bool:
-    """Return whether distances are three times those of data from the population.
+def is_far_from_data(sampling: SamplingDistribution, lowest: float) -> bool:
+    """Return whether distances, ``lowest`` in all, are three times those of data from there.
 
     Such a fit may be a local optimum.
     """
-    evaluator, scales = sampling.evaluator, sampling.scales
-    if not all(node.metric.distance for node in evaluator.nodes):
-        return False
-    (total,) = evaluator.total(sampling.theta[None], scales)
-    return bool(total > 3 * _noise(sampling))
+    is_distance = all(node.metric.distance for node in sampling.evaluator.nodes)
+    return is_distance and lowest > 3 * _noise(sampling)
 
 
 def _noise(sampling: SamplingDistribution) -> float:
@@ -165,7 +162,7 @@ def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | No
     is_long = seconds * n_populations > 30 or budget().is_limited
     if needs_refits(evaluator):
         return None
-    if not is_stored(evaluator) and (is_long or is_far_from_data(sampling)):
+    if not is_stored(evaluator) and (is_long or is_far_from_data(sampling, lowest)):
         return None
     noise = _noise(sampling)
 
