@@ -31,7 +31,8 @@ TRUE = {
     "A-basis": MU + SIGMA * stats.norm.ppf(0.01),
 }
 CELLS = [
-    f"{kind}, N = {n}" for kind in ("reference posterior", "sample", "optimum") for n in (10, 20)
+    *("reference posterior, N = 10", "reference posterior, N = 20"),
+    *("sample, N = 20", "optimum, N = 20"),
 ]
 DRAWS = 4000
 

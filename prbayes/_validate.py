@@ -134,7 +134,7 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
             f"{name}: got an array of shape {array.shape}, expected (N, m), a row for each "
-            "specimen and a column for each output"
+            f"specimen and a column for each output; {NO_POPULATION}"
         )
     if np.isneginf(array).any():
         raise ValueError(

@@ -23,9 +23,8 @@ from prbayes.results.predict import width_of_epsilon
 
 _CALLER = "prb.population"
 _VARIABLES = ("estimate", "lower", "upper")
-# Shares of specimens beyond tolerance bounds, and their confidence (MMPDS, CMH-17).
+# Shares of specimens beyond tolerance bounds of 95 % confidence (MMPDS, CMH-17).
 BASES = {"B-basis": 0.10, "A-basis": 0.01}
-_CONFIDENCE = 0.95
 
 
 @locked
@@ -148,7 +147,7 @@ def population(
     # Estimate, lower and upper
     table = np.full((3, len(elements), n_groups, len(names)), np.nan)
     tails = [(1 - prob) / 2, (1 + prob) / 2]
-    confidence = _CONFIDENCE if upper else 1 - _CONFIDENCE
+    confidence = 0.95 if upper else 0.05
     for i, x in enumerate(elements):
         for name, values in x.numbers.items():
             draws = values if populations.are_draws else values[..., 1:]
@@ -229,7 +228,7 @@ class PopulationTable(xr.Dataset):  # type: ignore[no-untyped-call]
             for quantity, (estimate, interval) in cells.items():
                 text = f"{quantity} {estimate}"
                 if quantity == "cv":
-                    text += " %"
+                    text += "%"
                 if interval:
                     text += f" ({interval})"
                 if quantity == "mean" and unit:
@@ -243,7 +242,7 @@ class PopulationTable(xr.Dataset):  # type: ignore[no-untyped-call]
         bounds = self.attrs.get("bounds", "")
         return (
             f"Population, with {prob:.0%} intervals by the {kind}; A- and B-basis values are "
-            f"{bounds} bounds for 99 % and 90 % of the specimens with 95 % confidence"
+            f"{bounds} bounds for 99% and 90% of the specimens with 95% confidence"
         )
 
     def __repr__(self) -> str:

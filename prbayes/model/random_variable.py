@@ -679,7 +679,7 @@ class abc_distance(Op):  # noqa: N801 (reads as a function in a model)
     -----
     `pymc.Simulator` draws new responses at every evaluation, each given to all observations;
     numbers of simulated and observed responses may differ. A simulated sample with NaN has
-    log-density -inf.
+    log-density -inf. A metric compares samples of specimens; one time series is no sample.
 
     Examples
     --------

@@ -376,9 +376,9 @@ def _add_measurement(
         )
     if dims is not None:
         dims = _checked_dims(name, dims, measurement.observed.shape, model)
-    known = {v: pt.constant(measurement.covariates[str(v.name)]) for v in inputs.covariates}
-    known |= {v: pt.constant(measurement.groups) for v in filter(is_group, inputs.parents)}
-    params = [known.get(v, v) for v in likelihood.variables(names)]
+    constants = {v: pt.constant(measurement.covariates[str(v.name)]) for v in inputs.covariates}
+    constants |= {v: pt.constant(measurement.groups) for v in filter(is_group, inputs.parents)}
+    params = [constants.get(v, v) for v in likelihood.variables(names)]
     params += joined
     signature = rv_signature([p.type.ndim for p in params], len(measurement.event))
     operation = SpecimenRV(signature=signature, reference=weakref.ref(likelihood), simulators=names)

@@ -214,10 +214,10 @@ def _log_density(
     Values of the inputs' parents are by variable.
     """
     inputs, stacked = likelihood.inputs, likelihood.stacked
-    known = dict(zip(inputs.covariates, stacked.covariates, strict=True))
-    known |= dict.fromkeys(filter(is_group, inputs.parents), stacked.groups)
+    of_specimens = dict(zip(inputs.covariates, stacked.covariates, strict=True))
+    of_specimens |= dict.fromkeys(filter(is_group, inputs.parents), stacked.groups)
     # Vectors of groups and covariates make vectors of the distributions' parameters.
-    vectors = {parent: pt.as_tensor(values)[specimens] for parent, values in known.items()}
+    vectors = {parent: pt.as_tensor(values)[specimens] for parent, values in of_specimens.items()}
     symbols = [vectors.get(parent, parent).type() for parent in inputs.parents]
     dists, _ = inputs.rebuilt(symbols)
     log_p = log_density(inputs, dists, points)
@@ -313,9 +313,9 @@ def draw_inputs(
             log_weights = np.where(np.isnan(log_weights), -np.inf, log_weights)
             totals = np.cumsum(np.exp(log_weights - log_weights.max(axis=1, keepdims=True)), axis=1)
             limits = totals[:, -1:] * rng.random((len(rows), 1))
-            chosen = (totals < limits).sum(axis=1)
+            places = (totals < limits).sum(axis=1)
             for drawn, points in zip(inputs, x, strict=True):
-                drawn[k, rows] = points[np.arange(len(rows)), chosen]
+                drawn[k, rows] = points[np.arange(len(rows)), places]
         if probability is not None:
             is_gross = rng.random((size, len(rows))) < probability[:, rows]
             population, _ = likelihood.density.sampler(parents, len(rows), rng)

@@ -119,8 +119,8 @@ def population_in_units(m: Material) -> list[Section]:
     about = (
         "How the inputs vary from specimen to specimen: mean, standard deviation (sd), coefficient "
         f"of variation (cv) and quantiles, with {INTERVAL:.0%} intervals in brackets. "
-        "A B-basis (A-basis) value is a tolerance bound: 90 % (99 %) of all specimens exceed it, "
-        "with 95 % confidence."
+        "A B-basis (A-basis) value is a tolerance bound: 90% (99%) of all specimens exceed it, "
+        "with 95% confidence."
     )
     return [Section("Population", about, rows_table(rows), level=3)]
 

@@ -20,9 +20,6 @@ from pytensor.tensor.variable import TensorConstant, TensorVariable
 
 from prbayes._validate import Floats, plain_text, real_array
 
-# Largest number of different values of a vector condition: an emulator has an output for each.
-MOST_OUTPUTS = 200
-
 
 class ConditionRV(UniformRV):  # type: ignore[misc]
     """A condition that is uniformly distributed beyond the range of its values by a tenth."""
@@ -132,7 +129,7 @@ def condition(name: str, values: ArrayLike) -> TensorVariable:
     return variable
 
 
-def _vector(name: str, array: Floats, caller: str) -> TensorVariable:
+def _vector(name: str, array: Floats, caller: str, most: int = 200) -> TensorVariable:
     """Return the different values of specimens with several values, (N, T), as a constant."""
     is_number = ~np.isnan(array)
     if np.isinf(array).any() or not is_number.any(axis=1).all():
@@ -141,10 +138,10 @@ def _vector(name: str, array: Floats, caller: str) -> TensorVariable:
             "numbers for each specimen, filled up with NaN"
         )
     distinct, inverse = np.unique(array[is_number], return_inverse=True)
-    if len(distinct) > MOST_OUTPUTS:
+    if len(distinct) > most:
         raise ValueError(
             f"{caller}: values: got {len(distinct)} different values, expected at most "
-            f"{MOST_OUTPUTS}, since the emulator has an output for each; round them, as in "
+            f"{most}, since the emulator has an output for each; round them, as in "
             "np.round(values, 1)"
         )
     columns = np.full(array.shape, -1)

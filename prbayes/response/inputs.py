@@ -184,9 +184,9 @@ def read_inputs(
         # A condition is an input itself, or a covariate of other ones.
         ends = model_variables - {x}
         if not is_condition(x):
-            known = list(filter(is_known, _ancestry([x], model_variables)))
-            _refuse_named_expressions(label, known, model)
-            model_variables.update(known)
+            of_specimens = list(filter(is_known, _ancestry([x], model_variables)))
+            _refuse_named_expressions(label, of_specimens, model)
+            model_variables.update(of_specimens)
             ends = model_variables
         ancestry = _ancestry([x], ends)
         parents.update(dict.fromkeys([v for v in ancestry if v in ends]))

@@ -16,10 +16,6 @@ from prbayes.response.condition import is_condition
 from prbayes.response.distributions import MVNORMAL, PopulationSampler, quantiles
 from prbayes.response.inputs import Inputs
 
-# Normal numbers of the trapezoidal rule for moments; its error is negligible for smooth inverses.
-_Z = np.linspace(-8.0, 8.0, 97)
-_N_DRAWN = 2000  # random draws from a population without an inverse distribution function
-
 
 class InputMoments:
     """Moments and quantiles of the elements of one input as functions of its parents."""
@@ -27,6 +23,9 @@ class InputMoments:
     def __init__(self, label: str, inputs: Inputs, levels: Sequence[float]) -> None:
         self.inputs = inputs
         self.levels = np.array(levels)
+        # Normal numbers of the trapezoidal rule for moments, exact enough for smooth inverses.
+        self.z = np.linspace(-8.0, 8.0, 97)
+        self.n_drawn = 2000  # from a population without an inverse distribution function
         (self.shape,) = inputs.event_shapes
         self.size = int(np.prod(self.shape, dtype=int))
         op = inputs.aleatory[0].owner.op
@@ -58,7 +57,7 @@ class InputMoments:
     def numbers(self, parents: Sequence[Floats]) -> Floats:
         """Return mean, sd, quantiles, and correlations with earlier elements, (k, q, elements)."""
         k = len(parents[0]) if parents else 1
-        n = _N_DRAWN if self._inverse is None else _Z.size + self.levels.size
+        n = self.n_drawn if self._inverse is None else self.z.size + self.levels.size
         step = max(1, AT_ONCE // (n * self.size))
         parts = []
         for first in range(0, k, step):
@@ -73,11 +72,11 @@ class InputMoments:
             for r, p in zip(self.inputs.parents, parents, strict=True)
         ]
         k = len(parents[0]) if parents else 1
-        placed, *covariance = self._inverse(*values, np.concatenate([ndtr(_Z), self.levels]))
-        n = _Z.size + self.levels.size
+        placed, *covariance = self._inverse(*values, np.concatenate([ndtr(self.z), self.levels]))
+        n = self.z.size + self.levels.size
         x = np.broadcast_to(placed, (k, n, *self.shape)).reshape(k, n, self.size)
-        nodes, levels = x[:, : _Z.size], x[:, _Z.size :]
-        weights = np.exp(-0.5 * _Z**2)
+        nodes, levels = x[:, : self.z.size], x[:, self.z.size :]
+        weights = np.exp(-0.5 * self.z**2)
         weights /= weights.sum()
         with np.errstate(invalid="ignore", over="ignore"):
             mean = np.tensordot(nodes, weights, (1, 0))
@@ -87,7 +86,7 @@ class InputMoments:
                 terms = weights[:, None] * deviation**power
                 total = terms.sum(axis=1)
                 # Infinite moments come from the ends.
-                beyond = terms[:, np.abs(_Z) > 7].sum(axis=1)
+                beyond = terms[:, np.abs(self.z) > 7].sum(axis=1)
                 exists = beyond <= 0.01 * total
                 moments.append(
                     np.where(exists, np.sqrt(total) if moment is None else moment, np.nan)
@@ -104,10 +103,10 @@ class InputMoments:
         (dist,) = self.inputs.aleatory
         if self._sampler is None:
             with interpreted():
-                draws = pm.draw(dist, draws=_N_DRAWN, random_seed=0, mode=PLAIN)
+                draws = pm.draw(dist, draws=self.n_drawn, random_seed=0, mode=PLAIN)
         else:
-            (draws,), _ = self._sampler(parents, _N_DRAWN, np.random.default_rng(0))
-        x = np.reshape(draws, (-1, _N_DRAWN, self.size))
+            (draws,), _ = self._sampler(parents, self.n_drawn, np.random.default_rng(0))
+        x = np.reshape(draws, (-1, self.n_drawn, self.size))
         is_discrete = not dist.dtype.startswith("float")
         method: Any = "inverted_cdf" if is_discrete else "linear"
         levels = np.moveaxis(np.quantile(x, self.levels, axis=1, method=method), 0, 1)
@@ -115,7 +114,7 @@ class InputMoments:
         correlation = None
         if self.is_multivariate:
             z = (x - mean[:, None]) / sd[:, None]
-            correlation = np.swapaxes(z, 1, 2) @ z / _N_DRAWN
+            correlation = np.swapaxes(z, 1, 2) @ z / self.n_drawn
         return self._stacked([mean, sd], levels, correlation)
 
     def _stacked(

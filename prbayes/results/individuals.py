@@ -13,10 +13,12 @@ from prbayes.model.locking import locked
 from prbayes.model.measurement import SpecimenLikelihood, specimen_labels
 from prbayes.model.specimen_likelihood import draw_inputs, draw_readings, specimen_likelihoods
 from prbayes.optimize.optimum import Optimum
-from prbayes.response.condition import is_condition
 from prbayes.response.inputs import aleatory_names
 from prbayes.response.outputs import Outputs
 from prbayes.results.predict import model_of, populations_of
+
+# Inputs whose shrinkage is that of their logarithms.
+_LOG_NORMAL = type(pm.LogNormal.rv_op)
 
 
 @locked
@@ -34,8 +36,9 @@ def individuals(
 
     .. math:: 1 - \frac{\operatorname{sd}_i\, E[x_i \mid y_i, \theta]}{\sigma(\theta)},
 
-    with the standard deviation of the means over the specimens, and that of the population: near
-    zero where readings identify the input, near one where they do not [1]_.
+    with the standard deviation of the means over the specimens, and that of the population, of the
+    logarithm of a lognormal input: near zero where readings identify the input, near one where they
+    do not [1]_.
 
     Parameters
     ----------
@@ -101,22 +104,19 @@ def individuals(
         size = len(likelihood.readings)
         specimens = {f"specimen{suffix}": np.arange(size) if labels is None else labels}
         inputs, gross_error = draw_inputs(likelihood, rng, points)
-        population_sd = _population_sd(likelihood, points, rng)
         function = likelihood.measurements[0].responses.function
         input_names = aleatory_names(likelihood.inputs, function)
-        for x, name, values, sd in zip(
-            likelihood.inputs.aleatory, input_names, inputs, population_sd, strict=True
-        ):
-            if is_condition(x):
-                condition = np.asarray(x.owner.op.values)
-                known = np.empty(size)
-                for numbers in likelihood.stacked.numbers:
-                    if len(numbers) == len(condition):
-                        known[numbers] = condition
-                array = xr.DataArray(known, specimens, tuple(specimens))
+        conditions = dict(zip(likelihood.inputs.conditions, _columns(likelihood), strict=True))
+        population = _population(likelihood, points, rng)
+        for position, (name, values) in enumerate(zip(input_names, inputs, strict=True)):
+            if position in conditions:
+                array = xr.DataArray(conditions[position], specimens, tuple(specimens))
                 groups["constant_data"][name + suffix] = array
                 continue
-            shrinkage = 1 - values.mean(axis=0).std(axis=0) / sd
+            is_log = isinstance(likelihood.inputs.aleatory[position].owner.op, _LOG_NORMAL)
+            scale: Any = np.log if is_log else np.positive
+            within = scale(population[position]).std(axis=1).mean(axis=0)
+            shrinkage = 1 - scale(values).mean(axis=0).std(axis=0) / within
             array = _array(name, values, coords | specimens)
             groups["posterior"][name + suffix] = array.assign_attrs(shrinkage=shrinkage.tolist())
         if gross_error is not None:
@@ -136,16 +136,22 @@ def individuals(
     return xr.DataTree.from_dict(datasets)
 
 
-def _population_sd(
+def _columns(likelihood: SpecimenLikelihood) -> list[Floats]:
+    """Return the values of the specimens of each condition that is an input, (S,)."""
+    conditions = likelihood.stacked.conditions
+    return [] if conditions is None else list(conditions.T)
+
+
+def _population(
     likelihood: SpecimenLikelihood, points: dict[str, Floats], rng: np.random.Generator
 ) -> list[Floats]:
-    """Return the standard deviation of each input in the populations, (*event), over all groups."""
-    parts: list[list[Floats]] = []
+    """Return 256 specimens of each group and population, (P, n, *event), by input."""
+    parts = []
     for group, rows in likelihood.by_group:
         parents = likelihood.parents(points, group, rows)
         drawn, _ = likelihood.density.sampler(parents, 256, rng)
-        parts.append([values.var(axis=1).mean(axis=0) for values in drawn])
-    return [np.sqrt(np.mean(variances, axis=0)) for variances in zip(*parts, strict=True)]
+        parts.append(drawn)
+    return [np.concatenate(values, axis=1) for values in zip(*parts, strict=True)]
 
 
 def _array(

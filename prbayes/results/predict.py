@@ -280,18 +280,18 @@ def covariate_values(
     Numbers have to be near those of runs if there are any.
     """
     names = [str(covariate.name) for covariate in inputs.covariates]
-    known = {name: stated[name] for name in names if name in stated}
-    names = [name for name in names if name not in known]
-    given = {} if at is None else at
-    if not isinstance(given, Mapping) or set(given) != set(names):
+    by_name = {name: stated[name] for name in names if name in stated}
+    names = [name for name in names if name not in by_name]
+    numbers = {} if at is None else at
+    if not isinstance(numbers, Mapping) or set(numbers) != set(names):
         raise ValueError(
             f"{label}: at: got {at!r}, expected a value of each covariate of the inputs, {names}; "
             "pass at={'hardness': 250.0}, for example"
         )
-    values = {name: finite_number(given[name], f"{label}: at: {name}") for name in names}
+    values = {name: finite_number(numbers[name], f"{label}: at: {name}") for name in names}
     for covariate in inputs.covariates:
         name = str(covariate.name)
-        if name in known:
+        if name in by_name:
             continue
         low, high = (float(end.eval()) for end in covariate.owner.op.dist_params(covariate.owner))
         if has_runs and not low <= values[name] <= high:
@@ -300,7 +300,7 @@ def covariate_values(
                 f"{high:.4g}, where the response has runs; pass stored=False, which computes it at "
                 "new specimens"
             )
-    return values | known
+    return values | by_name
 
 
 def _by_name(inputs: Inputs, conditions: Floats) -> dict[str, Floats]:

@@ -37,12 +37,10 @@ from prbayes.posterior.sample import draw_posterior, importance_chains, modes_of
 from prbayes.posterior.smc import SamplingSettings
 from prbayes.posterior.target import specimen_target
 from prbayes.propagation.reweighted import designs_restored
+from prbayes.propagation.specimen_emulation import Coordinates, Emulation
 from prbayes.response.inputs import model_on_context
 from prbayes.validation.area_test import area_test
 from prbayes.validation.nulls import PosteriorNull
-
-# Specimens of each population that a validity test compares with measured ones.
-_SPECIMENS = 50
 
 
 @locked
@@ -123,8 +121,8 @@ def calibrate_each(
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator.of(model)
-    every: list[Any] = [*evaluator.nodes, *evaluator.measurements]
-    simulator, *more = every
+    simulators: list[Any] = [*evaluator.nodes, *evaluator.measurements]
+    simulator, *more = simulators
     if more:
         raise TypeError(
             f"{caller}: got a model with the simulators {simulator.name} and {more[0].name}, "
@@ -287,18 +285,18 @@ class Fleet:
             has_graph=False,
         )
 
-    def _predicted(self, evaluator: Evaluator, values: Mapping[str, Floats]) -> xr.DataArray:
-        """Return responses of the calibrated populations, (1, draws, samples, ...)."""
+    def _predicted(
+        self, evaluator: Evaluator, values: Mapping[str, Floats], n: int = 50
+    ) -> xr.DataArray:
+        """Return responses of n specimens of calibrated populations, (1, draws, n, ...)."""
         rows = np.linspace(0, self.settings.draws - 1, 100).astype(np.intp)
         thinned = {name: value[rows] for name, value in values.items()}
         rng = np.random.default_rng(self.settings.random_seed)
         if evaluator.likelihoods:
             (likelihood,) = evaluator.likelihoods
-            responses = draw_readings(
-                likelihood, rng, thinned, _SPECIMENS, likelihood.measurements[0]
-            )
+            responses = draw_readings(likelihood, rng, thinned, n, likelihood.measurements[0])
         else:
-            responses = _resampled(evaluator, thinned, rng)
+            responses = _resampled(evaluator, thinned, rng, n)
         dims = ("chain", "draw", "sample", "output")[: responses.ndim + 1]
         return xr.DataArray(responses[None], dims=dims)
 
@@ -311,28 +309,41 @@ def _calibrated(pickled: bytes, names: Sequence[str]) -> list[Calibration]:
     return fleet.calibrated(names)
 
 
-def _common_likelihood(evaluator: Evaluator, observed: Mapping[str, Floats]) -> SpecimenLikelihood:
+def _common_likelihood(
+    evaluator: Evaluator, observed: Mapping[str, Floats], emulated: int = 512
+) -> SpecimenLikelihood:
     """Return the likelihood of the specimens of all products, with their points.
 
-    Limits of the errors of the emulator and the points are those of a product: less specimens, in a
-    narrower population.
+    The emulator is that of so many evenly spaced specimens. Limits of the errors of the emulator
+    and the points are those of a product: fewer specimens, in a narrower population.
     """
     (likelihood,) = evaluator.likelihoods
     (measurement,) = likelihood.measurements
     stacked = np.concatenate(list(observed.values()))
+    sizes = [len(values) for values in observed.values()]
     within = np.median([np.nanstd(values, axis=0) for values in observed.values()], axis=0)
-    narrower = float(np.min(within / np.nanstd(stacked, axis=0)))
-    fewer = np.sqrt(len(stacked) / np.median([len(values) for values in observed.values()]))
-    options = likelihood.options
-    options = replace(
-        options,
-        bias=options.bias * fewer * min(narrower, 1.0),
-        half_difference=options.half_difference * fewer,
-    )
-    of_all = likelihood.observing({measurement.name: stacked})
-    of_all = replace(of_all, options=options)
-    prepared(of_all)
-    return of_all
+    narrower = min(1.0, float(np.min(within / np.nanstd(stacked, axis=0))))
+    inputs, sampler = likelihood.inputs, likelihood.density.sampler
+    coordinates = Coordinates.of_prior(inputs, max(sizes), sampler=sampler)
+
+    def prepared_of(values: Floats, emulation: Emulation | None) -> SpecimenLikelihood:
+        fewer = np.sqrt(len(values) / np.median(sizes))
+        options = replace(
+            likelihood.options,
+            bias=likelihood.options.bias * fewer * narrower,
+            half_difference=likelihood.options.half_difference * fewer,
+        )
+        result = likelihood.observing({measurement.name: values})
+        result = replace(result, options=options, shared_emulation=emulation)
+        vars(result).update(density=likelihood.density, coordinates=coordinates)
+        prepared(result)
+        return result
+
+    if len(stacked) <= 2 * emulated:
+        return prepared_of(stacked, None)
+    order = np.argsort(stacked.reshape(len(stacked), -1)[:, 0], kind="stable")
+    rows = order[np.linspace(0, len(order) - 1, emulated).astype(np.intp)]
+    return prepared_of(stacked, prepared(prepared_of(stacked[rows], None)).emulation)
 
 
 def _of_rows(likelihood: SpecimenLikelihood, rows: NDArray[np.intp]) -> SpecimenLikelihood:
@@ -364,13 +375,13 @@ def _misfit(likelihood: SpecimenLikelihood, largest: float = 50.0) -> str:
 
 
 def _resampled(
-    evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator
+    evaluator: Evaluator, values: Mapping[str, Floats], rng: np.random.Generator, n: int
 ) -> Floats:
     """Return responses of points of the populations, (P, n), by weight."""
     hyperparameters = evaluator.hyperparameters
     free = [values[str(rv.name)] for rv in evaluator.model.free_RVs]
     responses, weights = evaluator.populations(hyperparameters.thetas_of(free), 0)
-    levels = (np.arange(_SPECIMENS) + rng.random((len(weights), 1))) / _SPECIMENS
+    levels = (np.arange(n) + rng.random((len(weights), 1))) / n
     rows = rng.permuted(reached(weights, levels, normalized=True), axis=1)
     return np.take_along_axis(np.broadcast_to(responses, weights.shape), rows, axis=1)
 

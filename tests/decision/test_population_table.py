@@ -11,6 +11,8 @@ import xarray as xr
 from scipy import stats
 
 import prbayes as prb
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.margins import margins
 from prbayes.model.random_variable import simulators
 
 DATA = np.random.default_rng(1).normal(3.0, 0.5, 20)
@@ -84,11 +86,13 @@ def test_numbers_are_those_of_the_distribution_in_each_draw() -> None:
     # 2000 specimens of each of 300 populations
     counted = table.sel(name="count", quantity=["mean", "sd"]).estimate
     np.testing.assert_allclose(counted, [np.exp(mu).mean(), np.exp(mu / 2).mean()], rtol=0.02)
+    of_quantile = float(table.estimate.sel(name="count", quantity="25% quantile"))
+    assert of_quantile == pytest.approx(stats.poisson.ppf(0.25, np.exp(mu)).mean(), abs=0.05)
     of_known = table.sel(name="known", quantity=["mean", "sd"])
     np.testing.assert_allclose(of_known.estimate, [0, 2 * np.sqrt(3)], atol=2e-3)
     np.testing.assert_array_equal(of_known.lower, of_known.upper)
     assert np.isnan(table.estimate.sel(name="heavy", quantity=["mean", "sd", "cv"])).all()
-    pattern = r"k: mean \d\.\d+ \(\d\.\d+, \d\.\d+\) kN/mm, sd 1\.\d+ \(.*\), cv 4\d(\.\d)? "
+    pattern = r"k: mean \d\.\d+ \(\d\.\d+, \d\.\d+\) kN/mm, sd 1\.\d+ \(.*\), cv 4\d(\.\d)?%"
     assert re.search(pattern, repr(table))
     assert ">k (kN/mm)</th>" in table._repr_html_()
     assert table.to_dataframe().loc[("k", "mean"), "unit"] == "kN/mm"
@@ -224,3 +228,25 @@ def test_unknown_names_are_refused() -> None:
         normal_model(units={"force": "N"})
     with pytest.raises(KeyError, match=r"inputs: got nothing, expected some of \['k'\]"):
         prb.population(reference_posterior(10, 1), "nothing", model=normal_model())
+
+
+def test_pictures_have_the_units() -> None:
+    model = normal_model(propagation=prb.Reweighted(64), units={"k": "kN/mm", "y": "mm"})
+    posterior = reference_posterior(40, 7)
+    (k,) = margins(Evaluator.of(model))
+    drawn = prb.plot_population(posterior, model=model).viz["after"]["k"].item()
+    assert drawn.axes.get_xlabel() == "k (kN/mm)"
+    later = prb.predict(posterior, np.positive, k.dist, model=model, n_samples=50, stored=False)
+    drawn = prb.plots.plot_prediction(DATA, later).viz["predicted"]["positive"].item()
+    assert drawn.axes.get_xlabel() == "positive (mm)"
+
+
+def test_one_time_series_is_no_population() -> None:
+    advice = "for one time series.* use pm.Simulator or a pm.Normal likelihood"
+    series = np.ones((100, 2))
+    with pytest.raises(ValueError, match=advice):
+        prb.AreaMetric().against(series)  # as prb.abc_distance does
+    with pytest.raises(ValueError, match=advice):
+        prb.Joint(prb.AreaMetric())(np.ones((50, 3)), series[None])
+    with pm.Model(), pytest.raises(ValueError, match=f"none of them aleatory.*{advice}"):
+        prb.Simulator("y", np.positive, pm.HalfNormal("a"), observed=series)

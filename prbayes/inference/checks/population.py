@@ -198,10 +198,10 @@ def replaced_findings(
     shares = {}
     for k, node in enumerate(evaluator.nodes):
         if _replaces(node.bound.responses):
-            bound = node.bound
-            if stored := evaluator.reweighted.get(node.name):
-                bound = stored.copied(stored.design.runs_alone())
-            values, weights = bound.populations(evaluator.parents(theta[None], k))
+            parents, bound = evaluator.parents(theta[None], k), node.bound
+            if node.reweighted is not None:
+                bound = node.reweighted.copied(node.reweighted.design.runs_alone())
+            values, weights = bound.populations(parents)
             shares[node.name] = _replaced_share(node.bound.responses, values[0], weights[0])
     for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
         if _replaces(simulator.responses):
