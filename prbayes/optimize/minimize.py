@@ -40,7 +40,11 @@ from prbayes.inference.checks.metric_suitability import (
     heavy_tails,
     smoothing_bias,
 )
-from prbayes.inference.checks.one_sided import bound_findings, bounds_by_metric
+from prbayes.inference.checks.one_sided import (
+    bound_findings,
+    bounds_by_metric,
+    is_far_from_data,
+)
 from prbayes.inference.checks.population import replaced_findings
 from prbayes.inference.checks.prior import ends_by_metric, prior_end_findings
 from prbayes.inference.checks.sample_size import few_specimens
@@ -224,7 +228,7 @@ def minimize(
     starts : int, optional
         Number of Sobol points of the prior that start a search for other optima, such as mirror
         solutions; 0 for none. By default 32 where a theta costs no response (`Reweighted`), and
-        else none.
+        else 4 if the fit is poor and they take less than half a minute.
     max_seconds : float, optional
         Seconds after which no new work begins: the best point up to then is returned, not
         converged, with ``search.stopped``. The same call with a larger budget on the same model,
@@ -422,7 +426,7 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
     evaluator, settings = problem.search.evaluator, problem.settings
     n_starts = settings.starts
     if n_starts is None:
-        n_starts = 0 if evaluator.responses_per_theta else 32
+        n_starts = _starts_by_cost(problem.search, fit)
     optima: list[LocalOptimum] = []
     for is_first in (True, False):
         if not n_starts or fit.sampling is None:
@@ -439,6 +443,24 @@ def _compare_optima(problem: _Problem, fit: Fit) -> tuple[Fit, list[LocalOptimum
         sampling = sampling_distribution(evaluator, moved.theta, fit.scales)
         fit = replace(moved, sampling=sampling, design_error=fit.design_error, pilot=fit.pilot)
     return fit, optima
+
+
+def _starts_by_cost(search: Search, fit: Fit) -> int:
+    """Return the number of starts in search of other optima.
+
+    Where responses are simulated again, a few if the fit is poor and they take half a minute.
+    """
+    evaluator = search.evaluator
+    if not evaluator.responses_per_theta:
+        return 32
+    if fit.sampling is None or search.prior or not is_far_from_data(fit.sampling, fit.lowest):
+        return 0
+    evaluator.total(fit.theta[None], fit.scales)  # the first call compiles
+    start = time.perf_counter()
+    evaluator.total(fit.theta[None], fit.scales)
+    seconds = time.perf_counter() - start
+    # Four starts take 200 populations for each element of theta, about, and a few more.
+    return 4 if 400 * fit.theta.size * seconds < 30 else 0
 
 
 def _settle(problem: _Problem, fit: Fit) -> Fit:

@@ -232,18 +232,27 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     failures, harmless = _failure_findings(tree, lost, _stored_shares(calibration, "failed_mass"))
     compared = [Finding("outputs-compared", sentence) for sentence in compared_in(calibration)]
     compared += [] if optimum is None else rough_emulators(optimum.evaluator)
+    later = (*checked.findings, *failures, *_lost_mass(optimum, lost), *_unsupported(coverage))
     return Diagnosis(
-        (
-            *findings,
-            *checked.findings,
-            *failures,
-            *_lost_mass(optimum, lost),
-            *_unsupported(coverage),
-        ),
+        _each_once(findings, later),
         _as_dataset(coverage),
         (*compared, *_specimens_left_out(lost), *harmless, *checked.remarks),
         checked.untested,
     )
+
+
+def _each_once(earlier: Sequence[Finding], later: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Return findings without copies, and no later ones on a condition reported earlier.
+
+    These have the same code, and the same simulator before the colon.
+    """
+
+    def condition(finding: Finding) -> tuple[str, str]:
+        return finding.code, finding.text.partition(":")[0]
+
+    reported = {condition(finding) for finding in earlier}
+    others = (finding for finding in later if condition(finding) not in reported)
+    return tuple(dict.fromkeys([*earlier, *others]))
 
 
 # -- optima ----------------------------------------------------------------------------------
@@ -343,7 +352,7 @@ def _failure_findings(
         inputs = rows["inputs"].values[0]
         point = ", ".join(f"{x:.6g}" for x in inputs[~np.isnan(inputs)])
         text = (
-            f"The response of {name} failed at {rows.sizes['failure']} point(s), the first at "
+            f"{name}: the response failed at {rows.sizes['failure']} point(s), the first at "
             f"({point}): {rows['reason'].values[0]}; "
         )
         replacement = rows["instead"].values[0]

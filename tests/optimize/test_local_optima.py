@@ -328,3 +328,19 @@ def test_where_a_descent_was_stopped_in_a_valley_is_no_optimum(
     short = partial(descend, max_iterations=iterations)
     monkeypatch.setattr("prbayes.optimize.local_optima.descend", short)
     assert optima_from_prior(best, 16, 0) == []
+
+
+def test_a_poor_fit_of_responses_that_are_simulated_again_is_left() -> None:
+    observed = np.random.default_rng(1).multivariate_normal([0, 0], [[1, 0.999], [0.999, 1]], 60)
+    with pm.Model() as model:
+        rho, s = pm.Uniform("rho", -1, 1), pm.HalfNormal("s", 2)
+        x = pm.MvNormal.dist(np.zeros(2), s**2 * pm.math.stack([[1.0, rho], [rho, 1.0]]))
+        metric = prb.Joint(prb.KullbackLeibler())
+        settings = {"metric": metric, "observed": observed, "propagation": prb.Resimulated(256)}
+        prb.Simulator("y", lambda x: x, x, **settings)
+    optimum = prb.minimize(model, progressbar=False)
+    assert optimum.point["rho"] == pytest.approx(np.corrcoef(observed.T)[0, 1], abs=0.001)
+    # From the first start alone: rho -0.91, where no bound is stated of a poor fit.
+    local = prb.minimize(model, starts=0, progressbar=False)
+    assert local.discrepancy > 5 * optimum.discrepancy
+    assert "one-sided-bound" not in [finding.code for finding in local.findings]

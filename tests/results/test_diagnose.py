@@ -22,7 +22,7 @@ from prbayes.optimize.convergence import Result
 from prbayes.posterior.results import Chains
 from prbayes.posterior.smc import _lost_findings
 from prbayes.propagation.base import DesignError
-from prbayes.results.diagnose import _NOISE, _failure_findings
+from prbayes.results.diagnose import _NOISE, _each_once, _failure_findings
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 AREA, KL = prb.AreaMetric(), prb.KullbackLeibler()
@@ -339,7 +339,7 @@ def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:
     assert f"y: {share:.1%} of specimens fail" in repr(best)
     tree = prb.sample_smc(20, chains=1, model=model, adjustment=None, **QUIET)
     assert 0 <= tree["calibration"]["failed_mass_at_best"].item() < 0.3
-    text = r"The response of y failed at \d+ point\(s\), the first at \(\d.*license server"
+    text = r"y: the response failed at \d+ point\(s\), the first at \(\d.*license server"
     for result in (best, best.to_datatree(), tree):
         (message,) = [m for m in prb.diagnose(result).messages if "failed" in m]
         assert re.search(text, message)
@@ -366,7 +366,7 @@ def test_failures_far_from_the_answer_are_harmless(value: float, share: float) -
     # A finite number in place of a failed response looks like any other.
     expected = ([], ["harmless-failures"]) if share < 0.1 and value else (["failed-responses"], [])
     assert ([f.code for f in findings], [f.code for f in harmless]) == expected
-    text = "The response of y failed at 2 point(s), the first at (3.5): it broke; "
+    text = "y: the response failed at 2 point(s), the first at (3.5): it broke; "
     assert str([*findings, *harmless][0]).startswith(text)
 
 
@@ -403,3 +403,10 @@ def test_components_of_curves_are_reported(components: int | None) -> None:
         assert any("no noise" in line for line in diagnosis.messages) == (components == 1)
     report = prb.Report("Cracks", optimum=best, pictures=False)
     assert any(note in text for section in report.sections for text in section.text)
+
+
+def test_each_finding_is_shown_once() -> None:
+    first, again = (Finding("failed-responses", f"y: {text}.") for text in ("5%", "at 3 points"))
+    others = [Finding("failed-responses", "z: at 2 points."), Finding("output-misfit", "y: a.")]
+    assert _each_once([first, first], [again, *others, others[0]]) == (first, *others)
+    assert _each_once([], [again]) == (again,)

@@ -129,10 +129,26 @@ def _limit(
     return float(theta[i] + middle * unit)
 
 
+def is_far_from_data(sampling: SamplingDistribution, lowest: float) -> bool:
+    """Return whether distances, ``lowest`` in all, are three times those of data from there.
+
+    Such a fit may be a local optimum.
+    """
+    is_distance = all(node.metric.distance for node in sampling.evaluator.nodes)
+    return is_distance and lowest > 3 * _noise(sampling)
+
+
+def _noise(sampling: SamplingDistribution) -> float:
+    """Return the objective's sampling noise."""
+    pairs = zip(sampling.information, sampling.scales, strict=True)
+    return float(sum(item.noise_floor / scale for item, scale in pairs))
+
+
 def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | None:
     """Return elements that are bounded from one side, None if that would take long.
 
-    Responses that are not stored are computed if they take less than half a minute.
+    Responses that are not stored are computed if they take less than half a minute, and the
+    optimum is no poor fit: elsewhere there may then be a better one.
     """
     evaluator, scales = sampling.evaluator, sampling.scales
     is_alone = (sampling.local.unidentified**2).sum(axis=1) > 0.9
@@ -144,10 +160,11 @@ def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | No
     # Some ten places, with the derivatives of the population at each.
     n_populations = 20 * sampling.theta.size**2
     is_long = seconds * n_populations > 30 or budget().is_limited
-    if needs_refits(evaluator) or (is_long and not is_stored(evaluator)):
+    if needs_refits(evaluator):
         return None
-
-    noise = sum(item.noise_floor / s for item, s in zip(sampling.information, scales, strict=True))
+    if not is_stored(evaluator) and (is_long or is_far_from_data(sampling, lowest)):
+        return None
+    noise = _noise(sampling)
 
     def statistic(theta: Floats, i: int) -> float:
         (total,) = evaluator.total(theta[None], scales)

@@ -213,11 +213,12 @@ def replaced_findings(
     responses = {s.name: s.responses for s in evaluator.simulators}
     return tuple(
         Finding(
-            "responses-replaced",
+            "failed-responses",
             f"{name}: got {responses[name].failures} failed responses, replaced by "
             f"{responses[name].replacement:g}, with {share:.1%} of the population on that number, "
-            "which is compared with the data like any response. Repair the response; or replace it "
-            "by NaN, if such specimens cannot be measured, or by inf, if they fail.",
+            "which is compared with the data like any response. Look at optimum.failures and "
+            "repair the response; or replace it by NaN, if such specimens cannot be measured, or "
+            "by inf, if they fail.",
             "distributed.md#when-a-response-fails",
         )
         for name, share in shares.items()
