@@ -86,7 +86,7 @@ def theophylline() -> xr.Dataset:
     >>> from prbayes import datasets
     >>> drug = datasets.theophylline()
     >>> round(float(drug.concentration_mg_per_l.max()), 1), round(float(drug.dose_mg.mean()))
-    (11.4, 318)
+    (11.4, 315)
     """
     with files(__package__).joinpath("theophylline.csv").open(encoding="utf-8") as file:
         table = np.loadtxt(file, delimiter=",", skiprows=1)

@@ -212,8 +212,9 @@ def Simulator(  # noqa: N802 (named like pm.Normal and pm.Simulator)
     weights = in_order_of(weights, observed, f"{name}: weights")
     values, outputs, groups, rows = _read_specimens(name, observed, arguments, weights, specimens)
     outputs = _with_units(name, units, arguments, response, outputs)
-    refuse_vectors_of_specimens(name, arguments.aleatory, arguments.parents, len(values))
-    size = len(values) if rows is None else len(np.asarray(weights))
+    n = np.shape(values)[0] if np.ndim(values) else 1
+    refuse_vectors_of_specimens(name, arguments.aleatory, arguments.parents, n)
+    size = n if rows is None else len(np.asarray(weights))
     weights = weights if rows is None else None
     metric = LogLikelihood() if metric is None else metric
     by_specimen = isinstance(metric, Metric) and metric.by_specimen

@@ -164,7 +164,9 @@ class Runs:
             refuse_unreachable(likelihood.name, values, likelihood.readings)
             refuse_unused_inputs(likelihood.name, z, values, _coordinate_names(likelihood))
             self.first = values
-            if not any(m.metric.error is not None or m.gross_errors for m in measurements):
+            if not any(
+                m.metric.error is not None or m.gross_errors is not False for m in measurements
+            ):
                 self.findings = check_failing_region(
                     likelihood.name,
                     likelihood.readings.values,

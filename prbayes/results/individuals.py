@@ -79,7 +79,7 @@ def individuals(
     ...     data = [0.0, 1.0, 2.5, 4.0, 3.0, 1.5]
     ...     y = prb.Simulator("y", lambda x: 2 * x, x, observed=data)
     >>> tree = prb.individuals(prb.minimize(model))
-    >>> tree["posterior"]["x"].mean(("chain", "draw")).values.round(2)
+    >>> tree["posterior"]["x"].mean(("chain", "draw")).values.round(2) + 0
     array([0.  , 0.5 , 1.25, 2.  , 1.5 , 0.75])
     """
     positive_integer(n_draws, "n_draws")

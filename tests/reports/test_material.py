@@ -141,7 +141,7 @@ def test_a_saved_optimum_is_diagnosed_as_in_memory(calibrated: Any) -> None:
     assert saved is not None
     assert memory.messages == saved.messages
     assert saved.messages[0] == "The data do not see mu."
-    assert "did not converge (The minimiser failed." in saved.messages[1]
+    assert "did not converge (The minimiser failed)" in saved.messages[1]
 
 
 def test_deterministics_are_compared(calibrated: Any) -> None:
