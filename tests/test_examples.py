@@ -32,6 +32,24 @@ def test_crack_growth_validity(tmp_path: Path) -> None:
     assert p[4] < 0.05 < min(p[5:])
 
 
+@pytest.mark.long
+def test_theophylline_has_the_published_estimates(capsys: pytest.CaptureFixture[str]) -> None:
+    """Within a tenth of a standard error; the two kinds of subjects are those of the simulation."""
+    module = runpy.run_path(str(EXAMPLES / "theophylline.py"))
+    module["main"]()
+    lines = capsys.readouterr().out.splitlines()
+    estimates = {line.split()[0]: float(line.split()[1]) for line in lines if "published" in line}
+    assert set(estimates) == set(module["PUBLISHED"])
+    for name, (published, error) in module["PUBLISHED"].items():
+        # Coefficients of variation were published to a tenth of a percent.
+        limit = 0.1 * error if error is not None else 0.25 if name.startswith("cv") else 0.005
+        assert estimates[name] == pytest.approx(published, abs=limit), name
+    for line in lines[-3:]:
+        estimate, subjects = (float(text) for text in re.findall(r"-?\d+\.\d+", line))
+        # Standard errors are .028, .04 and .075.
+        assert estimate == pytest.approx(subjects, abs=0.05)
+
+
 @pytest.mark.slow
 def test_gallery(tmp_path: Path) -> None:
     page = (EXAMPLES.parent / "docs" / "gallery.md").read_text(encoding="utf-8")
