@@ -170,6 +170,9 @@ def bounds_by_metric(sampling: SamplingDistribution) -> list[OneSidedBound] | No
         (total,) = evaluator.total(theta[None], scales)
         if not total > lowest + 0.1 * noise:
             return np.nan  # flat: saves the standard error
+        populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
+        if not all(np.nansum(weights) > 0 for _, weights in populations):
+            return np.nan  # without any response
         sampled = SamplingDistribution.of(evaluator, theta, scales)
         error = np.sqrt(sampled.local.in_theta[i, i])
         if not np.isfinite(error):
