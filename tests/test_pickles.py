@@ -60,6 +60,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "Resimulated": lambda: prb.Resimulated(8),
     "Reweighted": lambda: prb.Reweighted(64, on_failure=prb.response.Replace()),
     "Runs": lambda: prb.Runs(np.linspace(0, 1, 12), np.linspace(0, 1, 12) ** 2),
+    "Summary": lambda: prb.Summary(n=12, mean=1.0, sd=0.2),
     "Surrogate": surrogate,
     "abc_distance": lambda: prb.abc_distance(prb.AreaMetric()),
     "decision.Interval": lambda: prb.decision.Interval(0.9, 1.1),

@@ -415,24 +415,21 @@ def rough_emulators(evaluator: Evaluator) -> list[Finding]:
 def refuse(
     short: Mapping[str, Shortcoming], evaluator: Evaluator, unidentified: Sequence[str] = ()
 ) -> None:
-    """Raise for designs that still fall short, with ``unidentified`` directions as the cause."""
+    """Raise for designs that still fall short, perhaps in directions that are ``unidentified``."""
     if not short:
         return
     name, reason = next(iter(short.items()))
     suffix = f" (and {len(short) - 1} more)" if len(short) > 1 else ""
-    runs = evaluator.reweighted[name].n_runs
+    bound = evaluator.reweighted[name]
+    cause, advice = "the design does not support the answer", "narrow the priors"
     if unidentified:
-        cause = (
-            f"the data are less informative than the prior about {', '.join(unidentified)}, and "
-            "the design does not support the answer"
+        cause += (
+            f", where the data are less informative than the prior about {', '.join(unidentified)}"
         )
-        advice = "narrow these priors, or measure more outputs or conditions"
-    else:
-        cause = "the design does not support the answer"
-        advice = "narrow the priors, or pass a larger prb.Reweighted(n)"
+        advice = "narrow these priors, measure more outputs or conditions"
     raise DesignError(
-        f"{name}{suffix}: {cause}: {advice}, or use prb.Resimulated(n), which has no design; got "
-        f"{runs} runs, {reason}"
+        f"{name}{suffix}: {cause}: {advice}, pass a larger prb.Reweighted(n) (now {bound.n_runs} "
+        f"runs, of at most {bound.config.most}), or use prb.Resimulated(n); got {reason}"
     )
 
 

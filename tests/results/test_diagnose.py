@@ -7,7 +7,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -140,18 +139,6 @@ def test_particles_that_stick(noise: float, is_reason: bool) -> None:
     assert "Particles hardly moved in the last stage of chains 0, 1 (0.0" in text
     reason = f"The discrepancy is too noisy (its Monte Carlo error is {noise} epsilon)"
     assert (reason in text) == is_reason
-
-
-@pytest.mark.long
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_loo_of_a_metric_has_one_observation() -> None:
-    model, idata = sampled()
-    idata = xr.DataTree.from_dict({"posterior": idata["posterior"].to_dataset()})
-    with model:
-        prb.set_epsilon(model, {"y": 0.02})
-        pm.compute_log_likelihood(idata, model=model, progressbar=False)
-    assert idata["log_likelihood"]["y"].shape == (2, 200)
-    assert az.loo(idata).n_data_points == 1
 
 
 # -- optima
