@@ -204,7 +204,7 @@ class Discrepancy(ABC):
         return round(self.n_effective) if self.metric.exact_likelihood else len(self.observed)
 
     def replicate(self, specimens: Floats) -> Floats:
-        """Return what is observed of specimens, (..., n_drawn, *event): their responses."""
+        """Return what is observed of specimens, by default their responses."""
         return specimens
 
     @property

@@ -32,7 +32,7 @@ class Summary:
         The smallest and the largest of them.
     quantiles : mapping of float to float, optional
         Values by level, such as ``{0.25: 310.0, 0.5: 330.0}``. The quantile of level p has the rank
-        1 + (n - 1) p, as in `numpy.quantile`.
+        1 + (n - 1) p, as in ``numpy.quantile``.
 
     Raises
     ------

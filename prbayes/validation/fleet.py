@@ -85,7 +85,7 @@ def calibrate_each(
     -------
     xarray.DataTree
         Group ``posterior``: the hyperparameters with dims (chain, draw, product), for
-        `arviz.summary` or `arviz.plot_forest`; NaN for products that failed. Group ``products``, by
+        ArviZ's summary or forest plot; NaN for products that failed. Group ``products``, by
         product: ``pareto_k`` of importance sampling (NaN for another
         sampler), ``finding`` (why it failed, or which specimens no inputs reproduce; else an empty
         text), and with ``validation`` the ``statistic``, ``critical_value``, ``p_value`` and
