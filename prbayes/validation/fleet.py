@@ -128,6 +128,7 @@ def calibrate_each(
             f"{caller}: got a model with the simulators {simulator.name} and {more[0].name}, "
             "expected one; write a response with several outputs"
         )
+    _refuse_specimens_of_the_model(caller, simulator)
     event = np.shape(simulator.observed)[1:]
     observed = _read_data(data_sets, "data_sets", 2, event)
     further = {} if validation is None else _read_data(validation, "validation", 1, event)
@@ -166,6 +167,26 @@ def calibrate_each(
             f"{caller}: {len(failures)} of {len(names)} products failed; {failures[0]}"
         )
     return _tree(evaluator, names, rows, draws, {"random_seed": str(seed), "alpha": alpha})
+
+
+def _refuse_specimens_of_the_model(caller: str, simulator: Any) -> None:
+    """Raise if a simulator has numbers of its own observed specimens, or a data sheet."""
+    weights = simulator.weights
+    numbers = {
+        "weights=": weights is not None and np.ptp(weights) > 0,
+        "specimens=": simulator.specimens is not None,
+        "groups": simulator.inputs.groups is not None,
+        "prb.response.condition": bool(simulator.inputs.covariates)
+        or getattr(simulator, "conditions", None) is not None,
+        "a prb.Summary": simulator.metric.exact_likelihood,
+    }
+    names = [name for name, is_there in numbers.items() if is_there]
+    if names:
+        raise TypeError(
+            f"{caller}: {simulator.name}: got a simulator with {', '.join(names)} of its observed "
+            "specimens, expected none, since each product has specimens of its own; write a model "
+            "for each product, or prb.response.group for all together"
+        )
 
 
 def _read_data(data: object, name: str, minimum: int, event: tuple[int, ...]) -> dict[str, Floats]:

@@ -119,3 +119,29 @@ def test_further_specimens_are_of_a_product() -> None:
         prb.calibrate_each(
             {"a": [1.0, 2.0]}, model=model_of([1.0, 2.0]), validation={"b": [1.0]}, **QUIET
         )
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"weights": [0.5, 1.5, 1.0]}, "weights="),
+        ({"weights": [0.5, 1.5, 1.0], "metric": prb.KullbackLeibler()}, "weights="),
+        ({"specimens": ["a", "b", "c"]}, "specimens="),
+        ({"observed": prb.Summary(n=9, mean=1.6, sd=0.2)}, "a prb.Summary"),
+        ({"condition": [1.0, 2.0, 3.0]}, r"prb\.response\.condition"),
+        ({"covariate": [1.0, 2.0, 3.0]}, r"prb\.response\.condition"),
+    ],
+)
+def test_numbers_of_observed_specimens_are_refused(settings: dict[str, Any], name: str) -> None:
+    """They would be those of other specimens, where numbers of specimens are equal."""
+    given = {"observed": [1.0, 1.5, 2.1], **QUIET, **settings}
+    with pm.Model() as model:
+        mu, inputs = pm.Normal("mu", 1, 0.4), []
+        if "covariate" in given:
+            mu = mu + 0.1 * prb.response.condition("heat", given.pop("covariate"))
+        if "condition" in given:
+            inputs.append(prb.response.condition("load", given.pop("condition")))
+        x = pm.Normal.dist(mu, pm.HalfNormal("sigma", 0.4))
+        prb.Simulator("y", lambda x, load=1.0: np.exp(0.5 * x) * load, x, *inputs, **given)
+    with pytest.raises(TypeError, match=f"got a simulator with {name}"):
+        prb.calibrate_each({"a": [1.0, 1.5, 2.1]}, model=model, **QUIET)
