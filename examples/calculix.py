@@ -155,8 +155,10 @@ def main():
         )
     if arguments.out is not None:
         arguments.out.mkdir(parents=True, exist_ok=True)
-        prb.plot_outputs(posterior, model=model).savefig(arguments.out / "calculix.png")
-        prb.plot_population(posterior, model=model).savefig(arguments.out / "calculix_inputs.png")
+        prb.plots.plot_outputs(posterior, model=model).savefig(arguments.out / "calculix.png")
+        prb.plots.plot_population(posterior, model=model).savefig(
+            arguments.out / "calculix_inputs.png"
+        )
 
 
 if __name__ == "__main__":

@@ -197,7 +197,7 @@ def main():
             line(f"  all 21 {what}", tests)
         kept[f"{label}, growth ratio"] = tests[0]
     arguments.out.mkdir(parents=True, exist_ok=True)
-    prb.plot_validity(kept, col_wrap=2).savefig(arguments.out / "crack_growth_validity.png")
+    prb.plots.plot_validity(kept, col_wrap=2).savefig(arguments.out / "crack_growth_validity.png")
     print(
         f"figure: {arguments.out / 'crack_growth_validity.png'}; "
         f"{time.perf_counter() - clock:.0f} s"

@@ -142,7 +142,7 @@ def main(out):
     print(prb.area_test(at.isel(specimen=kept_back).values, curves))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        prb.plot_responses(posterior, model=model).savefig(out / "virkler.png")
+        prb.plots.plot_responses(posterior, model=model).savefig(out / "virkler.png")
 
 
 if __name__ == "__main__":

@@ -39,15 +39,6 @@ if TYPE_CHECKING:
     from prbayes.optimize.minimize import minimize as minimize
     from prbayes.optimize.minimize import refine as refine
     from prbayes.optimize.optimum import Optimum as Optimum
-    from prbayes.plots.comparison import plot_comparison as plot_comparison
-    from prbayes.plots.convergence import plot_optimizer as plot_optimizer
-    from prbayes.plots.convergence import plot_stages as plot_stages
-    from prbayes.plots.landscape import plot_landscape as plot_landscape
-    from prbayes.plots.outputs import plot_outputs as plot_outputs
-    from prbayes.plots.population import plot_population as plot_population
-    from prbayes.plots.posterior import plot_posterior as plot_posterior
-    from prbayes.plots.responses import plot_responses as plot_responses
-    from prbayes.plots.validity import plot_validity as plot_validity
     from prbayes.posterior.bootstrap import bootstrap as bootstrap
     from prbayes.posterior.epsilon import calibrate_epsilon as calibrate_epsilon
     from prbayes.posterior.epsilon import set_epsilon as set_epsilon
@@ -97,14 +88,6 @@ _NAMES = {
     "model.simulator": ("Simulator",),
     "optimize.minimize": ("minimize", "refine"),
     "optimize.optimum": ("Optimum",),
-    "plots.comparison": ("plot_comparison",),
-    "plots.convergence": ("plot_optimizer", "plot_stages"),
-    "plots.landscape": ("plot_landscape",),
-    "plots.outputs": ("plot_outputs",),
-    "plots.population": ("plot_population",),
-    "plots.posterior": ("plot_posterior",),
-    "plots.responses": ("plot_responses",),
-    "plots.validity": ("plot_validity",),
     "posterior.bootstrap": ("bootstrap",),
     "posterior.epsilon": ("calibrate_epsilon", "set_epsilon"),
     "posterior.sample": ("sample",),
@@ -151,5 +134,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return all names, for completion."""
-    return [*globals(), *__all__]
+    """Return the public names, for completion."""
+    return [*__all__, "__version__"]

@@ -606,12 +606,12 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         result=(None, 3, "result", xr.DataTree(), []),
         own="result",
     ),
-    "plot_landscape": Row(
+    "plots.plot_landscape": Row(
         pair=(("mu", "zz"), ("mu", "mu"), (), {3}),
         responses=(*ZERO_OR_MORE, None),
         own="responses",
     ),
-    "plot_outputs": Row(
+    "plots.plot_outputs": Row(
         {"result": Later(of_two_outputs), "model": two_outputs},
         result=(None, 3, "result", xr.DataTree(), []),
         simulator=("zz", ["y"]),
@@ -619,16 +619,16 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         before=BEFORE,
         own="result",
     ),
-    "plot_population": Row(inputs=("zz", [], [3], ["zz"])),
-    "plot_posterior": Row(
+    "plots.plot_population": Row(inputs=("zz", [], [3], ["zz"])),
+    "plots.plot_posterior": Row(
         posterior=BY_NAME["result"],
         optimum=(3, "a", posterior),
         own="optimum",
     ),
-    "plot_responses": Row(before=(*BEFORE, {"mu": "a"})),
-    "plot_stages": Row(posterior=BY_NAME["result"]),
-    "plot_comparison": Row(comparison=(xr.Dataset(), optimum, posterior)),
-    "plot_validity": Row(tests=({}, {"a": 3}, comparison)),
+    "plots.plot_responses": Row(before=(*BEFORE, {"mu": "a"})),
+    "plots.plot_stages": Row(posterior=BY_NAME["result"]),
+    "plots.plot_comparison": Row(comparison=(xr.Dataset(), optimum, posterior)),
+    "plots.plot_validity": Row(tests=({}, {"a": 3}, comparison)),
 }
 
 
@@ -639,7 +639,7 @@ def refused(name: str) -> dict[str, tuple[Any, ...]]:
         for parameter in inspect.signature(public(name)).parameters.values():
             if parameter.name not in ("self", "inputs", "pc_kwargs"):
                 bad[parameter.name] = bad_values(parameter.name, str(parameter.annotation))
-            elif parameter.name == "pc_kwargs" and name != "plot_validity":
+            elif parameter.name == "pc_kwargs" and name != "plots.plot_validity":
                 bad["figsize"] = BY_NAME["figsize"]
         if "figsize" in bad or name in ("compare", "Report"):  # a model without simulators is good
             bad = {key: v[:2] if key == "model" else v for key, v in bad.items()}

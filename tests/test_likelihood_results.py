@@ -382,15 +382,15 @@ def test_cost_before_and_after(problem: Problem, optimum: prb.Optimum) -> None:
 @pytest.mark.usefixtures("no_run")
 def test_plots(problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree) -> None:
     shown = [
-        prb.plot_population(optimum),
-        prb.plot_population(posterior, model=problem.model),
-        prb.plot_responses(optimum),
-        prb.plot_responses(posterior, model=problem.model, n_draws=20),
-        prb.plot_posterior(posterior, optimum=optimum, model=problem.model),
-        prb.plot_optimizer(optimum),
-        prb.plot_stages(posterior),
-        prb.plot_comparison(prb.compare({"a": optimum, "b": posterior})),
-        prb.plot_landscape(optimum, points=9),
+        prb.plots.plot_population(optimum),
+        prb.plots.plot_population(posterior, model=problem.model),
+        prb.plots.plot_responses(optimum),
+        prb.plots.plot_responses(posterior, model=problem.model, n_draws=20),
+        prb.plots.plot_posterior(posterior, optimum=optimum, model=problem.model),
+        prb.plots.plot_optimizer(optimum),
+        prb.plots.plot_stages(posterior),
+        prb.plots.plot_comparison(prb.compare({"a": optimum, "b": posterior})),
+        prb.plots.plot_landscape(optimum, points=9),
     ]
     assert all(list(collection.viz.children) for collection in shown)
     # The path is that of the descent that found the optimum.
@@ -458,7 +458,7 @@ def test_two_inputs_and_outputs() -> None:
     assert predicted.dims[-1] == "output"
     of_one = prb.predict(optimum, lambda a: 2 * a, a, name="double")
     assert float(of_one.mean()) == pytest.approx(2 * optimum.point["mu"], abs=0.01)
-    prb.plot_outputs(optimum)
+    prb.plots.plot_outputs(optimum)
     assert prb.diagnose(optimum).ok
     table = prb.compare({"optimum": optimum}, model=model)
     assert "Joint(AreaMetric)" in table
@@ -484,8 +484,8 @@ def test_groups() -> None:
     np.testing.assert_allclose(medians, np.exp(0.5 * optimum.point["mu"]), rtol=0.01)
     names = [simulator.name for simulator in optimum.evaluator.simulators]
     assert names == ["y[a]", "y[b]", "y[c]"]
-    prb.plot_responses(optimum)
-    prb.plot_population(optimum)
+    prb.plots.plot_responses(optimum)
+    prb.plots.plot_population(optimum)
     # The population is tested with the refits of all groups; its p-value is uniform.
     assert any("root(s)" in note for note in prb.diagnose(optimum).notes)
     assert prb.cross_validate(optimum).sizes["simulator"] == 3
@@ -528,7 +528,7 @@ def test_mixed_model() -> None:
     assert tree["calibration"]["is_likelihood"].values.tolist() == [0, 1]
     posterior = prb.sample_smc(model=model, draws=100, chains=2, random_seed=1, progressbar=False)
     assert posterior["calibration"].sizes["simulator"] == 2
-    prb.plot_responses(posterior, model=model)
+    prb.plots.plot_responses(posterior, model=model)
     prb.diagnose(posterior, model=model)
     prb.compare({"optimum": optimum, "posterior": posterior}, model=model)
     own = prb.predict(posterior, growth, x, model=model)

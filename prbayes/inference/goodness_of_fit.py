@@ -230,8 +230,8 @@ def population_misfit(
     text = (
         f"The data are farther from the best population than {1 - p_value:.1%} or more of data "
         "sets that the model draws there are from theirs: the inputs probably have another family, "
-        "or the response an error; look at prb.plot_responses, at outliers, and at other families, "
-        "by prb.rank."
+        "or the response an error; look at prb.plots.plot_responses, at outliers, and at other "
+        "families, by prb.rank."
     )
     if ties:
         text += f" Rounding does not explain it ({ties})."

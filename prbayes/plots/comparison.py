@@ -65,7 +65,7 @@ def plot_comparison(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
     >>> table = prb.compare({"optimum": prb.minimize(model)}, model=model)
-    >>> list(prb.plot_comparison(table).viz["estimate"])
+    >>> list(prb.plots.plot_comparison(table).viz["estimate"])
     ['mu']
     """
     refuse_look(labels, pc_kwargs)

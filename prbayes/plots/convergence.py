@@ -77,7 +77,7 @@ def plot_optimizer(
     ...     y = prb.Simulator(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> list(prb.plot_optimizer(prb.minimize(model)).viz["asked"])
+    >>> list(prb.plots.plot_optimizer(prb.minimize(model)).viz["asked"])
     ['discrepancy', 'mu']
     """
     refuse_look(labels, pc_kwargs)
@@ -155,7 +155,7 @@ def plot_stages(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
     ...     posterior = prb.sample_smc(100, chains=2, random_seed=1, progressbar=False)
-    >>> "chain_1" in prb.plot_stages(posterior).viz
+    >>> "chain_1" in prb.plots.plot_stages(posterior).viz
     True
     """
     refuse_look(labels, pc_kwargs)

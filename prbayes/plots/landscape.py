@@ -91,7 +91,7 @@ def plot_landscape(
     ...     y = prb.Simulator(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> prb.plot_landscape(prb.minimize(model)).viz["optimum"].name
+    >>> prb.plots.plot_landscape(prb.minimize(model)).viz["optimum"].name
     'optimum'
     """
     refuse_look(labels, pc_kwargs)

@@ -109,11 +109,11 @@ def plot_outputs(
     ...     y = prb.Simulator(
     ...         "y", response, a, b, metric=metric, observed=data, propagation=cheap
     ...     )
-    >>> list(prb.plot_outputs(prb.minimize(model)).viz["measured"])
+    >>> list(prb.plots.plot_outputs(prb.minimize(model)).viz["measured"])
     ['life, load']
     """
     refuse_look(labels, pc_kwargs)
-    ensemble = read_result(result, model, "prb.plot_outputs", n_draws)
+    ensemble = read_result(result, model, "prb.plots.plot_outputs", n_draws)
     evaluator = ensemble.evaluator
     start, text = read_before(result, evaluator, before, "plot_outputs")
     k = _simulator_index(evaluator, simulator)
@@ -176,7 +176,7 @@ def _simulator_index(evaluator: Evaluator, simulator: str | None) -> int:
     if not several:
         raise ValueError(
             f"plot_outputs: got simulators {names} of one output, expected one with several; draw "
-            "them by prb.plot_responses"
+            "them by prb.plots.plot_responses"
         )
     if simulator is None:
         return names.index(several[0])

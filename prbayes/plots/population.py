@@ -88,12 +88,12 @@ def plot_population(
     ...     y = prb.Simulator(
     ...         "y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> list(prb.plot_population(prb.minimize(model)).viz["after"])
+    >>> list(prb.plots.plot_population(prb.minimize(model)).viz["after"])
     ['load']
     """
     refuse_look(labels, pc_kwargs)
     share(prob, "prob")
-    ensemble = read_result(result, model, "prb.plot_population", n_draws, free=True)
+    ensemble = read_result(result, model, "prb.plots.plot_population", n_draws, free=True)
     shown = select_margins(margins(ensemble.evaluator), inputs)
     densities = margin_densities(ensemble.evaluator, shown, ensemble.every)
     names = [margin.name for margin in shown]

@@ -99,7 +99,7 @@ def plot_posterior(
     ...     posterior = prb.sample_smc(
     ...         100, chains=2, optimum=optimum, random_seed=1, progressbar=False
     ...     )
-    >>> pc = prb.plot_posterior(posterior, optimum=optimum, model=model)
+    >>> pc = prb.plots.plot_posterior(posterior, optimum=optimum, model=model)
     >>> list(pc.viz["posterior"])
     ['mu']
     """

@@ -122,13 +122,13 @@ def plot_responses(
     ...     y = prb.Simulator(
     ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
     ...     )
-    >>> prb.plot_responses(prb.minimize(model)).viz["after"].name
+    >>> prb.plots.plot_responses(prb.minimize(model)).viz["after"].name
     'after'
     """
     refuse_look(labels, pc_kwargs)
     flag(ecdf, "ecdf")
     share(prob, "prob")
-    ensemble = read_result(result, model, "prb.plot_responses", n_draws)
+    ensemble = read_result(result, model, "prb.plots.plot_responses", n_draws)
     evaluator = ensemble.evaluator
     start, text = read_before(result, evaluator, before, "plot_responses")
     by_simulator = panels_of(evaluator.simulators)

@@ -60,7 +60,7 @@ def plot_validity(
     >>> rng = np.random.default_rng(1)
     >>> predicted = rng.normal(rng.normal(0, 0.2, (200, 1)), 1.0, (200, 500))
     >>> test = prb.area_test(rng.normal(0, 1, 20), predicted)
-    >>> prb.plot_validity(test).viz["ecdf"].name
+    >>> prb.plots.plot_validity(test).viz["ecdf"].name
     'ecdf'
     """
     refuse_look(None, pc_kwargs)

@@ -163,7 +163,7 @@ def requests(m: Material) -> dict[str, Request]:
     if m.model is not None and result is not None:
         requested["population"] = ((result,), {"model": m.model, **labels})
     if m.model is not None and _computes_responses(m.model):
-        requested["responses"] = "it would recompute responses; call prb.plot_responses for it"
+        requested["responses"] = "it would recompute responses; call prb.plots.plot_responses"
     elif "population" in requested:
         requested["responses"] = requested["population"]
         if any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values()):

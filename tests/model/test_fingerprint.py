@@ -323,19 +323,19 @@ PAIRS: dict[str, tuple[Level, Callable[[str], Any]]] = {
     ),
     "plot_landscape: model": (
         Level.POPULATIONS,
-        lambda change: prb.plot_landscape(optimum(), model=model_with(change), points=5),
+        lambda change: prb.plots.plot_landscape(optimum(), model=model_with(change), points=5),
     ),
     "plot_population: model": (
-        Level.POPULATIONS, lambda change: prb.plot_population(posterior(), model=model_with(change))
+        Level.POPULATIONS, lambda change: prb.plots.plot_population(posterior(), model=model_with(change))
     ),
     "plot_responses: model": (
-        Level.POPULATIONS, lambda change: prb.plot_responses(optimum(), model=model_with(change))
+        Level.POPULATIONS, lambda change: prb.plots.plot_responses(optimum(), model=model_with(change))
     ),
     "plot_posterior: optimum": (
-        Level.POPULATIONS, lambda change: prb.plot_posterior(posterior(), optimum=optimum(change))
+        Level.POPULATIONS, lambda change: prb.plots.plot_posterior(posterior(), optimum=optimum(change))
     ),
     "plot_posterior: model": (
-        Level.PRIORS, lambda change: prb.plot_posterior(posterior(), model=model_with(change))
+        Level.PRIORS, lambda change: prb.plots.plot_posterior(posterior(), model=model_with(change))
     ),
     "diagnose: posterior": (
         Level.OPTIMUM, lambda change: prb.diagnose(posterior(), model=model_with(change))

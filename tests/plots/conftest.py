@@ -105,7 +105,7 @@ def pair() -> SimpleNamespace:
 
     @cache
     def drawn() -> Any:
-        return prb.plot_outputs(tree, model=model)
+        return prb.plots.plot_outputs(tree, model=model)
 
     return SimpleNamespace(
         model=model,
@@ -157,17 +157,19 @@ def pictures(
     """Return every plot with a legend or a panel for each result, by name."""
     model = optimum.model
     return {
-        "responses": lambda **k: prb.plot_responses(posterior, model=model, **k),
-        "ecdf": lambda **k: prb.plot_responses(optimum, ecdf=True, **k),
-        "outputs": lambda **k: prb.plot_outputs(pair.posterior, model=pair.model, **k),
-        "population": lambda **k: prb.plot_population(posterior, model=model, **k),
-        "posterior": lambda **k: prb.plot_posterior(posterior, optimum=optimum, model=model, **k),
-        "optimizer": lambda **k: prb.plot_optimizer(optimum, **k),
-        "landscape": lambda **k: prb.plot_landscape(optimum, points=21, **k),
-        "curve": lambda **k: prb.plot_landscape(optimum, pair="sigma", points=21, **k),
-        "stages": lambda **k: prb.plot_stages(posterior, **k),
-        "comparison": lambda **k: prb.plot_comparison(comparison, **k),
-        "scores": lambda **k: prb.plot_comparison(comparison, scores=True, **k),
+        "responses": lambda **k: prb.plots.plot_responses(posterior, model=model, **k),
+        "ecdf": lambda **k: prb.plots.plot_responses(optimum, ecdf=True, **k),
+        "outputs": lambda **k: prb.plots.plot_outputs(pair.posterior, model=pair.model, **k),
+        "population": lambda **k: prb.plots.plot_population(posterior, model=model, **k),
+        "posterior": lambda **k: prb.plots.plot_posterior(
+            posterior, optimum=optimum, model=model, **k
+        ),
+        "optimizer": lambda **k: prb.plots.plot_optimizer(optimum, **k),
+        "landscape": lambda **k: prb.plots.plot_landscape(optimum, points=21, **k),
+        "curve": lambda **k: prb.plots.plot_landscape(optimum, pair="sigma", points=21, **k),
+        "stages": lambda **k: prb.plots.plot_stages(posterior, **k),
+        "comparison": lambda **k: prb.plots.plot_comparison(comparison, **k),
+        "scores": lambda **k: prb.plots.plot_comparison(comparison, scores=True, **k),
     }
 
 

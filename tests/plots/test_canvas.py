@@ -45,13 +45,13 @@ def test_one_mapping_serves_all_pictures_of_a_model(pictures: dict[str, Any]) ->
 
 
 def test_settings_of_the_collection_are_passed_on(posterior: xr.DataTree) -> None:
-    pc = prb.plot_posterior(posterior, col_wrap=1, figure_kwargs={"figsize": (3, 7)})
+    pc = prb.plots.plot_posterior(posterior, col_wrap=1, figure_kwargs={"figsize": (3, 7)})
     assert tuple(pc.viz["figure"].item().get_size_inches()) == (3, 7)
     assert pc.viz["row_index"]["sigma"].item() == 1
-    figure = prb.plot_posterior(posterior, figsize=(9, 3)).viz["figure"]
+    figure = prb.plots.plot_posterior(posterior, figsize=(9, 3)).viz["figure"]
     assert tuple(figure.item().get_size_inches()) == (9, 3)
     with pytest.raises(TypeError, match=r"backend: got str 'plotly', expected none"):
-        prb.plot_posterior(posterior, backend="plotly")
+        prb.plots.plot_posterior(posterior, backend="plotly")
 
 
 @pytest.mark.parametrize(("width", "columns"), [(3, 1), (5, 2), (12, 4)])

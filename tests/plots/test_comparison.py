@@ -34,4 +34,4 @@ def test_a_comparison_has_a_row_for_each_result(
 
 def test_a_comparison_without_scores_is_refused(posterior: xr.DataTree) -> None:
     with pytest.raises(ValueError, match="got no scores"):
-        prb.plot_comparison(prb.compare({"draws": posterior}), scores=True)
+        prb.plots.plot_comparison(prb.compare({"draws": posterior}), scores=True)

@@ -38,4 +38,4 @@ def test_statistics_that_are_not_by_stage_are_refused(posterior: xr.DataTree) ->
     without = posterior.copy()
     without["sample_stats"] = xr.DataTree(xr.Dataset({"beta": ("chain", np.ones(2))}))
     with pytest.raises(ValueError, match="got sample_stats without dims"):
-        prb.plot_stages(without)
+        prb.plots.plot_stages(without)

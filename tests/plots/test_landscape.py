@@ -63,7 +63,7 @@ def test_a_curve_over_one_hyperparameter(
 def test_other_optima_are_marked(read: SimpleNamespace) -> None:
     optimum = prb.minimize(_one())
     modes = ({"theta": -optimum.theta, "point": {}, "discrepancy": 1.0, "comparable": True},)
-    pc = prb.plot_landscape(replace(optimum, local_optima=modes), points=21)
+    pc = prb.plots.plot_landscape(replace(optimum, local_optima=modes), points=21)
     np.testing.assert_allclose(read.xy(pc, "local_optima", "landscape")[0], -optimum.theta)
     path = read.xy(pc, "asked", "landscape")[0]
     largest = np.abs(optimum.search.trace["theta"]).max()
@@ -77,12 +77,12 @@ def test_a_landscape_that_costs_responses_says_how_many(build: Callable[..., pm.
         ValueError,
         match=r"got responses=0, expected at least 1600: 25 points with 64 responses each",
     ):
-        prb.plot_landscape(found, points=5)
-    assert "landscape" in prb.plot_landscape(found, points=5, responses=1600).viz
+        prb.plots.plot_landscape(found, points=5)
+    assert "landscape" in prb.plots.plot_landscape(found, points=5, responses=1600).viz
     with pytest.raises(
         KeyError, match=r"pair: got \['mu', 'nu'\], expected one or two of \['mu', 'sigma'\]"
     ):
-        prb.plot_landscape(found, pair=["mu", "nu"])
+        prb.plots.plot_landscape(found, pair=["mu", "nu"])
 
 
 def test_the_landscape_of_another_metric(
@@ -93,14 +93,14 @@ def test_the_landscape_of_another_metric(
         prb.Simulator(
             "y", np.positive, x, metric=prb.ProbabilityResidual(), observed=known.observed
         )
-    pc = prb.plot_landscape(optimum, model=other, pair="mu", points=9)
+    pc = prb.plots.plot_landscape(optimum, model=other, pair="mu", points=9)
     x, y = read.xy(pc, "landscape", "landscape")
     thetas = np.column_stack([x, np.full(x.size, optimum.theta[1])])
     np.testing.assert_allclose(y, Evaluator.of(other)(thetas).discrepancies[:, 0])
     with pytest.raises(
         ValueError, match=r"plot_landscape: .*hyperparameters: got sigma_log__, expected "
     ):
-        prb.plot_landscape(optimum, model=_one())
+        prb.plots.plot_landscape(optimum, model=_one())
 
 
 def _one() -> pm.Model:

@@ -44,7 +44,9 @@ def test_specimens_with_both_outputs_names_units_and_correlations(
         "measured",
     ]
     count = pair.calls()
-    named = prb.plot_outputs(pair.posterior, model=pair.model, before=False, labels={"first": "F"})
+    named = prb.plots.plot_outputs(
+        pair.posterior, model=pair.model, before=False, labels={"first": "F"}
+    )
     assert named.viz["plot"]["second, first"].item().get_xlabel() == "F"
     assert "before_50" not in named.viz
     assert pair.calls() == count
@@ -99,22 +101,22 @@ def pairs(pc: Any) -> list[str]:
 @pytest.mark.long
 def test_pairs_are_a_triangle(several: SimpleNamespace) -> None:
     how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4}
-    pc = prb.plot_outputs(several.posterior, outputs=["p", "r/s", "u"], **how)
+    pc = prb.plots.plot_outputs(several.posterior, outputs=["p", "r/s", "u"], **how)
     assert pairs(pc) == ["r\u2215s, p", "u, p", "u, r\u2215s"]
     axes = np.array(pc.viz["figure"].item().axes, dtype=object).reshape(2, 2)
     assert [axis.axison for axis in axes.ravel()] == [True, False, True, True]
     assert axes[0, 0].get_xlabel() == axes[1, 1].get_ylabel() == ""
     assert (axes[1, 0].get_xlabel(), axes[1, 0].get_ylabel()) == ("five: p", "five: u")
-    every = prb.plot_outputs(several.posterior, **how)
+    every = prb.plots.plot_outputs(several.posterior, **how)
     assert len(pairs(every)) == 10
 
 
 def test_of_a_curve_some_places_are_drawn(several: SimpleNamespace) -> None:
     how: dict[str, Any] = {"model": several.model, "before": False, "n_draws": 4}
-    pc = prb.plot_outputs(several.posterior, simulator="curve", **how)
+    pc = prb.plots.plot_outputs(several.posterior, simulator="curve", **how)
     assert pairs(pc)[-1] == "5.5, 3.5"
     assert len(pairs(pc)) == 6
-    chosen = prb.plot_outputs(several.posterior, simulator="curve", outputs=[0.5, "5"], **how)
+    chosen = prb.plots.plot_outputs(several.posterior, simulator="curve", outputs=[0.5, "5"], **how)
     assert pairs(chosen) == ["5, 0.5"]
 
 
@@ -131,9 +133,11 @@ def test_what_is_not_there_is_refused(
     several: SimpleNamespace, arguments: dict[str, Any], error: type[Exception], match: str
 ) -> None:
     with pytest.raises(error, match=match):
-        prb.plot_outputs(several.posterior, model=several.model, **arguments)
+        prb.plots.plot_outputs(several.posterior, model=several.model, **arguments)
 
 
 def test_a_model_of_single_outputs_is_refused(optimum: prb.Optimum) -> None:
-    with pytest.raises(ValueError, match=r"got simulators \['y'\] of one .* prb.plot_responses"):
-        prb.plot_outputs(optimum)
+    with pytest.raises(
+        ValueError, match=r"got simulators \['y'\] of one .* prb.plots.plot_responses"
+    ):
+        prb.plots.plot_outputs(optimum)

@@ -20,14 +20,14 @@ from prbayes.propagation.base import Propagation
 def test_the_population_is_the_closed_form(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_population(posterior, model=optimum.model, n_draws=300, prob=0.8)
+    pc = prb.plots.plot_population(posterior, model=optimum.model, n_draws=300, prob=0.8)
     x, y = read.xy(pc, "after", "x")
     each = stats.norm.pdf(x, known.mu.reshape(-1, 1), known.sigma.reshape(-1, 1))
     np.testing.assert_allclose(y, each.mean(axis=0), atol=1e-9)
     some = slice(10, 240, 15)
     expected = np.quantile(each, [0.1, 0.9], axis=0)[:, some]
     np.testing.assert_allclose(read.sides(pc, "band", "x", x[some]), expected, atol=1e-6)
-    x, y = read.xy(prb.plot_population(optimum), "after", "x")
+    x, y = read.xy(prb.plots.plot_population(optimum), "after", "x")
     np.testing.assert_allclose(
         y, stats.norm.pdf(x, optimum.point["mu"], optimum.point["sigma"]), atol=1e-9
     )
@@ -60,7 +60,7 @@ def test_a_multivariate_input_has_its_pairs(read: SimpleNamespace) -> None:
         }
     )
     posterior = xr.DataTree.from_dict({"posterior": draws})
-    pc = prb.plot_population(posterior, model=correlated(), prob=0.89)
+    pc = prb.plots.plot_population(posterior, model=correlated(), prob=0.89)
     pairs = ["loads[1], loads[0]", "loads[2], loads[0]", "loads[2], loads[1]"]
     assert list(pc.viz["region"].data_vars) == list(pc.viz["half"].data_vars) == pairs
     # The ellipse of 89%: as far out as the root of a chi-square quantile, and as inclined.

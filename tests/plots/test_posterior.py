@@ -15,7 +15,7 @@ import prbayes as prb
 def test_the_posterior_stands_against_the_optimum(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_posterior(posterior, optimum=optimum, model=optimum.model, prob=0.8)
+    pc = prb.plots.plot_posterior(posterior, optimum=optimum, model=optimum.model, prob=0.8)
     for name, draws in (("mu", known.mu), ("sigma", known.sigma)):
         x, y = read.xy(pc, "posterior", name)
         expected = stats.norm.pdf(x, draws.mean(), draws.std())
@@ -39,10 +39,10 @@ def test_the_posterior_stands_against_the_optimum(
 
 
 def test_a_posterior_alone(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
-    pc = prb.plot_posterior(posterior)
+    pc = prb.plots.plot_posterior(posterior)
     assert not {"optimum", "normal", "prior"} & set(pc.viz.children)
     blind = replace(optimum, stderr={"mu": np.inf, "sigma": np.nan})
-    pc = prb.plot_posterior(posterior, optimum=blind)
+    pc = prb.plots.plot_posterior(posterior, optimum=blind)
     assert "optimum" in pc.viz
     assert "normal" not in pc.viz
 
@@ -55,7 +55,7 @@ def test_some_of_the_variables(posterior: xr.DataTree) -> None:
     tree = xr.DataTree.from_dict({"posterior": many})
 
     def drawn(var_names: Any) -> list[str]:
-        return list(prb.plot_posterior(tree, var_names=var_names).viz["posterior"])
+        return list(prb.plots.plot_posterior(tree, var_names=var_names).viz["posterior"])
 
     assert drawn(["rate"]) == ["rate[Adler]", "rate[Busch]"]
     assert drawn("mu") == ["mu"]
@@ -74,13 +74,13 @@ def test_a_packed_factor_is_drawn_where_it_is_asked_for() -> None:
         for name, size in sizes.items()
     }
     tree = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
-    drawn = list(prb.plot_posterior(tree).viz["posterior"])
+    drawn = list(prb.plots.plot_posterior(tree).viz["posterior"])
     assert drawn == ["chol_stds[0]", "chol_stds[1]", "chol_corr[0]"]
-    drawn = list(prb.plot_posterior(tree, var_names="chol").viz["posterior"])
+    drawn = list(prb.plots.plot_posterior(tree, var_names="chol").viz["posterior"])
     assert drawn == ["chol[0]", "chol[1]", "chol[2]"]
 
 
 def test_a_constant_posterior_is_refused(posterior: xr.DataTree) -> None:
     constant = xr.DataTree.from_dict({"posterior": posterior["posterior"].to_dataset() * 0})
     with pytest.raises(ValueError, match=r"got a posterior of \['mu', 'sigma'\]"):
-        prb.plot_posterior(constant)
+        prb.plots.plot_posterior(constant)

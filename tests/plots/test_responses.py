@@ -20,7 +20,7 @@ from prbayes.response.outputs import SINGLE_OUTPUT, Outputs
 def test_responses_are_the_closed_forms(
     optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_responses(posterior, model=optimum.model, n_draws=300)
+    pc = prb.plots.plot_responses(posterior, model=optimum.model, n_draws=300)
     x, y = read.xy(pc, "after", "y")
     h = 0.9 * 0.5 * 700**-0.2  # about Silverman's for the weights' effective number
     each = stats.norm.pdf(x, known.mu.reshape(-1, 1), np.hypot(known.sigma.reshape(-1, 1), h))
@@ -87,11 +87,11 @@ def test_stored_responses_cost_nothing_and_others_as_little_as_said(
         model = build(propagation, counted)
         first_use(model)
         seen.clear()
-        pc = prb.plot_responses(posterior, model=model)
+        pc = prb.plots.plot_responses(posterior, model=model)
         assert "after" in pc.viz
         assert sum(seen) <= cost + 300  # a few more where a response is tried first
         seen.clear()
-        prb.plot_population(posterior, model=model)
+        prb.plots.plot_population(posterior, model=model)
         assert sum(seen) <= 300
 
 
@@ -99,7 +99,7 @@ def test_without_a_sampling_distribution_there_is_no_band(
     optimum: prb.Optimum, read: SimpleNamespace
 ) -> None:
     unknown = replace(optimum, covariance=np.full((2, 2), np.nan))
-    pc = prb.plot_responses(unknown, before={"mu": 1.0, "sigma": 0.05})
+    pc = prb.plots.plot_responses(unknown, before={"mu": 1.0, "sigma": 0.05})
     assert "band" not in pc.viz
     # A narrow peak before does not flatten the data
     low, high = pc.viz["plot"]["y"].item().get_ylim()
@@ -114,13 +114,13 @@ def test_a_posterior_beyond_the_design_is_refused(
     far["posterior"]["mu"] = far["posterior"]["mu"] + 50
     unsupported = "support 0 of 200 populations of the posterior"
     with pytest.raises(prb.propagation.DesignError, match=unsupported):
-        prb.plot_responses(far, model=optimum.model)
+        prb.plots.plot_responses(far, model=optimum.model)
 
 
 def test_each_output_has_a_panel_with_what_was_measured_of_it(
     pair: SimpleNamespace, read: SimpleNamespace
 ) -> None:
-    pc = prb.plot_responses(pair.posterior, model=pair.model)
+    pc = prb.plots.plot_responses(pair.posterior, model=pair.model)
     for column, mean in (("first", 2.0), ("second", 6.6)):
         x, y = read.xy(pc, "after", f"frame[{column}]")
         np.testing.assert_allclose(y, stats.norm.pdf(x, mean, 1), atol=0.025)
@@ -190,7 +190,7 @@ def test_groups_have_the_same_axis() -> None:
         z = pm.Normal.dist(100 * pm.Normal("nu", 1, 1), 1, name="z")
         prb.Simulator("far", lambda z: z, z, metric=prb.AreaMetric(), observed=[99.0, 101])
     optimum = prb.minimize(model)
-    for plot in (prb.plot_responses, prb.plot_population):
+    for plot in (prb.plots.plot_responses, prb.plots.plot_population):
         pc = plot(optimum)
         ends = [panel.item().get_xlim() for panel in pc.viz["plot"].data_vars.values()]
         first, second, other = ends
@@ -237,7 +237,7 @@ def test_a_curve_has_one_panel_from_left_to_right(read: SimpleNamespace) -> None
         response = lambda a: curve(a)[..., [0, 2, 3]]  # noqa: E731
         prb.Simulator("wear", response, a, observed=data[:, [0, 2, 3]], **given)
     draws = xr.Dataset({"mu": (("chain", "draw"), np.linspace(1.4, 1.6, 20).reshape(2, 10))})
-    pc = prb.plot_responses(xr.DataTree.from_dict({"posterior": draws}), model=model)
+    pc = prb.plots.plot_responses(xr.DataTree.from_dict({"posterior": draws}), model=model)
     axis = pc.viz["plot"]["wear"].item()
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("hour", "wear (mm)")
     assert axis.get_title() == "11 measured specimens, 1 incomplete, 4 failed"
@@ -274,7 +274,7 @@ def test_many_outputs_with_names_are_in_their_own_spread(read: SimpleNamespace) 
         prb.Simulator("strain", response, a, b, propagation=prb.Resimulated(64), **given)
     draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((1, 8)))})
     tree = xr.DataTree.from_dict({"posterior": draws})
-    pc = prb.plot_responses(tree, model=model, before=False)
+    pc = prb.plots.plot_responses(tree, model=model, before=False)
     _, y = read.xy(pc, "measured", "strain")
     expected = (data - data.mean(axis=0)) / data.std(axis=0)
     np.testing.assert_allclose(y[np.isfinite(y)], expected.ravel())

@@ -37,7 +37,7 @@ def shoelace(corners: np.ndarray[Any, Any]) -> float:
 @pytest.mark.parametrize(("shift", "folded"), [(0.0, False), (1.2, False), (0.0, True)])
 def test_the_shaded_area_is_the_statistic(shift: float, folded: bool) -> None:
     test = validity(shift, folded)
-    pc = prb.plot_validity(test)
+    pc = prb.plots.plot_validity(test)
     assert isinstance(pc, az.PlotCollection)
     assert shoelace(polygon(pc.viz["area"]["u"].item())) == pytest.approx(test.statistic, abs=1e-9)
     line = pc.viz["ecdf"]["u"].item()
@@ -50,17 +50,20 @@ def test_the_shaded_area_is_the_statistic(shift: float, folded: bool) -> None:
 def test_the_verdict_stands_in_the_title() -> None:
     for shift, verdict, sign in ((0.0, "not rejected", "<"), (1.2, "rejected", ">")):
         test = validity(shift)
-        axis = prb.plot_validity(test).viz["plot"]["u"].item()
+        axis = prb.plots.plot_validity(test).viz["plot"]["u"].item()
         expected = f"area {test.statistic:.3f} {sign} critical {test.critical_value:.3f}: {verdict}"
         assert axis.get_title() == f"p = {test.p_value:.2g}, level 5%\n{expected}"
         assert axis.get_xlabel() == "u-value"
-    assert prb.plot_validity(validity(0.0, True)).viz["plot"]["u"].item().get_xlabel() == "|2u - 1|"
+    assert (
+        prb.plots.plot_validity(validity(0.0, True)).viz["plot"]["u"].item().get_xlabel()
+        == "|2u - 1|"
+    )
 
 
 def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
     for shift, inside in ((0.0, True), (1.2, False)):
         test = validity(shift)
-        path = prb.plot_validity(test).viz["envelope"]["u"].item().get_paths()[0]
+        path = prb.plots.plot_validity(test).viz["envelope"]["u"].item().get_paths()[0]
         v = np.linspace(0.011, 0.989, 200)
         low, high = (np.searchsorted(test.envelope[i], v, side="right") / 20 for i in (1, 0))
         ecdf = np.searchsorted(np.sort(test.u_values), v, side="right") / 20
@@ -72,7 +75,7 @@ def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
 
 def test_several_tests_of_different_sizes_get_a_panel_each() -> None:
     small = prb.area_test(FRESH[:7], PREDICTED, null=QUICK)
-    pc = prb.plot_validity({"all": validity(), "some": small})
+    pc = prb.plots.plot_validity({"all": validity(), "some": small})
     axes = pc.viz["plot"]
     assert [axes[n].item().get_title().split(",")[0] for n in ("all", "some")] == ["all", "some"]
     assert [axes[n].item().get_ylabel() for n in ("all", "some")] == [
@@ -98,7 +101,7 @@ def test_outputs_have_a_line_for_each_direction_and_no_band_of_another_statistic
     folded: bool,
 ) -> None:
     test = of_outputs(folded)
-    pc = prb.plot_validity(test)
+    pc = prb.plots.plot_validity(test)
     expected = {"identity", "folded"} if folded else {"identity", "folded", "ecdf"}
     assert set(pc.viz.children) & {"area", "envelope", "identity", "ecdf", "folded"} == expected
     # The areas of the lines make the statistic, shared by numbers of values
@@ -122,7 +125,7 @@ def test_outputs_have_a_line_for_each_direction_and_no_band_of_another_statistic
 
 def test_the_title_of_outputs_has_the_mean_area_and_p() -> None:
     test = of_outputs()
-    axis = prb.plot_validity(test).viz["plot"]["u"].item()
+    axis = prb.plots.plot_validity(test).viz["plot"]["u"].item()
     assert axis.get_title().startswith(f"p = {test.p_value:.2g}, level 5%\nmean area 0.")
     assert axis.get_ylabel() == f"share of values in each of {len(in_directions(test))} directions"
     assert in_directions(validity()) == []

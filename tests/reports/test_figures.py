@@ -122,7 +122,7 @@ def test_a_report_computes_no_response(
     text = section(made, "Measured and calibrated responses").text
     assert text == (
         "This picture could not be made: it would recompute responses; "
-        "call prb.plot_responses for it",
+        "call prb.plots.plot_responses",
     )
 
 

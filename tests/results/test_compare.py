@@ -243,7 +243,7 @@ def test_several_outputs_are_scored_by_joint_metrics() -> None:
     names = ["ProbabilityResidual", "KullbackLeibler", "AreaMetric", "LogLikelihood"]
     assert {f"Joint({name})" for name in names} <= set(table.data_vars)
     assert float(table["Joint(AreaMetric)"][0]) == pytest.approx(best.discrepancy)
-    prb.plot_comparison(table)
+    prb.plots.plot_comparison(table)
 
 
 def test_scores_that_compute_responses_have_to_be_requested() -> None:
