@@ -1,4 +1,7 @@
-"""Results as sentences, as a table in a notebook, and as a DataFrame."""
+"""HTML of results in a notebook: a heading, a table, sentences.
+
+Also the same as text, and numbers as a DataFrame.
+"""
 
 from __future__ import annotations
 
@@ -72,14 +75,15 @@ class Shown:
 
     __slots__ = ()
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        return str(self._view())
+        return str(self.to_view())
 
     def _repr_html_(self) -> str:
-        return html_of(self._view())
+        return html_of(self.to_view())
 
 
 class ShownArray:
@@ -92,7 +96,8 @@ class ShownArray:
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         raise NotImplementedError
 
     @property
@@ -104,7 +109,7 @@ class ShownArray:
 
     def __repr__(self) -> str:
         """Return sentences; of a selection what xarray shows."""
-        return str(self._view()) if self._is_whole else super().__repr__()
+        return str(self.to_view()) if self._is_whole else super().__repr__()
 
     def __str__(self) -> str:
         return repr(self)
@@ -112,7 +117,7 @@ class ShownArray:
     def _repr_html_(self) -> str:
         """Show a table; of a selection what xarray shows."""
         if self._is_whole:
-            return html_of(self._view())
+            return html_of(self.to_view())
         return str(super()._repr_html_())  # type: ignore[misc]
 
 

@@ -253,7 +253,8 @@ class ExceedanceTable(Table):
     _parts = ("probability", "error", "lower", "upper", "draw", "prob", "limit", "response")
     _columns = ("probability", "error", "lower", "upper")
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         attrs = self.attrs
         sides = "below" if attrs["below"] else "above"
         values = [f"{p:.2g}" for p in np.atleast_1d(self["probability"].values)]

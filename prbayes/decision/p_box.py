@@ -183,7 +183,8 @@ class ProbabilityBox(Table):
     _parts = ("lower", "upper", "mean", "error", "y", "band", "prob", "response")
     _columns = ("lower", "upper", "mean", "error")
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         y, rows = self["y"].values, []
         for p in (0.01, 0.05, 0.5, 0.95, 0.99):
             row = [f"{p:.0%} quantile", f"{_place(self['mean'].values, y, p):.4g}"]

@@ -223,7 +223,8 @@ class PlanTable(Table):
     _parts = ("sd", "now", "candidate", "k", "name", "findings")
     _columns = ("sd", "now", "specimens")
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         rows = []
         for name in self["name"].values:
             for candidate in self["candidate"].values:

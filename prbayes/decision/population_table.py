@@ -262,7 +262,8 @@ class PopulationTable(Table):
             return super().__repr__()
         return "\n  ".join([f"{self._heading()}:", *self.sentences()])
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         quantities = self["quantity"].values.tolist()
         rows = []
         for name, unit, cells in self.rows():

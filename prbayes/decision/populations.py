@@ -614,7 +614,8 @@ class QuantityTable(Table):
     _parts = ("estimate", "lower", "upper", "error", "draw", "prob", "quantity")
     _columns = ("estimate", "lower", "upper", "error")
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         estimate, lower, upper = (float(self[key]) for key in self._columns[:3])
         rows = [
             ["standard error of the computation", f"{float(self['error']):.1g}"],

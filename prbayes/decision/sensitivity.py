@@ -203,7 +203,8 @@ class SensitivityTable(Table):
         *("derivative", "derivative_error"),
     )
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         attrs, rows = self.attrs, []
         for factor in self["factor"].values:
             row = self.sel(factor=factor)
@@ -218,8 +219,8 @@ class SensitivityTable(Table):
             f"{attrs['responses']} responses computed."
         )
         heading = (
-            f"{attrs['quantity']}: {attrs['value']:.4g}, with a standard deviation of "
-            f"{attrs['sd']:.2g} over the hyperparameters, and an error of the computation of "
+            f"{attrs['quantity']}: {attrs['value']:.4g} at the centre, with a standard deviation "
+            f"of {attrs['sd']:.2g} over the hyperparameters, and an error of the computation of "
             f"{attrs['value_error']:.1g}"
         )
         header = ["", "", "first-order share", "total share", "derivative bound"]

@@ -15,6 +15,7 @@ from prbayes._validate import Floats
 from prbayes.emulators.selection import CrossValidation
 from prbayes.emulators.surrogate import Surrogate
 from prbayes.emulators.table import read_csv, read_table
+from prbayes.response.call import column_names
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 
@@ -152,7 +153,7 @@ class Runs(Shown):
     @property
     def columns(self) -> list[str]:
         """Name of each number of the inputs."""
-        return self.surrogate.columns[: self.points.shape[1]]
+        return list(column_names(self.inputs, [r.size for r in self.surrogate.domain.inputs]))
 
     def error_beside(self, observed: Floats) -> float:
         """Return the largest left-out error of an output beside data (N,) or (N, m).
@@ -205,8 +206,9 @@ class Runs(Shown):
                     f"to {np.max(r.high):.6g}, the range of the runs"
                 )
 
-    def _view(self) -> View:
-        shown = self.surrogate._view()
+    def to_view(self) -> View:
+        """Return what a reader sees."""
+        shown = self.surrogate.to_view()
         names = [*self.columns, *self.outputs]
         rows = [[name, *row[1:]] for name, row in zip(names, shown.rows, strict=False)]
         return replace(shown, heading=f"Runs: {shown.heading.partition(' through ')[2]}", rows=rows)

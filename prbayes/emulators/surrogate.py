@@ -439,22 +439,21 @@ class Surrogate(Shown):
         """Lowest and highest value of each input."""
         return {r.name: (r.low.tolist(), r.high.tolist()) for r in self.domain.inputs}
 
-    @property
-    def columns(self) -> list[str]:
-        """Name of each number of the inputs, then of each output."""
-        m = self.responses[0].size
-        labels = [f"response[{i}]" for i in range(m)] if m > 1 else ["response"]
-        inputs = column_names(self.names, [r.size for r in self.domain.inputs])
-        return [*inputs, *(labels if self._named is None else self._named.names)]
-
     def to_dataframe(self) -> Any:
         """Return the runs as a DataFrame: a column for each number of the inputs and outputs."""
         import pandas as pd
 
         values = self.responses.reshape(len(self.points), -1)
-        return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=self.columns)
+        m = values.shape[1]
+        labels = [f"response[{i}]" for i in range(m)] if m > 1 else ["response"]
+        columns = [
+            *column_names(self.names, [r.size for r in self.domain.inputs]),
+            *(labels if self._named is None else self._named.names),
+        ]
+        return pd.DataFrame(np.concatenate([self.points, values], axis=1), columns=columns)
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         values = self.responses.reshape(len(self.points), -1)
         n_failed = int((~np.isfinite(values).all(axis=1)).sum())
         ends = [*zip(self.domain.low, self.domain.high, strict=True)]
@@ -465,7 +464,7 @@ class Surrogate(Shown):
         errors += [(f"{rms:.3g}", f"{relative:.2g} sd") for rms, relative in pairs]
         rows = [
             [name, f"{low:.6g}", f"{high:.6g}", *error]
-            for name, (low, high), error in zip(self.columns, ends, errors, strict=True)
+            for name, (low, high), error in zip(self.to_dataframe(), ends, errors, strict=True)
         ]
         heading = (
             f"Surrogate: {self.model!r:.60} through {len(values)} runs, {n_failed} of them without "

@@ -191,7 +191,8 @@ class Ranks(Tree):
         }
         return pd.DataFrame(columns, index=pd.Index(elements, name="variable"))
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         attrs, table = self["prior_sbc"].attrs, self.to_dataframe()
         rows = [
             [str(name), f"{mean:.3f}", f"{sd:.3f}", "outside" if is_outside else "inside"]

@@ -152,7 +152,8 @@ class Cost(Shown):
         ]
         return pd.DataFrame(rows, columns=columns).set_index("simulator")
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         rows = [
             [str(name), *("no limit" if x is None else str(x) for x in numbers)]
             for name, *numbers in self.to_dataframe().astype(object).itertuples(name=None)

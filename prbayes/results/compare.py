@@ -191,7 +191,8 @@ class Comparison(Table):
     _parts = (*_ESTIMATE, "result", "hyperparameter")
     _columns = (*_ESTIMATE, "shift")
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         rows = []
         for name in self["hyperparameter"].values:
             for label in self["result"].values:

@@ -163,17 +163,18 @@ class Individuals(Tree):
             tables.append(table)
         return pd.concat(tables, ignore_index=True)
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         numbers = ["mean", "sd", "lower", "upper"]
         table = self.to_dataframe()
-        labels = table.drop(columns=[*numbers, "input"]).itertuples(index=False, name=None)
+        indices = table.drop(columns=[*numbers, "input"]).itertuples(index=False, name=None)
         rows = []
         for name, index, values in zip(
-            table["input"], labels, table[numbers].to_numpy(), strict=True
+            table["input"], indices, table[numbers].to_numpy(), strict=True
         ):
-            own = [str(i) for i in index if i == i]  # NaN of a dimension that it has not
+            labels = [str(i) for i in index if i == i]  # NaN of a dimension that it has not
             mean, sd, lower, upper = (f"{x:.4g}" for x in values)
-            rows.append([element_name(name, own), mean, sd, f"{lower} to {upper}"])
+            rows.append([element_name(name, labels), mean, sd, f"{lower} to {upper}"])
         sentences = [
             f"{name}: shrinkage {np.array2string(np.asarray(x.attrs['shrinkage']), precision=2)}."
             for name, x in self["posterior"].data_vars.items()

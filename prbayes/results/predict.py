@@ -253,7 +253,8 @@ class Prediction(ShownArray, xr.DataArray):
     def _is_whole(self) -> bool:
         return super()._is_whole and bool({"sample", "specimen"} & set(self.dims))
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         drawn = [d for d in self.dims if d in ("chain", "draw", "sample", "specimen")]
         rows_of = [d for d in self.dims if d not in drawn]
         values = self.transpose(*rows_of, *drawn).values

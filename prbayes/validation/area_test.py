@@ -72,7 +72,8 @@ class ValidityTest(Shown):
         names = [name.split(DIRECTION)[0] for name in self.conditions.tolist()]
         return list(dict.fromkeys(names))
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         verdict = "rejected" if self.rejected else "not rejected"
         area = "area of |2u - 1|" if self.folded else "area"
         n_specimens = np.unique(self.specimens).size
@@ -92,7 +93,7 @@ class ValidityTest(Shown):
         return View(f"ValidityTest: {verdict} at level {self.alpha:g}", (), rows, sentences)
 
     def __repr__(self) -> str:
-        shown = self._view()
+        shown = self.to_view()
         numbers = ", ".join(" ".join(row) for row in shown.rows)
         return "\n  ".join([shown.heading, numbers, *shown.sentences])
 

@@ -141,7 +141,8 @@ class CrossValidationTable(Table):
     _parts = ("discrepancy", "calibrated", "score", "converged", "fold", "simulator", "specimen")
     _columns = ("discrepancy", "calibrated", "n_held_out", "converged")
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         means = self[["discrepancy", "calibrated"]].mean("fold")
         rows = [
             [str(name), *(f"{float(means[key].sel(simulator=name)):.4g}" for key in means)]
@@ -164,7 +165,8 @@ class Ranking(Table):
     _parts = ("score", "difference", "stderr", "verdict", "candidate", "n_specimens", "folds")
     _columns = ("score", "difference", "stderr", "significant", "converged")
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         table = self.to_dataframe()
         rows = [
             [str(label), *(f"{x:.4g}" for x in numbers[:3]), "yes" if numbers[3] else "no"]

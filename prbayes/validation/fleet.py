@@ -466,7 +466,8 @@ class Products(Tree):
         numbers = self["products"].to_dataset().drop_vars("finding")
         return table.merge(numbers).to_dataframe()
 
-    def _view(self) -> View:
+    def to_view(self) -> View:
+        """Return what a reader sees."""
         products = self["products"].to_dataset()
         table = self.to_dataframe()
         columns = [name for name in table.columns if not name.startswith("sd of ")]
