@@ -24,9 +24,9 @@ THEMES = {
 }
 
 
-def growth(C: Any, m: Any, million_cycles: float = 0.05) -> Any:
+def growth(rate: Any, m: float = 2.6, million_cycles: float = 0.05) -> Any:
     """Return crack length over notch length; +inf where the specimen has failed."""
-    left = 1 - (m - 1) * C * million_cycles
+    left = 1 - (m - 1) * rate * million_cycles
     length = np.maximum(left, 1e-12) ** (-1 / (m - 1))
     return np.where(left > 0, length, np.inf)
 
@@ -36,10 +36,8 @@ def calibrate(lengths: Any) -> tuple[dict[str, float], Any]:
     with pm.Model():
         mu = pm.Normal("mu", 1.1, 0.5)
         sigma = pm.HalfNormal("sigma", 0.5)
-        C = pm.LogNormal.dist(mu, sigma)
-        prb.Simulator(
-            "crack", growth, C, 2.6, metric=prb.ProbabilityResidual(), observed=lengths
-        )
+        rate = pm.LogNormal.dist(mu, sigma)
+        prb.Simulator("crack", growth, rate, metric=prb.ProbabilityResidual(), observed=lengths)
         optimum = prb.minimize(progressbar=False)
         posterior = prb.sample(optimum=optimum, random_seed=1, progressbar=False).posterior
     return optimum.point, np.stack([posterior[v].values.ravel() for v in ("mu", "sigma")], axis=-1)
@@ -66,7 +64,7 @@ def draw(theme: dict[str, str], lengths: Any, best: dict[str, float], draws: Any
     for (mu, sigma), color, style in ((first, start, "--"), (theta, model, "-")):
         frozen = lognorm(sigma, scale=np.exp(mu))
         population.plot(grid, frozen.pdf(grid), color=color, ls=style, lw=2)
-        values = growth(frozen.ppf(levels), 2.6)
+        values = growth(frozen.ppf(levels))
         kept = values[np.isfinite(values)]
         responses.plot(z, gaussian_kde(kept, 0.15)(z), color=color, ls=style, lw=2)
         predicted = np.searchsorted(np.sort(values), fine, side="right") / values.size
@@ -122,7 +120,7 @@ def main() -> None:
         figure.savefig(path, transparent=True, metadata={"Date": None})
         lines = path.read_text(encoding="utf-8").splitlines()
         digits = re.compile(r"(?<=\.\d\d)\d+")
-        shorter = [digits.sub("", line) if line[:2] in ("M ", "L ", "C ") else line for line in lines]
+        shorter = [digits.sub("", s) if s[:2] in ("M ", "L ", "C ") else s for s in lines]
         path.write_text("\n".join(shorter), encoding="utf-8")
         plt.close(figure)
 
