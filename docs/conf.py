@@ -7,6 +7,7 @@ from pathlib import Path
 from shutil import which
 
 from docutils import nodes
+from jupyter_client.connect import ConnectionFileMixin
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
@@ -56,6 +57,7 @@ html_title = "prbayes"
 html_logo = html_favicon = "_static/logo.svg"
 html_static_path = ["_static"]
 html_css_files = ["prbayes.css"]
+html_js_files = ["keyboard.js"]
 html_copy_source = html_show_sourcelink = False
 copybutton_selector = "div.highlight:not(.cell_output *) pre"
 copybutton_exclude = ".linenos, .gp, .go"
@@ -63,6 +65,9 @@ copybutton_exclude = ".linenos, .gp, .go"
 # Pages run side by side, one on a processor: threads within one would wait for those of others.
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
+
+# Kernels that start at the same time on TCP may choose the same port.
+ConnectionFileMixin.transport.default_value = "ipc"
 
 # Pages are notebooks: a page whose code fails stops the build. Results are kept, so that only
 # changed pages run again.
