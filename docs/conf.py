@@ -7,7 +7,6 @@ from pathlib import Path
 from shutil import which
 
 from docutils import nodes
-from jupyter_client.connect import ConnectionFileMixin
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
@@ -65,9 +64,6 @@ copybutton_exclude = ".linenos, .gp, .go"
 # Pages run side by side, one on a processor: threads within one would wait for those of others.
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
-
-# Kernels that start at the same time on TCP may choose the same port.
-ConnectionFileMixin.transport.default_value = "ipc"
 
 # Pages are notebooks: a page whose code fails stops the build. Results are kept, so that only
 # changed pages run again.
