@@ -11,7 +11,7 @@ from sphinx.util import logging
 
 WORDS = {  # by page, or page#heading
     "which_inputs": ["inverse uncertainty", "inverse uncertainty quantification", "how many runs"],
-    "my_data": ["data", "my data", "csv", "excel"],
+    "my_data": ["data", "my data", "csv", "excel", "decimal comma"],
     "my_data#units": ["unit", "units"],
     "my_data#missing-values": ["missing values", "nan", "nans"],
     "my_data#rounded-values-and-ties": ["ties", "rounded", "rounding"],
@@ -19,7 +19,7 @@ WORDS = {  # by page, or page#heading
     "my_data#limits-of-the-gauge": ["censored", "detection limit"],
     "my_data#few-specimens": ["few specimens", "small sample", "sample size"],
     "my_data#time-series-and-curves": ["time series"],
-    "definitions": ["formula", "formulas", "definition", "equation", "equations"],
+    "definitions": ["formula", "formulas", "equation", "probability residual", "wasserstein"],
     "decision": ["scatter", "probability of failure", "reliability", "quantile", "sensitivity"],
     "runs": ["table", "table of runs", "existing runs", "design of experiments"],
     "data_sheet": ["data sheet", "summary statistics", "published values"],
