@@ -43,7 +43,7 @@ class Finding:
     page: str = ""
 
     def __str__(self) -> str:
-        """Return the text; before its final period the call that shows the page, if there is one."""
+        """Return the text, with the call that shows its page before the final period."""
         if not self.page:
             return self.text
         sentence = self.text.removesuffix(".")
@@ -122,7 +122,7 @@ def help(code: str | None = None) -> Help:
     if code is None:
         first = {key: _plain(text).split(". ")[0].rstrip(".") for key, text in rows.items()}
         listed = "".join(f"- `{key}`: {sentence}.\n" for key, sentence in first.items())
-        return Help(f'Codes of findings. `prb.help("{next(iter(rows))}")` explains one.\n\n{listed}')
+        return Help(f'Codes of findings. `prb.help("rounded-data")` explains one.\n\n{listed}')
     if plain_text(code, "code") not in rows:
         near = ", ".join(map(repr, get_close_matches(code, rows, cutoff=0.4)))
         raise ValueError(
