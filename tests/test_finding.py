@@ -120,7 +120,9 @@ def test_help_of_an_installed_package_reads_its_own_pages(
     assert prb.help("a-code") == "`a-code`: Words.\n\n## B c\n\nText.\n\n### D\n\nMore."
 
 
-@pytest.mark.parametrize(("code", "near"), [("rounded", "'rounded-data'"), ("no-picure", "'no-pic")])
+@pytest.mark.parametrize(
+    ("code", "near"), [("rounded", "'rounded-data'"), ("no-picure", "'no-pic")]
+)
 def test_help_of_an_unknown_code_names_the_nearest(code: str, near: str) -> None:
     with pytest.raises(ValueError, match=rf"code: got '{code}', expected .*, such as {near}"):
         prb.help(code)
