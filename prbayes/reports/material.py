@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._finding import from_json
+from prbayes._stats import INTERVAL
 from prbayes._validate import Floats, called, texts
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.emulated import population_simulators
@@ -77,23 +80,89 @@ class Material:
         return dict(_estimates(self.results[label]).attrs)
 
     @property
-    def has_problems(self) -> bool:
-        """Whether a diagnosis found a problem.
+    def problems(self) -> list[str]:
+        """The problems that a diagnosis found, each once.
 
         Specimens that are too few for the standard errors of an optimum are none beside draws.
         """
         accepted = {"few-specimens"} if self.posteriors else set()
-        return any(
-            finding.code not in accepted
+        texts = [
+            str(finding)
             for diagnosis in self.diagnoses.values()
             if diagnosis is not None
             for finding in diagnosis.findings
-        )
+            if finding.code not in accepted
+        ]
+        return list(dict.fromkeys(texts))
 
     @property
     def is_usable(self) -> bool:
         """Whether no test rejected the model, and no diagnosis found a problem."""
-        return not (self.rejected or self.has_problems)
+        return not (self.rejected or self.problems)
+
+    @property
+    def prob(self) -> float:
+        """The probability of all intervals: that of the first probability of a decision."""
+        probs = [t.attrs["prob"] for t in self.decisions.values() if kind_of_decision(t) == "risk"]
+        return float(probs[0]) if probs else INTERVAL
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions by package, as the results have them."""
+        versions = {}
+        for label in self.results:
+            for key, value in self.attrs(label).items():
+                name = str(key).removesuffix("_version")
+                # ArviZ records libraries too
+                if name != key and name not in ("inference_library", "creation_library"):
+                    versions[name] = str(value)
+        return versions
+
+    @property
+    def software(self) -> str:
+        """The packages that a reader knows, with their versions."""
+        names = {"prbayes": "prbayes", "pymc": "PyMC", "arviz": "ArviZ"}
+        versions = self.versions
+        return ", ".join(f"{names[x]} {versions[x]}" for x in names if x in versions)
+
+    @property
+    def date(self) -> str:
+        """The day of the latest result: of an optimum in memory today; nothing if none has it."""
+        days = [str(self.attrs(label).get("created_at", ""))[:10] for label in self.results]
+        if self.live_optima:
+            days.append(datetime.now(UTC).isoformat()[:10])
+        return max((day for day in days if re.fullmatch(r"\d{4}-\d\d-\d\d", day)), default="")
+
+    @property
+    def metrics(self) -> dict[str, str]:
+        """The metric by simulator; by result as well, where results differ in it."""
+        by_result = {}
+        for label, table in self.calibrations.items():
+            pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
+            by_result[label] = {str(name): str(metric) for name, metric in pairs}
+        if not by_result:
+            return {s["name"]: s["metric"] for s in self.simulators}
+        first, *rest = by_result.values()
+        if all(metrics == first for metrics in rest):
+            return first
+        return {
+            f"{label}, {name}": metric
+            for label, metrics in by_result.items()
+            for name, metric in metrics.items()
+        }
+
+    @property
+    def constants(self) -> set[str]:
+        """Names of the inputs that are numbers."""
+        texts = (s["inputs"] for s in self.simulators)
+        return {name for text in texts for name in re.findall(r"(?:^|, )(\w+) = ", text)}
+
+    @property
+    def sheets(self) -> dict[str, str]:
+        """The statistics of each simulator that has a data sheet in place of specimens."""
+        pattern = re.compile(r"SummaryLikelihood\(summary=Summary\((.*)\)\)", re.S)
+        found = {name: pattern.fullmatch(metric) for name, metric in self.metrics.items()}
+        return {name: x[1].replace("=", " = ") for name, x in found.items() if x is not None}
 
     @property
     def is_by_specimen(self) -> bool:
@@ -168,12 +237,6 @@ def gather(
     if comparison is None and len(results) > 1:
         comparison = compare(results | live_optima, model=model)
     observed, outputs = _observed(model, results)
-    if labels and (description is not None or model is not None):
-        names = set(validation).union(outputs, *(columns.names for columns in outputs.values()))
-        if description is not None:
-            names |= {str(variable["name"]) for variable in description["variables"]}
-        evaluator = None if model is None else Evaluator.of(model)
-        refuse_labels(labels, sorted(names), evaluator=evaluator)
     diagnoses: dict[str, Diagnosis | None] = {}
     for label, result in results.items():
         if label in live_optima:
@@ -183,7 +246,7 @@ def gather(
         needs_model = not {"optimum", "calibration"} & set(result.children)
         is_possible = own_model is not None or not needs_model
         diagnoses[label] = diagnose(result, model=own_model) if is_possible else None
-    return Material(
+    material = Material(
         model=model,
         description=description,
         optima=optima,
@@ -198,6 +261,16 @@ def gather(
         validation=dict(validation),
         labels=dict(labels or {}),
     )
+    if labels and (description is not None or model is not None):
+        names = set(validation).union(outputs, *(columns.names for columns in outputs.values()))
+        if description is not None:
+            names |= {str(variable["name"]) for variable in description["variables"]}
+            names |= material.constants
+        evaluator = None if model is None else Evaluator.of(model)
+        refuse_labels(labels, sorted(names), evaluator=evaluator)
+    # Statistics of a data sheet are no measured responses
+    sampled = {name: y for name, y in observed.items() if name not in material.sheets}
+    return replace(material, observed=sampled)
 
 
 def _by_label(results: Any, kind: str) -> dict[str, Any]:
@@ -329,8 +402,7 @@ def _observed(
     """Return the measured responses, and their columns, by simulator."""
     if model is not None:
         simulators = population_simulators(model)
-        sampled = [s for s in simulators if not s.metric.exact_likelihood]  # no data sheets
-        observed = {simulator.name: simulator.observed for simulator in sampled}
+        observed = {simulator.name: simulator.observed for simulator in simulators}
         return observed, {simulator.name: simulator.outputs for simulator in simulators}
     observed, outputs = {}, {}
     tree = next((tree for tree in results.values() if "observed_data" in tree), None)
