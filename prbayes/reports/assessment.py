@@ -330,9 +330,9 @@ def answer(m: Material) -> list[Section]:
         row["standard deviation" if ends else "standard error"] = texts[1]
         rows.append(row | dict(zip((f"{m.prob:.0%} from", "to"), texts[2:], strict=False)))
     shown = rows if len(rows) <= 30 else []
-    text = [f"The population of the inputs is fitted to {_data(m)}. These are its parameters."]
-    if not shown:
-        text = ["The estimates are in the appendix."]
+    text = ["The estimates are in the appendix."]
+    if shown:
+        text = [f"The population of the inputs is fitted to {_data(m)}. These are its parameters."]
     if m.rejected:
         text.append("Measurements contradict the model: do not use these numbers for predictions.")
     diagnosis = m.diagnoses.get(label)
@@ -433,16 +433,16 @@ def agreement(m: Material) -> list[Section]:
 def _in_words(label: str, test: ValidityTest, m: Material) -> str:
     """Return the result of a test, in two sentences."""
     name = f"{label}: " if len(m.tests) > 1 else ""
-    aspect = "the scatter of the measured values" if test.folded else "the measured values"
-    agreed = "differ too much from" if test.rejected and not test.folded else "agree with"
+    aspect, agreed = "the measured values", ("differ too much from", "agree with")
     if test.folded:
-        agreed = "differs too much from" if test.rejected else "agrees with"
+        aspect = "the scatter of the measured values"
+        agreed = "differs too much from", "agrees with"
     p = "less than 0.1%" if test.p_value < 0.001 else in_percent(test.p_value)
-    sentence = (
-        f"{name}{aspect} {agreed} the prediction. Of a right model, {p} of such tests differ at "
-        f"least as much; below {percentage(test.alpha)} the model is rejected."
+    aspect = aspect if name else aspect.capitalize()
+    return (
+        f"{name}{aspect} {agreed[not test.rejected]} the prediction. Of a right "
+        f"model, {p} of such tests differ at least as much; below {percentage(test.alpha)} the model is rejected."
     )
-    return sentence if name else sentence[0].upper() + sentence[1:]
 
 
 def validation_pairs(m: Material) -> list[tuple[str, Comparable]]:

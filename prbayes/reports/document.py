@@ -17,7 +17,7 @@ import xarray as xr
 
 from prbayes._validate import called, file_path, flag, folder_path, plain_text
 from prbayes.optimize.optimum import Optimum
-from prbayes.reports.material import gather
+from prbayes.reports.material import date_of, gather, versions_of
 from prbayes.reports.numbers import cells
 from prbayes.reports.section import Section, is_broad, kind_of
 from prbayes.reports.sections import sections_of
@@ -147,10 +147,12 @@ class Report:
                 model, optimum, posterior, validity, comparison, decision, validation, labels
             )
             contents = sections_of(material, pictures=pictures)
-            date = material.date if date is None else date
+            date = date_of(material) if date is None else date
             if note is None and material.results:
-                intervals = f"intervals of {material.prob:.0%} probability"
-                note = ", ".join(filter(None, (material.software, intervals)))
+                names = {"prbayes": "prbayes", "pymc": "PyMC", "arviz": "ArviZ"}
+                packages = versions_of(material).items()
+                parts = [f"{names[name]} {version}" for name, version in packages if name in names]
+                note = ", ".join([*parts, f"intervals of {material.prob:.0%} probability"])
         for section in contents:
             if not isinstance(section, Section):
                 got = type(section).__name__

@@ -26,7 +26,7 @@ from prbayes.plots.prediction import plot_prediction
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.sensitivity import plot_sensitivity
 from prbayes.plots.validity import plot_validity
-from prbayes.reports.material import Material, kind_of_decision
+from prbayes.reports.material import Material, constants_of, kind_of_decision
 from prbayes.reports.section import Section, image
 
 _log = logging.getLogger("prbayes")
@@ -39,7 +39,7 @@ class Illustration:
     function: Callable[..., Any]  # returns an ArviZ `PlotCollection`
     title: str
     alt: str
-    caption: str
+    caption: str = ""
 
 
 ILLUSTRATIONS = {
@@ -61,38 +61,32 @@ ILLUSTRATIONS = {
         plot_optimizer,
         title="Path of the optimiser",
         alt="Objective, and hyperparameters, against the number of evaluations.",
-        caption="The objective at the points that the optimiser evaluated.",
     ),
     "landscape": Illustration(
         plot_landscape,
         title="Objective around the optimum",
         alt="Objective over the hyperparameters, with the optimum marked.",
-        caption="The objective around the optimum.",
     ),
     "posterior": Illustration(
         plot_posterior,
         title="Marginal posteriors",
         alt="Posterior density of each hyperparameter, with its interval.",
-        caption="Posterior distribution of each hyperparameter after the calibration.",
     ),
     "population": Illustration(
         plot_population,
         title="Calibrated population of the inputs",
         alt="Distribution of each input over the specimens, with a band for its uncertainty.",
-        caption="Variation of the inputs from specimen to specimen.",
     ),
     "stages": Illustration(
         plot_stages,
         title="Stages of the sampler",
         alt="Tempering, acceptance rate and moves against the stages of the sampler, "
         "one line per chain.",
-        caption="Stages of the sampler from the prior to the posterior.",
     ),
     "comparison": Illustration(
         plot_comparison,
         title="Estimates side by side",
         alt="Estimate and interval of each result, one panel per hyperparameter.",
-        caption="Estimates with their intervals.",
     ),
     "prediction": Illustration(
         plot_prediction,
@@ -106,20 +100,17 @@ ILLUSTRATIONS = {
         title="Distribution of the u-values",
         alt="Step curve of the sorted u-values against the diagonal, "
         "with the area between them, and of one output an acceptance band.",
-        caption="Places of the measured responses in the predicted distribution. "
-        "A right model is near the diagonal; the shaded area is the statistic. "
-        "With one output, the band contains the whole curve of a right model with probability one "
-        "minus the test's level; several outputs have a line for each direction, and no band. "
-        "Curves of a rejected model are red.",
+        caption="A right model is near the diagonal; the shaded area is the statistic. With one "
+        "output, the whole curve of a right model is in the band with probability one minus the "
+        "test's level; several outputs have a line for each direction. Rejected: red.",
     ),
     "sensitivity": Illustration(
         plot_sensitivity,
         title="Shares of parameters and inputs",
         alt="Share of each parameter of the population in the variance of the decision quantity, "
         "and of each input in that of the response.",
-        caption="Sensitivity of the decision: a dot is the share of a factor by itself, a diamond "
-        "the share that is left when all others are known, with two standard errors to either "
-        "side.",
+        caption="A dot is the share of a factor by itself, a diamond the share that is left with "
+        "all others known; bars are two standard errors.",
     ),
 }
 
@@ -138,7 +129,7 @@ def requests(m: Material) -> dict[str, Request]:
     # An optimum from a file has no evaluator, hence no population.
     optimum = next(iter(m.live_optima.values()), None)
     # Labels of the model, which has no conditions of a test
-    elsewhere = {*m.validation, *m.constants}
+    elsewhere = {*m.validation, *constants_of(m.description)}
     of_model = {name: text for name, text in m.labels.items() if name not in elsewhere}
     labels: dict[str, Any] = {"labels": of_model} if of_model else {}
     prob = {"prob": m.prob} if m.prob != INTERVAL else {}
@@ -162,10 +153,8 @@ def requests(m: Material) -> dict[str, Request]:
             requested["outputs"] = ((result,), {"model": m.model, **labels})
     if posterior is not None:
         shown = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
-        requested["posterior"] = (
-            (posterior,),
-            {"optimum": optimum, "model": m.model, **shown, **prob},
-        )
+        shown = {"optimum": optimum, "model": m.model, **shown, **prob}
+        requested["posterior"] = ((posterior,), shown)
         if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
             requested["stages"] = ((posterior,), {})
     if optimum is not None:
@@ -218,10 +207,10 @@ def pictures_of(m: Material) -> tuple[dict[str, list[Section]], list[Section]]:
             drawn[name] = [picture]
         else:
             missing.append(f"{ILLUSTRATIONS[name].title}: {picture.removesuffix('.')}.")
-    drawn["front"] = drawn.pop("prediction", None) or drawn.pop("responses", [])
+    drawn["front"] = drawn.pop("prediction", []) or drawn.pop("responses", [])
     graph = None if m.model is None else _graph(m.model)
     if graph is not None:
-        names = ", ".join(variable["name"] for variable in m.variables)
+        names = ", ".join(variable["name"] for variable in (m.description or {})["variables"])
         graph_section = Section(
             "Graph",
             picture=graph,

@@ -55,6 +55,7 @@ class Material:
     validation: dict[str, tuple[Any, xr.DataArray]] = field(default_factory=dict)
     # Labels of variables, inputs, simulators and outputs, with units
     labels: Mapping[str, str] = field(default_factory=dict)
+    sheets: Mapping[str, str] = field(default_factory=dict)  # statistics by simulator
 
     @property
     def results(self) -> dict[str, xr.DataTree]:
@@ -107,64 +108,6 @@ class Material:
         return float(probs[0]) if probs else INTERVAL
 
     @property
-    def versions(self) -> dict[str, str]:
-        """Versions by package, as the results have them."""
-        versions = {}
-        for label in self.results:
-            for key, value in self.attrs(label).items():
-                name = str(key).removesuffix("_version")
-                # ArviZ records libraries too
-                if name != key and name not in ("inference_library", "creation_library"):
-                    versions[name] = str(value)
-        return versions
-
-    @property
-    def software(self) -> str:
-        """The packages that a reader knows, with their versions."""
-        names = {"prbayes": "prbayes", "pymc": "PyMC", "arviz": "ArviZ"}
-        versions = self.versions
-        return ", ".join(f"{names[x]} {versions[x]}" for x in names if x in versions)
-
-    @property
-    def date(self) -> str:
-        """The day of the latest result: of an optimum in memory today; nothing if none has it."""
-        days = [str(self.attrs(label).get("created_at", ""))[:10] for label in self.results]
-        if self.live_optima:
-            days.append(datetime.now(UTC).isoformat()[:10])
-        return max((day for day in days if re.fullmatch(r"\d{4}-\d\d-\d\d", day)), default="")
-
-    @property
-    def metrics(self) -> dict[str, str]:
-        """The metric by simulator; by result as well, where results differ in it."""
-        by_result = {}
-        for label, table in self.calibrations.items():
-            pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
-            by_result[label] = {str(name): str(metric) for name, metric in pairs}
-        if not by_result:
-            return {s["name"]: s["metric"] for s in self.simulators}
-        first, *rest = by_result.values()
-        if all(metrics == first for metrics in rest):
-            return first
-        return {
-            f"{label}, {name}": metric
-            for label, metrics in by_result.items()
-            for name, metric in metrics.items()
-        }
-
-    @property
-    def constants(self) -> set[str]:
-        """Names of the inputs that are numbers."""
-        texts = (s["inputs"] for s in self.simulators)
-        return {name for text in texts for name in re.findall(r"(?:^|, )(\w+) = ", text)}
-
-    @property
-    def sheets(self) -> dict[str, str]:
-        """The statistics of each simulator that has a data sheet in place of specimens."""
-        pattern = re.compile(r"SummaryLikelihood\(summary=Summary\((.*)\)\)", re.S)
-        found = {name: pattern.fullmatch(metric) for name, metric in self.metrics.items()}
-        return {name: x[1].replace("=", " = ") for name, x in found.items() if x is not None}
-
-    @property
     def is_by_specimen(self) -> bool:
         """Whether all simulators of all results have the log-likelihood by specimen."""
         flags = [
@@ -175,11 +118,6 @@ class Material:
         return bool(flags) and all(flags)
 
     @property
-    def variables(self) -> list[dict[str, Any]]:
-        """The variables of the model; none where they are unknown."""
-        return [] if self.description is None else list(self.description["variables"])
-
-    @property
     def simulators(self) -> list[dict[str, Any]]:
         """The simulators of the model; none where they are unknown."""
         return [] if self.description is None else list(self.description["simulators"])
@@ -188,9 +126,57 @@ class Material:
     def hyperparameters(self) -> list[str]:
         """Names of the hyperparameters, without deterministics where they are known as such."""
         if self.description is not None:
-            return [v["name"] for v in self.variables if v["role"] == "hyperparameter"]
+            variables = self.description["variables"]
+            return [v["name"] for v in variables if v["role"] == "hyperparameter"]
         first = next(iter(self.results.values()), None)
         return [] if first is None else list(map(str, _estimates(first).data_vars))
+
+
+def metrics_of(m: Material) -> dict[str, str]:
+    """Return the metric by simulator; by result as well, where results differ in it."""
+    by_result = {}
+    for label, table in m.calibrations.items():
+        pairs = zip(table["simulator"].values, table["metric"].values, strict=True)
+        by_result[label] = {str(name): str(metric) for name, metric in pairs}
+    if not by_result:
+        return {s["name"]: s["metric"] for s in m.simulators}
+    first, *rest = by_result.values()
+    if all(metrics == first for metrics in rest):
+        return first
+    return {
+        f"{label}, {name}": metric
+        for label, metrics in by_result.items()
+        for name, metric in metrics.items()
+    }
+
+
+def sheets_of(m: Material) -> dict[str, str]:
+    """Return the statistics of each simulator that has a data sheet in place of specimens."""
+    pattern = re.compile(r"SummaryLikelihood\(summary=Summary\((.*)\)\)", re.S)
+    found = {name: pattern.fullmatch(metric) for name, metric in metrics_of(m).items()}
+    return {name: x[1].replace("=", " = ") for name, x in found.items() if x is not None}
+
+
+def constants_of(description: Mapping[str, Any] | None) -> set[str]:
+    """Return the names of inputs that are numbers."""
+    texts = [s["inputs"] for s in (description or {}).get("simulators", ())]
+    return {name for text in texts for name in re.findall(r"(?:^|, )(\w+) = ", text)}
+
+
+def date_of(m: Material) -> str:
+    """Return the day of the latest result: of an optimum in memory today; nothing if unknown."""
+    days = [str(m.attrs(label).get("created_at", ""))[:10] for label in m.results]
+    if m.live_optima:
+        days.append(datetime.now(UTC).isoformat()[:10])
+    return max((day for day in days if re.fullmatch(r"\d{4}-\d\d-\d\d", day)), default="")
+
+
+def versions_of(m: Material) -> dict[str, str]:
+    """Return versions by package, as the results have them."""
+    attrs = [pair for label in m.results for pair in m.attrs(label).items()]
+    names = ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy", "python")
+    versions = {str(key).removesuffix("_version"): str(value) for key, value in attrs}
+    return {name: versions[name] for name in names if name in versions}
 
 
 def gather(
@@ -237,6 +223,13 @@ def gather(
     if comparison is None and len(results) > 1:
         comparison = compare(results | live_optima, model=model)
     observed, outputs = _observed(model, results)
+    if labels and (description is not None or model is not None):
+        names = set(validation).union(outputs, *(columns.names for columns in outputs.values()))
+        if description is not None:
+            names |= {str(variable["name"]) for variable in description["variables"]}
+            names |= constants_of(description)
+        evaluator = None if model is None else Evaluator.of(model)
+        refuse_labels(labels, sorted(names), evaluator=evaluator)
     diagnoses: dict[str, Diagnosis | None] = {}
     for label, result in results.items():
         if label in live_optima:
@@ -261,16 +254,10 @@ def gather(
         validation=dict(validation),
         labels=dict(labels or {}),
     )
-    if labels and (description is not None or model is not None):
-        names = set(validation).union(outputs, *(columns.names for columns in outputs.values()))
-        if description is not None:
-            names |= {str(variable["name"]) for variable in description["variables"]}
-            names |= material.constants
-        evaluator = None if model is None else Evaluator.of(model)
-        refuse_labels(labels, sorted(names), evaluator=evaluator)
     # Statistics of a data sheet are no measured responses
-    sampled = {name: y for name, y in observed.items() if name not in material.sheets}
-    return replace(material, observed=sampled)
+    sheets = sheets_of(material)
+    sampled = {name: y for name, y in observed.items() if name not in sheets}
+    return replace(material, observed=sampled, sheets=sheets)
 
 
 def _by_label(results: Any, kind: str) -> dict[str, Any]:

@@ -91,11 +91,6 @@ def in_percent(p: float, floor: float = 1e-5) -> str:
     return f"{float(f'{100 * p:.{digits}g}'):g}%"
 
 
-def probability(p: float) -> str:
-    """Return a p-value after its sign: '= 0.18' or, beyond 9999 replicates, '< 0.001'."""
-    return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
-
-
 def span(values: Any, form: str) -> str:
     """Return the least and the largest of several numbers, or one where their texts are equal."""
     low = f"{values.min():{form}}"

@@ -37,7 +37,13 @@ from prbayes.reports.assessment import (
     verdict,
 )
 from prbayes.reports.figures import pictures_of
-from prbayes.reports.material import CALLED, Material, kind_of_decision
+from prbayes.reports.material import (
+    CALLED,
+    Material,
+    kind_of_decision,
+    metrics_of,
+    versions_of,
+)
 from prbayes.reports.numbers import (
     NOTHING,
     alike,
@@ -47,7 +53,6 @@ from prbayes.reports.numbers import (
     percentage,
     places,
     plus_minus,
-    probability,
     rows_table,
     sample_sd,
     span,
@@ -88,7 +93,7 @@ def model(m: Material) -> list[Section]:
             "distribution": v["distribution"],
             "meaning": m.labels.get(v["name"], ""),
         }
-        for v in m.variables
+        for v in m.description["variables"]
     ]
     about = (
         "Hyperparameters describe how the inputs vary from specimen to specimen, "
@@ -134,7 +139,7 @@ def comparison_of_responses(m: Material) -> list[Section]:
     """Return how measured and simulated responses are compared."""
     if not (m.calibrations or m.simulators):
         return []
-    labels = dict.fromkeys(map(metric_label, m.metrics.values()))
+    labels = dict.fromkeys(map(metric_label, metrics_of(m).values()))
     about = (
         "The metric measures how far the distribution of the simulated responses is "
         "from that of the measured ones; smaller is better."
@@ -144,7 +149,7 @@ def comparison_of_responses(m: Material) -> list[Section]:
             "The log-likelihood compares specimens: the density of each measured response in the "
             "population, through the inputs that reproduce it, on an emulator of the response."
         )
-    elif m.sheets and len(m.sheets) == len(m.metrics):
+    elif m.sheets and len(m.sheets) == len(metrics_of(m)):
         labels = {}
         about = "The likelihood is the density of the statistics of the data sheet."
     text = [about]
@@ -457,10 +462,9 @@ def support(m: Material) -> list[Section]:
     if not rows:
         return []
     about = (
-        "Responses were computed once, and weighted for each set of hyperparameters. "
-        "The effective sample size of the weights is the number of responses behind an answer; "
-        "the mean weight is 1 where the design covers the population; "
-        "lost mass is the probability of points without a response."
+        "Responses were computed once and are weighted. The effective sample size (ESS) is the "
+        "number of responses behind an answer; the mean weight is 1 where they cover the "
+        "population; lost mass is the probability of points without a response."
     )
     return [Section("Support by stored responses", about, rows_table(rows), level=3)]
 
@@ -505,17 +509,15 @@ def validity(m: Material) -> list[Section]:
         for label, test in m.tests.items()
     ]
     about = (
-        "The u-value of a measured response is its place in the predicted distribution, "
-        "between 0 and 1. "
-        "The statistic is the area between the distribution of the u-values and the uniform one; "
-        "a larger area than the critical value rejects the model. "
-        "The area of u detects a wrong mean, that of |2u - 1| a wrong spread."
+        "The u-value of a measured response is its place in the predicted distribution, from 0 to "
+        "1. The statistic is the area between the distribution of the u-values and the uniform "
+        "one: a larger one than the critical value rejects the model. The area of u detects a "
+        "wrong mean, that of |2u - 1| a wrong spread."
     )
     if any(in_directions(test) for test in m.tests.values()):
         about += (
-            " Several outputs of a specimen are projected on directions of the predicted ones, in "
-            "which a wrong correlation is a wrong spread; the statistic is the mean over the "
-            "directions of the areas of u and of |2u - 1|."
+            " Several outputs are projected on directions of the predicted ones, in which a wrong "
+            "correlation is a wrong spread; the statistic is the mean of the areas over these."
         )
     nulls = dict.fromkeys(f"Null hypothesis: {test.null}." for test in m.tests.values())
     return [Section("Test statistics", (about, *nulls), rows_table(rows), level=3)]
@@ -535,14 +537,14 @@ def _test_row(test: ValidityTest) -> dict[str, Any]:
         "of": values,
         "area": f"{test.statistic:.4f}",
         "critical value": f"{test.critical_value:.4f}",
-        "p-value": probability(test.p_value).removeprefix("= "),
+        "p-value": f"{test.p_value:.2g}" if test.p_value >= 0.001 else "< 0.001",
         "level": percentage(test.alpha),
     }
 
 
 def specimens(m: Material) -> list[Section]:
     """Return the measured values and u-values of each specimen of the test, a page of them."""
-    rows = _measured_rows(m) or _tested_rows(m)
+    rows = _measured_rows(m)
     if not rows:
         return []
     about = (
@@ -588,22 +590,6 @@ def _specimen_label(label: str, condition: str) -> str:
     return str(int(index) + 1) if index != label and index.isdigit() else label
 
 
-def _tested_rows(m: Material) -> list[dict[str, Any]]:
-    """Return a row for each u-value of one specimen in the tests."""
-    rows: dict[tuple[str, str], dict[str, Any]] = {}
-    for test in m.tests.values():
-        if in_directions(test):
-            continue
-        names = zip(test.conditions.tolist(), test.specimens.tolist(), strict=True)
-        for (condition, specimen), u in zip(names, test.u_values, strict=True):
-            rows[condition, specimen] = {
-                "condition": named(condition, m.labels),
-                "specimen": _specimen_label(specimen, condition),
-                "u": f"{u:.3f}",
-            }
-    return list(rows.values())
-
-
 # -- appendix: data --------------------------------------------------------------------------
 
 
@@ -635,10 +621,7 @@ def _correlations(name: str, m: Material) -> Section:
     columns = shown_outputs(m, name)
     y = np.column_stack([column for *_, column in columns])
     r = pandas.DataFrame(np.where(np.isfinite(y), y, np.nan)).corr(min_periods=3).values
-    about = (
-        f"Correlations of the measured outputs of {name}, each of the specimens that have both; "
-        "those that failed are in none."
-    )
+    about = "Each of the specimens that have both outputs, without those that failed."
     table = correlation_table([output for output, *_ in columns], r, 3)
     return Section(f"Correlations of {name}", about, table, level=3)
 
@@ -667,14 +650,12 @@ def origin(m: Material) -> list[Section]:
         seed = record.get("random_seed")
         rows.append(row | {"seconds": seconds, "seed": None if seed is None else str(seed)})
     text = [
-        "Responses are evaluations of the simulated response for one specimen, whatever the number "
-        "of its outputs; those of a common design are counted in each."
+        "Responses are runs for one specimen; those of a common design are counted in each result."
     ]
-    text += [f"{name}: {metric}." for name, metric in m.metrics.items()]
+    text += [f"{name}: {metric}." for name, metric in metrics_of(m).items()]
     text += [f"{s['name']}: {s['propagation']}." for s in m.simulators]
-    if m.versions:
-        packages = ", ".join(f"{name} {version}" for name, version in m.versions.items())
-        text.append(f"Computed with {packages}.")
+    packages = ", ".join(f"{name} {version}" for name, version in versions_of(m).items())
+    text += [f"Computed with {packages}."] if packages else []
     return [Section("Cost and origin", text, rows_table(rows), level=3)]
 
 

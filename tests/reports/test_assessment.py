@@ -70,7 +70,6 @@ def test_validity(calibrated: Any, page: Any, row: Any, section: Any) -> None:
     front = both.sections[0]
     assert (front.title, front.verdict) == ("Rejected", "bad")
     assert front.text[1] == "Failed: late, of 2 tests."
-    assert len(cells(section(both, "Specimens of the test").table).rows) == test.u_values.size
     in_words = section(both, "Test of the model").text
     assert in_words[0].startswith("early: the measured values agree with the prediction. Of a r")
     assert in_words[1].startswith("late: the measured values differ too much from the prediction.")
@@ -115,26 +114,20 @@ def later(calibrated: Any) -> xr.DataArray:
 
 
 def test_specimens_have_readings_beside_u_values(calibrated: Any, later: xr.DataArray) -> None:
-    rows = table(validity=calibrated.test)
-    assert [row["specimen"] for row in rows] == [str(i) for i in range(1, 13)]
-    us = [float(row["u"]) for row in rows]
-    np.testing.assert_allclose(us, calibrated.test.u_values, atol=6e-4)
-    assert "measured" not in rows[0]
+    assert table(validity=calibrated.test) == []
     data = {"hot": [1.5, 2.5], "cold": [2.0, np.inf, 1.0]}
     both = {"hot": later, "cold": later}
     tests = {
         "mean": prb.area_test(data, both, **NULL),
         "spread": prb.area_test(data, both, folded=True, **NULL),
     }
-    rows = table(validity=tests, labels={"hot": "300 K"})
+    validation = {name: (np.array(data[name]), later) for name in data}
+    rows = table(validity=tests, validation=validation, labels={"hot": "300 K"})
     assert [row["condition"] for row in rows] == ["300 K"] * 2 + ["cold"] * 3
     assert [row["specimen"] for row in rows] == ["1", "2", "1", "2", "3"]
     us = [float(row["u"]) for row in rows]
     np.testing.assert_allclose(us, tests["mean"].u_values, atol=6e-4)
-    validation = {name: (np.array(data[name]), later) for name in data}
-    rows = table(validity=tests, validation=validation)
     assert [row["measured"] for row in rows][3] == "\u221e"
-    assert [float(row["u"]) for row in rows] == us
     names = ["S0", "S1"]
     test = prb.area_test(data["hot"], later, specimens=names, **NULL)
     rows = table(validity=test, validation={"hot": validation["hot"]})

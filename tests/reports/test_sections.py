@@ -17,7 +17,7 @@ import prbayes as prb
 from prbayes._finding import Finding
 from prbayes.optimize.convergence import Result
 from prbayes.reports.assessment import data, population_in_units
-from prbayes.reports.material import gather
+from prbayes.reports.material import gather, metrics_of
 from prbayes.reports.numbers import NOTHING, cells
 from prbayes.reports.sections import (
     _labelled_inputs,
@@ -91,10 +91,10 @@ def test_results_under_different_metrics(calibrated: Any) -> None:
     changed = first.copy(deep=True)
     table = changed["calibration"].to_dataset()
     changed["calibration"] = table.assign(metric=("simulator", ["Other()"]))
-    assert list(gather(optimum={"a": first, "b": first}).metrics) == ["y"]
+    assert list(metrics_of(gather(optimum={"a": first, "b": first}))) == ["y"]
     m = gather(optimum={"a": first, "b": changed})
-    assert list(m.metrics) == ["a, y", "b, y"]
-    assert m.metrics["b, y"] == "Other()"
+    assert list(metrics_of(m)) == ["a, y", "b, y"]
+    assert metrics_of(m)["b, y"] == "Other()"
     (different,) = metric(m)
     assert "Epsilon" not in different.text[0], "optima have none"
     assert "epsilon" not in cells(different.table).header

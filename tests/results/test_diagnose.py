@@ -353,7 +353,7 @@ def test_failures_far_from_the_answer_are_harmless(value: float, share: float) -
     # A finite number in place of a failed response looks like any other.
     expected = ([], ["harmless-failures"]) if share < 0.1 and value else (["failed-responses"], [])
     assert ([f.code for f in findings], [f.code for f in harmless]) == expected
-    text = "y: the response failed at 2 point(s), the first at (3.5): it broke; "
+    text = "y: the response failed at 2 points, the first at (3.5): it broke; "
     assert str([*findings, *harmless][0]).startswith(text)
 
 
