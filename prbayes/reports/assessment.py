@@ -440,8 +440,8 @@ def _in_words(label: str, test: ValidityTest, m: Material) -> str:
     p = "less than 0.1%" if test.p_value < 0.001 else in_percent(test.p_value)
     aspect = aspect if name else aspect.capitalize()
     return (
-        f"{name}{aspect} {agreed[not test.rejected]} the prediction. Of a right "
-        f"model, {p} of such tests differ at least as much; below {percentage(test.alpha)} the model is rejected."
+        f"{name}{aspect} {agreed[not test.rejected]} the prediction. Of a right model, {p} of such "
+        f"tests differ at least as much; below {percentage(test.alpha)} the model is rejected."
     )
 
 
