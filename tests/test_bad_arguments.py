@@ -607,19 +607,15 @@ TABLE: dict[str, Row] = {name: Row() for name in public_names()} | {
         own="result",
     ),
     "plots.plot_landscape": Row(
-        pair=(("mu", "zz"), ("mu", "mu"), (), {3}),
         responses=(*ZERO_OR_MORE, None),
         own="responses",
     ),
     "plots.plot_outputs": Row(
         {"result": Later(of_two_outputs), "model": two_outputs},
         result=(None, 3, "result", xr.DataTree(), []),
-        simulator=("zz", ["y"]),
-        outputs=("zz", [], [3], ["zz", "y"]),
         before=BEFORE,
         own="result",
     ),
-    "plots.plot_population": Row(inputs=("zz", [], [3], ["zz"])),
     "plots.plot_posterior": Row(
         posterior=BY_NAME["result"],
         optimum=(3, "a", posterior),
