@@ -132,9 +132,11 @@ NO_LIMIT = (np.nan, np.inf, [1.0])
 BY_NAME: dict[str, tuple[Any, ...]] = {
     "alpha": SHARE,
     "checkpoint": (b"a", "/dev/null/run.nc", "/"),
+    "coords": (3, {"no such dim": 1}),
     "density": (prb.GaussianKDE,),
     "executor": (map, object()),
     "figsize": (3, "wide", (3,), (0, 4), (np.inf, 4), ("a", 4)),
+    "filter_vars": (3, "glob"),
     "folds": (1, 29),
     "idata_kwargs": ({"model": 1}, {"dims": 1}, {"log_prior": 1}),
     "labels": ({"mu": 3}, {"no such name": "mean"}),

@@ -32,9 +32,9 @@ def plot_comparison(
     comparison: xr.Dataset,
     *,
     scores: bool = False,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
@@ -124,8 +124,8 @@ def plot_comparison(
                 text = f"estimate of {texts[0]}"
                 axis.axvline(estimate[0], color=GREY, linestyle=":", label=text, gid="first")
             text = f"{comparison.attrs.get('interval', 0.89):.0%} interval"
-            known = np.isfinite(lower) & np.isfinite(upper)
-            ends = rows[known], lower[known], upper[known]
+            has_ends = np.isfinite(lower) & np.isfinite(upper)
+            ends = rows[has_ends], lower[has_ends], upper[has_ends]
             axis.hlines(*ends, color=BLUE, linewidth=3, label=text, gid="interval")
             axis.scatter(
                 estimate, rows, 45, color=ink(), label="estimate", gid="estimate", zorder=3

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 def plot_optimizer(
     optimum: Optimum,
     *,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
@@ -131,9 +131,9 @@ def plot_optimizer(
 def plot_stages(
     posterior: xr.DataTree,
     *,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> Figure:
@@ -211,12 +211,12 @@ def plot_stages(
         chains = [str(chain) for chain in statistics[name].chain.values.tolist()]
         for c, (chain, row) in enumerate(zip(chains, rows, strict=True)):
             look: dict[str, Any] = {"color": CYCLE[c % len(CYCLE)], "gid": f"chain_{chain}"}
-            known = np.flatnonzero(np.isfinite(row))
+            at = np.flatnonzero(np.isfinite(row))
             if is_once[name]:
-                axis.scatter([c + 1.0], row[known][-1:], 45, **look)
+                axis.scatter([c + 1.0], row[at][-1:], 45, **look)
             else:  # chains differ in colour and in style; five times four before they repeat
                 style = ("-", "--", ":", "-.")[c % 4]
-                axis.plot(known + 1.0, row[known], style, label=f"chain {chain}", **look)
+                axis.plot(at + 1.0, row[at], style, label=f"chain {chain}", **look)
         ticks = chains if is_once[name] else [str(stage + 1) for stage in range(rows.shape[1])]
         step = -(-len(ticks) // 10)  # at most ten
         axis.set_xticks(np.arange(1, len(ticks) + 1, step), ticks[::step])

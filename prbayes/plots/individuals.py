@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 def plot_individuals(
     individuals: xr.DataTree,
     *,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     prob: float = INTERVAL,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,

@@ -41,9 +41,9 @@ def plot_landscape(
     optimum: Optimum,
     *,
     model: pm.Model | None = None,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     points: int | None = None,
     responses: int = 0,
     labels: Mapping[str, str] | None = None,
@@ -273,9 +273,9 @@ def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
 
 def select_free(
     optimum: Optimum,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
 ) -> list[str]:
     """Return names of these elements, all by default, without constants as zeros of a factor."""
     point = {str(rv.name): optimum.point[str(rv.name)] for rv in optimum.model.free_RVs}

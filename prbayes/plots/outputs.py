@@ -44,9 +44,9 @@ def plot_outputs(
     result: Optimum | xr.DataTree,
     *,
     model: pm.Model | None = None,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     before: Mapping[str, Any] | bool | None = None,
     n_draws: int | None = None,
     labels: Mapping[str, str] | None = None,
@@ -187,7 +187,10 @@ def plot_outputs(
 
 
 def _shown_outputs(
-    evaluator: Evaluator, var_names: VarNames, filter_vars: FilterVars, coords: Coords
+    evaluator: Evaluator,
+    var_names: VarNames | None,
+    filter_vars: FilterVars | None,
+    coords: Coords | None,
 ) -> tuple[int, list[Output]]:
     """Return the index of the simulator, and its outputs in the picture."""
     nodes = evaluator.simulators
@@ -206,12 +209,15 @@ def _shown_outputs(
         output for outputs in several.values() for output in outputs.values()
     )
     names = select(elements, var_names, filter_vars, coords)
-    k = next(k for k, outputs in several.items() if names[0] in outputs)
-    others = [name for name in names if name not in several[k]]
-    if others and var_names is not None:
+    chosen = {k: sum(name in outputs for name in names) for k, outputs in several.items()}
+    # The first simulator, but one of which only some outputs are selected comes before.
+    first = [k for k, n in chosen.items() if 0 < n < len(several[k])]
+    k = (first or [k for k, n in chosen.items() if n])[0]
+    rest = [name for name in names if name not in several[k]]
+    if rest and var_names is not None:
         raise ValueError(
             f"plot_outputs: var_names: got outputs of several simulators, {names[0]} and "
-            f"{others[0]}, expected those of one"
+            f"{rest[0]}, expected those of one"
         )
     columns = [several[k][name] for name in names if name in several[k]]
     if len(columns) == len(several[k]):

@@ -51,12 +51,12 @@ def plot_posterior(
     *,
     optimum: Optimum | None = None,
     model: pm.Model | None = None,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     prob: float = INTERVAL,
-    labels: Mapping[str, str] | None = None,
     backend: str | None = None,
+    labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> PlotCollection:
     """Draw the posterior of each hyperparameter against the optimum and the prior, by ArviZ.
@@ -82,10 +82,10 @@ def plot_posterior(
         Labels of the variables by dimension, such as ``{"supplier": ["Adler"]}``.
     prob : float
         Probability of the intervals.
-    labels : mapping, optional
-        Labels of hyperparameters by name, with units.
     backend : {"matplotlib", "plotly", "bokeh"}, optional
         Library that ArviZ draws with; that of ``arviz.rcParams`` by default.
+    labels : mapping, optional
+        Labels of hyperparameters by name, with units.
     **pc_kwargs
         ``figsize=(8, 5)`` in inches, and keywords of ``arviz.PlotCollection.wrap``, such as
         ``col_wrap``.
@@ -134,6 +134,10 @@ def plot_posterior(
     if model is not None:
         require_of_model(posterior, model, "plot_posterior", Level.PRIORS)
     share(prob, "prob")
+    if backend not in (None, "matplotlib", "plotly", "bokeh", "none"):
+        raise ValueError(
+            f"backend: got {backend!r:.60}, expected 'matplotlib', 'plotly', 'bokeh' or 'none'"
+        )
     evaluator = None if model is None else Evaluator.of(model)
 
     # Elements of the variables that posterior, optimum and model share
@@ -205,7 +209,8 @@ def _summary(
     size = max(map(len, samples))
     padded = [np.append(x, np.full(size - len(x), np.nan)) for x in samples]
     along = "distribution"
-    lines = np.stack([np.broadcast_to(grid, (len(rows), grid.size)), curves], axis=1)
+    # ArviZ leaves out a line without numbers.
+    lines = [[np.where(np.isnan(curve), np.nan, grid), curve] for curve in curves]
     return xr.Dataset(
         {
             "draws": ((along, "sample"), padded),
@@ -235,7 +240,7 @@ def _draw(
     columns, options = layout(len(summaries), (4.6, 3.6), pc_kwargs)
     if backend != "matplotlib":
         options.pop("layout")
-    others = {key: value for key, value in pc_kwargs.items() if key != "figsize"}
+    rest = {key: value for key, value in pc_kwargs.items() if key != "figsize"}
     shown = next(iter(summaries.values())).distribution.values.tolist()
     colors, styles, markers = zip(*(_LOOKS[name] for name in shown), strict=True)
     along = ["distribution"]
@@ -270,7 +275,7 @@ def _draw(
             "credible_interval": by_name("interval"),
             "point_estimate": by_name("point"),
         },
-        **(settings | others | {"figure_kwargs": options}),
+        **(settings | rest | {"figure_kwargs": options}),
     )
     look: dict[str, Any] = {"loc": "outside lower center", "ncols": len(shown), "frameon": False}
     drawn.add_legend(

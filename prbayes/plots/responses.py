@@ -58,9 +58,9 @@ def plot_responses(
     result: Optimum | xr.DataTree,
     *,
     model: pm.Model | None = None,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
     before: Mapping[str, Any] | bool | None = None,
     ecdf: bool = False,
     prob: float = INTERVAL,
@@ -390,9 +390,9 @@ def output_elements(outputs: Iterable[Output]) -> Elements:
 
 def panels_of(
     nodes: Sequence[PopulationSimulator],
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
-    coords: Coords = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
+    coords: Coords | None = None,
 ) -> list[Output]:
     """Return the panels of simulators: their outputs, or one for a curve or many outputs."""
     alone = len(nodes) == 1
@@ -402,8 +402,8 @@ def panels_of(
     names = select(output_elements(available.values()), var_names, filter_vars, coords)
     for name in names:
         output = available[name]
-        every = by_node[output.node.name]
-        if in_one_panel(output.node.outputs) and {x.name for x in every} <= set(names):
+        outputs = by_node[output.node.name]
+        if in_one_panel(output.node.outputs) and {x.name for x in outputs} <= set(names):
             output = Output(output.node, None, alone)
         shown[output.name] = output
     if coords is not None and sum(x.column is not None for x in shown.values()) > 24:

@@ -13,9 +13,9 @@ import xarray as xr
 from prbayes._validate import called
 from prbayes.model.parameters import split_elements, variable_of
 
-VarNames = str | Sequence[str] | None
-FilterVars = Literal["like", "regex"] | None
-Coords = Mapping[str, Any] | None
+VarNames = str | Sequence[str]
+FilterVars = Literal["like", "regex"]
+Coords = Mapping[str, Any]
 # Variable, and coordinate by dimension, of each element by name.
 Elements = Mapping[str, tuple[str, Mapping[str, Any]]]
 
@@ -33,7 +33,10 @@ def elements_of(arrays: Mapping[Any, xr.DataArray]) -> Elements:
 
 
 def select(
-    elements: Elements, var_names: VarNames, filter_vars: FilterVars, coords: Coords
+    elements: Elements,
+    var_names: VarNames | None,
+    filter_vars: FilterVars | None,
+    coords: Coords | None,
 ) -> list[str]:
     """Return the elements of variables that have one of some coordinates, as ArviZ selects them.
 
@@ -43,30 +46,32 @@ def select(
     names = _select_names(elements, var_names, filter_vars)
     for dim, value in _items(coords, set(chain.from_iterable(x for _, x in elements.values()))):
         labels = dict.fromkeys(x[dim] for _, x in elements.values() if dim in x)
-        kept = _kept_labels(list(labels), dim, value)
-        names = [name for name in names if elements[name][1].get(dim, kept[0]) in kept]
+        selected = _selected_labels(list(labels), dim, value)
+        names = [name for name in names if elements[name][1].get(dim, selected[0]) in selected]
     if not names:
         raise KeyError(f"coords: got {coords!r:.200}, expected some of {list(elements)}")
     return names
 
 
 def select_variables(
-    names: Iterable[str], var_names: VarNames, filter_vars: FilterVars
+    names: Iterable[str], var_names: VarNames | None, filter_vars: FilterVars | None
 ) -> list[str]:
     """Return names that ArviZ's arguments select, each an element of a variable."""
     elements: Elements = {name: (variable_of(name), {}) for name in names}
     return _select_names(elements, var_names, filter_vars)
 
 
-def subset(data: xr.Dataset, coords: Coords, available: Iterable[Any] = ()) -> xr.Dataset:
+def subset(data: xr.Dataset, coords: Coords | None, available: Iterable[Any] = ()) -> xr.Dataset:
     """Return data with some labels of their dimensions; ``available`` are those of other data."""
     for dim, value in _items(coords, {*map(str, data.dims), *map(str, available)}):
         if dim in data.dims:
-            data = data.sel({dim: _kept_labels(data[dim].values.tolist(), dim, value)})
+            data = data.sel({dim: _selected_labels(data[dim].values.tolist(), dim, value)})
     return data
 
 
-def _select_names(elements: Elements, var_names: VarNames, filter_vars: FilterVars) -> list[str]:
+def _select_names(
+    elements: Elements, var_names: VarNames | None, filter_vars: FilterVars | None
+) -> list[str]:
     if filter_vars not in (None, "like", "regex"):
         raise ValueError(f"filter_vars: got {filter_vars!r:.60}, expected None, 'like' or 'regex'")
     if var_names is None:
@@ -88,17 +93,17 @@ def _select_names(elements: Elements, var_names: VarNames, filter_vars: FilterVa
             or (filter_vars == "regex" and re.search(text, variable))
         ]
 
-    found = {text: matches(text) for text in requested}
-    unknown = [text for text, names in found.items() if not names]
-    if unknown or not found:
+    matching = {text: matches(text) for text in requested}
+    unknown = [text for text, names in matching.items() if not names]
+    if unknown or not matching:
         raise KeyError(f"var_names: got {unknown or 'none'}, expected some of {list(elements)}")
-    excluded = [names for text, names in found.items() if text.startswith("~")]
+    excluded = [names for text, names in matching.items() if text.startswith("~")]
     if excluded:
         return [name for name in elements if name not in chain.from_iterable(excluded)]
-    return list(dict.fromkeys(chain.from_iterable(found.values())))
+    return list(dict.fromkeys(chain.from_iterable(matching.values())))
 
 
-def _items(coords: Coords, dims: set[str]) -> list[tuple[str, Any]]:
+def _items(coords: Coords | None, dims: set[str]) -> list[tuple[str, Any]]:
     """Return dimensions with the values to select; raise for unknown ones."""
     if coords is None:
         return []
@@ -110,13 +115,13 @@ def _items(coords: Coords, dims: set[str]) -> list[tuple[str, Any]]:
     return list(coords.items())
 
 
-def _kept_labels(labels: list[Any], dim: str, value: Any) -> list[Any]:
+def _selected_labels(labels: list[Any], dim: str, value: Any) -> list[Any]:
     """Return the labels that a value, a list or a slice selects along a dimension."""
     along = xr.DataArray(labels, {dim: labels}, [dim])
     try:
-        kept: list[Any] = np.atleast_1d(along.sel({dim: value}).values).tolist()
+        selected: list[Any] = np.atleast_1d(along.sel({dim: value}).values).tolist()
     except (KeyError, TypeError, ValueError, IndexError):
-        kept = []
-    if not kept:
+        selected = []
+    if not selected:
         raise KeyError(f"coords: {dim}: got {value!r:.60}, expected some of {labels!s:.200}")
-    return kept
+    return selected

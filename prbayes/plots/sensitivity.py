@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 def plot_sensitivity(
     table: xr.Dataset,
     *,
-    var_names: VarNames = None,
-    filter_vars: FilterVars = None,
+    var_names: VarNames | None = None,
+    filter_vars: FilterVars | None = None,
     labels: Mapping[str, str] | None = None,
     **pc_kwargs: Any,
 ) -> Figure:

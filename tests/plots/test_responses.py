@@ -64,7 +64,7 @@ def test_distribution_functions_of_an_optimum(
     ends = ["before: as given", band.format("standard error"), "calibrated: optimum"]
     assert read.texts(pc) == ["measured", *ends]
     ends = ["before: prior's initial point", band.format("posterior")]
-    assert read.texts(drawn("responses"))[1:3] == ends
+    assert read.texts(drawn("responses"))[2:4] == ends
     axis = read.panel(pc, "y")
     assert axis.get_ylabel() == "share of specimens"
     assert axis.get_title() == "30 measured values"
@@ -165,7 +165,7 @@ def test_each_output_has_a_panel_but_a_curve_or_many_have_one() -> None:
     assert names == ["y", "z[a]", "z[b]", "curve", "many"]
     chosen = panels_of(nodes, ["curve", "z[b]"], None, {"hour": [0.0, 2.0]})
     assert [output.name for output in chosen] == ["curve[0]", "curve[2]", "z[b]"]
-    assert [output.name for output in panels_of(nodes, "^c|y", "regex")] == ["curve", "many", "y"]
+    assert [output.name for output in panels_of(nodes, "^c|y", "regex")] == ["y", "curve", "many"]
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,7 @@ def test_outputs_have_a_line_for_each_direction_and_no_band_of_another_statistic
         drawn = [alone, *directions] if folded or line == "ecdf" else directions
         for part, u in zip(parts, drawn, strict=True):
             known = part[~np.isnan(x[part])]
-            at, (low, high) = _between(x[known], y[known])
+            at, low, high = _between(x[known], y[known])
             area = np.trapezoid(high - low, at)
             share = 1.0 if folded or u is alone else 0.5
             mean += area * share * u.size / test.u_values.size
