@@ -240,6 +240,9 @@ def _draw(
     columns, options = layout(len(summaries), (4.6, 3.6), pc_kwargs)
     if backend != "matplotlib":
         options.pop("layout")
+        if "figsize" not in pc_kwargs.get("figure_kwargs", {}):  # in dots, 100 per inch
+            width, height = options["figsize"]
+            options |= {"figsize": (100 * width, 100 * height), "figsize_units": "dots"}
     rest = {key: value for key, value in pc_kwargs.items() if key != "figsize"}
     shown = next(iter(summaries.values())).distribution.values.tolist()
     colors, styles, markers = zip(*(_LOOKS[name] for name in shown), strict=True)
