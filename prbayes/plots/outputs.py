@@ -209,10 +209,10 @@ def _shown_outputs(
         output for outputs in several.values() for output in outputs.values()
     )
     names = select(elements, var_names, filter_vars, coords)
-    chosen = {k: sum(name in outputs for name in names) for k, outputs in several.items()}
+    selected = {k: sum(name in outputs for name in names) for k, outputs in several.items()}
     # The first simulator, but one of which only some outputs are selected comes before.
-    first = [k for k, n in chosen.items() if 0 < n < len(several[k])]
-    k = (first or [k for k, n in chosen.items() if n])[0]
+    first = [k for k, n in selected.items() if 0 < n < len(several[k])]
+    k = (first or [k for k, n in selected.items() if n])[0]
     rest = [name for name in names if name not in several[k]]
     if rest and var_names is not None:
         raise ValueError(

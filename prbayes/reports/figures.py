@@ -156,8 +156,8 @@ def requests(m: Material) -> dict[str, Request]:
     def labels_of(names: Iterable[Any]) -> dict[str, Any]:
         """Return as keywords the labels of names in a picture without a model."""
         variables = {variable_of(str(name)) for name in names}
-        chosen = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
-        return {"labels": chosen} if chosen else {}
+        texts = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
+        return {"labels": texts} if texts else {}
 
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
