@@ -36,7 +36,7 @@ _log = logging.getLogger("prbayes")
 class Illustration:
     """A picture that a report shows where it has the contents."""
 
-    function: Callable[..., Any]  # returns an ArviZ `PlotCollection`
+    function: Callable[..., Any]  # returns a figure with ``savefig``
     title: str
     alt: str
     caption: str = ""
@@ -137,8 +137,8 @@ def requests(m: Material) -> dict[str, Request]:
     def labels_of(names: Iterable[Any]) -> dict[str, Any]:
         """Return as keywords the labels of names in a picture without a model."""
         variables = {variable_of(str(name)) for name in names}
-        chosen = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
-        return {"labels": chosen} if chosen else {}
+        texts = {name: text for name, text in m.labels.items() if variable_of(name) in variables}
+        return {"labels": texts} if texts else {}
 
     result = optimum if posterior is None else posterior
     if m.model is not None and result is not None:
@@ -154,6 +154,7 @@ def requests(m: Material) -> dict[str, Request]:
     if posterior is not None:
         shown = labels if m.model is not None else labels_of(posterior["posterior"].data_vars)
         shown = {"optimum": optimum, "model": m.model, **shown, **prob}
+        shown["backend"] = "matplotlib"
         requested["posterior"] = ((posterior,), shown)
         if "sample_stats" in posterior and "stage" in posterior["sample_stats"].dims:
             requested["stages"] = ((posterior,), {})
