@@ -479,8 +479,9 @@ class Responses:
                 f"{self.name}: got {numbers_text(values[rows[changed]])} from the response "
                 f"{self._place(selected, changed)}, expected {numbers_text(then[changed])}, which "
                 "it gave when the simulator was written: a variable that it reads has changed "
-                "since, before or in its runs, which begin at the first use; write a function without a "
-                "state, and one for each condition, such as functools.partial(response, load=2.0)"
+                "since, before or in its runs, which begin at the first use; write a function "
+                "without a state, and one for each condition, such as "
+                "functools.partial(response, load=2.0)"
             )
 
 
