@@ -499,6 +499,7 @@ def test_a_number_says_why() -> None:
 
 # Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py` tests directly.
 INNER = {
+    "plots.posterior": {"arviz_plots.plot_collection.PlotCollection"},
     "posterior.results": {
         "pymc.backends.base.MultiTrace",
         "pymc.backends.ndarray.NDArray",
