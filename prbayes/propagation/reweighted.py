@@ -17,7 +17,7 @@ from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, counted, report
 from prbayes._validate import AT_ONCE, IN_CACHE, Floats, positive_integer
 from prbayes.emulators.selection import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
@@ -213,10 +213,10 @@ class Reweighted(Propagation):
         if self.coarse is not None:
             if not self.emulates(inputs):
                 raise TypeError(
-                    f"{name}: coarse: got a coarse response for {inputs.dimensions} aleatory "
-                    f"number(s) and n = {self.n}, expected several continuous numbers for each "
-                    f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
-                    "leave coarse= out"
+                    f"{name}: coarse: got a coarse response for "
+                    f"{counted(inputs.dimensions, 'aleatory number')} and n = {self.n}, expected "
+                    "several continuous numbers for each specimen and at most "
+                    f"{MOST_RUNS} runs, between which something is emulated: leave coarse= out"
                 )
             refuse_misfit(f"{name}: coarse", self.coarse, inputs.sizes)
 

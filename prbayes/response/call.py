@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._finding import Finding, report
+from prbayes._finding import Finding, counted, report
 from prbayes._progress import progress
 from prbayes._validate import Floats, unmasked
 from prbayes.response.budget import BudgetError, budget
@@ -666,7 +666,7 @@ def _failure_error(settings: CallSettings, points: Points, raised: dict[int, str
     if is_wrong_result(reason):
         advice = f"repair it; if this is what a run that failed returns, pass {policies}"
     return ResponseError(
-        f"{settings.name}: the response failed at {len(raised)} point(s){place}: {reason}"
+        f"{settings.name}: the response failed at {counted(len(raised), 'point')}{place}: {reason}"
         f"{store_text}; {advice}"
     )
 
