@@ -21,7 +21,7 @@ import structure
 import prbayes
 
 PACKAGE = Path(prbayes.__file__).parent
-ROOT = PACKAGE.parent
+ROOT = Path(__file__).parents[1]
 FILES = sorted(PACKAGE.rglob("*.py"))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 README_OUTPUT, LIKELIHOOD_OUTPUT = re.findall(
@@ -499,6 +499,7 @@ def test_a_number_says_why() -> None:
 
 # Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py` tests directly.
 INNER = {
+    "plots.posterior": {"arviz_plots.plot_collection.PlotCollection"},
     "posterior.results": {
         "pymc.backends.base.MultiTrace",
         "pymc.backends.ndarray.NDArray",

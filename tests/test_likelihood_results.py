@@ -191,7 +191,7 @@ def test_exceedance(problem: Problem, optimum: prb.Optimum) -> None:
 @pytest.mark.usefixtures("no_run")
 def test_sensitivity_and_plan(problem: Problem, posterior: xr.DataTree) -> None:
     mean = prb.decision.Mean(problem.growth, problem.x)
-    shares = prb.sensitivity(posterior, mean, model=problem.model, n_samples=128)
+    shares = prb.sensitivity(posterior, mean, model=problem.model, n_points=128)
     assert float(shares["first"].sel(factor="mu")) > 0.5
     plan = prb.plan(
         posterior,
@@ -375,13 +375,13 @@ def test_cost_before_and_after(problem: Problem, optimum: prb.Optimum) -> None:
     assert fresh.growth.runs == 0
     assert before.runs == 128
     assert "128 runs, 0 of them computed" in str(before)
-    assert prb.cost(lambda: build(data).model).runs == 128
+    assert prb.cost(build(data).model).runs == 128
     assert prb.cost(problem.model).runs == 0
 
 
 @pytest.mark.usefixtures("no_run")
 def test_plots(problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree) -> None:
-    shown = [
+    shown: list[Any] = [
         prb.plots.plot_population(optimum),
         prb.plots.plot_population(posterior, model=problem.model),
         prb.plots.plot_responses(optimum),
@@ -392,7 +392,7 @@ def test_plots(problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree) -
         prb.plots.plot_comparison(prb.compare({"a": optimum, "b": posterior})),
         prb.plots.plot_landscape(optimum, points=9),
     ]
-    assert all(list(collection.viz.children) for collection in shown)
+    assert all(getattr(picture, "axes", None) or picture.viz.children for picture in shown)
     # The path is that of the descent that found the optimum.
     assert np.isfinite(optimum.search.trace["discrepancy"][-1])
     np.testing.assert_allclose(optimum.search.trace["theta"][-1], optimum.theta, atol=1e-3)
@@ -411,7 +411,7 @@ def test_report(
     assert "emulator of 128 runs" in text
     assert "width is that of epsilon" not in text
     assert "could not be made" not in text
-    assert "The diagnostics found no problem." in text
+    assert "no problem was found." in text
     assert "was not tested" not in text
 
 
@@ -487,7 +487,7 @@ def test_groups() -> None:
     prb.plots.plot_responses(optimum)
     prb.plots.plot_population(optimum)
     # The population is tested with the refits of all groups; its p-value is uniform.
-    assert any("root(s)" in note for note in prb.diagnose(optimum).notes)
+    assert any("root" in note for note in prb.diagnose(optimum).notes)
     assert prb.cross_validate(optimum).sizes["simulator"] == 3
     with pytest.raises(TypeError, match="group"):
         prb.exceedance(optimum, growth, 2.0, inputs)

@@ -11,8 +11,8 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._display import view
-from prbayes._finding import Finding, from_json
+from prbayes._display import view, without_constructor
+from prbayes._finding import Finding, counted, from_json
 from prbayes._validate import Floats
 from prbayes.inference.checks.metric_suitability import refit_bias, small_simulators
 from prbayes.inference.checks.population import lost_mass_shift
@@ -64,7 +64,8 @@ _NOISE = 11.0
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
 
-@dataclass(frozen=True, eq=False)
+@without_constructor
+@dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
     """The result of `diagnose`.
 
@@ -109,8 +110,16 @@ class Diagnosis:
             return "No problem was found by the tests that were run."
         return "No problem was found."
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return "\n".join([*(self.messages or [self.all_clear]), *self.notes, *self.untested])
+
+    def to_dataframe(self) -> Any:
+        """Return a row for each finding and remark: its code, kind and text."""
+        import pandas as pd
+
+        rows = [("finding", f.code, f.text) for f in self.findings]
+        rows += [("remark", f.code, f.text) for f in self.remarks]
+        return pd.DataFrame(rows, columns=["kind", "code", "text"])
 
     def _repr_html_(self) -> str:
         """Show the sentences in a notebook, findings first."""
@@ -119,7 +128,7 @@ class Diagnosis:
             clear = self.all_clear.removesuffix(".")
             return view(f"Diagnosis: {clear[0].lower()}{clear[1:]}", sentences=sentences)
         count = len(self.findings)
-        return view(f"Diagnosis: {count} problem{'s' if count > 1 else ''}", sentences=sentences)
+        return view(f"Diagnosis: {counted(count, 'problem')}", sentences=sentences)
 
 
 @locked
@@ -352,8 +361,8 @@ def _failure_findings(
         inputs = rows["inputs"].values[0]
         point = ", ".join(f"{x:.6g}" for x in inputs[~np.isnan(inputs)])
         text = (
-            f"{name}: the response failed at {rows.sizes['failure']} point(s), the first at "
-            f"({point}): {rows['reason'].values[0]}; "
+            f"{name}: the response failed at {counted(rows.sizes['failure'], 'point')}, the first "
+            f"at ({point}): {rows['reason'].values[0]}; "
         )
         replacement = rows["instead"].values[0]
         share = np.nan  # a finite number in place of a failed response looks like any other
