@@ -652,7 +652,15 @@ def all_scores() -> Iterator[Row]:
                 error, width = scoreboard.worst(one, "rms"), scoreboard.worst(one, "width")
                 shown = ["" if v is None else short(v) for v in (error, width)]
                 sets = str(one["data sets"])
-                yield [problem, size, rival, *shown, f"{one['runs']:,.0f}", f"{one['cpu']:.2g}", sets]
+                yield [
+                    problem,
+                    size,
+                    rival,
+                    *shown,
+                    f"{one['runs']:,.0f}",
+                    f"{one['cpu']:.2g}",
+                    sets,
+                ]
 
 
 TABLES: dict[str, Callable[[], Iterator[Row]]] = {

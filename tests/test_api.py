@@ -66,7 +66,9 @@ def as_text() -> str:
 
 def test_public_names_and_signatures_are_those_that_are_promised() -> None:
     promised = json.loads(FILE.read_text(encoding="utf-8"))
-    assert json.loads(as_text()) == promised, "see the docstring of this file, and docs/stability.md"
+    assert json.loads(as_text()) == promised, (
+        "see the docstring of this file, and docs/stability.md"
+    )
 
 
 if __name__ == "__main__":

@@ -33,8 +33,6 @@ def no_response(x: Any) -> Any:
     raise AssertionError("a stored response is computed again")
 
 
-
-
 def test_a_store_and_a_checkpoint_need_no_run(folder: Path, numbers: dict[str, Any]) -> None:
     model = formats.model_of(no_response, folder)
     before = (folder / "run.nc").read_bytes()
