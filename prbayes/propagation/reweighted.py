@@ -419,14 +419,15 @@ class ReweightedBound(Bound):
         values = np.empty(0)
         if pairs:
             # The design may have other runs, after the first ones in common.
-            _, earlier = pairs[0]
+            previous, earlier = pairs[0]
+            responses.outputs = responses.outputs or previous.outputs  # names of a mapping
             n = min(len(earlier), len(runs))
             equal = np.ones(n, dtype=bool)
             for x, y in zip(earlier.points, runs.points, strict=True):
                 equal &= (x[:n] == y[:n]).reshape(n, -1).all(axis=1)
             values = earlier.values[: n if equal.all() else int(equal.argmin())]
             points = self.points_of(responses.inputs, earlier.points)
-            responses.refuse_change(points, earlier.values, pairs[0][0])
+            responses.refuse_change(points, earlier.values, previous)
         if len(values) < len(runs):
             points = self.points_of(responses.inputs, runs.points)
             missing = [x[len(values) :] for x in points]

@@ -643,9 +643,14 @@ def _apply_policy(
 def inputs_text(settings: CallSettings, points: Points, row: int) -> str:
     """Return the inputs of a point as a text, with their names where these are known."""
     (inputs,) = points.at(np.array([row])).keys()
-    if len(settings.columns) != inputs.size or inputs.size > 12:
-        return numbers_text(inputs, 6)
-    pairs = zip(settings.columns, inputs, strict=True)
+    return named_numbers(settings.columns, inputs)
+
+
+def named_numbers(names: Sequence[str], numbers: Floats) -> str:
+    """Return few numbers with their names as a text, and many without."""
+    if len(names) != numbers.size or numbers.size > 12:
+        return numbers_text(numbers, 6)
+    pairs = zip(names, numbers, strict=True)
     return f"({', '.join(f'{name} = {value:.6g}' for name, value in pairs)})"
 
 
