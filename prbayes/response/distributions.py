@@ -20,6 +20,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._validate import Floats
 from prbayes.response.compile import PLAIN, compile_batched, interpreted, with_leading_axis
 from prbayes.response.condition import is_condition
+from prbayes.response.dims import without_dims
 from prbayes.response.inputs import Inputs, event_shape, is_random, quiet_logp
 
 # Operations of distributions, for `isinstance`.
@@ -227,9 +228,15 @@ class PriorSampler:
     @interpreted()
     def __init__(self, drawn: Sequence[TensorVariable]) -> None:
         self._names = ", ".join([str(v.name) for v in drawn])
+        drawn, given = without_dims(drawn), drawn
         self._shapes = [event_shape(v) for v in drawn]
         # PyMC gives a `str_repr` to the variables of a model.
-        parents = [v for v in ancestors(drawn) if hasattr(v, "str_repr") and is_random(v)]
+        # Without dimensions all are copies.
+        parents = [
+            v
+            for v in ancestors(drawn)
+            if is_random(v) and (hasattr(v, "str_repr") or drawn[0] is not given[0])
+        ]
         variables = dict.fromkeys([*drawn, *parents])
         n = pt.iscalar("n")
         try:
@@ -269,6 +276,7 @@ class PriorPoints:
 
     @interpreted()
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
+        variables = without_dims(variables)
         self._shapes = [event_shape(v) for v in variables]
         self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
         self.size = sum(self._sizes)
