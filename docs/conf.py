@@ -42,17 +42,23 @@ extensions = [
     "sphinx.ext.viewcode",
     "numpydoc",
     "myst_nb",
+    "sphinx_copybutton",
     "alt_texts",
     "notebooks",
     "offline_math",
+    "search_words",
 ]
 html_math_renderer = "mathml"
 templates_path = ["_templates"]
 exclude_patterns = ["_build", "_extensions", "inventories"]
 html_theme = "furo"
 html_title = "prbayes"
+html_logo = html_favicon = "_static/logo.svg"
 html_static_path = ["_static"]
 html_css_files = ["prbayes.css"]
+html_copy_source = html_show_sourcelink = False
+copybutton_selector = "div.highlight:not(.cell_output *) pre"
+copybutton_exclude = ".linenos, .gp, .go"
 
 # Pages run side by side, one on a processor: threads within one would wait for those of others.
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
