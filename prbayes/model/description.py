@@ -23,7 +23,7 @@ from prbayes.model.measurement import Measurement
 from prbayes.model.random_variable import Node, nodes, response_name
 from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.model.specimen_preparation import prepared
-from prbayes.response.inputs import is_random
+from prbayes.response.dims import is_random
 from prbayes.response.outputs import Outputs
 
 # Fields of the description of a variable, and of a simulator.

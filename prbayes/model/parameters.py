@@ -30,7 +30,7 @@ from prbayes.response.compile import (
     with_leading_axis,
 )
 from prbayes.response.condition import is_condition
-from prbayes.response.dims import tensor, with_dims, without_dims
+from prbayes.response.dims import values_of, with_dims, without_dims
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import Inputs, event_shape, is_group
 
@@ -118,13 +118,13 @@ class Hyperparameters:
         model = self.model
         with building("priors"):
             terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
-        terms = [tensor(term) for term in terms]
+        terms = [values_of(term) for term in terms]
         jacobian: Any = np.float64(0.0)
         for rv in model.free_RVs:
             transform = model.rvs_to_transforms[rv]
             if transform is not None:
                 value = model.rvs_to_values[rv]
-                jacobian += tensor(transform.log_jac_det(value, *rv.owner.inputs)).sum()
+                jacobian += values_of(transform.log_jac_det(value, *rv.owner.inputs)).sum()
         graphs = model.replace_rvs_by_values([pt.as_tensor(jacobian)])
         return self.compile([*(term.sum() for term in terms), *graphs])
 
@@ -204,8 +204,8 @@ class Hyperparameters:
             rv = self.model.values_to_rvs[value_variable]
             transform = self.model.rvs_to_transforms[rv]
             value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
-            columns.append(pt.atleast_1d(tensor(value)).ravel())
-        symbols = [tensor(rv).type() for rv in self.model.free_RVs]
+            columns.append(pt.atleast_1d(values_of(value)).ravel())
+        symbols = [values_of(rv).type() for rv in self.model.free_RVs]
         swap = {v: with_dims(s, v) for v, s in zip(self.model.free_RVs, symbols, strict=True)}
         (theta,) = without_dims(graph_replace([pt.concatenate(columns)], swap, strict=False))
         batched = with_leading_axis(symbols)

@@ -62,8 +62,8 @@ from prbayes.response.condition import (
     refuse_covariates,
     refuse_vectors_of_specimens,
 )
+from prbayes.response.dims import values_of
 from prbayes.response.distributions import refuse_without_density
-from prbayes.response.dims import tensor
 from prbayes.response.inputs import (
     Groups,
     Inputs,
@@ -531,7 +531,7 @@ def _measurement_variables(
                 f"{name}: metric: {role}: got {value}, expected a named variable of the model, "
                 "such as pm.HalfNormal('error', 0.1), or a number"
             )
-        extras[role] = tensor(value)
+        extras[role] = values_of(value)
     return extras
 
 

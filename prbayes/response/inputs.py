@@ -21,7 +21,13 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._validate import NO_POPULATION, plain_text, real_array
 from prbayes.response.compile import PLAIN, interpreted
 from prbayes.response.condition import is_condition
-from prbayes.response.dims import foreign_variable, has_dims, input_without_dims, tensor
+from prbayes.response.dims import (
+    foreign_variable,
+    has_dims,
+    input_without_dims,
+    is_random,
+    values_of,
+)
 
 
 class Inputs:
@@ -153,7 +159,7 @@ def read_inputs(
 
     ``fixed`` is whether they may depend on no hyperparameter.
     """
-    tensors = {v: tensor(v) for v in model.basic_RVs}
+    tensors = {v: values_of(v) for v in model.basic_RVs}
     model_variables: set[Variable] = {*tensors, *tensors.values()}
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
@@ -282,17 +288,6 @@ def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
         return pm.logp(dist, x, warn_rvs=False)
-
-
-def is_random(variable: Variable) -> bool:
-    """Return whether a variable of a graph is a random one: drawn, not computed."""
-    if variable.owner is None:
-        return False
-    op = variable.owner.op
-    return (
-        isinstance(op, RandomVariable | pm.distributions.distribution.SymbolicRandomVariable)
-        and variable is variable.owner.outputs[op.default_output or 0]
-    )
 
 
 def event_shape(dist: TensorVariable) -> tuple[int, ...]:
